@@ -129,6 +129,10 @@ demo-ros:
 demo: demo-ros demo-deps build-demo ## push Debian's people_detect and find people in real pictures; ROS=2 a node of rclpy, CHECK=1 ends by itself
 	@ROS="$(ROS)" CHECK="$(CHECK)" BIN="$(CARGO_TARGET_DIR)/demo" demo/demo
 
+.PHONY: types
+types: init web ## write the page's types (web/src/lib/types.ts) from the schemas of the API
+	@WRITE_TYPES=1 cargo test $(DEV) --lib -- the_pages_types
+
 .PHONY: test
 test: ## format, lints, unit tests, stories, a quick evaluation, stories in a virtual machine; says how long each took
 	@scripts/parts room test-deps vm-image robots build-dev lint unit vm-home test-vm test-eval stories $(ALSO)

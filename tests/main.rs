@@ -113,6 +113,8 @@ mod readiness;
 mod recordings;
 #[path = "stories/refusals.rs"]
 mod refusals;
+#[path = "stories/registries.rs"]
+mod registries;
 mod rehearsal;
 #[path = "stories/robot_network.rs"]
 mod robot_network;
@@ -306,6 +308,7 @@ fn main() -> ExitCode {
             an_exported_service_is_published_on_another_server,
             what_nobody_refers_to_is_collected,
         ],
+        stories![registries: skopeo_and_containerd_pull_with_a_token],
         stories![inside:
             a_viewer_hears_and_does_nothing_and_an_operator_acts,
             looking_inside_keeps_no_servant_and_is_bounded,

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::bail;
+use support::cable::Cable;
 use support::world::{GREETER, world};
 use support::{Verdict, story};
 
@@ -11,6 +12,9 @@ use crate::runner::RunnableStory;
 /// Environment variable that selects these stories; its value is the number of seconds after which a story counts as
 /// hanging.
 pub const VARIABLE: &str = "CLOUDROID_REHEARSAL";
+
+/// Begin of the line that says that a servant is at work; the path of a network namespace follows.
+pub const AT_WORK: &str = "rehearsal: a servant is at work, and the network ";
 
 /// Returns that time, if these stories are selected.
 pub fn limit() -> Option<Duration> {
@@ -61,12 +65,13 @@ fn panic_once() -> Verdict {
     Ok(())
 }
 
-/// Keeps a servant working until the run is killed.
+/// Keeps a servant and a network working until the run is killed.
 fn wait_with_a_servant() -> Verdict {
     let daemon = world().setup("rehearsal-waits").start()?;
     GREETER.push_to(&daemon)?;
     let _robot = daemon.robot("greeter_cpp?robot=r1")?;
-    println!("rehearsal: a servant is at work");
+    let cable = Cable::new(&daemon.address)?;
+    println!("{AT_WORK}{}", cable.namespace().display());
     loop {
         std::thread::sleep(Duration::from_secs(3600));
     }

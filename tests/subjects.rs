@@ -61,6 +61,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("recordings", &["observe", "recording"]),
     ("refusals", &["foreign", "push"]),
     ("robot_network", &["rtps"]),
+    ("registries", &["image", "portal"]),
     ("rollouts", &["catalogue", "choreographer"]),
     ("ros2", &["ros", "rtps"]),
     ("shadowing", &["catalogue", "package", "sign"]),

@@ -14,6 +14,7 @@ use serde_json::Value;
 
 use crate::interrupt;
 use crate::report::current_date;
+use crate::section::{MissingMeasurement, Section};
 
 /// Directory of the results.
 pub struct RunCache {
@@ -50,6 +51,23 @@ impl<T> CachedResult<T> {
         match self {
             Self::Done(measured) => Some(measured),
             Self::Missing(_) => None,
+        }
+    }
+
+    /// Returns the measurement; without one, lists it in the section as missing, with the next step.
+    pub fn require(
+        &self,
+        section: &mut Section,
+        what: impl Into<String>,
+        next: &str,
+    ) -> Option<&T> {
+        match self {
+            Self::Done(measured) => Some(measured),
+            Self::Missing(why) => {
+                let missing = MissingMeasurement::new(what, why, next);
+                section.missing.push(missing);
+                None
+            }
         }
     }
 }

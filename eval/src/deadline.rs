@@ -1,12 +1,13 @@
-//! Waiting for programs and threads with a time limit.
+//! Waiting for programs with a time limit.
 
 use std::fs::File;
 use std::io::{Read, Seek};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
-use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+
+use crate::interrupt;
 
 /// Polling interval for the end of a program.
 const LOOK: Duration = Duration::from_millis(50);
@@ -14,16 +15,22 @@ const LOOK: Duration = Duration::from_millis(50);
 /// Waits until a program has exited.
 ///
 /// # Errors
-/// If the program, named `what` in the error, has not exited after `longest`: it is killed.
+/// If the program, named `what` in the error, has not exited after `longest`, or if the evaluation is interrupted: it
+/// is killed.
 pub fn wait_for_exit(child: &mut Child, what: &str, longest: Duration) -> Result<ExitStatus> {
     let begun = Instant::now();
     loop {
         if let Some(status) = child.try_wait()? {
             return Ok(status);
         }
-        if begun.elapsed() > longest {
+        let is_late = begun.elapsed() > longest;
+        if is_late || interrupt::is_requested() {
             let _ = child.kill();
             let _ = child.wait();
+            ensure!(
+                is_late,
+                "the evaluation was asked to end while this was measured"
+            );
             bail!(
                 "{what} had not ended after {:.0} s and was killed",
                 longest.as_secs_f64()
@@ -61,47 +68,6 @@ pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
     })
 }
 
-/// A barrier for threads with a time limit.
-pub struct TimedBarrier {
-    members: usize,
-    came: Mutex<usize>,
-    changed: Condvar,
-}
-
-impl TimedBarrier {
-    /// Creates a barrier for `members` threads.
-    pub fn new(members: usize) -> Self {
-        Self {
-            members,
-            came: Mutex::new(0),
-            changed: Condvar::new(),
-        }
-    }
-
-    /// Waits until all threads have arrived.
-    ///
-    /// # Errors
-    /// If some have not arrived after `longest`, because they failed or hang.
-    pub fn wait(&self, longest: Duration) -> Result<()> {
-        let mut came = self.came.lock().unwrap_or_else(PoisonError::into_inner);
-        *came += 1;
-        self.changed.notify_all();
-        let lacks = |came: &mut usize| *came < self.members;
-        let (came, _) = self
-            .changed
-            .wait_timeout_while(came, longest, lacks)
-            .unwrap_or_else(PoisonError::into_inner);
-        ensure!(
-            *came >= self.members,
-            "only {} of {} threads were ready after {:.0} s",
-            *came,
-            self.members,
-            longest.as_secs_f64()
-        );
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -119,14 +85,6 @@ mod tests {
         );
         assert_eq!(output.status.code(), Some(3));
         assert!(begun.elapsed() < Duration::from_secs(4));
-    }
-
-    #[test]
-    fn who_does_not_come_is_not_waited_for() {
-        let alone = TimedBarrier::new(2);
-        let error = alone.wait(Duration::ZERO).expect_err("one is lacking");
-        assert!(error.to_string().starts_with("only 1 of 2"), "{error}");
-        alone.wait(Duration::from_secs(60)).expect("both have come");
     }
 
     #[test]

@@ -13,8 +13,10 @@ use support::daemon::Daemon;
 use support::site::{image_config, image_shell};
 use tempfile::TempDir;
 
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
 use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
 use crate::stereo;
+use crate::trace::Trace;
 use crate::weights;
 use crate::{attempts, deadline};
 
@@ -176,6 +178,22 @@ impl<'a> EvalFixtures<'a> {
             patience: 600.0,
             changes: Vec::new(),
         })
+    }
+
+    /// Runs an example on a robot of this class over this network; `adapt` changes the robot's plan before.
+    pub fn run(
+        &self,
+        example: &EvalPackage,
+        at: ExecutionSite,
+        (class, network): (RobotHardware, NetworkProfile),
+        adapt: impl FnOnce(&mut RobotPlan),
+    ) -> Result<(Trace, RunCost)> {
+        self.publish(example)?;
+        let directory = self.directory()?;
+        let mut plan = self.plan(example, at, directory.path())?;
+        adapt(&mut plan);
+        let place = RobotSandbox::new(&self.daemon.address, class, network)?;
+        place.run(&plan, directory.path())
     }
 
     /// Returns the file of a recording; it is created when it is first requested.

@@ -16,38 +16,152 @@ use eval::experiments::{
     codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
 };
 use eval::section::{MissingMeasurement, Section};
-use eval::{basis, estimate, interrupt, rehearsal, report, robot, sweep};
+use eval::{basis, interrupt, rehearsal, report, robot, sweep};
 
 /// Requests per run of a quick evaluation.
 const QUICK: usize = 6;
 
-/// Experiments that a quick evaluation omits unless they are named: number, id, title, and the tests that cover the
-/// same.
-const LEFT_OUT: [(u8, &str, &str, &str); 4] = [
-    (
-        3,
-        "memory",
-        "A package that needs more memory than the robot has",
-        "the stories eval and isolation",
-    ),
-    (
-        6,
-        "failover",
-        "A network that becomes bad",
-        "the stories failover and fallback",
-    ),
-    (
-        9,
-        "neighbours",
-        "Robots beside each other",
-        "the stories limits and sla of the virtual machine",
-    ),
-    (
-        11,
-        "overhead",
-        "What the system itself adds",
-        "benches/servant, benches/portal and benches/link",
-    ),
+/// Everything that experiments need.
+struct Evaluation<'a> {
+    cells: &'a RunCache,
+    workshop: &'a EvalFixtures<'a>,
+    crowd: CrowdDaemon,
+    quick: bool,
+}
+
+impl Evaluation<'_> {
+    /// Returns the maximum number of requests per run.
+    fn most(&self) -> Option<usize> {
+        self.quick.then_some(QUICK)
+    }
+}
+
+/// Experiments that are measured together.
+struct Experiment {
+    /// Their numbers.
+    numbers: &'static [u8],
+    /// Seconds of a quick and of a full evaluation, on a machine with two cores and with packages compiled earlier.
+    seconds: [u32; 2],
+    /// Id, title and the tests that cover the same, if a quick evaluation omits it unless it is named.
+    left_out: Option<[&'static str; 3]>,
+    /// Measures them, and creates their sections.
+    run: fn(&mut Evaluation) -> Result<Vec<Section>>,
+}
+
+/// All experiments.
+static EXPERIMENTS: [Experiment; 10] = [
+    Experiment {
+        numbers: &[1],
+        seconds: [55, 300],
+        left_out: None,
+        run: |all| {
+            let runs = transparency::measure(all.cells, all.workshop, all.most())?;
+            Ok(vec![transparency::section(&runs)])
+        },
+    },
+    Experiment {
+        numbers: &[2, 4, 5],
+        // With that of cores.
+        seconds: [20, 540],
+        left_out: None,
+        run: |all| {
+            let runs = outsourcing::measure(all.cells, all.workshop, all.most())?;
+            Ok(vec![
+                outsourcing::response_times(&runs)?,
+                outsourcing::phases(&runs)?,
+                outsourcing::jitter(&runs)?,
+            ])
+        },
+    },
+    Experiment {
+        numbers: &[2],
+        seconds: [0, 0],
+        left_out: None,
+        run: |all| {
+            let studies = cores::measure(all.cells, all.workshop, all.quick)?;
+            Ok(vec![cores::section(&studies)?])
+        },
+    },
+    Experiment {
+        numbers: &[3],
+        seconds: [60, 60],
+        left_out: Some([
+            "memory",
+            "A package that needs more memory than the robot has",
+            "the stories eval and isolation",
+        ]),
+        run: |all| {
+            let runs = memory::measure(all.cells, all.workshop)?;
+            Ok(vec![memory::section(&runs)])
+        },
+    },
+    Experiment {
+        numbers: &[6],
+        seconds: [30, 390],
+        left_out: Some([
+            "failover",
+            "A network that becomes bad",
+            "the stories failover and fallback",
+        ]),
+        run: |all| {
+            let runs = failover::measure(all.cells, all.workshop, all.quick)?;
+            Ok(vec![failover::section(&runs)?])
+        },
+    },
+    Experiment {
+        numbers: &[7],
+        seconds: [10, 365],
+        left_out: None,
+        run: |all| {
+            let most = all.most().map(|most| most * 5);
+            let runs = map::measure(all.cells, all.workshop, most)?;
+            Ok(vec![map::section(&runs)?])
+        },
+    },
+    Experiment {
+        numbers: &[8],
+        seconds: [20, 420],
+        left_out: None,
+        run: |all| {
+            let runs = codecs::measure(all.cells, all.workshop, all.quick)?;
+            Ok(vec![codecs::section(&runs)?])
+        },
+    },
+    Experiment {
+        numbers: &[9],
+        seconds: [20, 500],
+        left_out: Some([
+            "neighbours",
+            "Robots beside each other",
+            "the stories limits and sla of the virtual machine",
+        ]),
+        run: |all| {
+            let runs = neighbours::measure(all.cells, &mut all.crowd, all.quick)?;
+            Ok(vec![neighbours::section(&runs)?])
+        },
+    },
+    Experiment {
+        numbers: &[10],
+        seconds: [15, 110],
+        left_out: None,
+        run: |all| {
+            let runs = scale::measure(all.cells, &mut all.crowd, all.quick)?;
+            Ok(vec![scale::section(&runs)?])
+        },
+    },
+    Experiment {
+        numbers: &[11],
+        seconds: [0, 300],
+        left_out: Some([
+            "overhead",
+            "What the system itself adds",
+            "benches/servant, benches/portal and benches/link",
+        ]),
+        run: |all| {
+            let runs = overhead::measure(all.cells)?;
+            Ok(vec![overhead::section(&runs)?])
+        },
+    },
 ];
 
 /// Run the published experiments on this machine and write target/eval/report.html
@@ -133,14 +247,14 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
             vec![rehearsal::section(&cells, &workshop, *seconds)?]
         }
         _ => {
-            let numbers = selected_numbers(arguments);
-            estimate::print_estimate(arguments.quick, &numbers);
-            let mut sections = run_experiments(arguments.quick, &numbers, &cells, &workshop);
-            if arguments.only.is_empty() {
-                sections.extend(left_out_sections(&numbers));
-                sections.sort_by_key(|section| section.number);
-            }
-            sections
+            let directory = workshop.directory()?;
+            let evaluation = Evaluation {
+                cells: &cells,
+                workshop: &workshop,
+                crowd: CrowdDaemon::new(directory.path()),
+                quick: arguments.quick,
+            };
+            run_experiments(arguments, evaluation)
         }
     };
     // Written before the daemon is stopped, so that a failure there does not lose the results.
@@ -149,107 +263,49 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
     Ok(complete)
 }
 
-/// Returns the numbers of the selected experiments.
-fn selected_numbers(arguments: &EvalArguments) -> Vec<u8> {
-    if !arguments.only.is_empty() {
-        return arguments.only.clone();
-    }
-    let shown = |number: &u8| LEFT_OUT.iter().any(|(one, ..)| one == number);
-    (1..=11)
-        .filter(|number| !arguments.quick || !shown(number))
-        .collect()
-}
-
-fn run_experiments(
-    quick: bool,
-    numbers: &[u8],
-    cells: &RunCache,
-    workshop: &EvalFixtures,
-) -> Vec<Section> {
-    let wanted = |number: u8| numbers.contains(&number);
-    let most = quick.then_some(QUICK);
+/// Runs the experiments that are named, or all: a quick evaluation then says where else those that it omits are
+/// covered. If an experiment fails as a whole, a section has the reason, and the others continue.
+fn run_experiments(arguments: &EvalArguments, mut evaluation: Evaluation) -> Vec<Section> {
+    let quick = evaluation.quick;
+    let is_wanted = |number: &u8| arguments.only.is_empty() || arguments.only.contains(number);
+    let is_omitted =
+        |one: &Experiment| quick && arguments.only.is_empty() && one.left_out.is_some();
+    let wanted = EXPERIMENTS
+        .iter()
+        .filter(|one| one.numbers.iter().any(is_wanted));
+    let (omitted, wanted): (Vec<&Experiment>, Vec<_>) = wanted.partition(|one| is_omitted(one));
+    let seconds = wanted.iter().map(|one| one.seconds[usize::from(!quick)]);
+    eprintln!(
+        "this takes about {} min on a machine of two cores, less what was measured before; packages that were never \
+         compiled take some minutes more",
+        seconds.sum::<u32>().div_ceil(60)
+    );
+    eprintln!("min:s  run");
     let mut sections = Vec::new();
-    if wanted(1) {
-        sections.extend(run_experiment(1, || {
-            let runs = transparency::measure(cells, workshop, most)?;
-            Ok(vec![transparency::section(&runs)])
-        }));
-    }
-    if [2, 4, 5].into_iter().any(wanted) {
-        sections.extend(run_experiment(2, || {
-            let runs = outsourcing::measure(cells, workshop, most)?;
-            let mut made = vec![
-                outsourcing::response_times(&runs)?,
-                outsourcing::phases(&runs)?,
-                outsourcing::jitter(&runs)?,
-            ];
-            made.retain(|section| wanted(section.number));
-            Ok(made)
-        }));
-    }
-    if wanted(2) {
-        sections.extend(run_experiment(2, || {
-            let studies = cores::measure(cells, workshop, quick)?;
-            Ok(vec![cores::section(&studies)?])
-        }));
-    }
-    if wanted(3) {
-        sections.extend(run_experiment(3, || {
-            let runs = memory::measure(cells, workshop)?;
-            Ok(vec![memory::section(&runs)])
-        }));
-    }
-    if wanted(6) {
-        sections.extend(run_experiment(6, || {
-            let runs = failover::measure(cells, workshop, quick)?;
-            Ok(vec![failover::section(&runs)?])
-        }));
-    }
-    if wanted(7) {
-        sections.extend(run_experiment(7, || {
-            let runs = map::measure(cells, workshop, most.map(|most| most * 5))?;
-            Ok(vec![map::section(&runs)?])
-        }));
-    }
-    if wanted(8) {
-        sections.extend(run_experiment(8, || {
-            let runs = codecs::measure(cells, workshop, quick)?;
-            Ok(vec![codecs::section(&runs)?])
-        }));
-    }
-    if [9, 10].into_iter().any(wanted) {
-        match workshop.directory() {
-            Ok(place) => {
-                let mut yard = CrowdDaemon::new(place.path());
-                if wanted(9) {
-                    sections.extend(run_experiment(9, || {
-                        let runs = neighbours::measure(cells, &mut yard, quick)?;
-                        Ok(vec![neighbours::section(&runs)?])
-                    }));
-                }
-                if wanted(10) {
-                    sections.extend(run_experiment(10, || {
-                        let runs = scale::measure(cells, &mut yard, quick)?;
-                        Ok(vec![scale::section(&runs)?])
-                    }));
-                }
+    for one in wanted {
+        match (one.run)(&mut evaluation) {
+            Ok(made) => sections.extend(made.into_iter().filter(|made| is_wanted(&made.number))),
+            Err(error) => {
+                let numbers = one.numbers.iter().copied().filter(is_wanted);
+                sections.extend(
+                    numbers
+                        .take(1)
+                        .map(|number| failure_section(number, &error)),
+                );
             }
-            Err(error) => sections.push(failure_section(9, &error)),
         }
     }
-    if wanted(11) {
-        sections.extend(run_experiment(11, || {
-            let runs = overhead::measure(cells)?;
-            Ok(vec![overhead::section(&runs)?])
-        }));
+    for one in omitted {
+        if let Some([id, title, covered]) = one.left_out {
+            let mut section = Section::new(one.numbers[0], id, title);
+            section.findings.push(format!(
+                "A quick evaluation leaves this out: {covered} run the same of the programs. make eval measures it."
+            ));
+            sections.push(section);
+        }
     }
     sections.sort_by_key(|section| section.number);
     sections
-}
-
-/// Runs an experiment; if it fails as a whole, returns a section with the reason, so that the others continue.
-fn run_experiment(number: u8, made: impl FnOnce() -> Result<Vec<Section>>) -> Vec<Section> {
-    made().unwrap_or_else(|error| vec![failure_section(number, &error)])
 }
 
 /// Creates the section of an experiment that failed as a whole.
@@ -261,20 +317,4 @@ fn failure_section(number: u8, error: &anyhow::Error) -> Section {
         .missing
         .push(MissingMeasurement::retryable("the whole experiment", why));
     section
-}
-
-/// Creates sections for the experiments that were omitted.
-fn left_out_sections(numbers: &[u8]) -> Vec<Section> {
-    let left_out = LEFT_OUT
-        .into_iter()
-        .filter(|(number, ..)| !numbers.contains(number));
-    left_out
-        .map(|(number, id, title, shown)| {
-            let mut section = Section::new(number, id, title);
-            section.findings.push(format!(
-                "A quick evaluation leaves this out: {shown} run the same of the programs. make eval measures it."
-            ));
-            section
-        })
-        .collect()
 }

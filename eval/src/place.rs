@@ -8,23 +8,22 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use servant::cgroup::{Cgroup, CgroupParent};
 use servant::container::{ContainerSpec, Profile};
-use servant::spec::ResourceLimits;
-use support::cable::{Cable, NetworkImpairment};
+use servant::spec::{Limits, Size};
+use support::cable::Cable;
 
+pub use crate::network::NetworkProfile;
 use crate::robot::RobotPlan;
 use crate::trace::Trace;
-use crate::{interrupt, sweep};
+use crate::{deadline, sweep};
 
 /// Maximum time for the kernel to end the processes of a sandbox.
 const END: Duration = Duration::from_secs(20);
-/// Polling interval for the end of the robot.
-const LOOK: Duration = Duration::from_millis(50);
 const GIB: u64 = 1 << 30;
 /// Response to a robot that requested another network.
 const DONE: &str = "done";
@@ -53,71 +52,6 @@ impl RobotHardware {
     /// Name in tables.
     pub fn name(self) -> &'static str {
         if self == Self::PI { "Pi" } else { "ultrabook" }
-    }
-}
-
-/// Networks between a robot and the server.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum NetworkProfile {
-    /// 1 ms each way, 100 Mbit/s.
-    Lan,
-    /// 30 ms each way, 20 Mbit/s.
-    Wan,
-    /// 5 ms each way with a jitter of 4 ms, 40 Mbit/s, 1 % packet loss.
-    Wifi,
-    /// 100 ms each way, 2 Mbit/s, 1 % packet loss: the degraded network of the benchmark `failover`.
-    Bad,
-}
-
-impl NetworkProfile {
-    /// All networks.
-    pub const ALL: [Self; 4] = [Self::Lan, Self::Wan, Self::Wifi, Self::Bad];
-
-    /// Name in tables.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Lan => "LAN",
-            Self::Wan => "WAN",
-            Self::Wifi => "Wi-Fi",
-            Self::Bad => "bad",
-        }
-    }
-
-    /// Properties of the network, for each direction.
-    pub fn rules(self) -> NetworkImpairment {
-        let (rate, delay, jitter, loss) = match self {
-            Self::Lan => (100_000, 1, 0, 0.0),
-            Self::Wan => (20_000, 30, 0, 0.0),
-            Self::Wifi => (40_000, 5, 4, 0.01),
-            Self::Bad => (2000, 100, 0, 0.01),
-        };
-        NetworkImpairment {
-            rate,
-            delay,
-            jitter,
-            loss,
-            limit: if self == Self::Bad { 100 } else { 1000 },
-        }
-    }
-
-    /// Describes its properties in words.
-    pub fn describe(self) -> String {
-        let rules = self.rules();
-        let mut told = format!("{} ms each way", rules.delay);
-        if rules.jitter > 0 {
-            told += &format!(", more or less {} ms", rules.jitter);
-        }
-        told += &format!(", {} Mbit/s", f64::from(rules.rate) / 1e3);
-        if rules.loss > 0.0 {
-            told += &format!(", {} % of packets lost", rules.loss * 100.0);
-        }
-        told
-    }
-
-    /// Returns the seconds that sending `bytes` takes at its rate.
-    pub fn transfer_time(self, bytes: usize) -> f64 {
-        8.0 * bytes as f64 / (f64::from(self.rules().rate) * 1e3)
     }
 }
 
@@ -157,10 +91,10 @@ impl RobotSandbox {
              are delegated",
             parent.reason
         );
-        let limits = ResourceLimits {
+        let limits = Limits {
             cpus: Some(class.cores),
-            memory: Some(class.memory),
-            ..ResourceLimits::default()
+            memory: Some(Size(class.memory)),
+            ..Limits::default()
         };
         let name = cable.namespace();
         let name = name.file_name().and_then(|name| name.to_str());
@@ -175,7 +109,7 @@ impl RobotSandbox {
         let now = place.cgroup.set_limits(&limits).limits;
         let cores = now.cpus.unwrap_or(f64::INFINITY);
         ensure!(
-            (cores - class.cores).abs() < 0.01 && now.memory == Some(class.memory),
+            (cores - class.cores).abs() < 0.01 && now.memory == Some(Size(class.memory)),
             "the limits of a robot are not in force here: asked for {} cores and {} bytes, the kernel says {:?} and \
              {:?}",
             class.cores,
@@ -316,7 +250,7 @@ pub fn remove_abandoned() -> Vec<String> {
         if Path::new(&format!("/proc/{pid}")).exists() {
             continue;
         }
-        let cgroup = Cgroup::for_servant(&parent, &spec(&name, &ResourceLimits::default()));
+        let cgroup = Cgroup::for_servant(&parent, &spec(&name, &Limits::default()));
         if let Err(error) = cgroup.destroy(END) {
             told.push(format!("the robot's place {name} is left: {error}"));
             continue;
@@ -335,26 +269,7 @@ fn parse_owner(name: &str) -> Option<(u32, u32)> {
 }
 
 fn wait_for_robot(child: &mut Child, patience: Duration) -> Result<()> {
-    let deadline = Instant::now() + patience;
-    let status = loop {
-        if let Some(status) = child.try_wait()? {
-            break status;
-        }
-        if interrupt::is_requested() {
-            let _ = child.kill();
-            let _ = child.wait();
-            bail!("the evaluation was asked to end while this was measured");
-        }
-        if Instant::now() > deadline {
-            let _ = child.kill();
-            let _ = child.wait();
-            bail!(
-                "the robot was not done after {:.0} s",
-                patience.as_secs_f64()
-            );
-        }
-        std::thread::sleep(LOOK);
-    };
+    let status = deadline::wait_for_exit(child, "the robot", patience)?;
     match status.signal() {
         Some(signal) => bail!("the robot's place was ended by signal {signal}"),
         None if !status.success() => bail!("the robot could not go on ({status})"),
@@ -372,7 +287,7 @@ fn output_tail(said: &str) -> String {
     lines[from..].join(" | ")
 }
 
-fn spec(id: &str, limits: &ResourceLimits) -> ContainerSpec {
+fn spec(id: &str, limits: &Limits) -> ContainerSpec {
     ContainerSpec {
         id: id.to_owned(),
         layers: Vec::new(),
@@ -408,14 +323,6 @@ mod tests {
         child.kill().expect("it is ours");
         let error = wait_for_robot(&mut child, END).expect_err("it was killed");
         assert!(error.to_string().contains("signal 9"), "{error}");
-    }
-
-    #[test]
-    fn a_robot_that_takes_too_long_is_ended() {
-        let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
-        let error = wait_for_robot(&mut child, Duration::ZERO).expect_err("it takes a minute");
-        assert!(error.to_string().contains("not done"), "{error}");
-        assert!(child.try_wait().expect("it was waited for").is_some());
     }
 
     #[test]

@@ -11,7 +11,9 @@ mod canvas;
 mod series;
 mod timeline;
 
-use anyhow::Result;
+pub use bars::bars;
+pub use series::{curves, distribution, lines, map, points};
+pub use timeline::timeline;
 
 /// A series of points.
 #[derive(Debug, Clone)]
@@ -60,61 +62,10 @@ pub struct TimelineData {
     pub q: Vec<(f64, f64)>,
 }
 
-/// Draws lines through the points in their order; an omitted value interrupts its line. `x` and `y` are the labels of
-/// the axes, with units.
-pub fn lines(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
-    series::lines(title, (x, y), series, log_y)
-}
-
-/// Draws points without lines.
-pub fn points(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
-    series::points(title, (x, y), series, log_y)
-}
-
-/// Draws curves, such as those of a model, as lines, and measurements as points.
-pub fn curves(
-    title: &str,
-    x: &str,
-    y: &str,
-    curves: &[Series],
-    points: &[Series],
-    log_y: bool,
-) -> Result<String> {
-    let series = [curves, points].concat();
-    series::curves(title, (x, y), &series, curves.len(), log_y)
-}
-
-/// Draws trajectories as lines, with the same scale for x and y.
-pub fn map(title: &str, x: &str, y: &str, series: &[Series]) -> Result<String> {
-    series::map(title, (x, y), series)
-}
-
-/// Draws the empirical cumulative distribution of each series: for each value, the percentage of the series that is at
-/// most as large. `x` is the label of the axis, with its unit. Values that the axis cannot show, such as infinite ones,
-/// still count in the percentages; NaN does not.
-pub fn distribution(
-    title: &str,
-    x: &str,
-    series: &[(String, Vec<f64>)],
-    log_x: bool,
-) -> Result<String> {
-    series::distribution(title, x, series, log_x)
-}
-
-/// Draws grouped bars with whiskers and values. `y` is the label of the axis, with its unit.
-pub fn bars(title: &str, y: &str, bars: &[Bar], log_y: bool) -> Result<String> {
-    bars::draw(title, y, bars, log_y)
-}
-
-/// Draws classified points over shaded ranges, on a logarithmic axis, with horizontal levels and Q below. `x` and `y`
-/// are the labels of the axes, with units.
-pub fn timeline(title: &str, x: &str, y: &str, banded: &TimelineData) -> Result<String> {
-    timeline::draw(title, (x, y), banded)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::words::assert_tells;
 
     fn count(text: &str, what: &str) -> usize {
         text.matches(what).count()
@@ -140,7 +91,7 @@ mod tests {
                 map("t", "x (m)", "y (m)", &given),
             ] {
                 let text = text.expect("it is drawn");
-                assert!(text.contains("nothing was measured"), "{text}");
+                assert_tells(&text, "nothing was measured");
             }
         }
         let bar = |value| Bar {
@@ -151,7 +102,7 @@ mod tests {
         };
         for given in [vec![], vec![bar(f64::NAN), bar(f64::INFINITY)]] {
             let text = bars("t", "y", &given, false).expect("it is drawn");
-            assert!(text.contains("nothing was measured"), "{text}");
+            assert_tells(&text, "nothing was measured");
         }
         for given in [
             vec![],
@@ -159,10 +110,10 @@ mod tests {
             vec![("a".to_owned(), vec![f64::NAN])],
         ] {
             let text = distribution("t", "x", &given, true).expect("it is drawn");
-            assert!(text.contains("nothing was measured"), "{text}");
+            assert_tells(&text, "nothing was measured");
         }
         let text = timeline("t", "x", "y", &TimelineData::default()).expect("it is drawn");
-        assert!(text.contains("nothing was measured"), "{text}");
+        assert_tells(&text, "nothing was measured");
     }
 
     /// One point, equal points, huge and tiny numbers: ranges of zero width must not prevent a plot.
@@ -193,19 +144,16 @@ mod tests {
     #[test]
     fn titles_and_names_are_escaped() {
         let text = lines("a < b & \"c\"", "x", "y", &series(&[(1.0, 2.0)]), false).expect("drawn");
-        assert!(text.contains("a &lt; b &amp; &quot;c&quot;"), "{text}");
+        assert_tells(&text, "a &lt; b &amp; &quot;c&quot;");
     }
 
     #[test]
     fn what_is_left_out_is_counted() {
         let given = series(&[(1.0, 2.0), (2.0, f64::NAN), (3.0, 0.0), (4.0, 3.0)]);
         let linear = lines("t", "x", "y", &given, false).expect("it is drawn");
-        assert!(linear.contains("1 value is left out"), "{linear}");
+        assert_tells(&linear, "1 value is left out");
         let logarithmic = points("t", "x", "y", &given, true).expect("it is drawn");
-        assert!(
-            logarithmic.contains("2 values are left out"),
-            "{logarithmic}"
-        );
+        assert_tells(&logarithmic, "2 values are left out");
     }
 
     /// Three points, the middle one unknown: no line crosses the gap.
@@ -317,18 +265,18 @@ mod tests {
         assert!(without.contains("T_desire") && !without.contains("\nQ\n"));
         given.q = vec![(1.0, 10.0), (2.0, 4.0), (3.0, f64::NAN)];
         let with = timeline("t", "request", "RRT (s)", &given).expect("it is drawn");
-        assert!(with.contains("\nQ\n"), "{with}");
+        assert_tells(&with, "\nQ\n");
     }
 
     /// Among 1, 2, 2 and 4, three quarters are at most 2; together with an unanswered one, three fifths are.
     #[test]
     fn shares_are_of_all_values() {
         assert_eq!(
-            series::cumulative_shares(&[4.0, 1.0, 2.0, 2.0]),
+            super::series::cumulative_shares(&[4.0, 1.0, 2.0, 2.0]),
             [(1.0, 25.0), (2.0, 75.0), (4.0, 100.0)]
         );
         assert_eq!(
-            series::cumulative_shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
+            super::series::cumulative_shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
             [(1.0, 20.0), (2.0, 60.0), (4.0, 80.0)]
         );
     }

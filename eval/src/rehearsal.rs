@@ -5,11 +5,11 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use crate::cells::{CachedResult, RunCache};
+use crate::cells::RunCache;
 use crate::examples::EvalFixtures;
 use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
 use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{Section, Table};
 use crate::trace::Trace;
 
 /// Images of zeros: one more than the warm-up of a robot needs.
@@ -39,17 +39,11 @@ pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Resul
         let seen: (Trace, RunCost) = place.run(&plan, directory.path())?;
         Ok(seen.0.node_ended.unwrap_or_default())
     })?;
-    let mut table = Table::new("What came of it", ["what", "outcome"]);
+    let mut table = Table::new("What came of it", "what | outcome");
     for (name, measured) in [("place", place), ("robot", robot)] {
-        match measured {
-            CachedResult::Done(outcome) => table.push([name.to_owned(), outcome]),
-            CachedResult::Missing(why) => {
-                section.missing.push(MissingMeasurement::new(
-                    name,
-                    why,
-                    "run it again: what was measured stays",
-                ));
-            }
+        let next = "run it again: what was measured stays";
+        if let Some(outcome) = measured.require(&mut section, name, next) {
+            table.push([name, outcome]);
         }
     }
     section.tables.push(table);

@@ -6,6 +6,7 @@ mod asking;
 mod boxes;
 mod carried;
 mod ends;
+mod numbers;
 mod plan;
 mod rate;
 
@@ -22,12 +23,8 @@ use crate::trace::Trace;
 
 pub use answers::digest_message;
 pub use asking::has_ended;
+pub use numbers::{FIRST, WARM_UP};
 pub use plan::{NodeUnderTest, RequestPacing, RobotPlan};
-
-/// Stamps of measured requests are greater than this number.
-pub const FIRST: u32 = 1000;
-/// Warm-up requests, which are not counted: after them everything is connected and running.
-pub const WARM_UP: usize = 3;
 
 /// Runs the robot with the plan in the file `order` in this process, and writes its trace to `answer`.
 pub fn main(order: &Path, answer: &Path) -> Result<()> {
@@ -59,7 +56,7 @@ fn run(plan: &RobotPlan) -> Result<Trace> {
     let asked = asking::ask(&site, &mut ends, plan, &steps, &mut node);
     let mut trace = asked.with_context(|| format!("the node said: {}", node.output()))?;
     if let NodeUnderTest::Stub { .. } = plan.node {
-        trace.answered_locally = node.output().matches("answer=Some((Local").count();
+        trace.handovers = rate::count_handovers(&node.output());
         rate::apply_stub_log(&node.output(), &mut trace.requests);
         let warns = |line: &&str| line.contains(" WARN ");
         trace.warnings = node

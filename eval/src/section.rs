@@ -1,9 +1,13 @@
-//! Section of the report for one experiment: stored as JSON next to its figures, so that a later run can show it again.
+//! Section of the report for one experiment.
 
-use serde::{Deserialize, Serialize};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde::{Serialize, Serializer};
+
+use crate::trace::Trace;
 
 /// One experiment, in the order of the report.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Section {
     /// Number of the experiment.
     pub number: u8,
@@ -45,10 +49,18 @@ impl Section {
     pub fn add_drawing(&mut self, id: impl Into<String>, caption: impl Into<String>, svg: String) {
         self.figures.push(Figure::svg(id, caption, svg));
     }
+
+    /// Lists what a run did not measure because its node ended before it was done.
+    pub fn note_early_end(&mut self, what: impl Into<String>, trace: &Trace) {
+        if let Some(why) = &trace.node_ended {
+            let next = "look at what the node printed";
+            self.missing.push(MissingMeasurement::new(what, why, next));
+        }
+    }
 }
 
 /// A table of formatted cells; units are part of the column heads.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Table {
     /// Caption.
     pub caption: String,
@@ -59,14 +71,11 @@ pub struct Table {
 }
 
 impl Table {
-    /// Creates a table without rows.
-    pub fn new<T: Into<String>>(
-        caption: impl Into<String>,
-        head: impl IntoIterator<Item = T>,
-    ) -> Self {
+    /// Creates a table without rows, of heads parted by ` | `.
+    pub fn new(caption: impl Into<String>, head: &str) -> Self {
         Self {
             caption: caption.into(),
-            head: head.into_iter().map(Into::into).collect(),
+            head: head.split(" | ").map(str::to_owned).collect(),
             rows: Vec::new(),
         }
     }
@@ -84,7 +93,7 @@ impl Table {
 }
 
 /// A figure with its caption.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Figure {
     /// Name of its file without the extension; unique in the report.
     pub id: String,
@@ -115,19 +124,19 @@ impl Figure {
 }
 
 /// Content of an image file.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize)]
 pub enum FigureImage {
     /// Text of an SVG document.
     Svg(String),
     /// Bytes of a PNG file; base64 in JSON.
-    Png(#[serde(with = "as_base64")] Vec<u8>),
+    Png(#[serde(serialize_with = "encode_base64")] Vec<u8>),
 }
 
 /// Next step after a failed run.
 pub const AGAIN: &str = "run make eval again: what was measured stays";
 
 /// A measurement that could not be made.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize)]
 pub struct MissingMeasurement {
     /// Measurement that should have been made.
     pub what: String,
@@ -153,53 +162,6 @@ impl MissingMeasurement {
     }
 }
 
-mod as_base64 {
-    use base64::Engine;
-    use base64::engine::general_purpose::STANDARD;
-    use serde::{Deserialize, Deserializer, Serializer, de::Error};
-
-    pub(super) fn serialize<S: Serializer>(bytes: &[u8], to: S) -> Result<S::Ok, S::Error> {
-        to.serialize_str(&STANDARD.encode(bytes))
-    }
-
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<u8>, D::Error> {
-        let text = String::deserialize(from)?;
-        STANDARD.decode(text).map_err(D::Error::custom)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_section_comes_back_from_json() {
-        let mut section = Section::new(7, "map", "A real robot's map");
-        section.tables.push(
-            Table::new("error", ["set-up", "RMSE (m)"])
-                .row(["native", "0.21"])
-                .row(vec!["stub".to_owned(), "0.20".to_owned()]),
-        );
-        section.figures.push(Figure::svg("plot", "a", "<svg/>"));
-        section
-            .figures
-            .push(Figure::png("map", "b", vec![0x89, b'P', 0, 255]));
-        section
-            .missing
-            .push(MissingMeasurement::new("GPU", "none", "buy one"));
-        let text = serde_json::to_string(&section).expect("it is plain data");
-        assert!(text.contains(r#"{"Png":"iVAA/w=="}"#), "{text}");
-        let again: Section = serde_json::from_str(&text).expect("it was just written");
-        assert_eq!(again.tables[0].rows, section.tables[0].rows);
-        assert_eq!(again.number, 7);
-        let FigureImage::Png(bytes) = &again.figures[1].image else {
-            panic!("{:?}", again.figures[1]);
-        };
-        assert_eq!(bytes, &[0x89, b'P', 0, 255]);
-    }
-
-    #[test]
-    fn a_picture_that_is_not_base64_is_refused() {
-        assert!(serde_json::from_str::<FigureImage>(r#"{"Png":"*"}"#).is_err());
-    }
+fn encode_base64<S: Serializer>(bytes: &[u8], to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_str(&STANDARD.encode(bytes))
 }

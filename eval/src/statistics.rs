@@ -6,21 +6,17 @@
 mod figures;
 mod models;
 mod paths;
-mod pictures;
 mod queues;
-mod random;
 
+pub use bench_report::{median, quantile};
 pub use figures::{
-    FittedLine, least_squares, mean, median, median_interval, quantile, root_mean_square_error,
-    standard_deviation,
+    FittedLine, least_squares, mean, median_interval, root_mean_square_error, standard_deviation,
 };
-pub use models::{Point, RrtModel};
+pub use models::RrtModel;
 pub use paths::{TrajectoryError, trajectory_error};
-pub use pictures::psnr;
 pub use queues::{
     NodeModel, QueueObservation, QueuePrediction, machine_repair, response_time, robots_per_node,
 };
-pub use random::Xorshift;
 
 #[cfg(test)]
 #[track_caller]

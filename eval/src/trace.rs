@@ -72,8 +72,9 @@ pub struct Trace {
     pub late_before: bool,
     /// The last map.
     pub map: Option<MapGrid>,
-    /// Number of answers by the local original, if known.
-    pub answered_locally: usize,
+    /// How often the stub asked the local original as well, no longer asked it, started its process, and stopped it.
+    #[serde(default)]
+    pub handovers: [usize; 4],
     /// Warnings in the node's log.
     #[serde(default)]
     pub warnings: Vec<String>,

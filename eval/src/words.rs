@@ -1,5 +1,7 @@
 //! Formats numbers for the report.
 
+pub use bench_report::format_number as digits;
+
 /// Formats a value; a dash if it is unknown.
 pub fn or_dash<T>(value: Option<T>, says: impl FnOnce(T) -> String) -> String {
     value.map_or_else(|| "–".to_owned(), says)
@@ -29,13 +31,11 @@ pub fn ratio(times: Option<f64>) -> String {
     })
 }
 
-/// Formats with three digits, or all digits before the point.
-pub fn digits(value: f64) -> String {
-    match value.abs() {
-        size if size >= 100.0 => format!("{value:.0}"),
-        size if size >= 10.0 => format!("{value:.1}"),
-        _ => format!("{value:.2}"),
-    }
+/// Checks that a text contains these words.
+#[cfg(test)]
+#[track_caller]
+pub(crate) fn assert_tells(text: &str, words: &str) {
+    assert!(text.contains(words), "{words}: {text}");
 }
 
 #[cfg(test)]

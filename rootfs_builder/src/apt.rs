@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use nix::fcntl::{Flock, FlockArg};
-use serde::{Deserialize, Serialize};
 use tokio::process::Command;
 
 use crate::cache::write_atomically;
 use crate::candidates::Candidates;
+use crate::debian_package::{Deb, Relations};
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::process::{self, Stream};
@@ -28,48 +28,6 @@ use output::{NAMING, extract_errors, parse_relations, parse_stanza, parse_uri, s
 /// if the host has the same release, and otherwise mmdebstrap's default mirror.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Sources(pub BTreeMap<String, Vec<String>>);
-
-/// A Debian package at a version.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Deb {
-    /// Name, without architecture.
-    pub name: String,
-    /// Version as in the archive.
-    pub version: String,
-    /// Architecture, such as `amd64` or `all`.
-    pub architecture: String,
-}
-
-/// Relations of a package to others.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Relations {
-    /// Source package that it was built from.
-    pub source: String,
-    /// Packages named in Depends and Pre-Depends, including alternatives.
-    pub needs: BTreeSet<String>,
-    /// Packages named in Pre-Depends, including alternatives.
-    pub before: BTreeSet<String>,
-    /// Virtual packages that it provides.
-    pub provides: BTreeSet<String>,
-}
-
-impl std::fmt::Display for Deb {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}={}:{}", self.name, self.version, self.architecture)
-    }
-}
-
-impl Deb {
-    /// Returns the file name that apt uses, in which the colon of the epoch is escaped.
-    fn file_name(&self) -> String {
-        format!(
-            "{}_{}_{}.deb",
-            self.name,
-            self.version.replace(':', "%3a"),
-            self.architecture
-        )
-    }
-}
 
 /// apt with a separate state directory.
 #[derive(Debug, Clone)]
@@ -122,7 +80,7 @@ impl Apt {
         let path = self.root.join("lock");
         let mut file = fs::File::create(&path).io_context("opening", &path)?;
         // Whoever can open the file can hold the lock.
-        crate::install::set_mode(&path, 0o600)?;
+        crate::modes::set_mode(&path, 0o600)?;
         // Polls instead of blocking a thread, so that no thread is left behind on cancellation.
         let _lock = loop {
             match Flock::lock(file, FlockArg::LockExclusiveNonblock) {

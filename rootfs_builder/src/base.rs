@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use ros::flavour::{Flavour, Version};
 use serde::{Deserialize, Serialize};
 
+pub use crate::base_file_error::{BaseFileError, BaseFileProblem, WheelsError};
 use crate::error::{Error, IoContext};
 
 pub(crate) use wheels::RequiredWheels;
@@ -195,19 +196,20 @@ pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
 }
 
 /// Parses and validates a definition; the error does not contain the file name yet.
-fn parse(text: &str) -> Result<Definition, String> {
-    let definition: Definition = toml::from_str(text).map_err(|error| {
-        let line = error
-            .span()
-            .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
-        match line {
-            Some(line) => format!("line {line}: {}", error.message()),
-            None => error.message().to_owned(),
+fn parse(text: &str) -> Result<Definition, BaseFileError> {
+    let definition: Definition =
+        toml::from_str(text).map_err(|error: toml::de::Error| BaseFileError {
+            line: error
+                .span()
+                .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1),
+            problem: BaseFileProblem::Toml(Box::new(error)),
+        })?;
+    let wrong = |needle: &str, problem: BaseFileProblem| {
+        let index = text.lines().position(|line| line.contains(needle));
+        BaseFileError {
+            line: index.map(|index| index + 1),
+            problem,
         }
-    })?;
-    let line_of = |needle: &str| match text.lines().position(|line| line.contains(needle)) {
-        Some(index) => format!("line {}: ", index + 1),
-        None => String::new(),
     };
     let packages = [&definition.runtime.packages, &definition.build.packages];
     for package in packages
@@ -216,29 +218,23 @@ fn parse(text: &str) -> Result<Definition, String> {
         .chain(definition.keys.values().flatten())
     {
         if !is_debian_name(package) {
-            return Err(format!(
-                "{}{package:?} is not a Debian package name",
-                line_of(&format!("{package:?}"))
-            ));
+            let problem = BaseFileProblem::PackageName(package.clone());
+            return Err(wrong(&format!("{package:?}"), problem));
         }
     }
     if definition.runtime.packages.is_empty() {
-        return Err(format!(
-            "{}runtime.packages is empty: list the packages that nodes need",
-            line_of("[runtime]")
-        ));
+        return Err(wrong("[runtime]", BaseFileProblem::NoPackages));
     }
     for rule in &definition.strip.unpacked {
         if !rule.starts_with("path-exclude=/") && !rule.starts_with("path-include=/") {
-            return Err(format!(
-                "{}{rule:?} is neither path-exclude=/… nor path-include=/…",
-                line_of(&format!("{rule:?}"))
-            ));
+            let problem = BaseFileProblem::StripRule(rule.clone());
+            return Err(wrong(&format!("{rule:?}"), problem));
         }
     }
     if let Some(wheels) = &definition.wheels {
-        let at = |problem| format!("{}{problem}", line_of("[wheels]"));
-        wheels.check().map_err(at)?;
+        wheels
+            .check()
+            .map_err(|error| wrong("[wheels]", error.into()))?;
     }
     let absolute = definition
         .build
@@ -252,10 +248,7 @@ fn parse(text: &str) -> Result<Definition, String> {
             .any(|part| part == std::path::Component::ParentDir);
         if !path.is_absolute() || climbs || path == Path::new("/") {
             let shown = path.display().to_string();
-            return Err(format!(
-                "{}{shown:?} is not an absolute path below /",
-                line_of(&shown)
-            ));
+            return Err(wrong(&shown, BaseFileProblem::Path(shown.clone())));
         }
     }
     Ok(definition)

@@ -8,6 +8,7 @@ use std::future::Future;
 
 use foreign::cancel::Cancel;
 use tokio::task::JoinHandle;
+use tracing::Span;
 
 tokio::task_local! {
     static CANCEL: Cancel;
@@ -31,10 +32,12 @@ pub fn spawn_reader<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static
     tokio::task::spawn_blocking(move || privilege::run_as_reader(work))
 }
 
-/// Wraps `work` so that it is cancelled with the [`cancellable`] future that calls this, wherever it runs.
+/// Wraps `work` so that it is cancelled with the [`cancellable`] future that calls this, wherever it runs, and logs in
+/// the caller's span.
 pub fn cancel_with_caller<T>(work: impl FnOnce() -> T) -> impl FnOnce() -> T {
     let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();
-    move || cancel.run(work)
+    let span = Span::current();
+    move || span.in_scope(|| cancel.run(work))
 }
 
 #[cfg(test)]

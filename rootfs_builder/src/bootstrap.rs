@@ -6,10 +6,10 @@ use std::path::Path;
 
 use image::{Mtime, TreeOptions};
 
-use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::cache::LayerEntry;
+use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::key::Key;

@@ -10,9 +10,9 @@ use package::inventory::{Inventory, SearchHints};
 use ros::flavour::Version;
 
 use crate::advice::{self, AdviceIndex};
-use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
+use crate::debian_package::Deb;
 use crate::error::Error;
 use crate::event::Progress;
 use crate::indexed;

@@ -10,15 +10,16 @@ use package::foreseen;
 use package::workspace::{PushedDirectory, Workspace};
 use ros::flavour::Version;
 use servant::sandbox::Sandbox;
-use servant::spec::ResourceLimits;
+use servant::spec::Limits;
 use tokio::sync::mpsc;
 
-use crate::apt::{Deb, Sources};
+use crate::apt::Sources;
 use crate::archive::Archive;
 use crate::base::{self, Base};
 use crate::bootstrap;
 use crate::build::Build;
 use crate::cache::{LayerCache, LayerEntry};
+use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
 use crate::indexed::IndexedPackages;
@@ -59,7 +60,7 @@ pub struct Config {
     pub sandbox: Arc<dyn Sandbox>,
     /// Limits of each sandbox (default: half of the machine's memory, 4096 processes and threads, and the cores that
     /// servants leave idle).
-    pub limits: ResourceLimits,
+    pub limits: Limits,
 }
 
 /// Builds images. Cheap to share in an `Arc`; several builds may run concurrently.
@@ -167,7 +168,7 @@ impl Builder {
             &self.config.build_dir,
             &request.id,
             self.config.sandbox.clone(),
-            self.config.limits.or(&sandbox::default_limits()),
+            self.config.limits.or(sandbox::default_limits()),
             self.removals.clone(),
         )?;
         // Before anything is downloaded: what was pushed may not be a package at all.
@@ -432,7 +433,7 @@ mod tests {
             sources: Sources::default(),
             store: Arc::new(store),
             sandbox: Arc::new(UnusedSandbox),
-            limits: ResourceLimits::default(),
+            limits: Limits::default(),
         })
         .expect("prepared");
         let trees = [

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::apt::Deb;
+use crate::debian_package::Deb;
 
 /// About sixty thousand packages, stored as sorted lines of a single text, since they stay in memory as long as the
 /// daemon runs.

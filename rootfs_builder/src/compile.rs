@@ -18,7 +18,8 @@ use crate::bootstrap::{EPOCH, tree_options};
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::excerpt::Excerpt;
-use crate::install::{set_mode, write_tree};
+use crate::install::write_tree;
+use crate::modes::set_mode;
 use crate::sandbox::SandboxRun;
 use crate::workshop::BuildContext;
 
@@ -101,7 +102,7 @@ impl BuildLog {
             .create(true)
             .open(path)
             .io_context("making", path)?;
-        crate::install::set_mode(path, 0o600)?;
+        crate::modes::set_mode(path, 0o600)?;
         file.set_len(0).io_context("emptying", path)?;
         Ok(Self {
             path: path.to_owned(),

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::PathBuf;
 
+use crate::base_file_error::{BaseFileError, RequirementsError};
+
 /// Errors of a build. The message names the object and the next step.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -22,7 +24,15 @@ pub enum Error {
         /// File.
         path: PathBuf,
         /// Description of the problem, with its line if known.
-        problem: String,
+        problem: BaseFileError,
+    },
+    /// Invalid requirements of a base's wheels.
+    #[error("base definition {path}: {problem}", path = path.display())]
+    BadRequirements {
+        /// File.
+        path: PathBuf,
+        /// Description of the problem, with its line.
+        problem: RequirementsError,
     },
     /// A program is not installed on the host.
     #[error("{program} is not installed: run `apt-get install {package}`")]

@@ -17,11 +17,11 @@ use std::path::{Path, PathBuf};
 
 use futures_util::{StreamExt, stream};
 
-use crate::apt::Deb;
 use crate::archive::{Archive, DependencyDepth};
 use crate::base::Base;
 use crate::contents::RosPackagePart;
 use crate::deb::{self, DebMember, MemberContent};
+use crate::debian_package::Deb;
 use crate::error::Error;
 use crate::event::Progress;
 use crate::imports::{self, SelectedPrograms};

@@ -2,23 +2,23 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, TreeOptions};
 use servant::container::{Mount, Profile};
 
-use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::bootstrap::{EPOCH, tree_options};
 use crate::chain::{Chains, FoundChain, Link, MOST_LINKS};
 use crate::complaint::FirstError;
 use crate::deb::{self, DebMember, MemberContent};
+use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::key::{Key, sha256};
+use crate::modes::set_mode;
 use crate::sandbox::SandboxRun;
 use crate::split;
 use crate::steps;
@@ -410,12 +410,6 @@ fn write_file(path: &Path, bytes: &[u8], mode: u32) -> Result<(), Error> {
     set_mode(path, mode)
 }
 
-/// Sets the mode of a file regardless of the umask.
-pub(crate) fn set_mode(path: &Path, mode: u32) -> Result<(), Error> {
-    fs::set_permissions(path, fs::Permissions::from_mode(mode))
-        .io_context("changing the mode of", path)
-}
-
 pub(crate) fn link_or_copy(from: &Path, to: &Path) -> Result<(), Error> {
     if fs::hard_link(from, to).is_err() {
         fs::copy(from, to).io_context("copying", from)?;
@@ -425,6 +419,8 @@ pub(crate) fn link_or_copy(from: &Path, to: &Path) -> Result<(), Error> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
 
     #[test]

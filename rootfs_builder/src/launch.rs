@@ -14,7 +14,8 @@ use servant::container::{Mount, Profile};
 use servant::spec::NodeSpec;
 
 use crate::error::{Error, IoContext};
-use crate::install::{set_mode, write_tree};
+use crate::install::write_tree;
+use crate::modes::set_mode;
 use crate::sandbox::SandboxRun;
 use crate::workshop::BuildContext;
 use crate::{blocking, plan};

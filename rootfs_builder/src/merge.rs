@@ -7,7 +7,7 @@ use std::path::Path;
 use foreign::Visit;
 
 use crate::error::{Error, IoContext};
-use crate::install::set_mode;
+use crate::modes::set_mode;
 
 /// Copies `tree` over the content of `target`. Files are hard-linked if possible, so they must not be modified
 /// afterwards. Deletions of the tree are applied. Blocking.

@@ -10,9 +10,10 @@ use crate::build::{Build, BuildParts};
 use crate::compile;
 use crate::error::{Error, IoContext};
 use crate::indexed::IndexedPackages;
-use crate::install::{LayerSet, set_mode};
+use crate::install::LayerSet;
 use crate::key::{self, Key};
 use crate::keys::{self, RequiredKeys};
+use crate::modes::set_mode;
 use crate::workshop::PackJob;
 use crate::{pushed, source};
 

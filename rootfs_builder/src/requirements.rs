@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::base_file_error::{RequirementProblem, RequirementsError};
 use crate::key::{self, Key};
 
 /// Content of a requirements file.
@@ -25,8 +26,7 @@ struct PinnedPackage {
 
 impl Requirements {
     /// Parses lines of `NAME==VERSION --hash=sha256:HEX…`, continued after a backslash; comments are on separate lines.
-    /// The error begins with the line number.
-    pub(crate) fn parse(text: &str) -> Result<Self, String> {
+    pub(crate) fn parse(text: &str) -> Result<Self, RequirementsError> {
         let mut pinned = BTreeMap::new();
         let mut lines = text.lines().enumerate();
         while let Some((index, line)) = lines.next() {
@@ -38,10 +38,13 @@ impl Requirements {
             if whole.is_empty() || whole.starts_with('#') {
                 continue;
             }
-            let at = |problem: String| format!("line {}: {problem}", index + 1);
+            let at = |problem| RequirementsError {
+                line: index + 1,
+                problem,
+            };
             let (name, one) = PinnedPackage::parse(&whole).map_err(at)?;
             if pinned.insert(name.clone(), one).is_some() {
-                return Err(at(format!("{name} appears twice")));
+                return Err(at(RequirementProblem::Repeated(name)));
             }
         }
         Ok(Self {
@@ -86,30 +89,29 @@ impl Requirements {
 }
 
 impl PinnedPackage {
-    fn parse(line: &str) -> Result<(String, Self), String> {
+    fn parse(line: &str) -> Result<(String, Self), RequirementProblem> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default();
-        let Some((name, version)) = first.split_once("==") else {
-            return Err(format!("{first:?} is not NAME==VERSION"));
-        };
+        let not_pinned = || RequirementProblem::NotPinned(first.to_owned());
+        let (name, version) = first.split_once("==").ok_or_else(not_pinned)?;
         let plain = |text: &str, more: &[u8]| {
             let good = |byte: u8| byte.is_ascii_alphanumeric() || more.contains(&byte);
             !text.is_empty() && text.bytes().all(good)
         };
         if !plain(name, b"-_.") || !plain(version, b".+!") {
-            return Err(format!("{first:?} is not NAME==VERSION"));
+            return Err(not_pinned());
         }
         let mut hashes = BTreeSet::new();
         for word in words {
             let hash = word.strip_prefix("--hash=sha256:");
             let hash = hash.filter(|hash| hash.len() == 64 && plain(hash, b""));
             let Some(hash) = hash else {
-                return Err(format!("{word:?} is not --hash=sha256:HEX"));
+                return Err(RequirementProblem::NotAHash(word.to_owned()));
             };
             hashes.insert(hash.to_ascii_lowercase());
         }
         if hashes.is_empty() {
-            return Err(format!("{first} has no --hash=sha256:HEX"));
+            return Err(RequirementProblem::NoHash(first.to_owned()));
         }
         let version = version.to_owned();
         Ok((normalize_name(name), Self { version, hashes }))
@@ -197,7 +199,7 @@ mod tests {
             ),
         ] {
             let text = format!("{good}{bad}\n");
-            let problem = Requirements::parse(&text).expect_err(bad);
+            let problem = Requirements::parse(&text).expect_err(bad).to_string();
             assert!(
                 problem.starts_with("line 3: ") && problem.contains(words),
                 "{bad}: {problem}"

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use servant::container::{ContainerSpec, Mount, Profile};
 use servant::engine::{LogStart, NodeExit};
 use servant::sandbox::{Sandbox, SandboxContainer};
-use servant::spec::{NodeSpec, ResourceLimits};
+use servant::spec::{Limits, NodeSpec, Size};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
@@ -22,7 +22,7 @@ pub(crate) struct BuildSite {
     id: String,
     directory: PathBuf,
     sandbox: Arc<dyn Sandbox>,
-    limits: ResourceLimits,
+    limits: Limits,
     removals: PendingRemovals,
     running: Arc<Mutex<Vec<JoinHandle<()>>>>,
 }
@@ -90,13 +90,13 @@ impl BuildSite {
         root: &Path,
         id: &str,
         sandbox: Arc<dyn Sandbox>,
-        limits: ResourceLimits,
+        limits: Limits,
         removals: PendingRemovals,
     ) -> Result<Self, Error> {
         let directory = root.join(id);
         fs::create_dir_all(&directory).io_context("making", &directory)?;
         // Files that are readable in the container must not be readable for others on the host.
-        crate::install::set_mode(&directory, 0o700)?;
+        crate::modes::set_mode(&directory, 0o700)?;
         Ok(Self {
             id: id.to_owned(),
             directory,
@@ -232,12 +232,12 @@ async fn run_to_end(
 }
 
 /// Default limits of a build's container: half of the machine's memory, and the cores that servants leave idle.
-pub(crate) fn default_limits() -> ResourceLimits {
-    ResourceLimits {
+pub(crate) fn default_limits() -> Limits {
+    Limits {
         cpu_weight: Some(20),
-        memory: servant::host::total_memory().map(|bytes| bytes / 2),
+        memory: servant::host::total_memory().map(|bytes| Size(bytes / 2)),
         pids: Some(4096),
-        ..ResourceLimits::default()
+        ..Limits::default()
     }
 }
 

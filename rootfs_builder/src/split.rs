@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::apt::{Deb, Relations};
+use crate::debian_package::{Deb, Relations};
 
 /// Minimum number of packages worth a separate layer.
 const FEW: usize = 8;

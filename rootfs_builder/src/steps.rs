@@ -4,7 +4,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::apt::{Deb, Relations};
+use crate::debian_package::{Deb, Relations};
 
 /// Packages that are unpacked together.
 #[derive(Debug, Default, PartialEq, Eq)]

@@ -25,9 +25,10 @@ use rustix::fs::FileType;
 use crate::build::Build;
 use crate::compile::{self, BuildLog, BuildUnit, CompileOrder, CompileOutput, Task};
 use crate::error::{Error, IoContext};
-use crate::install::{LayerSet, set_mode};
+use crate::install::LayerSet;
 use crate::key::{self, Key};
 use crate::merge::overlay_tree;
+use crate::modes::set_mode;
 use crate::workshop::PackJob;
 
 /// Kinds of dependencies that make another package of the workspace visible.

@@ -17,6 +17,9 @@ const IN_USE: Duration = Duration::from_secs(15 * 60);
 /// File whose time is that of the last search.
 const LOOKED: &str = "unused-looked-for";
 
+/// Directory of downloaded wheels in the cache, with a subdirectory for each list of requirements.
+pub(crate) const DOWNLOADS: &str = "wheels";
+
 /// Marks a file of the cache as used, by setting its modification time.
 pub(crate) fn mark_used(path: &Path) {
     let note = || {
@@ -86,7 +89,7 @@ struct CachedFile {
 /// Returns all files of the cache that can be rebuilt individually.
 fn cache_files(cache: &Path) -> Vec<CachedFile> {
     let mut directories: Vec<PathBuf> = ["layers", "notes"].map(|name| cache.join(name)).into();
-    for name in ["chains", crate::wheels::DOWNLOADS] {
+    for name in ["chains", DOWNLOADS] {
         directories.extend(list_directory(&cache.join(name)));
     }
     for archive in list_directory(&cache.join("apt")) {

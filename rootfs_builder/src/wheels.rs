@@ -13,18 +13,16 @@ use crate::base::{Base, Wheels};
 use crate::bootstrap::{EPOCH, tree_options};
 use crate::error::{Error, IoContext};
 use crate::event::Progress;
-use crate::install::{LayerSet, link_or_copy, set_mode, write_tree};
+use crate::install::{LayerSet, link_or_copy, write_tree};
 use crate::key::Key;
+use crate::modes::set_mode;
 use crate::process::{self, Stream};
 use crate::requirements::Requirements;
 use crate::sandbox::SandboxRun;
-use crate::unused;
+use crate::unused::{self, DOWNLOADS};
 use crate::workshop::{BuildContext, PackJob};
 
 const INSTALL: &str = include_str!("inside/wheels.py");
-
-/// Directory of downloaded wheels in the cache, with a subdirectory for each list of requirements.
-pub(crate) const DOWNLOADS: &str = "wheels";
 
 /// Adds the layer with the wheels of every image of this base to a base layer.
 pub(crate) async fn add_runtime_wheels(

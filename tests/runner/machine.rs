@@ -5,7 +5,7 @@ use std::path::Path;
 use nix::mount::{MsFlags, mount, umount};
 
 use support::world::{self, world};
-use support::{binaries, claim, disk, procfs};
+use support::{binaries, cable, claim, disk, procfs};
 
 /// Space in bytes that homes take in the directory for temporary files if there is no separate disk.
 const ROOM: u64 = 12 << 30;
@@ -37,6 +37,9 @@ pub(super) fn prepare() -> Result<(), String> {
                 place.display()
             ),
         }
+    }
+    for name in cable::remove_abandoned() {
+        println!("removed the network {name}, which a run that was killed had left");
     }
     let place = world().place();
     if let Err(error) = disk::mount_on(place, &binaries::cache()) {

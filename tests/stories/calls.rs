@@ -8,7 +8,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use parking_lot::Mutex;
-use ros::bus::{Bus, BusError, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Bus, BusError, FailureReason, RosVersion, ServiceHandler, ServiceType};
 use ros::schema::Registry;
 use support::Verdict;
 use support::cutter::Cutter;
@@ -28,7 +28,7 @@ const MEANWHILE: Duration = Duration::from_secs(5);
 /// A server of std_srvs/Trigger.
 struct TriggerService {
     ros: RosVersion,
-    says: Mutex<Result<String, String>>,
+    says: Mutex<Result<String, FailureReason>>,
     /// Number of calls so far.
     calls: watch::Sender<u32>,
     /// Permits to answer calls.
@@ -68,9 +68,10 @@ impl TriggerService {
 
 #[async_trait]
 impl ServiceHandler for TriggerService {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         self.calls.send_modify(|calls| *calls += 1);
-        let answer = self.answers.acquire().await.map_err(|_| "closed")?;
+        let answer = self.answers.acquire().await;
+        let answer = answer.map_err(|_| FailureReason::new("closed"))?;
         answer.forget();
         let text = self.says.lock().clone()?;
         Ok(trigger_response(self.ros, true, &text))
@@ -280,7 +281,7 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
     let told = with_log(wait_for_success(ask, &["unavailable", "no answer"]), &stub)?;
     ensure!(told == "the robot says 42", "{told:?}");
     // The reason of a failure is transmitted, where ROS has reasons.
-    *secret.says.lock() = Err("it is a secret".to_owned());
+    *secret.says.lock() = Err(FailureReason::new("it is a secret"));
     let error = format!("{:#}", ask().err().context("it refuses")?);
     let reason = match ros {
         RosVersion::One => "it is a secret",
@@ -345,7 +346,7 @@ struct RobotScale {
 
 #[async_trait]
 impl ServiceHandler for RobotScale {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let now = link::clock::now() + self.ahead;
         let number = |at: usize| -> i64 {
             let bytes = request[at..at + 4].try_into().unwrap_or_default();
@@ -353,7 +354,7 @@ impl ServiceHandler for RobotScale {
         };
         let age = now - (number(4) * SECOND + number(8));
         if age.abs() > 60 * SECOND {
-            return Err(format!("asked {} s ago", age / SECOND));
+            return Err(FailureReason::new(format!("asked {} s ago", age / SECOND)));
         }
         let time = |at: i64| {
             let part = |part: i64| u32::try_from(part).unwrap_or(0).to_le_bytes();

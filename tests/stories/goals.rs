@@ -5,7 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, GoalOutcome, RosVersion};
+use ros::bus::{ActionClient, Bus, GoalEnd, GoalError, GoalEvents, GoalOutcome, RosVersion};
 use support::Verdict;
 use support::cable::{Cable, NetworkImpairment};
 use support::cutter::Cutter;
@@ -24,7 +24,7 @@ const ACTION: &str = "/crossing/act";
 #[derive(Default)]
 struct GoalRecord {
     steps: Mutex<Vec<i32>>,
-    end: Mutex<Option<Result<GoalEnd, String>>>,
+    end: Mutex<Option<Result<GoalEnd, GoalError>>>,
 }
 
 impl GoalEvents for GoalRecord {
@@ -32,7 +32,7 @@ impl GoalEvents for GoalRecord {
         self.steps.lock().extend(last_number(&feedback));
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         *self.end.lock() = Some(end);
     }
 }
@@ -122,7 +122,7 @@ impl<'a> GoalApplication<'a> {
             Ok(end.ok_or_else(|| format!("{:?}", goal.steps.lock())))
         });
         let end = with_log(end, self.stub)?;
-        let end = with_log(end.map_err(anyhow::Error::msg), self.stub)?;
+        let end = with_log(end.map_err(anyhow::Error::from), self.stub)?;
         Ok((end.outcome, last_number(&end.result).context("a number")?))
     }
 }

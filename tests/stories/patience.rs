@@ -7,7 +7,8 @@ use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{
-    Bus, Publisher, SerializedMessage, ServiceHandler, ServiceType, wait_for_connected,
+    Bus, FailureReason, Publisher, SerializedMessage, ServiceHandler, ServiceType,
+    wait_for_connected,
 };
 use ros::ros1::Ros1Bus;
 use support::Verdict;
@@ -37,7 +38,7 @@ struct FixedAnswer(&'static [u8]);
 
 #[async_trait]
 impl ServiceHandler for FixedAnswer {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(Bytes::from_static(self.0))
     }
 }

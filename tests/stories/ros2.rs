@@ -12,8 +12,8 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, Graph, NodeEntities, ParamValue, RosVersion,
-    WireFormat,
+    Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, NodeEntities, ParamValue,
+    RosVersion, WireFormat,
 };
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
@@ -263,7 +263,7 @@ fn count_action() -> anyhow::Result<Arc<ActionDef>> {
 #[derive(Default)]
 struct GoalEventRecorder {
     feedback: Mutex<usize>,
-    end: Mutex<Option<Result<GoalEnd, String>>>,
+    end: Mutex<Option<Result<GoalEnd, GoalError>>>,
     ended: Notify,
 }
 
@@ -272,7 +272,7 @@ impl GoalEvents for GoalEventRecorder {
         *self.feedback.lock() += 1;
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         *self.end.lock() = Some(end);
         self.ended.notify_one();
     }
@@ -290,8 +290,7 @@ fn expect_count(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
         let ended = wait_for(heard.ended.notified());
         ended.await.context("a result should come")
     })?;
-    let end = heard.end.lock().take().context("an end")?;
-    let end = end.map_err(anyhow::Error::msg)?;
+    let end = heard.end.lock().take().context("an end")??;
     let mut expected = MessageLayout::new(RosVersion::Two);
     expected.u32(to);
     for number in 1..=to {

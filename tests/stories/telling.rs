@@ -1,7 +1,7 @@
 //! The runner of the stories: stories that fail by chance, runs that are killed, and machines that lack something.
 
 use std::io::{BufRead, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use anyhow::{Context, ensure};
@@ -167,20 +167,26 @@ pub fn what_the_machine_lacks_is_said_in_a_line() -> Verdict {
 }
 
 /// A rehearsal run in progress.
-struct RehearsalRun(Child);
+struct RehearsalRun {
+    child: Child,
+    /// The network namespace that it uses.
+    network: PathBuf,
+}
 
 impl RehearsalRun {
     fn start_with_servant(place: &Directory) -> anyhow::Result<RehearsalRun> {
-        let mut run = RehearsalRun(
-            rehearse_command(place, &["waits"])?
+        let mut run = RehearsalRun {
+            child: rehearse_command(place, &["waits"])?
                 .stdout(Stdio::piped())
                 .spawn()?,
-        );
-        let lines = BufReader::new(run.0.stdout.take().context("piped")?).lines();
+            network: PathBuf::new(),
+        };
+        let lines = BufReader::new(run.child.stdout.take().context("piped")?).lines();
         let mut said = Vec::new();
         for line in lines {
             let line = line?;
-            if line.contains("a servant is at work") {
+            if let Some((_, network)) = line.split_once(rehearsal::AT_WORK) {
+                run.network = network.into();
                 return Ok(run);
             }
             said.push(line);
@@ -189,8 +195,8 @@ impl RehearsalRun {
     }
 
     fn kill(&mut self) -> Verdict {
-        self.0.kill()?;
-        self.0.wait()?;
+        self.child.kill()?;
+        self.child.wait()?;
         Ok(())
     }
 }
@@ -201,11 +207,11 @@ impl Drop for RehearsalRun {
     }
 }
 
-fn run_directories(parent: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
+fn run_directories(parent: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(parent)?
         .flatten()
         .map(|entry| entry.path());
-    let is_place = |path: &std::path::PathBuf| {
+    let is_place = |path: &PathBuf| {
         path.file_name()
             .is_some_and(|name| name.to_string_lossy().starts_with(PREFIX))
     };
@@ -227,13 +233,14 @@ pub fn what_a_killed_run_left_is_removed_by_the_next_and_a_living_one_is_left_al
     };
     first.kill()?;
     ensure!(
-        !leftovers::find_leftovers(left).is_empty(),
-        "its daemon and its servant are there"
+        !leftovers::find_leftovers(left).is_empty() && first.network.exists(),
+        "its daemon, its servant and its network are there"
     );
     let outcome = passes()?;
     let removed = format!("removed {}", path_str(left));
     ensure!(outcome.stdout.contains(&removed), "{}", outcome.output());
     let there = leftovers::find_leftovers(left);
     ensure!(there.is_empty() && !left.exists(), "{there:#?}");
+    ensure!(!first.network.exists(), "{}", first.network.display());
     Ok(())
 }

@@ -19,11 +19,33 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use nix::sched::CloneFlags;
 
+use crate::claim;
 use crate::patience::scale;
 use crate::shaper::Shaper;
 
 /// Number of the next cable of this process, for its name and addresses.
 static NEXT: AtomicU32 = AtomicU32::new(0);
+
+/// Begin of the namespaces' names; the pid and start time of the owning process follow.
+const PREFIX: &str = "cloudroid-cable-";
+
+/// Removes the network namespaces of runs that were killed; returns their names.
+pub fn remove_abandoned() -> Vec<String> {
+    let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
+    let names = entries
+        .flatten()
+        .map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let is_abandoned = |name: &String| {
+        let mut words = name.strip_prefix(PREFIX).unwrap_or_default().split('-');
+        match (words.next(), words.next()) {
+            (Some(pid), Some(start)) => !claim::is_alive(&format!("{pid} {start}")),
+            _ => false,
+        }
+    };
+    let mut removed: Vec<String> = names.filter(is_abandoned).collect();
+    removed.retain(|name| ip(&["netns", "del", name]).is_ok());
+    removed
+}
 
 /// Impairment of a network, in each direction.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -97,7 +119,8 @@ impl Cable {
     fn create(portal: &str, robot_inside: bool) -> anyhow::Result<Self> {
         let id = std::process::id();
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let name = format!("cloudroid-cable-{id}-{number}");
+        let owner = claim::own_note().replace(' ', "-");
+        let name = format!("{PREFIX}{owner}-{number}");
         let ends = [format!("cr{id}-{number}"), format!("cs{id}-{number}")];
         // From the range for benchmarks of networks (RFC 2544), four addresses each.
         let subnet = (id.wrapping_mul(8).wrapping_add(number) % (1 << 15)) * 4;

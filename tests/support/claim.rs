@@ -21,9 +21,13 @@ const END: Duration = Duration::from_secs(60);
 /// # Errors
 /// If the file cannot be written.
 pub fn claim(directory: &Path) -> std::io::Result<()> {
+    fs::write(directory.join(OWNER), own_note())
+}
+
+/// Returns the note by which a later run recognises this process: its pid and start time.
+pub fn own_note() -> String {
     let own = std::process::id();
-    let text = format!("{own} {}", start_time(own as i32).unwrap_or_default());
-    fs::write(directory.join(OWNER), text)
+    format!("{own} {}", start_time(own as i32).unwrap_or_default())
 }
 
 /// Returns the directories in `parent` whose names start with `prefix` and whose owner no longer exists.
@@ -97,7 +101,7 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
 }
 
 /// Returns whether the process that wrote this note still exists.
-fn is_alive(owner: &str) -> bool {
+pub fn is_alive(owner: &str) -> bool {
     let (pid, start) = owner.split_once(' ').unwrap_or((owner, ""));
     pid.parse()
         .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == start))

@@ -14,10 +14,10 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
-    GoalEnd, GoalEvents, GoalOutcome, Graph, IncompatiblePeer, MatchedPeers, MessageSender,
-    NodeEntities, NodeParameters, ParamValue, PeerId, Publisher, QosProfile, QosReliability,
-    RosVersion, SerializedMessage, ServiceHandler, ServiceType, Subscription, TopicNodes,
-    TopicPeer, WireFormat, WireType, message_queue,
+    GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, IncompatiblePeer, MatchedPeers,
+    MessageSender, NodeEntities, NodeParameters, ParamValue, PeerId, Publisher, QosProfile,
+    QosReliability, RosVersion, SerializedMessage, ServiceHandler, ServiceType, Subscription,
+    TopicNodes, TopicPeer, WireFormat, WireType, message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
@@ -518,7 +518,7 @@ impl Bus for MemoryBus {
         match timeout(patience, handler.call(request, &self.node)).await {
             Ok(answer) => answer.map_err(|reason| BusError::CallFailed {
                 service: service.to_owned(),
-                reason,
+                reason: reason.into(),
                 fate: CallFate::Answered,
             }),
             Err(_) => Err(BusError::Timeout {
@@ -664,7 +664,7 @@ impl ActionClient for MemoryClient {
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
         let Some(server) = self.server() else {
-            return events.on_ended(Err(format!("action server {} is gone", self.action)));
+            return events.on_ended(Err(GoalError::ServerGone(self.action.clone())));
         };
         {
             let mut state = self.system.state.lock();
@@ -674,14 +674,14 @@ impl ActionClient for MemoryClient {
                 .insert(id.to_owned(), (self.number, events.clone()));
         }
         let taken = server.on_goal(id, goal);
-        if let Err(text) = taken {
+        if let Err(reason) = taken {
             let mut state = self.system.state.lock();
             let action = state.actions.entry(self.action.clone()).or_default();
             action.goals.remove(id);
             drop(state);
             events.on_ended(Ok(GoalEnd {
                 outcome: GoalOutcome::Rejected,
-                text,
+                text: reason.into_string(),
                 result: Bytes::new(),
             }));
         } else {
@@ -772,7 +772,7 @@ impl Drop for MemoryServer {
             Some(std::mem::take(&mut action.goals))
         });
         for (_, events) in left.unwrap_or_default().into_values() {
-            events.on_ended(Err(format!("action server {} is gone", self.action)));
+            events.on_ended(Err(GoalError::ServerGone(self.action.clone())));
         }
     }
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Bus, FailureReason, RosVersion, ServiceHandler, ServiceType};
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::schema::{Registry, ServiceDef};
 use serde_json::{Value, json};
@@ -131,7 +131,7 @@ impl Part {
 
 #[async_trait]
 impl ServiceHandler for Part {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let mut asked = Vec::new();
         to_json(
             &self.of.request,

@@ -48,12 +48,9 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let times = race.run();
     let milliseconds = |index: usize| times[index].best_micros() / 1000.0;
     for (index, what) in ["nearly all change", "few change"].into_iter().enumerate() {
+        let title = format!("decide on {SERVANTS} servants, {what}");
         report
-            .figure(
-                format!("decide on {SERVANTS} servants, {what}"),
-                "ms",
-                milliseconds(index),
-            )
+            .figure(title, "ms", milliseconds(index))
             .relative_to("one pass over the facts", milliseconds(2))
             .require(Target::AtMost(1.0));
     }

@@ -6,13 +6,12 @@ use std::sync::Barrier;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchDaemon, BenchReport, Target};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::robot::Robot;
+use support::{binaries, deployer};
 use tokio_tungstenite::tungstenite::Message;
-
-use crate::worker;
 
 const ROBOTS: usize = 50;
 const PLACES: usize = 4;
@@ -32,9 +31,16 @@ struct QueueSample {
 }
 
 pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
-    let place = worker::temporary_directory()?;
-    let daemon = worker::start_daemon(place.path(), CONFIG)?;
-    worker::push_worker(&daemon, "worker", &["--cpus", "1"])?;
+    let daemon = BenchDaemon::start(CONFIG)?;
+    daemon.push(&[
+        deployer::path_str(&binaries::package("adder_py")),
+        "--name",
+        "worker",
+        "--node",
+        "adder.py",
+        "--cpus",
+        "1",
+    ])?;
     let floor = run_concurrently(|_| {
         let asked = Instant::now();
         daemon.get("/healthz")?;
@@ -46,12 +52,9 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let twice =
         went.iter().filter(|one| one.answers > 1).count() + count_duplicate_starts(&daemon)?;
     let waited = went.iter().filter(|one| one.waited).count();
+    let title = format!("{ROBOTS} robots before {PLACES} places: the last knows where it stands");
     report
-        .figure(
-            format!("{ROBOTS} robots before {PLACES} places: the last knows where it stands"),
-            "s",
-            told(&went).as_secs_f64(),
-        )
+        .figure(title, "s", told(&went).as_secs_f64())
         .relative_to(
             "the last of as many HTTP answers",
             floor
@@ -71,7 +74,6 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     report
         .figure("served twice", "robots", twice as f64)
         .require(Target::AtMost(0.0));
-    daemon.stop()?;
     Ok(())
 }
 

@@ -9,9 +9,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchDaemon, BenchReport, Target};
 use serde_json::{Value, json};
-use support::daemon::{Daemon, DaemonSetup};
+use support::daemon::Daemon;
 use support::robot::Robot;
 
 const PACKAGE: &str = "sharer_cpp";
@@ -41,11 +41,7 @@ const PUSHED: [(&str, &[&str]); 4] = [
 ];
 
 pub fn measure(report: &mut BenchReport) -> Result<()> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let setup = DaemonSetup::new(&place.path().join("home"));
-    let daemon = setup.config("[capacity]\ncpus = 64\n").start()?;
+    let daemon = BenchDaemon::start("[capacity]\ncpus = 64\n")?;
     for (name, arguments) in PUSHED {
         let arguments = [&["--name", name, "--cpus", "0.5"], arguments].concat();
         daemon
@@ -61,30 +57,17 @@ pub fn measure(report: &mut BenchReport) -> Result<()> {
     for (name, servants) in [("one", 1), ("two", 2)] {
         let shared = measure_call_rate(&daemon, name, ROBOTS)?;
         let sum = single * f64::from(servants);
+        let title = format!("{ROBOTS} robots at {servants} shared");
         report
-            .figure(
-                format!("{ROBOTS} robots at {servants} shared"),
-                "calls/s",
-                shared,
-            )
+            .figure(title, "calls/s", shared)
             .relative_to(format!("{servants} x one robot at its own"), sum)
             .require(Target::RatioAtLeast(0.9));
-        report
-            .figure(
-                format!("{ROBOTS} robots at {servants} shared"),
-                "calls/s",
-                shared,
-            )
-            .relative_to(
-                format!("{servants} x roscpp in the same container"),
-                roscpp * f64::from(servants),
-            );
+        let title = format!("{ROBOTS} robots at {servants} shared");
+        report.figure(title, "calls/s", shared).relative_to(
+            format!("{servants} x roscpp in the same container"),
+            roscpp * f64::from(servants),
+        );
     }
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
-    daemon.stop()?;
     Ok(())
 }
 

@@ -2,14 +2,23 @@
 
 use crate::zlib;
 use anyhow::{Result, ensure};
-use bench_report::Race;
+use bench_report::{Race, Times};
 use codec::{Codec, Decoder, Encoder, Schema};
 use std::cell::RefCell;
 use std::hint::black_box;
 
 /// zstd levels from here on take seconds per round and only serve as a lower bound for the size: they, and zlib, run
-/// once.
+/// twice.
 const SLOW: i32 = 10;
+
+/// A codec with the sizes of its frames; the functions encode all messages and decode all frames.
+struct Contestant<'a> {
+    name: String,
+    slow: bool,
+    sizes: Vec<usize>,
+    encode: Box<dyn FnMut() + 'a>,
+    decode: Box<dyn FnMut() + 'a>,
+}
 
 /// Result of one codec for all messages.
 #[derive(Clone, Debug)]
@@ -45,153 +54,157 @@ impl CodecComparison<'_> {
 
     /// Runs our codecs `codecs` and the general-purpose ones; the first result is that of `memcpy`.
     pub fn run(&self, codecs: &[Codec], levels: &[i32]) -> Result<Vec<CodecResult>> {
-        let mut outcomes = vec![CodecResult {
-            name: "memcpy".into(),
-            saved: 0.0,
-            encode: 0.0,
-            decode: 0.0,
-        }];
-        let mut frames = Vec::new();
-        for &codec in codecs {
-            let encoded = self.encode_all(codec);
-            self.verify(codec, &encoded)?;
-            let sizes: Vec<usize> = encoded.iter().map(Vec::len).collect();
-            outcomes.push(CodecResult {
-                name: codec.to_string(),
-                saved: self.space_saved(&sizes),
-                encode: 0.0,
-                decode: 0.0,
-            });
-            frames.push(encoded);
-        }
-        let mut zstd_frames = Vec::new();
-        for &level in levels {
-            let encoded: Vec<Vec<u8>> = self
-                .messages
-                .iter()
-                .map(|message| zstd::bulk::compress(message, level))
-                .collect::<Result<_, _>>()?;
-            let sizes: Vec<usize> = encoded.iter().map(Vec::len).collect();
-            outcomes.push(CodecResult {
-                name: format!("zstd {level}"),
-                saved: self.space_saved(&sizes),
-                encode: 0.0,
-                decode: 0.0,
-            });
-            zstd_frames.push(encoded);
-        }
-        let zlib_frames: Vec<Vec<u8>> = self
-            .messages
-            .iter()
-            .map(|message| zlib::compress(message, 6))
-            .collect();
-        let sizes: Vec<usize> = zlib_frames.iter().map(Vec::len).collect();
-        outcomes.push(CodecResult {
-            name: "zlib 6".into(),
-            saved: self.space_saved(&sizes),
-            encode: 0.0,
-            decode: 0.0,
-        });
-
         let largest = self.messages.iter().map(Vec::len).max().unwrap_or(0);
         let buffer = RefCell::new(vec![0u8; largest * 2 + 4096]);
-        let mut race = Race::new(self.rounds);
-        race.add("memcpy", || {
-            for message in self.messages {
-                black_box(&mut buffer.borrow_mut()[..message.len()]).copy_from_slice(message);
-            }
-        });
+        let mut contestants = vec![self.memcpy(&buffer)];
         for &codec in codecs {
-            let mut encoder = Encoder::new(self.schema);
-            let mut out = Vec::new();
-            race.add(codec.to_string(), move || {
-                for message in self.messages {
-                    out.clear();
-                    encoder.encode(codec, message, &mut out);
-                    black_box(&out);
-                }
-            });
+            contestants.push(self.ours(codec, largest)?);
         }
         for &level in levels {
-            let mut context = zstd::bulk::Compressor::new(level)?;
-            let buffer = &buffer;
-            let mut runs = 0;
-            race.add(format!("zstd {level}"), move || {
-                runs += 1;
-                // High levels take seconds per round and only serve as a lower bound for the size, so two rounds
-                // suffice.
-                for message in if level < 10 || runs <= 2 {
-                    self.messages
+            contestants.push(self.zstd(level, &buffer)?);
+        }
+        contestants.push(self.zlib(&buffer));
+        let (mut encoding, mut decoding) = (Race::new(self.rounds), Race::new(self.rounds));
+        let mut entered = Vec::new();
+        for one in contestants {
+            encoding.add(one.name.clone(), one.encode);
+            decoding.add(one.name.clone(), one.decode);
+            entered.push((one.name, one.slow, self.space_saved(&one.sizes)));
+        }
+        let bytes = self.total_bytes();
+        let times = encoding.run().into_iter().zip(decoding.run());
+        let result =
+            |((name, slow, saved), (encoding, decoding)): ((String, bool, f64), (Times, Times))| {
+                // A slow codec that did some work is timed by its longest run alone.
+                let took = if slow {
+                    encoding.longest()
                 } else {
-                    &[]
-                } {
-                    black_box(
-                        context
-                            .compress_to_buffer(message, &mut buffer.borrow_mut()[..])
-                            .unwrap_or(0),
-                    );
+                    encoding.best()
+                };
+                CodecResult {
+                    name,
+                    saved,
+                    encode: bytes as f64 / 1e6 / took.as_secs_f64(),
+                    decode: decoding.megabytes_per_second(bytes),
                 }
-            });
-        }
-        let mut runs = 0;
-        race.add("zlib 6", move || {
-            runs += 1;
-            for message in if runs <= 2 { self.messages } else { &[] } {
-                black_box(zlib::compress(message, 6));
-            }
-        });
-        for (outcome, times) in outcomes.iter_mut().zip(race.run()) {
-            let slow = outcome.name == "zlib 6"
-                || levels
-                    .iter()
-                    .any(|&level| level >= SLOW && outcome.name == format!("zstd {level}"));
-            // A slow codec that did some work is timed by its longest run alone.
-            let took = if slow {
-                times.quantile(1.0)
-            } else {
-                times.best()
             };
-            outcome.encode = self.total_bytes() as f64 / 1e6 / took.as_secs_f64();
-        }
+        Ok(entered.into_iter().zip(times).map(result).collect())
+    }
 
-        let mut race = Race::new(self.rounds);
-        race.add("memcpy", || {
+    fn memcpy<'a>(&'a self, buffer: &'a RefCell<Vec<u8>>) -> Contestant<'a> {
+        let copy = move || {
             for message in self.messages {
                 black_box(&mut buffer.borrow_mut()[..message.len()]).copy_from_slice(message);
             }
-        });
-        for frames in &frames {
-            let mut decoder = Decoder::new(largest);
-            let mut out = Vec::new();
-            race.add("", move || {
-                for frame in frames {
-                    out.clear();
-                    black_box(decoder.decode(frame, &mut out)).ok();
-                }
-            });
+        };
+        Contestant {
+            name: "memcpy".to_owned(),
+            slow: false,
+            sizes: self.messages.iter().map(Vec::len).collect(),
+            encode: Box::new(copy),
+            decode: Box::new(copy),
         }
-        for frames in &zstd_frames {
-            let mut context = zstd::bulk::Decompressor::new()?;
-            let buffer = &buffer;
-            race.add("", move || {
-                for frame in frames {
-                    black_box(
-                        context
-                            .decompress_to_buffer(frame, &mut buffer.borrow_mut()[..])
-                            .unwrap_or(0),
-                    );
-                }
-            });
-        }
-        race.add("", || {
-            for frame in &zlib_frames {
+    }
+
+    fn ours(&self, codec: Codec, largest: usize) -> Result<Contestant<'_>> {
+        let frames = self.encode_all(codec);
+        self.verify(codec, &frames)?;
+        let sizes = frames.iter().map(Vec::len).collect();
+        let (mut encoder, mut out) = (Encoder::new(self.schema), Vec::new());
+        let encode = move || {
+            for message in self.messages {
+                out.clear();
+                encoder.encode(codec, message, &mut out);
+                black_box(&out);
+            }
+        };
+        let (mut decoder, mut back) = (Decoder::new(largest), Vec::new());
+        let decode = move || {
+            for frame in &frames {
+                back.clear();
+                black_box(decoder.decode(frame, &mut back)).ok();
+            }
+        };
+        Ok(Contestant {
+            name: codec.to_string(),
+            slow: false,
+            sizes,
+            encode: Box::new(encode),
+            decode: Box::new(decode),
+        })
+    }
+
+    fn zstd<'a>(&'a self, level: i32, buffer: &'a RefCell<Vec<u8>>) -> Result<Contestant<'a>> {
+        let frames = self
+            .messages
+            .iter()
+            .map(|message| zstd::bulk::compress(message, level));
+        let frames: Vec<Vec<u8>> = frames.collect::<Result<_, _>>()?;
+        let slow = level >= SLOW;
+        let (mut context, mut runs) = (zstd::bulk::Compressor::new(level)?, 0);
+        let encode = move || {
+            runs += 1;
+            for message in self.messages_of_run(slow, runs) {
+                let mut frame = buffer.borrow_mut();
+                black_box(
+                    context
+                        .compress_to_buffer(message, &mut frame[..])
+                        .unwrap_or(0),
+                );
+            }
+        };
+        let mut context = zstd::bulk::Decompressor::new()?;
+        let sizes = frames.iter().map(Vec::len).collect();
+        let decode = move || {
+            for frame in &frames {
+                let mut message = buffer.borrow_mut();
+                black_box(
+                    context
+                        .decompress_to_buffer(frame, &mut message[..])
+                        .unwrap_or(0),
+                );
+            }
+        };
+        Ok(Contestant {
+            name: format!("zstd {level}"),
+            slow,
+            sizes,
+            encode: Box::new(encode),
+            decode: Box::new(decode),
+        })
+    }
+
+    fn zlib<'a>(&'a self, buffer: &'a RefCell<Vec<u8>>) -> Contestant<'a> {
+        let frames = self
+            .messages
+            .iter()
+            .map(|message| zlib::compress(message, 6));
+        let frames: Vec<Vec<u8>> = frames.collect();
+        let sizes = frames.iter().map(Vec::len).collect();
+        let mut runs = 0;
+        let encode = move || {
+            runs += 1;
+            for message in self.messages_of_run(true, runs) {
+                black_box(zlib::compress(message, 6));
+            }
+        };
+        let decode = move || {
+            for frame in &frames {
                 black_box(zlib::uncompress(frame, &mut buffer.borrow_mut()));
             }
-        });
-        for (outcome, times) in outcomes.iter_mut().zip(race.run()) {
-            outcome.decode = times.megabytes_per_second(self.total_bytes());
+        };
+        Contestant {
+            name: "zlib 6".to_owned(),
+            slow: true,
+            sizes,
+            encode: Box::new(encode),
+            decode: Box::new(decode),
         }
-        Ok(outcomes)
+    }
+
+    /// Returns the messages that a codec encodes in its run with this number: slow ones encode none after the second.
+    fn messages_of_run(&self, slow: bool, runs: usize) -> &[Vec<u8>] {
+        if slow && runs > 2 { &[] } else { self.messages }
     }
 
     fn encode_all(&self, codec: Codec) -> Vec<Vec<u8>> {

@@ -18,6 +18,16 @@ fn image_comparison(messages: &[Vec<u8>]) -> CodecComparison<'_> {
     }
 }
 
+/// Serializes images, with what `data` makes of each.
+fn images(
+    encoding: &str,
+    pictures: &[Picture],
+    data: impl Fn(&Picture) -> Vec<u8>,
+) -> Vec<Vec<u8>> {
+    let one = |p: &Picture| image(encoding, p.width, p.height, &data(p));
+    pictures.iter().map(one).collect()
+}
+
 /// Reports the four figures of a lossless image codec.
 fn report_lossless(
     report: &mut BenchReport,
@@ -86,29 +96,17 @@ fn jpeg(picture: &Picture) -> Result<Vec<u8>> {
 
 pub fn measure_colour(report: &mut BenchReport) -> Result<()> {
     let pictures = samples::colour_frames()?;
-    let messages: Vec<_> = pictures
-        .iter()
-        .map(|p| image("rgb8", p.width, p.height, &p.data))
-        .collect();
+    let whole = |picture: &Picture| picture.data.clone();
+    let messages = images("rgb8", &pictures, whole);
     report_lossless(report, "colour", &messages, Some(63.0))?;
     measure_peers(report, &pictures, &messages)?;
 
-    let packaged: Vec<_> = samples::packaged_photographs()?
-        .iter()
-        .map(|p| image("bgr8", p.width, p.height, &p.data))
-        .collect();
+    let packaged = images("bgr8", &samples::packaged_photographs()?, whole);
     report_lossless(report, "colour, packaged photographs", &packaged, None)?;
     let grey = |p: &Picture| -> Vec<u8> { p.data.chunks_exact(3).map(|pixel| pixel[1]).collect() };
-    let messages: Vec<_> = pictures
-        .iter()
-        .map(|p| image("mono8", p.width, p.height, &grey(p)))
-        .collect();
-    report_lossless(report, "grey", &messages, None)?;
-    let messages: Vec<_> = pictures
-        .iter()
-        .map(|p| image("bayer_rggb8", p.width, p.height, &to_bayer(p)))
-        .collect();
-    report_lossless(report, "Bayer", &messages, None)?;
+    report_lossless(report, "grey", &images("mono8", &pictures, grey), None)?;
+    let bayer = images("bayer_rggb8", &pictures, to_bayer);
+    report_lossless(report, "Bayer", &bayer, None)?;
     Ok(())
 }
 
@@ -193,20 +191,11 @@ pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
         !pictures.is_empty(),
         "no depth image at hand: neither recordings nor scikit-image's samples"
     );
-    let messages: Vec<_> = pictures
-        .iter()
-        .map(|p| image("16UC1", p.width, p.height, &p.data))
-        .collect();
-    report_lossless(report, "depth", &messages, Some(83.0))?;
-    let holes: Vec<_> = pictures
-        .iter()
-        .map(|p| image("16UC1", p.width, p.height, &with_holes(p)))
-        .collect();
+    let whole = images("16UC1", &pictures, |picture| picture.data.clone());
+    report_lossless(report, "depth", &whole, Some(83.0))?;
+    let holes = images("16UC1", &pictures, with_holes);
     report_lossless(report, "depth with holes", &holes, None)?;
-    let metres: Vec<_> = pictures
-        .iter()
-        .map(|p| image("32FC1", p.width, p.height, &to_metres(p)))
-        .collect();
+    let metres = images("32FC1", &pictures, to_metres);
     report_lossless(report, "float depth", &metres, None)?;
     if let Some(disparity) = samples::motorcycle_disparity() {
         let data: Vec<u8> = disparity

@@ -2,10 +2,9 @@
 //! and the distortion of lossy codecs.
 
 use crate::messages::{grid, image};
-use crate::psnr::Psnr;
 use crate::samples;
 use anyhow::{Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Psnr, Target};
 use codec::{Codec, Decoder, Encoder, JpegOptions, Schema, VideoOptions};
 
 /// Number of frames of the video.
@@ -66,12 +65,9 @@ pub fn measure_published_table(report: &mut BenchReport) -> Result<()> {
                 "    {kind:<10} {how:<24} {published:5.1}%  {:6.2}%  {psnr}",
                 outcome.saved
             );
+            let title = format!("published {kind}: saved by {how}");
             let figure = report
-                .figure(
-                    format!("published {kind}: saved by {how}"),
-                    "%",
-                    outcome.saved,
-                )
+                .figure(title, "%", outcome.saved)
                 .relative_to("published", published)
                 .note(psnr);
             if target {

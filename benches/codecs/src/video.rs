@@ -1,10 +1,9 @@
 //! Colour video compared with x264, by the processor time of one core, independent of other load.
 
 use crate::messages::image;
-use crate::psnr::Psnr;
 use crate::samples;
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target, children_processor_time, thread_processor_time};
+use bench_report::{BenchReport, Psnr, Target, children_processor_time, thread_processor_time};
 use codec::{Codec, Decoder, Encoder, Schema, VideoOptions};
 use std::io::Write;
 use std::process::{Command, Stdio};

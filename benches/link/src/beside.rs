@@ -6,13 +6,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::BenchReport;
+use bench_report::{BenchReport, is_full_run, quantile_seconds};
 use bytes::Bytes;
-use ros::bus::{Bus, Publisher, QosProfile, Subscription, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, Subscription};
 use ros::ros1::Ros1Bus;
 use support::cable::{Cable, NetworkImpairment};
 use support::daemon::Daemon;
+use support::people;
 use support::site::{Site, string};
+
+use crate::people::next_noise;
 
 /// Properties of the network.
 const NETWORK: NetworkImpairment = NetworkImpairment {
@@ -22,58 +25,23 @@ const NETWORK: NetworkImpairment = NetworkImpairment {
     loss: 0.0,
     limit: 1000,
 };
-/// Size of a picture in bytes; its content cannot be compressed.
-const PICTURE: usize = 900_000;
+/// Size of a picture of 900 kB; its content cannot be compressed.
+const SIZE: (u32, u32) = (600, 500);
 /// Intervals between two pictures and between two small messages.
 const PICTURES: Duration = Duration::from_millis(100);
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Quantiles of round-trip times, in milliseconds.
-struct RoundTripQuantiles {
-    p50: f64,
-    p99: f64,
-}
-
-fn quantiles(times: &[Duration]) -> RoundTripQuantiles {
-    let milliseconds = |share| {
-        let time = bench_report::quantile(times, share);
-        time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
-    };
-    RoundTripQuantiles {
-        p50: milliseconds(0.5),
-        p99: milliseconds(0.99),
-    }
-}
-
 /// Serializes a sensor_msgs/Image of noise.
 fn noise_image(number: u32) -> Bytes {
-    let mut out = Vec::with_capacity(PICTURE + 64);
-    for word in [number, 0, 0, 0, 480, 640, 4] {
-        out.extend(u32::to_le_bytes(word));
-    }
-    out.extend(b"rgb8\0");
-    out.extend(u32::to_le_bytes(640 * 3));
-    out.extend(u32::try_from(PICTURE).unwrap_or(0).to_le_bytes());
     let mut noise = number.wrapping_mul(2_654_435_761) | 1;
-    out.extend((0..PICTURE).map(|_| {
-        noise ^= noise << 13;
-        noise ^= noise >> 17;
-        noise ^= noise << 5;
-        (noise >> 24) as u8
-    }));
-    out.into()
+    let pixels = (0..SIZE.0 * SIZE.1 * 3).map(|_| (next_noise(&mut noise) >> 24) as u8);
+    people::picture(number, SIZE, &pixels.collect::<Vec<u8>>())
 }
 
 fn advertise_images(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
-    Ok(site.runtime.block_on(app.advertise(
-        "/meter/image_in",
-        WireType::new(
-            "sensor_msgs/Image",
-            "060021388200f6f0f447d0fcd9c64743",
-            crate::people::IMAGE,
-        ),
-        QosProfile::keep_last(1),
-    ))?)
+    let quality = QosProfile::keep_last(1);
+    let advertised = app.advertise("/meter/image_in", people::image_type(), quality);
+    Ok(site.runtime.block_on(advertised)?)
 }
 
 /// Measures small messages through the stub, one after the other.
@@ -82,7 +50,7 @@ fn time_link_trips(
     pings: &dyn Publisher,
     pongs: &mut Subscription,
     trips: usize,
-) -> Result<RoundTripQuantiles> {
+) -> Result<Vec<Duration>> {
     let mut times = Vec::with_capacity(trips);
     for number in 0..trips {
         let text = string(&number.to_string());
@@ -92,12 +60,12 @@ fn time_link_trips(
         times.push(begun.elapsed());
         std::thread::sleep(PAUSE);
     }
-    Ok(quantiles(&times))
+    Ok(times)
 }
 
 /// Measures round trips over the shaped network, without and with pictures.
 pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
-    let trips = if crate::is_full_run() { 1000 } else { 200 };
+    let trips = if is_full_run() { 1000 } else { 200 };
     eprintln!("a small message beside pictures: {trips} trips each");
     let cable = Cable::new(&daemon.address)?;
     let site = Site::new()?;
@@ -145,17 +113,12 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     drop((pictures, pings, pongs, stub));
     cable.restore()?;
     // Time for which a message waits that is queued behind a whole picture.
-    let picture = PICTURE as f64 * 8.0 / f64::from(NETWORK.rate);
-    for (what, beside, alone) in [
-        ("p50", beside.p50, alone.p50),
-        ("p99", beside.p99, alone.p99),
-    ] {
+    let picture = f64::from(SIZE.0 * SIZE.1 * 3) * 8.0 / f64::from(NETWORK.rate);
+    for (what, share) in [("p50", 0.5), ("p99", 0.99)] {
+        let [beside, alone] = [&beside, &alone].map(|times| quantile_seconds(times, share) * 1e3);
+        let title = format!("String there and back beside 900 kB pictures, 20 Mbit/s: {what}");
         report
-            .figure(
-                format!("String there and back beside 900 kB pictures, 20 Mbit/s: {what}"),
-                "ms",
-                beside,
-            )
+            .figure(title, "ms", beside)
             .relative_to("the same without pictures", alone)
             .note(format!(
                 "a picture takes {picture:.0} ms; {}",

@@ -3,18 +3,15 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Process, Target, is_full_run, quantile_seconds};
 use bytes::Bytes;
-use ros::bus::{Bus, Publisher, QosProfile, Subscription, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, Subscription};
 use ros::ros1::Ros1Bus;
 use support::daemon::Daemon;
+use support::people;
 use support::site::Site;
 
 const SIZE: (u32, u32) = (640, 480);
-pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
-    uint32 step\nuint8[] data\n\
-    ================================================================================\n\
-    MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
 
 /// One path on which the same messages are sent.
 struct MessagePath {
@@ -30,11 +27,7 @@ impl MessagePath {
         let topic = format!("/{node}_camera");
         let pictures = site.runtime.block_on(app.advertise(
             &topic,
-            WireType::new(
-                "sensor_msgs/Image",
-                "060021388200f6f0f447d0fcd9c64743",
-                IMAGE,
-            ),
+            people::image_type(),
             QosProfile::keep_last(10),
         ))?;
         site.wait_for_subscribers(&*pictures, 1)?;
@@ -64,34 +57,25 @@ impl MessagePath {
 
 /// An image like a camera's: shapes with noise.
 fn camera_image(stamp: u32) -> Bytes {
-    let mut out = Vec::new();
-    let word = |out: &mut Vec<u8>, word: u32| out.extend(word.to_le_bytes());
-    for part in [stamp, stamp, 0] {
-        word(&mut out, part);
-    }
-    word(&mut out, 6);
-    out.extend(b"camera");
-    word(&mut out, SIZE.1);
-    word(&mut out, SIZE.0);
-    word(&mut out, 4);
-    out.extend(b"bgr8");
-    out.push(0);
-    word(&mut out, SIZE.0 * 3);
-    word(&mut out, SIZE.0 * SIZE.1 * 3);
     let mut noise = stamp.wrapping_mul(2_654_435_761) | 1;
-    for at in 0..SIZE.0 * SIZE.1 * 3 {
-        noise ^= noise << 13;
-        noise ^= noise >> 17;
-        noise ^= noise << 5;
+    let pixels = (0..SIZE.0 * SIZE.1 * 3).map(|at| {
         let shape = ((at / 3 % SIZE.0) / 40 + at / (SIZE.0 * 3) / 60) % 2 * 90;
-        out.push((shape + (noise & 15) + 60) as u8);
-    }
-    out.into()
+        (shape + (next_noise(&mut noise) & 15) + 60) as u8
+    });
+    people::picture(stamp, SIZE, &pixels.collect::<Vec<u8>>())
+}
+
+/// Returns the next word of a xorshift generator.
+pub fn next_noise(state: &mut u32) -> u32 {
+    *state ^= *state << 13;
+    *state ^= *state >> 17;
+    *state ^= *state << 5;
+    *state
 }
 
 /// Measures response times in turns, and the resources of the stub.
 pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
-    let rounds = if crate::is_full_run() { 300 } else { 60 };
+    let rounds = if is_full_run() { 300 } else { 60 };
     let site = Site::new()?;
     let app = site.node("/app")?;
     let native = site.start_original(
@@ -135,15 +119,15 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     }
     let [native_way, linked_way] = &mut ways;
     let (alone, linked) = (
-        crate::median_seconds(&native_way.times) * 1e3,
-        crate::median_seconds(&linked_way.times) * 1e3,
+        quantile_seconds(&native_way.times, 0.5) * 1e3,
+        quantile_seconds(&linked_way.times, 0.5) * 1e3,
     );
     report
         .figure("people_detect, picture in, found out: median", "ms", linked)
         .relative_to("the same on the robot", alone)
         .require(Target::RatioAtMost(1.05))
         .note(format!("640x480, {rounds} pictures each, in turns"));
-    let memory = crate::idle::pss(stub.pid())?;
+    let memory = Process::from_pid(stub.pid()).proportional()?;
     report
         .figure("memory of its stub, after that", "MB", memory)
         .require(Target::AtMost(15.0))

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Target, is_full_run, quantile_seconds};
 use serde_json::json;
 use support::daemon::Daemon;
 use support::robot::Robot;
@@ -12,13 +12,13 @@ use support::site::{Site, string};
 /// Messages per turn; the first tenth is not counted.
 const TRIPS: usize = 1000;
 
-fn warm_median_micros(times: &mut [Duration]) -> f64 {
-    crate::median_seconds(&times[TRIPS / 10..]) * 1e6
+fn warm_median_micros(times: &[Duration]) -> f64 {
+    quantile_seconds(&times[TRIPS / 10..], 0.5) * 1e6
 }
 
 /// Reports the best median of the turns of each path.
 pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
-    let rounds = if crate::is_full_run() { 15 } else { 5 };
+    let rounds = if is_full_run() { 15 } else { 5 };
     let site = Site::new()?;
     let app = site.node("/app")?;
     let stub = site.start_stub(
@@ -63,7 +63,7 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
             }
             anyhow::Ok(())
         })?;
-        link = link.min(warm_median_micros(&mut times));
+        link = link.min(warm_median_micros(&times));
         times.clear();
         for number in 0..TRIPS {
             let publication = json!({"op": "publish", "topic": "/meter/ping", "msg": {"data": number.to_string()}});
@@ -72,7 +72,7 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
             client.next_message_on("/meter/pong")?;
             times.push(begun.elapsed());
         }
-        portal = portal.min(warm_median_micros(&mut times));
+        portal = portal.min(warm_median_micros(&times));
     }
     report
         .figure("String there and back over the link: p50", "µs", link)

@@ -5,22 +5,24 @@
 
 mod inside;
 mod outside;
-mod process;
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchDaemon, BenchReport, Process, Target};
 use serde_json::json;
 use servant::launch::{self, RuntimeRecord};
 use servant::netns::NetNs;
-use support::daemon::{Daemon, DaemonSetup};
+use support::daemon::Daemon;
 use support::robot::Robot;
-
-use process::Process;
 
 /// Default memory budget of a client, of a servant and of a shim, in megabytes (10⁶).
 const LIMIT: f64 = 268.0;
+/// Sampling interval of the peak.
+const LOOK: Duration = Duration::from_millis(50);
+/// A process has settled when its peak has not changed for `SETTLED`; the wait ends after `PATIENCE` in any case.
+const SETTLED: Duration = Duration::from_secs(1);
+const PATIENCE: Duration = Duration::from_secs(30);
 /// Duration over which the shim's processor time is measured.
 const DRIVEN: Duration = Duration::from_secs(5);
 
@@ -42,7 +44,7 @@ impl Victim {
         let node = servant["pids"][0].as_i64().context("a node")?;
         Ok(Self {
             network: NetNs::from_pid(i32::try_from(node)?)?,
-            shim: Process(runtime.shim.pid),
+            shim: Process::from_pid(runtime.shim.pid),
         })
     }
 }
@@ -51,14 +53,14 @@ impl Victim {
 fn attack(
     report: &mut BenchReport,
     name: &str,
-    process: Process,
+    process: &Process,
     (peer, floor): (&str, f64),
     attack: impl FnOnce() -> Result<String>,
 ) -> Result<()> {
     let before = process.resident()?;
     process.reset_peak()?;
     let said = attack().with_context(|| name.to_owned())?;
-    process.wait_until_settled()?;
+    wait_until_settled(process)?;
     let peak = process.peak()?;
     eprintln!("{name}: {peak:.0} MB, {before:.0} MB before; {said}");
     report
@@ -71,13 +73,22 @@ fn attack(
     Ok(())
 }
 
+/// Waits until the memory of a process no longer grows, for half a minute at most.
+fn wait_until_settled(process: &Process) -> Result<()> {
+    let began = Instant::now();
+    let (mut peak, mut since) = (process.peak()?, Instant::now());
+    while since.elapsed() < SETTLED && began.elapsed() < PATIENCE {
+        std::thread::sleep(LOOK);
+        let now = process.peak()?;
+        if now > peak {
+            (peak, since) = (now, Instant::now());
+        }
+    }
+    Ok(())
+}
+
 fn main() -> Result<()> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let daemon = DaemonSetup::new(&place.path().join("home"))
-        .config("[servant]\nwarm_pool = 0\n")
-        .start()?;
+    let daemon = BenchDaemon::start("[servant]\nwarm_pool = 0\n")?;
     let node = ["--node", "adder.py"];
     let deployer = daemon.deployer();
     deployer.push("adder_py", &node)?.expect_success()?;
@@ -93,7 +104,7 @@ fn main() -> Result<()> {
     let mut robot = daemon.robot("adder_py?robot=victim")?;
     robot.call("/add_two", json!({"a": 1, "b": 1}))?;
     let victim = Victim::for_robot(&daemon, "adder_py", "victim")?;
-    let whole = Process(daemon.pid());
+    let whole = &Process::from_pid(daemon.pid());
     let mut report = BenchReport::new("memory");
     let first = |megabytes| ("first release", megabytes);
 
@@ -101,7 +112,7 @@ fn main() -> Result<()> {
     let mut other = daemon.robot("adder_py?robot=other")?;
     other.call("/add_two", json!({"a": 1, "b": 1}))?;
     let other = Victim::for_robot(&daemon, "adder_py", "other")?;
-    attack(&mut report, name, other.shim, first(3300.0), || {
+    attack(&mut report, name, &other.shim, first(3300.0), || {
         inside::flood_parameters(&other.network)
     })?;
     answered()?;
@@ -110,50 +121,48 @@ fn main() -> Result<()> {
         inside::send_unfinished_requests(&victim.network, &mut robot)
     })?;
     answered()?;
-    let name = "daemon: 20 unfinished WebSocket messages of 63 MB";
-    attack(&mut report, name, whole, first(1300.0), || {
-        outside::hold_unfinished_messages(&daemon)
-    })?;
-    answered()?;
-    let name = "daemon: 4 unfinished bodies of trials of 330 MB";
-    attack(&mut report, name, whole, first(1300.0), || {
-        outside::hold_unfinished_trials(&daemon)
-    })?;
-    answered()?;
-    let name = "daemon: a message of 60 MB that is 300 MB as JSON";
-    let limit = ("limit of a servant", LIMIT);
-    attack(&mut report, name, whole, limit, || {
-        outside::subscribe_to_oversized_json(&daemon)
-    })?;
-    answered()?;
-    let name = "daemon: 20 connections of a robot that do not read";
-    let limit = ("limit of a client", LIMIT);
-    attack(&mut report, name, whole, limit, || {
-        outside::leave_messages_unread(&daemon)
-    })?;
-    answered()?;
+    /// Begins an attack; returns what it did.
+    type Attack = fn(&Daemon) -> Result<String>;
+    let attacks: [(&str, (&str, f64), Attack); 4] = [
+        (
+            "daemon: 20 unfinished WebSocket messages of 63 MB",
+            first(1300.0),
+            outside::hold_unfinished_messages,
+        ),
+        (
+            "daemon: 4 unfinished bodies of trials of 330 MB",
+            first(1300.0),
+            outside::hold_unfinished_trials,
+        ),
+        (
+            "daemon: a message of 60 MB that is 300 MB as JSON",
+            ("limit of a servant", LIMIT),
+            outside::subscribe_to_oversized_json,
+        ),
+        (
+            "daemon: 20 connections of a robot that do not read",
+            ("limit of a client", LIMIT),
+            outside::leave_messages_unread,
+        ),
+    ];
+    for (name, peer, begin) in attacks {
+        attack(&mut report, name, whole, peer, || begin(&daemon))?;
+        answered()?;
+    }
 
     let mut robot: Robot = daemon.robot("small?robot=small")?;
     robot.call("/add_two", json!({"a": 1, "b": 1}))?;
     let small = Victim::for_robot(&daemon, "small", "small")?;
-    let (began, before) = (Instant::now(), small.shim.processor_time()?);
+    let (began, before) = (Instant::now(), small.shim.total_processor_time()?);
     inside::drive_master(&small.network, DRIVEN)?;
     let cores =
-        (small.shim.processor_time()? - before).as_secs_f64() / began.elapsed().as_secs_f64();
+        (small.shim.total_processor_time()? - before).as_secs_f64() / began.elapsed().as_secs_f64();
+    let title = "shim of a servant with 0.1 cores, asked all the time";
     report
-        .figure(
-            "shim of a servant with 0.1 cores, asked all the time",
-            "cores",
-            cores,
-        )
+        .figure(title, "cores", cores)
         .relative_to("first release", 0.41)
         .require(Target::AtMost(0.12))
         .note(format!("over {DRIVEN:?}, from 4 connections"));
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
-    daemon.stop()?;
     report.finish()?;
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::fmt;
 
 use anyhow::{Context, Result, ensure};
 use base64::prelude::{BASE64_STANDARD, Engine as _};
-use bench_servant::Daemon;
+use bench_report::BenchDaemon;
 use rosbridge::{Format, Writer};
 use serde_json::Value;
 
@@ -64,7 +64,7 @@ pub(crate) struct OpenPath {
 
 /// The daemon, the node and the topics or service that all paths are opened to.
 pub(crate) struct PathTarget<'a> {
-    pub(crate) daemon: &'a Daemon,
+    pub(crate) daemon: &'a BenchDaemon,
     pub(crate) node: &'a MeterNode,
     pub(crate) hops: RelayHops<'a>,
 }

@@ -5,11 +5,11 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 
 use anyhow::{Context, Result, bail, ensure};
-use bench_servant::Daemon;
+use bench_report::BenchDaemon;
 use tokio_tungstenite::tungstenite;
 
 use crate::node::PATIENCE;
-use crate::secure::{self, BenchTlsStream};
+use crate::tls::{self, BenchTlsStream};
 
 /// URL path of the robot that all measurements use.
 pub(crate) const ROBOT: &str = "meter?robot=bench";
@@ -66,11 +66,11 @@ impl BenchConnection {
     }
 
     /// Connects as the robot to a daemon, through TLS if the daemon uses it.
-    pub(crate) fn connect_robot(daemon: &Daemon) -> Result<Self> {
-        let Some(token) = secure::robot_token(daemon)? else {
+    pub(crate) fn connect_robot(daemon: &BenchDaemon) -> Result<Self> {
+        let Some(token) = tls::robot_token(daemon)? else {
             return Self::connect_websocket(&daemon.address, ROBOT);
         };
-        let stream = secure::connect(daemon)?;
+        let stream = tls::connect(daemon)?;
         let url = format!("wss://localhost/{ROBOT}&token={token}");
         match tungstenite::client(url, stream) {
             Ok((socket, _)) => {

@@ -10,6 +10,7 @@
 mod contestants;
 mod framing;
 mod line;
+mod meter;
 mod node;
 mod rates;
 mod raw;
@@ -17,22 +18,17 @@ mod relay;
 mod secure;
 mod slow_reader;
 mod suite;
+mod tls;
 mod trips;
 mod value;
 mod watch;
 
-use std::path::PathBuf;
+use anyhow::{Result, bail};
+use bench_report::{BenchDaemon, BenchReport, Process, Target};
 
-use anyhow::{Context, Result, bail, ensure};
-use bench_report::{BenchReport, Target};
-use bench_servant::Daemon;
-
+use crate::meter::{CONFIG, fixture_path, push_meter};
 use crate::node::MeterNode;
 use crate::watch::MemoryWatch;
-
-/// A single servant, which is kept.
-const CONFIG: &str =
-    "[capacity]\ncpus = 64.0\nmemory = \"64G\"\n[servant]\nreserve_cpus = 0.1\ngrace = \"1h\"\n";
 
 /// Memory that the daemon may use, in megabytes.
 const MEMORY: f64 = 60.0;
@@ -50,26 +46,9 @@ fn main() -> Result<()> {
     }
 }
 
-/// Publishes the node that all measurements use, and nothing else.
-fn push_meter(daemon: &Daemon) -> Result<()> {
-    eprintln!("pushing rosbridge_fixture");
-    daemon.push(&[
-        fixture_path().to_str().context("UTF-8")?,
-        "--name",
-        "meter",
-        "--node",
-        "rosbridge_fixture/meter",
-    ])?;
-    Ok(())
-}
-
-fn fixture_path() -> PathBuf {
-    bench_report::root().join("tests/packages/rosbridge_fixture")
-}
-
 /// Publishes the node together with rosbridge_suite, or alone if that fails; returns whether rosbridge_suite is
 /// available.
-fn push_with_suite(report: &mut BenchReport, daemon: &Daemon) -> Result<bool> {
+fn push_with_suite(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<bool> {
     let Err(why) = suite::push_with_fixture(daemon, &fixture_path()) else {
         return Ok(true);
     };
@@ -86,18 +65,10 @@ fn measure(only: &str) -> Result<()> {
         report.finish()?;
         return Ok(());
     }
-    let root = std::fs::metadata("/proc/self").is_ok_and(|about| {
-        use std::os::unix::fs::MetadataExt;
-        about.uid() == 0
-    });
-    ensure!(root, "servants are made by root: sudo make bench");
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let daemon = Daemon::start(place, CONFIG, &[])?;
+    let daemon = BenchDaemon::start(CONFIG)?;
     let suite = push_with_suite(&mut report, &daemon)?;
     let node = MeterNode::find(&daemon)?;
-    let watch = MemoryWatch::start(daemon.pid());
+    let watch = MemoryWatch::start(Process::from_pid(daemon.pid()));
     trips::measure(&mut report, &daemon, &node, only, suite)?;
     rates::measure(&mut report, &daemon, &node, only)?;
     secure::measure(&mut report, &daemon, &node, only)?;
@@ -105,11 +76,11 @@ fn measure(only: &str) -> Result<()> {
     slow_reader::measure(&mut report, &daemon, &node, only)?;
     let memory = watch.stop()?;
     report
-        .figure("memory of the daemon, at its peak", "MB", memory.rss)
+        .figure("memory of the daemon, at its peak", "MB", memory.resident)
         .require(Target::AtMost(MEMORY))
         .note(format!(
             "resident, during all this; {:.1} MB of it in proportion (PSS)",
-            memory.pss
+            memory.proportional
         ));
     report.finish()?;
     Ok(())

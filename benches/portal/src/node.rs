@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use async_trait::async_trait;
-use bench_servant::Daemon;
+use bench_report::{BenchDaemon, first_child};
 use bytes::Bytes;
 use ros::bus::{Bus, Publisher, QosProfile, WireType};
 use ros::net::Sockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::xmlrpc::{Value, XmlRpcClient};
-use servant::launch::{self, RuntimeRecord as Record};
+use servant::launch::{self, RuntimeRecord};
 use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
@@ -76,23 +76,13 @@ pub(crate) struct MeterNode {
 
 impl MeterNode {
     /// Has a servant started, which is kept for its grace time, and finds the node in it.
-    pub(crate) fn find(daemon: &Daemon) -> Result<Self> {
+    pub(crate) fn find(daemon: &BenchDaemon) -> Result<Self> {
         let mut robot = BenchConnection::connect_robot(daemon)?;
         robot.request(r#"{"op":"call_service","service":"/rosapi/nodes"}"#)?;
         let id = daemon.servants()?.into_iter().next().context("a servant")?;
-        let path = daemon
-            .home()
-            .join("servants")
-            .join(id)
-            .join(launch::RUNTIME);
-        let record: Record = launch::read_record(&path)?.context("its record")?;
-        let shim = record.shim.pid;
-        let children = std::fs::read_to_string(format!("/proc/{shim}/task/{shim}/children"))?;
-        let pid = children
-            .split_whitespace()
-            .next()
-            .context("init")?
-            .parse()?;
+        let path = daemon.home.join("servants").join(id).join(launch::RUNTIME);
+        let record: RuntimeRecord = launch::read_record(&path)?.context("its record")?;
+        let pid = first_child(record.shim.pid)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()

@@ -4,13 +4,11 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Process, Target, is_full_run};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget, check_message};
 use crate::node::{MessageCount, MeterNode, PATIENCE, PublishCredit};
 use crate::relay::RelayHops;
-use crate::watch::processor_time;
 
 /// Duration of a turn; its first fifth is not counted.
 const TURN: Duration = Duration::from_millis(700);
@@ -58,7 +56,7 @@ impl RateTarget {
 /// Measures all rates.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    daemon: &Daemon,
+    daemon: &BenchDaemon,
     node: &MeterNode,
     only: &str,
 ) -> Result<()> {
@@ -158,6 +156,7 @@ fn measure_in_turns(
 ) -> Result<Vec<MessageRate>> {
     let rounds = if is_full_run() { 20 } else { 6 };
     let mut found = vec![MessageRate::default(); ways.len()];
+    let process = Process::from_pid(course.daemon.pid());
     // One for all turns, because it takes the node a while to connect and disconnect.
     let counter = match (course.hops.outward, course.hops.inward) {
         (Some(topic), _) => Counter::Credit(course.node.credit(topic)?),
@@ -166,7 +165,7 @@ fn measure_in_turns(
     for round in 1..=rounds {
         eprintln!("{what}: round {round} of {rounds}");
         for (way, rate) in ways.iter().zip(&mut found) {
-            let before = processor_time(course.daemon.pid())?;
+            let before = process.total_processor_time()?;
             let (per_second, messages) = match &counter {
                 Counter::Credit(credit) => measure_outward(course, *way, credit),
                 Counter::Count(count) => measure_inward(course, *way, count),
@@ -174,7 +173,7 @@ fn measure_in_turns(
             .with_context(|| format!("{what}, {way}"))?;
             rate.best = rate.best.max(per_second);
             rate.messages += messages;
-            rate.processor += processor_time(course.daemon.pid())? - before;
+            rate.processor += process.total_processor_time()? - before;
         }
     }
     Ok(found)

@@ -1,71 +1,31 @@
 //! Cost of TLS and the policy: a second daemon with TLS, a robot's token and the default rules, measured in turns with
 //! the first daemon, which has neither. The client's encryption and decryption run on the same machine.
 
-use std::net::TcpStream;
 use std::process::Command;
-use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, is_full_run};
-use tokio_rustls::rustls::crypto::ring;
-use tokio_rustls::rustls::pki_types::CertificateDer;
-use tokio_rustls::rustls::pki_types::pem::PemObject;
-use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
+use bench_report::{BenchDaemon, BenchReport, Target, is_full_run};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget, serialize_message};
-use crate::node::{MeterNode, PATIENCE};
+use crate::meter::{CONFIG, push_meter};
+use crate::node::MeterNode;
 use crate::relay::RelayHops;
-use crate::{CONFIG, rates, trips};
-
-/// Client side of a TLS connection.
-pub(crate) type BenchTlsStream = StreamOwned<ClientConnection, TcpStream>;
+use crate::tls::connect;
+use crate::{rates, trips};
 
 /// Limit for p50, as a multiple of the plain daemon's.
 const TIMES: f64 = 1.1;
 const STRING: &str = "String there and back, TLS and policy";
 const PICTURES: &str = "640x480 RGB out, cbor-raw, TLS and policy";
 
-/// Returns the robot's token if the daemon requires one.
-pub(crate) fn robot_token(daemon: &Daemon) -> Result<Option<String>> {
-    match std::fs::read_to_string(daemon.directory().join("token")) {
-        Ok(token) => Ok(Some(token.trim().to_owned())),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(error.into()),
-    }
-}
-
-/// Connects by TLS to a daemon, trusting the certificate in its home.
-pub(crate) fn connect(daemon: &Daemon) -> Result<BenchTlsStream> {
-    let stream = TcpStream::connect(&daemon.address)?;
-    stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    let mut roots = RootCertStore::empty();
-    let own = daemon.home().join("tls/own.pem");
-    roots.add(CertificateDer::from_pem_file(own)?)?;
-    let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
-    let config = builder
-        .with_safe_default_protocol_versions()?
-        .with_root_certificates(roots)
-        .with_no_client_auth();
-    let connection = ClientConnection::new(Arc::new(config), "localhost".try_into()?)?;
-    Ok(StreamOwned::new(connection, stream))
-}
-
-fn start_tls_daemon() -> Result<(Daemon, MeterNode)> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let config = format!("{CONFIG}[tls]\nserve = \"tls\"\n");
-    let daemon = Daemon::start(place, &config, &[])?;
-    crate::push_meter(&daemon)?;
-    let made = daemon
-        .ctl()?
-        .args(["--format", "json", "token", "create", "bench"])
-        .args(["--role", "robot", "--robot", "bench", "--service", "meter"])
-        .output()?;
-    let answer: serde_json::Value = serde_json::from_slice(&made.stdout)
-        .with_context(|| String::from_utf8_lossy(&made.stderr).into_owned())?;
+fn start_tls_daemon() -> Result<(BenchDaemon, MeterNode)> {
+    let daemon = BenchDaemon::start(&format!("{CONFIG}[tls]\nserve = \"tls\"\n"))?;
+    push_meter(&daemon)?;
+    let create = ["token", "create", "bench", "--role", "robot"];
+    let rights = ["--robot", "bench", "--service", "meter"];
+    let answer = daemon
+        .deployer()
+        .run_json(&[&create[..], &rights].concat())?;
     let token = answer["secret"].as_str().context("a secret")?;
     std::fs::write(daemon.directory().join("token"), token)?;
     let node = MeterNode::find(&daemon)?;
@@ -75,7 +35,7 @@ fn start_tls_daemon() -> Result<(Daemon, MeterNode)> {
 /// Measures both figures.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    plain: &Daemon,
+    plain: &BenchDaemon,
     node: &MeterNode,
     only: &str,
 ) -> Result<()> {
@@ -95,14 +55,14 @@ pub(crate) fn measure(
 }
 
 /// Returns the negotiated cipher suite.
-fn negotiated_suite(daemon: &Daemon) -> Result<String> {
+fn negotiated_suite(daemon: &BenchDaemon) -> Result<String> {
     let mut stream = connect(daemon)?;
     stream.conn.complete_io(&mut stream.sock)?;
     let suite = stream.conn.negotiated_cipher_suite().context("a suite")?;
     Ok(format!("{:?}", suite.suite()))
 }
 
-type DaemonPair<'a> = [(&'a Daemon, &'a MeterNode); 2];
+type DaemonPair<'a> = [(&'a BenchDaemon, &'a MeterNode); 2];
 
 fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
     let hops = RelayHops {

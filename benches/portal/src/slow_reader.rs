@@ -6,14 +6,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Process, Target, is_full_run, quantile_seconds};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget};
 use crate::line::BenchConnection;
 use crate::node::{MeterNode, PublishCredit};
 use crate::relay::RelayHops;
-use crate::watch::resident;
 
 const PICTURES: &str = "/meter/image_out";
 /// Images per second, 0.92 MB each.
@@ -22,7 +20,7 @@ const PER_SECOND: u32 = 108;
 /// Measures the same load with and without a slow reader.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    daemon: &Daemon,
+    daemon: &BenchDaemon,
     node: &MeterNode,
     only: &str,
 ) -> Result<()> {
@@ -51,17 +49,15 @@ pub(crate) fn measure(
         .join()
         .map_err(|_| anyhow!("the reader panicked"))??;
     let slow = subscribe_to_pictures(daemon)?;
-    let before = resident(daemon.pid())?;
+    let process = Process::from_pid(daemon.pid());
+    let before = process.resident()?;
     let with = measure_under_load(&course, &credit, time)?;
-    let grown = resident(daemon.pid())? - before;
+    let grown = process.resident()? - before;
     drop(slow);
     for (at, name) in [(0, "p50"), (1, "p99")] {
+        let title = format!("a String beside a slow reader, {name}");
         report
-            .figure(
-                format!("a String beside a slow reader, {name}"),
-                "µs",
-                with[at],
-            )
+            .figure(title, "µs", with[at])
             .relative_to("beside one that reads", without[at])
             .require(Target::RatioAtMost(1.5));
     }
@@ -72,7 +68,7 @@ pub(crate) fn measure(
     Ok(())
 }
 
-fn subscribe_to_pictures(daemon: &Daemon) -> Result<BenchConnection> {
+fn subscribe_to_pictures(daemon: &BenchDaemon) -> Result<BenchConnection> {
     let mut line = BenchConnection::connect_robot(daemon)?;
     line.send_text(&format!(
         r#"{{"op":"subscribe","topic":"{PICTURES}","type":"sensor_msgs/Image"}}"#
@@ -109,9 +105,5 @@ fn measure_under_load(
         std::thread::sleep(Duration::from_millis(3));
     }
     course.close(open)?;
-    let part = |fraction| bench_report::quantile(&times, fraction);
-    Ok(
-        [0.5, 0.99]
-            .map(|fraction| part(fraction).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)),
-    )
+    Ok([0.5, 0.99].map(|fraction| quantile_seconds(&times, fraction) * 1e6))
 }

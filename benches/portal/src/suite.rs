@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result, ensure};
-use bench_servant::Daemon;
+use bench_report::BenchDaemon;
 use ros::net::Sockets;
 
 use crate::line::BenchConnection;
@@ -22,7 +22,7 @@ const SERVER: &str = "rosbridge_server/rosbridge_websocket.py _port:=9090 _addre
 
 /// Publishes the fixture's node and the server as one service; the error says why that is not possible, such as missing
 /// sources.
-pub(crate) fn push_with_fixture(daemon: &Daemon, fixture: &Path) -> Result<()> {
+pub(crate) fn push_with_fixture(daemon: &BenchDaemon, fixture: &Path) -> Result<()> {
     let sources = std::env::var_os(SOURCES).map(PathBuf::from);
     let sources = sources.with_context(|| {
         format!(

@@ -3,8 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Target, is_full_run};
 
 use crate::contestants::{ClientPath, Encoding, PathTarget};
 use crate::node::MeterNode;
@@ -16,7 +15,7 @@ const TRIPS: usize = 3000;
 /// Measures a String through the node and back, and a call; also through rosbridge_suite, if `suite` is set.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    daemon: &Daemon,
+    daemon: &BenchDaemon,
     node: &MeterNode,
     only: &str,
     suite: bool,

@@ -1,12 +1,12 @@
-//! Resources of a process, from the kernel's counters.
+//! Peak memory of a process.
 
-use std::fs;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
+use bench_report::Process;
 
 /// Sampling interval of the memory.
 const PAUSE: Duration = Duration::from_millis(50);
@@ -15,9 +15,9 @@ const PAUSE: Duration = Duration::from_millis(50);
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct PeakMemory {
     /// Resident set size.
-    pub(crate) rss: f64,
+    pub(crate) resident: f64,
     /// Proportional set size: shared pages are divided among their users.
-    pub(crate) pss: f64,
+    pub(crate) proportional: f64,
 }
 
 /// A thread that records the peak memory of a process.
@@ -28,18 +28,18 @@ pub(crate) struct MemoryWatch {
 
 impl MemoryWatch {
     /// Starts to watch a process.
-    pub(crate) fn start(pid: i32) -> Self {
+    pub(crate) fn start(process: Process) -> Self {
         let over = Arc::new(AtomicBool::new(false));
         let ended = over.clone();
-        // Resets the kernel's own high-water mark; without permission it keeps its value.
-        let _ = fs::write(format!("/proc/{pid}/clear_refs"), "5");
+        // Without permission the kernel's own high-water mark keeps its value.
+        let _ = process.reset_peak();
         let thread = std::thread::spawn(move || {
             let mut most = PeakMemory::default();
             while !ended.load(Ordering::Relaxed) {
-                most.pss = most.pss.max(field(pid, "smaps_rollup", "Pss:")?);
+                most.proportional = most.proportional.max(process.proportional()?);
                 std::thread::sleep(PAUSE);
             }
-            most.rss = field(pid, "status", "VmHWM:")?;
+            most.resident = process.peak()?;
             Ok(most)
         });
         Self { over, thread }
@@ -52,38 +52,4 @@ impl MemoryWatch {
             .join()
             .map_err(|_| anyhow!("the memory's watch panicked"))?
     }
-}
-
-/// Returns the resident memory in megabytes.
-pub(crate) fn resident(pid: i32) -> Result<f64> {
-    field(pid, "status", "VmRSS:")
-}
-
-fn field(pid: i32, file: &str, name: &str) -> Result<f64> {
-    let path = format!("/proc/{pid}/{file}");
-    let text = fs::read_to_string(&path).with_context(|| path.clone())?;
-    let line = text.lines().find_map(|line| line.strip_prefix(name));
-    let kilobytes = line
-        .with_context(|| format!("{name} in {path}"))?
-        .trim()
-        .trim_end_matches("kB");
-    Ok(kilobytes.trim().parse::<f64>()? * 1024.0 / 1e6)
-}
-
-/// Returns the processor time of all threads so far, in steps of 10 ms.
-pub(crate) fn processor_time(pid: i32) -> Result<Duration> {
-    let path = format!("/proc/{pid}/stat");
-    let text = fs::read_to_string(&path).with_context(|| path.clone())?;
-    // The fields after the name in parentheses start with state, field 3; utime and stime are 14 and 15.
-    let fields = text
-        .rsplit(')')
-        .next()
-        .unwrap_or_default()
-        .split_whitespace();
-    let ticks: u64 = fields
-        .skip(11)
-        .take(2)
-        .filter_map(|field| field.parse::<u64>().ok())
-        .sum();
-    Ok(Duration::from_millis(ticks * 10))
 }

@@ -13,8 +13,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, TimedPush, is_full_run, write_install_space};
+use bench_report::{
+    BenchDaemon, BenchReport, Target, TimedPush, create_directory, is_full_run, quantile_seconds,
+    write_install_space,
+};
 use rand::{RngCore, SeedableRng, rngs::StdRng};
 
 /// Title of the step in which the image is started once (`cloudroidd`'s push).
@@ -25,12 +27,10 @@ const BOUND: f64 = 2.0;
 const MODEL: usize = 64 << 20;
 
 fn main() -> Result<()> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
+    let place = create_directory()?;
     // Base and dependencies may be cached on this machine; what is pushed here must be new to it every time.
     let cache = cache::copy_user_cache(place.path())?;
-    let daemon = Daemon::start(place, "", &[("XDG_CACHE_HOME", &cache)])?;
+    let daemon = BenchDaemon::start_in(place, "", &[("XDG_CACHE_HOME", &cache)])?;
     eprintln!(
         "pushing a launch file for topic_tools/relay: base and dependencies are made now, if they are not cached"
     );
@@ -57,13 +57,13 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-fn push_launch_file(daemon: &Daemon, space: &Path) -> Result<TimedPush> {
+fn push_launch_file(daemon: &BenchDaemon, space: &Path) -> Result<TimedPush> {
     daemon.push(&[space.to_str().context("UTF-8")?, "--launch", "relay.launch"])
 }
 
 /// Returns the node's executable from the image.
-fn find_relay(daemon: &Daemon) -> Result<PathBuf> {
-    let layers = fs::read_dir(daemon.home().join("layers"))?;
+fn find_relay(daemon: &BenchDaemon) -> Result<PathBuf> {
+    let layers = fs::read_dir(daemon.home.join("layers"))?;
     let mut found =
         layers.filter_map(|layer| Some(layer.ok()?.path().join("usr/lib/topic_tools/relay")));
     found
@@ -71,7 +71,7 @@ fn find_relay(daemon: &Daemon) -> Result<PathBuf> {
         .context("topic_tools/relay in a layer")
 }
 
-fn measure(report: &mut BenchReport, daemon: &Daemon, space: &Path, size: &str) -> Result<()> {
+fn measure(report: &mut BenchReport, daemon: &BenchDaemon, space: &Path, size: &str) -> Result<()> {
     eprintln!("pushing {size}");
     let first = push_launch_file(daemon, space)?;
     let made = first.built_layers()?;
@@ -92,35 +92,24 @@ fn measure(report: &mut BenchReport, daemon: &Daemon, space: &Path, size: &str) 
         probes.push(probe);
         totals.push(again.total);
     }
-    let median = |times: &[Duration]| {
-        bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64())
-    };
+    let median = |times: &[Duration]| quantile_seconds(times, 0.5);
     let first_probe = first
         .step_duration(PROBE)
         .context("a push tells of its probe")?;
     let probe = median(&probes);
+    let title = format!("{size}, again: layers made");
     report
-        .figure(
-            format!("{size}, again: layers made"),
-            "layers",
-            rebuilt as f64,
-        )
+        .figure(title, "layers", rebuilt as f64)
         .require(Target::AtMost(0.0));
+    let title = format!("{size}, again: without the probe");
     report
-        .figure(
-            format!("{size}, again: without the probe"),
-            "s",
-            median(&rests),
-        )
+        .figure(title, "s", median(&rests))
         .relative_to("first push", (first.total - first_probe).as_secs_f64())
         .require(Target::AtMost(BOUND))
         .note(format!("median of {rounds}; the probe {probe:.2} s"));
+    let title = format!("{size}, again: with the probe");
     report
-        .figure(
-            format!("{size}, again: with the probe"),
-            "s",
-            median(&totals),
-        )
+        .figure(title, "s", median(&totals))
         .relative_to("first push", first.total.as_secs_f64());
     Ok(())
 }

@@ -5,8 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, TimedPush};
+use bench_report::{BenchDaemon, BenchReport, Target, TimedPush, create_directory};
 use serde_json::Value;
 
 use crate::{PROBE, cache, steps};
@@ -17,20 +16,20 @@ const BOUND: f64 = 0.2;
 const PACKAGES: [&str; 2] = ["image_proc", "stereo_image_proc"];
 
 pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
-    let place = temporary_directory()?;
+    let place = create_directory()?;
     // A first run with whatever this user has cached, for the base and the downloads.
     let begun = cache::copy_user_cache(place.path())?;
-    let daemon = Daemon::start(place, "", &[("XDG_CACHE_HOME", &begun)])?;
+    let daemon = BenchDaemon::start_in(place, "", &[("XDG_CACHE_HOME", &begun)])?;
     let mut base = None;
     for package in PACKAGES {
         eprintln!("pushing {package} for what it downloads");
         base = Some(base_digest(&push_package(&daemon, package)?)?);
     }
-    let second = self::temporary_directory()?;
+    let second = create_directory()?;
     let fresh = second.path().join("cache");
     cache::copy_base_and_downloads(&begun, &fresh, &base.context("two packages")?)?;
     drop(daemon);
-    let daemon = Daemon::start(second, "", &[("XDG_CACHE_HOME", &fresh)])?;
+    let daemon = BenchDaemon::start_in(second, "", &[("XDG_CACHE_HOME", &fresh)])?;
     let mut costs = Vec::new();
     for package in PACKAGES {
         eprintln!("pushing {package} with the base and all downloads in the cache");
@@ -48,32 +47,20 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let [first, second] = costs[..] else {
         anyhow::bail!("two packages, and not {costs:?}");
     };
+    let title = "stereo_image_proc after image_proc: from the first step on, without the probe";
     report
-        .figure(
-            "stereo_image_proc after image_proc: from the first step on, without the probe",
-            "s",
-            second.0,
-        )
+        .figure(title, "s", second.0)
         .relative_to("image_proc", first.0)
         .require(Target::RatioAtMost(BOUND))
         .note(format!("layers made: {} and {}", second.2, first.2));
+    let title = "stereo_image_proc after image_proc: with the probe";
     report
-        .figure(
-            "stereo_image_proc after image_proc: with the probe",
-            "s",
-            second.1,
-        )
+        .figure(title, "s", second.1)
         .relative_to("image_proc", first.1);
     Ok(())
 }
 
-fn temporary_directory() -> Result<tempfile::TempDir> {
-    Ok(tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?)
-}
-
-fn push_package(daemon: &Daemon, package: &str) -> Result<TimedPush> {
+fn push_package(daemon: &BenchDaemon, package: &str) -> Result<TimedPush> {
     daemon.push(&["--apt", package, "--node", package])
 }
 

@@ -1,7 +1,6 @@
 //! Time spent in each kind of step of a push.
 
-use bench_report::BenchReport;
-use bench_servant::TimedPush;
+use bench_report::{BenchReport, TimedPush};
 
 /// Titles of steps, and the kind of step that each belongs to.
 const KINDS: [(&str, &str); 10] = [

@@ -5,8 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, TimedPush};
+use bench_report::{BenchDaemon, BenchReport, Target, TimedPush};
 
 use crate::{PROBE, steps};
 
@@ -15,7 +14,7 @@ const SOURCES: usize = 6;
 /// Limit for a push in which one of three packages changed, as a fraction of a push that compiles all.
 const BOUND: f64 = 0.7;
 
-pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<()> {
     let workspace = daemon.directory().join("bench_ws");
     write_workspace(&workspace)?;
     eprintln!("pushing a workspace whose last package cannot be compiled");
@@ -43,18 +42,15 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
             .context("a push tells of its probe")?;
         Ok((pushed.total - probe).as_secs_f64())
     };
-    for (name, pushed, bound) in [
-        ("the last one fixed after it failed", &fixed, BOUND),
-        ("nothing changed", &unchanged, BOUND),
+    for (name, pushed) in [
+        ("the last one fixed after it failed", &fixed),
+        ("nothing changed", &unchanged),
     ] {
+        let title = format!("workspace of three, {name}: without the probe");
         report
-            .figure(
-                format!("workspace of three, {name}: without the probe"),
-                "s",
-                cost(pushed)?,
-            )
+            .figure(title, "s", cost(pushed)?)
             .relative_to("all changed", cost(&all)?)
-            .require(Target::RatioAtMost(bound));
+            .require(Target::RatioAtMost(BOUND));
     }
     eprintln!("pushing it with a mistake in the last CMakeLists.txt");
     let list = workspace.join("src/bench_app/CMakeLists.txt");
@@ -66,18 +62,15 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         push_workspace(daemon, &workspace).is_err(),
         "a push that cannot be configured fails"
     );
+    let title = "workspace of three: until a mistake in the last CMakeLists.txt is told";
     report
-        .figure(
-            "workspace of three: until a mistake in the last CMakeLists.txt is told",
-            "s",
-            begun.elapsed().as_secs_f64(),
-        )
+        .figure(title, "s", begun.elapsed().as_secs_f64())
         .relative_to("all changed", cost(&all)?)
         .require(Target::BelowFloor);
     Ok(())
 }
 
-fn push_workspace(daemon: &Daemon, workspace: &Path) -> Result<TimedPush> {
+fn push_workspace(daemon: &BenchDaemon, workspace: &Path) -> Result<TimedPush> {
     let path = workspace.to_str().context("UTF-8")?;
     daemon.push(&[path, "--node", "bench_app/app"])
 }

@@ -1,10 +1,10 @@
 //! Description of the machine on which a benchmark ran.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fs;
 
 /// A machine, described from `/proc`.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct MachineDescription {
     /// Processor model.
     pub processor: String,

@@ -3,6 +3,8 @@
 use rustix::time::{ClockId, clock_gettime};
 use std::time::Duration;
 
+use crate::quantile_seconds;
+
 /// Run times of one runner.
 #[derive(Clone, Debug)]
 pub struct Times {
@@ -12,34 +14,20 @@ pub struct Times {
     pub sorted: Vec<Duration>,
 }
 
-/// Returns the quantile of `values` at a fraction `0.0..=1.0`; `None` for an empty slice.
-pub fn quantile<T: Copy + PartialOrd>(values: &[T], fraction: f64) -> Option<T> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(|one, other| one.partial_cmp(other).unwrap_or(std::cmp::Ordering::Equal));
-    quantile_of_sorted(&sorted, fraction)
-}
-
-fn quantile_of_sorted<T: Copy>(sorted: &[T], fraction: f64) -> Option<T> {
-    let last = sorted.len().checked_sub(1)?;
-    sorted
-        .get((fraction * last as f64).round() as usize)
-        .copied()
-}
-
 impl Times {
     /// Shortest time: the cost of the code without disturbances.
     pub fn best(&self) -> Duration {
-        self.quantile(0.0)
+        self.sorted.first().copied().unwrap_or_default()
     }
 
-    /// Median time.
-    pub fn median(&self) -> Duration {
-        self.quantile(0.5)
+    /// Longest time.
+    pub fn longest(&self) -> Duration {
+        self.sorted.last().copied().unwrap_or_default()
     }
 
-    /// Quantile of the times at a fraction `0.0..=1.0`.
-    pub fn quantile(&self, fraction: f64) -> Duration {
-        quantile_of_sorted(&self.sorted, fraction).unwrap_or_default()
+    /// Median time in milliseconds.
+    pub fn median_milliseconds(&self) -> f64 {
+        quantile_seconds(&self.sorted, 0.5) * 1e3
     }
 
     /// [`Times::best`] in microseconds.
@@ -57,24 +45,6 @@ impl Times {
 pub fn thread_processor_time() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
-}
-
-/// Returns the processor time of the child processes that have ended and been waited for.
-pub fn children_processor_time() -> Duration {
-    let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // The fields after the name in parentheses start with state, field 3; cutime and cstime are 16 and 17, in
-    // hundredths of a second.
-    let fields = text
-        .rsplit(')')
-        .next()
-        .unwrap_or_default()
-        .split_whitespace();
-    let ticks: u64 = fields
-        .skip(13)
-        .take(2)
-        .filter_map(|field| field.parse::<u64>().ok())
-        .sum();
-    Duration::from_millis(ticks * 10)
 }
 
 /// Runs several functions in turns on this thread and measures the thread's processor time.
@@ -144,6 +114,6 @@ mod tests {
                 .collect::<Vec<_>>(),
             [2, 2]
         );
-        assert!(times[0].best() <= times[0].median());
+        assert!(times[0].best() <= times[0].longest());
     }
 }

@@ -3,8 +3,8 @@
 use crate::{BenchReport, Figure};
 use std::fmt::Write as _;
 
-/// Formats with three significant digits, without an exponent.
-fn format_number(value: f64) -> String {
+/// Formats with three digits, or all digits before the point.
+pub fn format_number(value: f64) -> String {
     match value.abs() {
         size if size >= 100.0 => format!("{value:.0}"),
         size if size >= 10.0 => format!("{value:.1}"),

@@ -9,16 +9,17 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, Bus, GoalEnd, GoalEvents, GoalOutcome, Publisher, QosProfile, RosVersion,
-    ServiceHandler, ServiceType, Subscription, WireType, wait_for_connected,
+    ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, Publisher,
+    QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    wait_for_connected,
 };
 use ros::net::HostSockets;
 use ros::schema::ActionDef;
 use serde_json::json;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
+use crate::measuring::{PATIENCE, WARM, print_json, quantiles, wait_for_request};
 use crate::message::{self, TEXT};
-use crate::roles::{PATIENCE, WARM, print_json, quantiles, wait_for_request};
 use crate::types;
 
 /// Quality of service of the rclpy nodes that these roles communicate with.
@@ -64,7 +65,7 @@ struct EchoService;
 
 #[async_trait]
 impl ServiceHandler for EchoService {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(message::set_bool_response(&request))
     }
 }
@@ -72,10 +73,10 @@ impl ServiceHandler for EchoService {
 struct GoalQueue(UnboundedSender<String>);
 
 impl ActionHandler for GoalQueue {
-    fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), FailureReason> {
         self.0
             .send(id.to_owned())
-            .map_err(|_| "nobody carries it out".to_owned())
+            .map_err(|_| FailureReason::new("nobody carries it out"))
     }
 
     fn on_cancel(&self, _id: &str) {}
@@ -182,7 +183,7 @@ async fn time_calls(count: usize) -> Result<()> {
 }
 
 struct GoalListener {
-    ends: UnboundedSender<Result<GoalEnd, String>>,
+    ends: UnboundedSender<Result<GoalEnd, GoalError>>,
     feedbacks: UnboundedSender<()>,
 }
 
@@ -192,7 +193,7 @@ impl GoalEvents for GoalListener {
         let _ = self.feedbacks.send(());
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let _ = self.ends.send(end);
     }
 }
@@ -214,7 +215,7 @@ async fn time_goals(count: usize) -> Result<()> {
             message::fibonacci_goal(),
             events.clone(),
         );
-        let end = next_event(&mut ended).await?.map_err(anyhow::Error::msg)?;
+        let end = next_event(&mut ended).await??;
         ensure!(end.outcome == GoalOutcome::Succeeded, "{end:?}");
         if number >= WARM {
             times.push(begun.elapsed());

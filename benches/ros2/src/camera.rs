@@ -3,14 +3,14 @@
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use bench_report::{Process, quantile_seconds};
 use rtps::ReceivedSample;
 use serde_json::{Value, json};
 use tokio::sync::mpsc::UnboundedReceiver;
 
 use crate::ends::{create_reader, create_writer, join, qos_profile, wait_until_matched};
+use crate::measuring::{print_json, wait_for_request};
 use crate::message::{self, IMAGE, Size};
-use crate::process::Process;
-use crate::roles::{print_json, wait_for_request};
 
 const PICTURES: (&str, &str) = ("rt/pictures", IMAGE);
 /// Images per second.
@@ -91,10 +91,7 @@ impl FrameStatistics {
 
     /// Returns the statistics in the form in which a role prints them.
     pub(crate) fn to_json(&self) -> Value {
-        let milliseconds = |share| {
-            let age = bench_report::quantile(&self.ages, share);
-            age.map_or(f64::NAN, |age| age.as_secs_f64() * 1e3)
-        };
+        let milliseconds = |share| quantile_seconds(&self.ages, share) * 1e3;
         json!({
             "came": self.came, "reordered": self.reordered, "p50": milliseconds(0.5), "p99": milliseconds(0.99),
         })

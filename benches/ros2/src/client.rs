@@ -13,9 +13,9 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{self, Error, Message, WebSocket};
 
 use crate::camera::{self, FrameStatistics, RATE};
+use crate::measuring::{WARM, print_json, quantiles};
 use crate::message::{self, Size, TEXT};
 use crate::portal::ADDRESS;
-use crate::roles::{WARM, print_json, quantiles};
 use crate::types;
 
 /// Maximum time for a server to start and to discover nodes.

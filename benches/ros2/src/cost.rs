@@ -3,9 +3,8 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Process, Target, is_full_run};
 
-use crate::process::Process;
 use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
 /// Limit for the memory of a servant beyond its nodes, in megabytes.
@@ -34,7 +33,7 @@ fn core_share(program: &BenchProgram, time: Duration) -> Result<f64> {
 }
 
 fn measure_one(report: &mut BenchReport) -> Result<()> {
-    let time = Duration::from_secs(if crate::is_full_run() { 120 } else { 30 });
+    let time = Duration::from_secs(if is_full_run() { 120 } else { 30 });
     eprintln!("a participant at rest, for {} s", time.as_secs());
     let world = BenchNetwork::new()?;
     let node = world.start_rclpy(Transport::Udp, &["relay"])?;
@@ -44,34 +43,25 @@ fn measure_one(report: &mut BenchReport) -> Result<()> {
     let found = ours.request_answer()?;
     // Over another period of the same length, the node's own share; it receives as much as we do.
     let theirs = core_share(&node, time)?;
+    let title = "a participant at rest beside a node of rclpy";
     report
-        .figure(
-            "a participant at rest beside a node of rclpy",
-            "% of a core",
-            idle,
-        )
+        .figure(title, "% of a core", idle)
         .relative_to("that node", theirs)
         .require(Target::AtMost(IDLE))
         .note(format!("over {} s", time.as_secs()));
     let resident = Process::from_pid(node.pid()).resident()?;
+    let title = "memory of that participant";
     report
-        .figure(
-            "memory of that participant",
-            "MB",
-            json_number(&found, "memory")?,
-        )
+        .figure(title, "MB", json_number(&found, "memory")?)
         .relative_to("that node", resident)
         .require(Target::AtMost(MEMORY))
         .note(format!(
             "resident, beyond its process without it; {:.1} with it",
             json_number(&found, "process")?
         ));
+    let title = "descriptors of that participant";
     report
-        .figure(
-            "descriptors of that participant",
-            "",
-            json_number(&found, "descriptors")?,
-        )
+        .figure(title, "", json_number(&found, "descriptors")?)
         .relative_to(
             "that node",
             Process::from_pid(node.pid()).descriptors()? as f64,
@@ -96,27 +86,21 @@ const CROWDS: [(&str, &str, &str); 2] = [
 ];
 
 fn measure_many(report: &mut BenchReport) -> Result<()> {
-    let (count, seconds) = (50, if crate::is_full_run() { 120 } else { 30 });
+    let (count, seconds) = (50, if is_full_run() { 120 } else { 30 });
     for (role, what, note) in CROWDS {
         eprintln!("{count} {role} at rest, for {seconds} s");
         let world = BenchNetwork::new()?;
         let mut crowd =
             world.start_role(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
         let found = crowd.answer_within(Duration::from_secs(seconds + 60))?;
+        let title = format!("each of {count} {what}, at rest");
         report
-            .figure(
-                format!("each of {count} {what}, at rest"),
-                "% of a core",
-                json_number(&found, "share")?,
-            )
+            .figure(title, "% of a core", json_number(&found, "share")?)
             .require(Target::AtMost(IDLE))
             .note(format!("over {seconds} s, {note}"));
+        let title = format!("memory of each of {count} {what}");
         report
-            .figure(
-                format!("memory of each of {count} {what}"),
-                "MB",
-                json_number(&found, "memory")?,
-            )
+            .figure(title, "MB", json_number(&found, "memory")?)
             .require(Target::AtMost(MEMORY))
             .note(format!(
                 "resident; {:.1} descriptors each, {} threads in all",

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
+use bench_report::Process;
 use bridge::SessionOptions;
 use futures_util::future::try_join_all;
 use futures_util::{SinkExt as _, StreamExt as _};
@@ -22,10 +23,9 @@ use tokio_tungstenite::tungstenite::protocol::Role;
 use crate::ends::{
     create_listener, create_reader, create_writer, join_namespace, wait_until_matched,
 };
+use crate::measuring::print_json;
 use crate::message::{self, STRING};
 use crate::portal;
-use crate::process::Process;
-use crate::roles::print_json;
 use crate::types;
 
 /// Topics of a node in each direction: an rclpy node has seven services, `/rosout` and `/parameter_events`.

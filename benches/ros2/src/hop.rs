@@ -8,8 +8,8 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 use serde_json::json;
 
+use crate::measuring::{DATAGRAM, ECHO, PATIENCE, WARM, print_json, quantiles};
 use crate::portal::ADDRESS;
-use crate::roles::{DATAGRAM, ECHO, PATIENCE, WARM, print_json, quantiles};
 
 /// Serves one client, copying between its connection and the echo.
 pub(crate) fn run_relay() -> Result<()> {

@@ -1,7 +1,7 @@
 //! Time from joining a running node until its messages arrive, and until ours have been returned.
 
 use anyhow::Result;
-use bench_report::{BenchReport, Target, quantile};
+use bench_report::{BenchReport, Target, is_full_run, quantile};
 
 use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
@@ -46,7 +46,7 @@ impl Newcomer {
 
 /// Reports the medians of the first beat and of the first pong; the node stays, newcomers come and go.
 pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
-    let rounds = if crate::is_full_run() { 31 } else { 9 };
+    let rounds = if is_full_run() { 31 } else { 9 };
     eprintln!("joining: {rounds} times each");
     let world = BenchNetwork::new()?;
     let _node = world.start_rclpy(Transport::Udp, &["relay", BEATS])?;

@@ -17,29 +17,22 @@ mod ends;
 mod hop;
 mod joins;
 mod lost;
+mod measuring;
 mod message;
 mod pictures;
 mod place;
 mod portal;
-mod process;
 mod rivals;
 mod roles;
 mod trips;
 mod types;
 mod world;
 
-use anyhow::{Result, ensure};
-use bench_report::BenchReport;
-
-/// Returns whether longer measurements are requested (`CLOUDROID_BENCH_FULL=1`).
-fn is_full_run() -> bool {
-    std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| value == "1")
-}
-
-type Part = fn(&mut BenchReport) -> Result<()>;
+use anyhow::Result;
+use bench_report::{Part, run_parts};
 
 /// Parts of the benchmark, in the order in which they run.
-const PARTS: [(&str, Part); 6] = [
+const PARTS: [Part; 6] = [
     ("trips", trips::measure_strings),
     ("calls", trips::measure_calls),
     ("goals", trips::measure_goals),
@@ -54,28 +47,7 @@ fn main() -> Result<()> {
     if let ["inside", role @ ..] = words.as_slice() {
         return roles::run(role);
     }
-    let unknown = words
-        .iter()
-        .find(|word| PARTS.iter().all(|(name, _)| name != *word));
-    ensure!(
-        unknown.is_none(),
-        "no part is called {unknown:?}: there are trips, calls, goals, joins, cost, pictures"
-    );
     // Fails early rather than after an hour.
     world::python_path()?;
-    let mut report = BenchReport::new("ros2");
-    let mut failed = Vec::new();
-    for (name, part) in PARTS {
-        if !words.is_empty() && !words.contains(&name) {
-            continue;
-        }
-        // Earlier figures are reported all the same.
-        if let Err(why) = part(&mut report) {
-            report.skip(format!("what {name} has not come to"), format!("{why:#}"));
-            failed.push(name);
-        }
-    }
-    report.finish()?;
-    ensure!(failed.is_empty(), "not measured to the end: {failed:?}");
-    Ok(())
+    run_parts("ros2", &PARTS)
 }

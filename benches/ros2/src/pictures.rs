@@ -4,13 +4,12 @@
 use std::fmt;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Process, Target, is_full_run};
 use serde_json::Value;
 
 use crate::camera::{self, RATE};
 use crate::lost::PictureLosses;
 use crate::message::Size;
-use crate::process::Process;
 use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
 /// Sender and receiver.
@@ -154,7 +153,7 @@ fn run_transfer(
 
 /// Returns the duration in seconds of reliable transfers and of the others.
 fn transfer_seconds() -> Result<(u32, u32)> {
-    let brief = if crate::is_full_run() { 60 } else { 20 };
+    let brief = if is_full_run() { 60 } else { 20 };
     match std::env::var("CLOUDROID_BENCH_SECONDS") {
         Ok(all) => all
             .parse()
@@ -236,20 +235,14 @@ fn report_transfer(
         .require(Target::AtMost(0.0))
         .note(note);
     if let Some(portal) = &found.portal {
+        let title = format!("{what}: lost by the portal");
         report
-            .figure(
-                format!("{what}: lost by the portal"),
-                "",
-                portal.lost.portal as f64,
-            )
+            .figure(title, "", portal.lost.portal as f64)
             .require(Target::AtMost(0.0));
     }
+    let title = format!("{what}: reordered");
     report
-        .figure(
-            format!("{what}: reordered"),
-            "",
-            json_number(&found.taker, "reordered")?,
-        )
+        .figure(title, "", json_number(&found.taker, "reordered")?)
         .require(Target::AtMost(0.0));
     for (peer, floor) in floors {
         if !floor.is_comparable()? {
@@ -257,22 +250,16 @@ fn report_transfer(
         }
         let ([sender, taker], [sends, takes]) =
             (found.processor_per_frame()?, floor.processor_per_frame()?);
+        let title = format!("{what}: processor for a frame, both sides");
         report
-            .figure(
-                format!("{what}: processor for a frame, both sides"),
-                "ms",
-                sender + taker,
-            )
+            .figure(title, "ms", sender + taker)
             .relative_to(peer.to_string(), sends + takes)
             .note(format!(
                 "sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"
             ));
+        let title = format!("{what}: age when taken, p50");
         report
-            .figure(
-                format!("{what}: age when taken, p50"),
-                "ms",
-                json_number(&found.taker, "p50")?,
-            )
+            .figure(title, "ms", json_number(&found.taker, "p50")?)
             .relative_to(peer.to_string(), json_number(&floor.taker, "p50")?)
             .note(format!("p99 {:.1}", json_number(&found.taker, "p99")?));
     }

@@ -15,8 +15,8 @@ use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::lost;
+use crate::measuring::{print_json, wait_for_request};
 use crate::place::NamespaceSockets;
-use crate::roles::{print_json, wait_for_request};
 use crate::types;
 
 /// Address of every rosbridge server under measurement, each in a network of its own.

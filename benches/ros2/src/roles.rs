@@ -1,19 +1,19 @@
 //! The roles of this program inside a [`BenchNetwork`](crate::world::BenchNetwork): `bench-ros2 inside ROLE …`. Each
 //! role prints `{}` when it is ready, then lines of JSON.
 
-use std::io::Read;
 use std::net::UdpSocket;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use bench_report::Process;
 use rtps::{EndpointQos, ReceivedSample, SampleIdentity, SequenceNumber};
-use serde_json::{Value, json};
+use serde_json::json;
 use tokio::sync::mpsc::UnboundedReceiver;
 
 use crate::ends::{create_listener, create_reader, create_writer, join, wait_until_matched};
+use crate::measuring::{DATAGRAM, ECHO, PATIENCE, WARM, print_json, quantiles, wait_for_request};
 use crate::message::{self, REQUEST, RESPONSE, STRING, TEXT};
-use crate::process::Process;
 use crate::{awake, bus, camera, client, crowd, hop, portal};
 
 const PING: (&str, &str) = ("rt/ping", STRING);
@@ -21,20 +21,6 @@ const PONG: (&str, &str) = ("rt/pong", STRING);
 const BEAT: (&str, &str) = ("rt/beat", STRING);
 const ASKED: (&str, &str) = ("rq/setboolRequest", REQUEST);
 const ANSWERED: (&str, &str) = ("rr/setboolReply", RESPONSE);
-/// Address of the plain datagram echo.
-pub(crate) const ECHO: &str = "127.0.0.1:20000";
-/// A datagram of the length of a String within RTPS.
-pub(crate) const DATAGRAM: [u8; 128] = [7; 128];
-/// Time after which an answer counts as missing.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(2);
-/// Number of warm-up exchanges, which are not counted.
-pub(crate) const WARM: usize = 10;
-
-/// Prints a line of JSON.
-pub(crate) fn print_json(line: &Value) {
-    println!("{line}");
-}
-
 /// Runs the role that `words` names.
 pub(crate) fn run(words: &[&str]) -> Result<()> {
     match words {
@@ -68,12 +54,6 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     })
 }
 
-/// Waits for a request of the parent, or for its end; returns whether it was a request.
-pub(crate) async fn wait_for_request() -> Result<bool> {
-    let ask = || std::io::stdin().read(&mut [0]);
-    Ok(tokio::task::spawn_blocking(ask).await?? > 0)
-}
-
 /// Runs the role `relay`: returns every ping and answers calls.
 async fn run_relay() -> Result<()> {
     let participant = join().await?;
@@ -96,14 +76,6 @@ async fn run_relay() -> Result<()> {
     });
     print_json(&json!({}));
     wait_for_request().await.map(drop)
-}
-
-pub(crate) fn quantiles(times: &[Duration]) -> Value {
-    let micros = |share| {
-        let time = bench_report::quantile(times, share);
-        time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
-    };
-    json!({"p50": micros(0.5), "p99": micros(0.99)})
 }
 
 /// Returns the next sample, or `None` if none arrives in time.

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use anyhow::{Result, ensure};
-use bench_report::{BenchReport, Target};
+use bench_report::{BenchReport, Target, is_full_run};
 use serde_json::Value;
 
 use crate::awake::AwakeCores;
@@ -133,7 +133,7 @@ fn measure_in_turns(
     role: &str,
     ways: &[TripPath],
 ) -> Result<Vec<Option<[f64; 2]>>> {
-    let rounds = if crate::is_full_run() { 15 } else { 5 };
+    let rounds = if is_full_run() { 15 } else { 5 };
     let _awake = AwakeCores::start()?;
     let mut best = vec![Some([f64::INFINITY; 2]); ways.len()];
     for round in 1..=rounds {
@@ -157,75 +157,57 @@ fn measure_in_turns(
     Ok(best)
 }
 
-/// Paths, each with the paths that it is compared with.
-type PathComparisons = Vec<(TripPath, Vec<TripPath>)>;
+/// A path, and one with which it is compared.
+type PathPair = (TripPath, TripPath);
 
-/// Paths through the portal, compared with the direct path and with other servers.
-fn portal_comparisons(rivals: &[Rival]) -> PathComparisons {
-    let beside = |direct: &[TripPath], rival: fn(Rival) -> TripPath| {
+/// Paths between a bus and a node in both directions, and through the portal, compared with the direct path and with
+/// other servers.
+fn node_pairs(rivals: &[Rival]) -> Vec<PathPair> {
+    use TripPath::{Bus, BusToRclpy, Portal, PortalToRclpy, Rclpy, RclpyToBus, Stock};
+    let beside = |way: TripPath, rival: fn(Rival) -> TripPath| {
         let rivals = rivals.iter().cloned().map(rival);
-        direct.iter().cloned().chain(rivals).collect()
+        rivals.map(move |rival| (way.clone(), rival))
     };
-    let nodes = [TripPath::BusToRclpy, TripPath::Rclpy, TripPath::Stock];
-    vec![
-        (
-            TripPath::Portal,
-            beside(&[TripPath::Bus], TripPath::ByRival),
-        ),
-        (
-            TripPath::PortalToRclpy,
-            beside(&nodes, TripPath::ByRivalToRclpy),
-        ),
-    ]
+    let mut pairs = vec![(BusToRclpy, Rclpy), (RclpyToBus, Rclpy), (Portal, Bus)];
+    pairs.extend(beside(Portal, TripPath::ByRival));
+    pairs.extend([BusToRclpy, Rclpy, Stock].map(|direct| (PortalToRclpy, direct)));
+    pairs.extend(beside(PortalToRclpy, TripPath::ByRivalToRclpy));
+    pairs
 }
 
-/// Paths between a bus and a node, in both directions.
-fn node_comparisons() -> PathComparisons {
-    vec![
-        (TripPath::BusToRclpy, vec![TripPath::Rclpy]),
-        (TripPath::RclpyToBus, vec![TripPath::Rclpy]),
-    ]
+/// Measures one message in each direction.
+fn measure_messages(report: &mut BenchReport, what: &str, role: &str) -> Result<()> {
+    use TripPath::{Bus, Datagrams, Hop, Ours, Portal, Rclpy, Stock};
+    let mut pairs = [Datagrams, Rclpy, Stock]
+        .map(|floor| (Ours, floor))
+        .to_vec();
+    pairs.extend([(Bus, Ours), (Hop, Datagrams)]);
+    pairs.extend(node_pairs(&Rival::find_available(report)));
+    pairs.push((Portal, Hop));
+    measure(report, what, role, &pairs)
 }
 
 /// Measures Strings.
 pub(crate) fn measure_strings(report: &mut BenchReport) -> Result<()> {
-    let mut ways = vec![
-        (
-            TripPath::Ours,
-            vec![TripPath::Datagrams, TripPath::Rclpy, TripPath::Stock],
-        ),
-        (TripPath::Bus, vec![TripPath::Ours]),
-        (TripPath::Hop, vec![TripPath::Datagrams]),
-    ];
-    ways.extend(node_comparisons());
-    ways.extend(portal_comparisons(&Rival::find_available(report)));
-    ways.push((TripPath::Portal, vec![TripPath::Hop]));
-    measure(report, "String there and back", "trips", &ways)
+    measure_messages(report, "String there and back", "trips")
 }
 
 /// Measures calls.
 pub(crate) fn measure_calls(report: &mut BenchReport) -> Result<()> {
-    let mut ways = vec![
-        (
-            TripPath::Ours,
-            vec![TripPath::Datagrams, TripPath::Rclpy, TripPath::Stock],
-        ),
-        (TripPath::Bus, vec![TripPath::Ours]),
-        (TripPath::Hop, vec![TripPath::Datagrams]),
-    ];
-    ways.extend(node_comparisons());
-    ways.extend(portal_comparisons(&Rival::find_available(report)));
-    // A call is one message in each direction, as a String is.
-    ways.push((TripPath::Portal, vec![TripPath::Hop]));
-    measure(report, "service call", "calls", &ways)
+    measure_messages(report, "service call", "calls")
 }
 
 /// Measures goals.
 pub(crate) fn measure_goals(report: &mut BenchReport) -> Result<()> {
-    let mut ways = vec![(TripPath::Bus, vec![TripPath::Rclpy, TripPath::Stock])];
-    ways.extend(node_comparisons());
-    ways.extend(portal_comparisons(&Rival::find_available(report)));
-    measure(report, "goal of an action until its result", "goals", &ways)
+    use TripPath::{Bus, Rclpy, Stock};
+    let mut pairs = vec![(Bus, Rclpy), (Bus, Stock)];
+    pairs.extend(node_pairs(&Rival::find_available(report)));
+    measure(
+        report,
+        "goal of an action until its result",
+        "goals",
+        &pairs,
+    )
 }
 
 /// Returns the target of a path relative to another, if there is one.
@@ -238,18 +220,11 @@ fn target(way: &TripPath, floor: &TripPath) -> Option<Target> {
     }
 }
 
-fn measure(
-    report: &mut BenchReport,
-    what: &str,
-    role: &str,
-    beside: &[(TripPath, Vec<TripPath>)],
-) -> Result<()> {
+fn measure(report: &mut BenchReport, what: &str, role: &str, pairs: &[PathPair]) -> Result<()> {
     let mut ways: Vec<TripPath> = Vec::new();
-    for (way, floors) in beside {
-        for way in [way].into_iter().chain(floors) {
-            if !ways.contains(way) {
-                ways.push(way.clone());
-            }
+    for way in pairs.iter().flat_map(|(way, floor)| [way, floor]) {
+        if !ways.contains(way) {
+            ways.push(way.clone());
         }
     }
     let found = measure_in_turns(report, what, role, &ways)?;
@@ -257,9 +232,6 @@ fn measure(
         let at = ways.iter().position(|other| other == way);
         at.and_then(|at| found[at])
     };
-    let pairs = beside
-        .iter()
-        .flat_map(|(way, floors)| floors.iter().map(move |floor| (way, floor)));
     for (way, floor) in pairs {
         let (Some(value), Some(beside)) = (of(way), of(floor)) else {
             continue;

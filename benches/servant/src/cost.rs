@@ -1,10 +1,9 @@
 //! Resources of processes, from the kernel's counters.
 
-use std::fs;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use bench_servant::Daemon;
+use bench_report::{BenchDaemon, Process, first_child};
 use servant::launch::{self, RuntimeRecord};
 
 /// The processes of a servant other than its nodes.
@@ -18,7 +17,7 @@ pub(crate) struct ServantOverhead {
 
 impl ServantOverhead {
     /// Returns the processes of every servant.
-    pub(crate) fn for_all_servants(daemon: &Daemon) -> Result<Vec<Self>> {
+    pub(crate) fn for_all_servants(daemon: &BenchDaemon) -> Result<Vec<Self>> {
         daemon
             .servants()?
             .iter()
@@ -26,42 +25,22 @@ impl ServantOverhead {
             .collect()
     }
 
-    fn for_servant(daemon: &Daemon, id: &str) -> Result<Self> {
-        let path = daemon
-            .home()
-            .join("servants")
-            .join(id)
-            .join(launch::RUNTIME);
+    fn for_servant(daemon: &BenchDaemon, id: &str) -> Result<Self> {
+        let path = daemon.home.join("servants").join(id).join(launch::RUNTIME);
         let runtime: RuntimeRecord = launch::read_record(&path)?
             .with_context(|| format!("{} is missing", path.display()))?;
         let shim = runtime.shim.pid;
-        let children = fs::read_to_string(format!("/proc/{shim}/task/{shim}/children"))?;
-        let init = children
-            .split_whitespace()
-            .next()
-            .with_context(|| format!("shim {shim} has no child"))?;
         Ok(Self {
             shim,
-            init: init.parse()?,
+            init: first_child(shim)?,
         })
     }
 
     /// Returns the memory of both in megabytes (10⁶).
     pub(crate) fn memory(self) -> Result<f64> {
-        Ok(proportional_memory(self.shim)? + proportional_memory(self.init)?)
+        Ok(Process::from_pid(self.shim).proportional()?
+            + Process::from_pid(self.init).proportional()?)
     }
-}
-
-/// Returns the proportional set size of a process in megabytes (10⁶).
-pub(crate) fn proportional_memory(pid: i32) -> Result<f64> {
-    let path = format!("/proc/{pid}/smaps_rollup");
-    let text = fs::read_to_string(&path).with_context(|| path.clone())?;
-    let line = text
-        .lines()
-        .find_map(|line| line.strip_prefix("Pss:"))
-        .context(path)?;
-    let kilobytes: f64 = line.trim().trim_end_matches("kB").trim().parse()?;
-    Ok(kilobytes * 1024.0 / 1e6)
 }
 
 /// Returns the processor time of all threads so far, including those that have ended.

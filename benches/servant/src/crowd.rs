@@ -3,13 +3,11 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{BenchReport, Target};
-use bench_servant::{Daemon, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Process, Target, is_full_run, quantile_seconds};
 
-use crate::cost::{ServantOverhead, processor_time, proportional_memory};
+use crate::cost::{ServantOverhead, processor_time};
 use crate::image::ServiceImage;
-use crate::robot::BenchRobot;
-use crate::starts::{median_milliseconds, sorted_times, time_robot_start};
+use crate::starts::{list_nodes, time_robot_start};
 
 /// Number of starts on either side of the comparison.
 const STARTS: usize = 7;
@@ -21,7 +19,7 @@ const IDLE: f64 = 0.1;
 /// Measures from one servant to many and back.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    daemon: &Daemon,
+    daemon: &BenchDaemon,
     image: &ServiceImage,
 ) -> Result<()> {
     let (crowd, watch) = if is_full_run() { (100, 60) } else { (30, 35) };
@@ -44,15 +42,12 @@ pub(crate) fn measure(
     daemon.stop_servants()?;
     // Once more, because the load on a shared machine may have changed meanwhile.
     first.extend(starts("on an idle host")?);
+    let title = format!("start of servant {}", crowd + 1);
     report
-        .figure(
-            format!("start of servant {}", crowd + 1),
-            "ms",
-            median_milliseconds(&sorted_times("last", last)),
-        )
+        .figure(title, "ms", quantile_seconds(&last, 0.5) * 1e3)
         .relative_to(
             "the first, before and after",
-            median_milliseconds(&sorted_times("first", first)),
+            quantile_seconds(&first, 0.5) * 1e3,
         )
         .require(Target::RatioAtMost(1.5))
         .note(format!("medians of {STARTS} and {}", 2 * STARTS));
@@ -60,14 +55,12 @@ pub(crate) fn measure(
 }
 
 /// Starts servants until there are `count`: each for a robot of its own, which then leaves.
-fn start_servants(daemon: &Daemon, image: &ServiceImage, count: usize) -> Result<()> {
+fn start_servants(daemon: &BenchDaemon, image: &ServiceImage, count: usize) -> Result<()> {
     eprintln!("{count} servants");
     for number in daemon.servants()?.len()..count {
         let path = format!("{}?robot=r{number}", image.service);
-        let mut robot = BenchRobot::connect(&daemon.address, &path)?;
-        robot
-            .nodes()
-            .with_context(|| format!("the servant of {path}"))?;
+        let mut robot = daemon.robot(&path)?;
+        list_nodes(&mut robot).with_context(|| format!("the servant of {path}"))?;
         robot.leave()?;
     }
     settle();
@@ -80,7 +73,7 @@ fn settle() {
 }
 
 /// Reports the memory of shim and init per servant.
-fn report_overhead(report: &mut BenchReport, daemon: &Daemon, count: usize) -> Result<()> {
+fn report_overhead(report: &mut BenchReport, daemon: &BenchDaemon, count: usize) -> Result<()> {
     let all = ServantOverhead::for_all_servants(daemon)?;
     let costs = all
         .iter()
@@ -89,7 +82,7 @@ fn report_overhead(report: &mut BenchReport, daemon: &Daemon, count: usize) -> R
     let mean = costs.iter().sum::<f64>() / costs.len() as f64;
     let inits = all
         .iter()
-        .map(|one| proportional_memory(one.init))
+        .map(|one| Process::from_pid(one.init).proportional())
         .collect::<Result<Vec<_>>>()?;
     let init = inits.iter().sum::<f64>() / inits.len() as f64;
     report
@@ -105,19 +98,16 @@ fn report_overhead(report: &mut BenchReport, daemon: &Daemon, count: usize) -> R
 /// Reports our processes together: memory per servant, and processor time while idle.
 fn report_total(
     report: &mut BenchReport,
-    daemon: &Daemon,
+    daemon: &BenchDaemon,
     count: usize,
     watch: Duration,
 ) -> Result<()> {
     let all = ServantOverhead::for_all_servants(daemon)?;
-    let of_daemon = proportional_memory(daemon.pid())?;
+    let of_daemon = Process::from_pid(daemon.pid()).proportional()?;
     let of_servants = all.iter().map(|one| one.memory()).sum::<Result<f64>>()?;
+    let title = format!("daemon, shims, inits, per servant of {count}");
     report
-        .figure(
-            format!("daemon, shims, inits, per servant of {count}"),
-            "MB",
-            (of_daemon + of_servants) / count as f64,
-        )
+        .figure(title, "MB", (of_daemon + of_servants) / count as f64)
         .require(Target::AtMost(MEMORY))
         .note(format!("PSS; the daemon {of_daemon:.1}"));
     let sum = |pick: fn(&ServantOverhead) -> i32| {
@@ -139,12 +129,9 @@ fn report_total(
     let share =
         |index: usize| (after[index] - before[index]).as_secs_f64() / lasted.as_secs_f64() * 100.0;
     let [daemon, shims, inits] = [share(0), share(1), share(2)];
+    let title = format!("idle processor, all of ours, {count} servants");
     report
-        .figure(
-            format!("idle processor, all of ours, {count} servants"),
-            "%",
-            daemon + shims + inits,
-        )
+        .figure(title, "%", daemon + shims + inits)
         .require(Target::AtMost(IDLE))
         .note(format!(
             "of a core over {} s; daemon {daemon:.3}, shims {shims:.3}, inits {inits:.3}",

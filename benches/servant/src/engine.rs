@@ -4,10 +4,10 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_servant::binary;
 use servant::container::ContainerSpec;
 use servant::engine::ServantHandle;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
+use support::binaries;
 use tokio::runtime::Handle;
 
 /// An engine inside this program.
@@ -19,9 +19,12 @@ pub(crate) struct BenchEngine<'a> {
 impl<'a> BenchEngine<'a> {
     /// Creates an engine with its servants below `place`.
     pub(crate) fn prepare(place: &Path, runtime: &'a Handle) -> Result<Self> {
-        let shim = vec![binary("cloudroidd")?.into_os_string(), "shim".into()];
-        let mut config =
-            LocalEngineConfig::new(place.join("servants"), shim, binary("cloudroid-init")?);
+        let shim = vec![binaries::path("cloudroidd").into_os_string(), "shim".into()];
+        let mut config = LocalEngineConfig::new(
+            place.join("servants"),
+            shim,
+            binaries::path("cloudroid-init"),
+        );
         config.isolation = Isolation::BestEffort;
         let engine = runtime.block_on(async { LocalEngine::new(config) })?;
         engine.warm_up();

@@ -1,20 +1,14 @@
 //! The image of a service as its servants run it, from the specification that the daemon gives to their shims.
 
-use std::time::{Duration, Instant};
-
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
+use bench_report::BenchDaemon;
 use package::interface::{Direction, Interface};
 use ros::bus::Graph;
 use servant::container::ContainerSpec;
 use servant::launch::{self, LaunchRecord};
 use servant::spec::NodeSpec;
 
-use bench_servant::Daemon;
-
-use crate::robot::BenchRobot;
-
-/// Maximum time until the record of a servant's nodes exists.
-const PATIENCE: Duration = Duration::from_secs(30);
+use crate::starts::list_nodes;
 
 /// A service with one node.
 pub(crate) struct ServiceImage {
@@ -29,13 +23,13 @@ pub(crate) struct ServiceImage {
 impl ServiceImage {
     /// Starts a servant of the service and reads its specification; the daemon must have no other servants, and has
     /// none afterwards.
-    pub(crate) fn inspect(daemon: &Daemon, service: &str) -> Result<Self> {
-        let mut robot = BenchRobot::connect(&daemon.address, service)?;
-        robot.nodes()?;
+    pub(crate) fn inspect(daemon: &BenchDaemon, service: &str) -> Result<Self> {
+        let mut robot = daemon.robot(service)?;
+        list_nodes(&mut robot)?;
         let launch = find_started(daemon)?;
         robot.leave()?;
         daemon.wait_for_servants(0)?;
-        let interface = daemon.get(&format!("/api/v1/services/{service}/interface"))?;
+        let interface = daemon.api(&format!("/api/v1/services/{service}/interface"))?;
         Ok(Self {
             service: service.to_owned(),
             spec: launch.spec,
@@ -79,20 +73,15 @@ impl ServiceImage {
 
 /// Returns the record of the servant whose nodes were started. A container of the warm pool has a record as well,
 /// without nodes; on a busy machine that one may be seen first.
-fn find_started(daemon: &Daemon) -> Result<LaunchRecord> {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
+fn find_started(daemon: &BenchDaemon) -> Result<LaunchRecord> {
+    support::wait_until("a servant with a record of its nodes", || {
         for id in daemon.servants()? {
-            let path = daemon.home().join("servants").join(id).join(launch::SPEC);
+            let path = daemon.home.join("servants").join(id).join(launch::SPEC);
             let record: Option<LaunchRecord> = launch::read_record(&path)?;
             if let Some(launch) = record.filter(|launch| !launch.spec.nodes.is_empty()) {
-                return Ok(launch);
+                return Ok(Ok(launch));
             }
         }
-        ensure!(
-            Instant::now() < deadline,
-            "no servant has a record of its nodes"
-        );
-        std::thread::sleep(Duration::from_millis(20));
-    }
+        Ok(Err("no servant has one".to_owned()))
+    })
 }

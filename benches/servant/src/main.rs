@@ -13,7 +13,6 @@ mod engine;
 mod image;
 mod native;
 mod peers;
-mod robot;
 mod root;
 mod starts;
 mod upgrade;
@@ -21,8 +20,7 @@ mod upgrade;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
-use bench_report::BenchReport;
-use bench_servant::{Daemon, write_install_space};
+use bench_report::{BenchDaemon, BenchReport, write_install_space};
 use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 
@@ -34,12 +32,8 @@ const CONFIG: &str = "[capacity]\ncpus = 4096.0\nmemory = \"4096G\"\n\
 
 fn main() -> Result<()> {
     let words: Vec<String> = std::env::args().skip(1).collect();
-    match words
-        .iter()
-        .map(String::as_str)
-        .collect::<Vec<_>>()
-        .as_slice()
-    {
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    match words.as_slice() {
         [] => measure(true),
         ["starts"] => measure(false),
         ["bare", how, directory] => bare::run_process(how, Path::new(directory)),
@@ -48,11 +42,8 @@ fn main() -> Result<()> {
 }
 
 /// Starts a daemon and publishes the relay; `servants` is appended to the `[servant]` section of the configuration.
-fn start_daemon(servants: &str) -> Result<Daemon> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
-    let daemon = Daemon::start(place, &format!("{CONFIG}{servants}"), &[])?;
+fn start_daemon(servants: &str) -> Result<BenchDaemon> {
+    let daemon = BenchDaemon::start(&format!("{CONFIG}{servants}"))?;
     eprintln!("pushing a launch file for topic_tools/relay");
     let space = write_install_space(daemon.directory(), "relay_only", None)?;
     daemon.push(&[

@@ -3,9 +3,10 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{BenchReport, Target, Times};
-use bench_servant::{Daemon, is_full_run};
+use bench_report::{BenchDaemon, BenchReport, Target, Times, is_full_run};
+use serde_json::json;
 use servant::container::ContainerSpec;
+use support::robot::Robot;
 use tokio::runtime::Handle;
 
 use crate::bare;
@@ -13,15 +14,25 @@ use crate::engine::BenchEngine;
 use crate::image::ServiceImage;
 use crate::native::NativeNode;
 use crate::peers::PeerRuntime;
-use crate::robot::BenchRobot;
 use crate::upgrade;
 
+/// Returns the nodes that rosapi reports; the call is answered once the servant is ready.
+pub(crate) fn list_nodes(robot: &mut Robot) -> Result<Vec<String>> {
+    let answer = robot.call("/rosapi/nodes", json!({}))?;
+    let nodes = answer["values"]["nodes"].as_array();
+    let nodes = nodes.with_context(|| format!("nodes in {answer}"))?;
+    Ok(nodes
+        .iter()
+        .filter_map(|node| Some(node.as_str()?.to_owned()))
+        .collect())
+}
+
 /// Measures from a robot's connection until rosapi reports its node. Then the robot leaves, and its servant ends.
-pub(crate) fn time_robot_start(daemon: &Daemon, image: &ServiceImage) -> Result<Duration> {
+pub(crate) fn time_robot_start(daemon: &BenchDaemon, image: &ServiceImage) -> Result<Duration> {
     let before = daemon.servants()?.len();
     let begun = Instant::now();
-    let mut robot = BenchRobot::connect(&daemon.address, &image.service)?;
-    let nodes = robot.nodes()?;
+    let mut robot = daemon.robot(&image.service)?;
+    let nodes = list_nodes(&mut robot)?;
     let took = begun.elapsed();
     let node = &image.node()?.name;
     ensure!(
@@ -34,28 +45,12 @@ pub(crate) fn time_robot_start(daemon: &Daemon, image: &ServiceImage) -> Result<
 }
 
 /// Waits until the nodes run in a container of the warm pool; they have registered long before the next turn.
-fn wait_until_warm(daemon: &Daemon) -> Result<()> {
-    let deadline = Instant::now() + Duration::from_secs(60);
-    while daemon.get("/api/v1/status")?["warm_nodes"] == 0 {
-        ensure!(Instant::now() < deadline, "no nodes run ahead");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+fn wait_until_warm(daemon: &BenchDaemon) -> Result<()> {
+    daemon.wait_for("/api/v1/status", "nodes that run ahead", |status| {
+        (status["warm_nodes"] != 0).then_some(())
+    })?;
     std::thread::sleep(SETTLES);
     Ok(())
-}
-
-/// Sorts the times of a contestant.
-pub(crate) fn sorted_times(name: &str, mut list: Vec<Duration>) -> Times {
-    list.sort_unstable();
-    Times {
-        name: name.to_owned(),
-        sorted: list,
-    }
-}
-
-/// Median in milliseconds.
-pub(crate) fn median_milliseconds(times: &Times) -> f64 {
-    times.median().as_secs_f64() * 1e3
 }
 
 /// Time for nodes that were started just now to register.
@@ -105,9 +100,9 @@ const UNLIMITED: &str = "libcontainer alone, without cgroups";
 /// Measures all starts in turns, so that disturbances affect all of them.
 pub(crate) fn measure(
     report: &mut BenchReport,
-    daemon: &Daemon,
-    without_warm_pool: &Daemon,
-    warm_nodes: &Daemon,
+    daemon: &BenchDaemon,
+    without_warm_pool: &BenchDaemon,
+    warm_nodes: &BenchDaemon,
     image: &ServiceImage,
     runtime: &Handle,
 ) -> Result<()> {
@@ -164,7 +159,13 @@ pub(crate) fn measure(
     }
     let all: Vec<Times> = contestants
         .into_iter()
-        .map(|one| sorted_times(one.name, one.times))
+        .map(|mut one| {
+            one.times.sort_unstable();
+            Times {
+                name: one.name.to_owned(),
+                sorted: one.times,
+            }
+        })
         .collect();
     report_starts(report, &all, rounds)
 }
@@ -172,53 +173,41 @@ pub(crate) fn measure(
 fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Result<()> {
     let of = |name: &str| all.iter().find(|times| times.name == name);
     let needed = |name: &str| of(name).with_context(|| name.to_owned());
-    let (robots, node) = (needed(ROBOT)?, median_milliseconds(needed(NODE)?));
-    let engine = median_milliseconds(needed(ENGINE)?);
+    let (robots, node) = (needed(ROBOT)?, needed(NODE)?.median_milliseconds());
+    let engine = needed(ENGINE)?.median_milliseconds();
     let unlimited = needed(UNLIMITED)?;
     // If libcontainer cannot set limits, the container without limits is the reference.
     let bare = of(LIMITED).unwrap_or(unlimited);
+    let title = "robot connects → node registered, bridged";
     report
-        .figure(
-            "robot connects → node registered, bridged",
-            "ms",
-            median_milliseconds(robots),
-        )
+        .figure(title, "ms", robots.median_milliseconds())
         .relative_to(
             "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * median_milliseconds(bare),
+            node + 1.5 * bare.median_milliseconds(),
         )
         .require(Target::RatioAtMost(1.0))
         .note(format!(
             "medians of {rounds}, in turns; best {:.1} ms",
             robots.best().as_secs_f64() * 1e3
         ));
+    let title = "robot connects → node registered, bridged, without a container made ahead";
     report
-        .figure(
-            "robot connects → node registered, bridged, without a container made ahead",
-            "ms",
-            median_milliseconds(needed(COLD)?),
-        )
+        .figure(title, "ms", needed(COLD)?.median_milliseconds())
         .relative_to(
             "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * median_milliseconds(bare),
+            node + 1.5 * bare.median_milliseconds(),
         )
         .note("the first robot of a service, and robots that come faster than containers are made");
+    let title = "robot connects → node registered, bridged, in a container made ahead";
     report
-        .figure(
-            "robot connects → node registered, bridged, in a container made ahead",
-            "ms",
-            median_milliseconds(robots),
-        )
+        .figure(title, "ms", robots.median_milliseconds())
         .relative_to("node alone", node)
         .require(Target::RatioAtMost(1.2));
     let ready = needed(READY)?;
+    let title = "robot connects → first answer, nodes running already";
     report
-        .figure(
-            "robot connects → first answer, nodes running already",
-            "ms",
-            median_milliseconds(ready),
-        )
-        .relative_to(UPGRADE, median_milliseconds(needed(UPGRADE)?))
+        .figure(title, "ms", ready.median_milliseconds())
+        .relative_to(UPGRADE, needed(UPGRADE)?.median_milliseconds())
         .require(Target::RatioAtMost(10.0))
         .note(format!(
             "warm_nodes = 1; the answer names the node; best {:.2} ms",
@@ -229,7 +218,7 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
         .note("in a chroot of the same layers, namespaces ready, the same Master");
     report
         .figure("create → running", "ms", engine)
-        .relative_to(bare.name.clone(), median_milliseconds(bare))
+        .relative_to(bare.name.clone(), bare.median_milliseconds())
         .require(Target::RatioAtMost(1.5))
         .note("ours with limits read back, shim, Master and init");
     for other in all
@@ -239,7 +228,7 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
         if other.name != bare.name {
             report
                 .figure("create → running", "ms", engine)
-                .relative_to(other.name.clone(), median_milliseconds(other));
+                .relative_to(other.name.clone(), other.median_milliseconds());
         }
     }
     Ok(())

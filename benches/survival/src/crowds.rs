@@ -12,36 +12,16 @@ use support::daemon::Daemon;
 
 use crate::greeters;
 
-/// Results of all parts.
-#[derive(Debug)]
-pub(crate) struct CrowdResults {
-    coming: coming::ConnectResult,
-    idle: idle::IdleResult,
-    unread: unread::UnreadResult,
-}
-
 /// Runs all parts against one daemon.
-pub(crate) fn measure(daemon: &Daemon) -> Result<CrowdResults> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     raise_descriptor_limit()?;
     for robot in ["crowd", "polite"] {
         greeters::ask_until_answered(daemon, robot)?;
     }
-    let crowds = CrowdResults {
-        coming: coming::measure(daemon)?,
-        idle: idle::measure(daemon)?,
-        unread: unread::measure(daemon)?,
-    };
-    greeters::stop_all(daemon)?;
-    Ok(crowds)
-}
-
-impl CrowdResults {
-    /// Adds the figures to the report.
-    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
-        self.coming.add_figures(report);
-        self.idle.add_figures(report);
-        self.unread.add_figures(report);
-    }
+    coming::measure(report, daemon)?;
+    idle::measure(report, daemon)?;
+    unread::measure(report, daemon)?;
+    greeters::stop_all(daemon)
 }
 
 /// Raises the limit of open files for this program. The daemon under test was started with a lower one, as by a service

@@ -158,35 +158,26 @@ fn apply_changes(daemon: &Daemon) -> Result<Vec<String>> {
 
 impl FullDiskResult {
     fn add_figures(&self, report: &mut BenchReport, rounds: u32) {
+        let title = "calls of robots at work that fail while the disk is full";
         report
-            .figure(
-                "calls of robots at work that fail while the disk is full",
-                "",
-                self.failed as f64,
-            )
+            .figure(title, "", self.failed as f64)
             .require(Target::AtMost(0.0))
             .note(format!(
                 "of {}, by {ROBOTS} robots in {rounds} rounds",
                 self.asked
             ));
+        let title = format!("new robots answered once there is room again, of {rounds}");
         report
-            .figure(
-                format!("new robots answered once there is room again, of {rounds}"),
-                "",
-                f64::from(self.recovered),
-            )
+            .figure(title, "", f64::from(self.recovered))
             .require(Target::AtLeast(f64::from(rounds)))
             .note(format!("{} of them were refused before", self.refused));
         report
             .figure("until they are", "ms", median(&self.again))
             .relative_to("a robot's first answer", median(&self.first))
             .note(format!("medians; at worst {:.0} ms", worst(&self.again)));
+        let title = "changes that were confirmed on a full disk and are gone after a restart";
         report
-            .figure(
-                "changes that were confirmed on a full disk and are gone after a restart",
-                "",
-                self.gone.len() as f64,
-            )
+            .figure(title, "", self.gone.len() as f64)
             .require(Target::AtMost(0.0))
             .note(format!(
                 "of {} that were confirmed, of {} that were asked for; gone: {:?}",

@@ -23,29 +23,43 @@ const LINKS: usize = 5;
 /// Response time that their SLA accepts: after that a link counts as silent.
 const ACCEPTED: Duration = Duration::from_secs(1);
 
-/// Results.
-#[derive(Debug)]
-pub(crate) struct HalfOpenResult {
-    /// Time until the daemon had disconnected all clients.
-    let_go: Duration,
-    rounds: u32,
-    /// Durations of calls over working links, and of the first call after each link fell silent.
+/// Durations of calls over working links, and of the first call after each link fell silent.
+#[derive(Default)]
+struct LinkTimes {
     standing: Vec<Duration>,
     silent: Vec<Duration>,
 }
 
 /// Runs both parts against one daemon; links fall silent `rounds` times.
-pub(crate) fn measure(daemon: &Daemon, rounds: u32) -> Result<HalfOpenResult> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon, rounds: u32) -> Result<()> {
     let let_go = lose_clients(daemon)?;
-    let mut outcome = HalfOpenResult {
-        let_go,
-        rounds,
-        standing: Vec::new(),
-        silent: Vec::new(),
-    };
-    silence_links(daemon, &mut outcome)?;
+    let links = silence_links(daemon, rounds)?;
     greeters::stop_all(daemon)?;
-    Ok(outcome)
+    let title = format!("until {CLIENTS} half-open WebSockets are let go");
+    report
+        .figure(title, "s", let_go.as_secs_f64())
+        .relative_to(
+            "the time without data that is configured",
+            greeters::SILENCE.as_secs_f64(),
+        )
+        .require(Target::RatioAtMost(1.5));
+    let all = rounds as usize * LINKS;
+    let title = format!("half-open links of {all} whose next call is answered");
+    report
+        .figure(title, "", links.silent.len() as f64)
+        .require(Target::AtLeast(all as f64));
+    report
+        .figure("until that is answered", "ms", median(&links.silent))
+        .relative_to(
+            "what the robot accepts (T_max)",
+            ACCEPTED.as_secs_f64() * 1e3,
+        )
+        .note(format!(
+            "medians; at worst {:.0} ms; {:.0} ms by a link that stands",
+            worst(&links.silent),
+            median(&links.standing)
+        ));
+    Ok(())
 }
 
 /// Makes clients fall silent; returns how long the daemon keeps their descriptors.
@@ -82,7 +96,8 @@ fn lose_clients(daemon: &Daemon) -> Result<Duration> {
 }
 
 /// Makes links fall silent and measures the time until the node behind each is heard again.
-fn silence_links(daemon: &Daemon, outcome: &mut HalfOpenResult) -> Result<()> {
+fn silence_links(daemon: &Daemon, rounds: u32) -> Result<LinkTimes> {
+    let mut links = LinkTimes::default();
     let freezer = Freezer::new(&daemon.address)?;
     let (site, twin) = (Site::new()?, Twin::greeter(RosVersion::One));
     let app = site.node("/app")?;
@@ -105,56 +120,20 @@ fn silence_links(daemon: &Daemon, outcome: &mut HalfOpenResult) -> Result<()> {
     for (number, stub) in stubs.iter().enumerate() {
         ask(number).with_context(|| stub.output())?;
     }
-    for _ in 0..outcome.rounds {
+    for _ in 0..rounds {
         for number in 0..LINKS {
-            outcome.standing.push(ask(number)?);
+            links.standing.push(ask(number)?);
         }
         freezer.freeze();
         let began = Instant::now();
         for (number, stub) in stubs.iter().enumerate() {
             match ask(number) {
-                Ok(_) => outcome.silent.push(began.elapsed()),
+                Ok(_) => links.silent.push(began.elapsed()),
                 Err(error) => {
                     eprintln!("link{number}: {error:#}; it said:\n{}", stub.output());
                 }
             }
         }
     }
-    Ok(())
-}
-
-impl HalfOpenResult {
-    /// Adds the figures to the report.
-    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
-        report
-            .figure(
-                format!("until {CLIENTS} half-open WebSockets are let go"),
-                "s",
-                self.let_go.as_secs_f64(),
-            )
-            .relative_to(
-                "the time without data that is configured",
-                greeters::SILENCE.as_secs_f64(),
-            )
-            .require(Target::RatioAtMost(1.5));
-        let all = self.rounds as usize * LINKS;
-        report
-            .figure(
-                format!("half-open links of {all} whose next call is answered"),
-                "",
-                self.silent.len() as f64,
-            )
-            .require(Target::AtLeast(all as f64));
-        report
-            .figure("until that is answered", "ms", median(&self.silent))
-            .relative_to(
-                "what the robot accepts (T_max)",
-                ACCEPTED.as_secs_f64() * 1e3,
-            )
-            .note(format!(
-                "medians; at worst {:.0} ms; {:.0} ms by a link that stands",
-                worst(&self.silent),
-                median(&self.standing)
-            ));
-    }
+    Ok(links)
 }

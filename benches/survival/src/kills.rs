@@ -2,7 +2,7 @@
 //! time that takes.
 
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::Result;
 use bench_report::{BenchReport, Target};
@@ -69,12 +69,9 @@ pub(crate) fn kill_daemons(
         "{lost} servants of {} lost, {forgotten} nodes that had forgotten what they knew",
         robots.len()
     ));
+    let title = "until a daemon with servants to find answers";
     report
-        .figure(
-            "until a daemon with servants to find answers",
-            "ms",
-            median(&found),
-        )
+        .figure(title, "ms", median(&found))
         .relative_to("with none", median(&alone))
         .note("medians");
     report
@@ -113,20 +110,14 @@ impl fmt::Display for Victim {
     }
 }
 
-/// Results of killing this process repeatedly.
-#[derive(Debug)]
-pub(crate) struct KillResult {
-    victim: Victim,
-    rounds: u32,
-    /// Times from a robot's first connection to its first answer.
-    first: Vec<Duration>,
-    /// Times from the kill to the next answer, for those robots that were answered.
-    again: Vec<Duration>,
-}
-
 /// Kills the process in servants of a new robot each time, because a robot whose servants fail repeatedly has to wait
 /// before the next start.
-pub(crate) fn kill_in_servants(daemon: &Daemon, victim: Victim, rounds: u32) -> Result<KillResult> {
+pub(crate) fn kill_in_servants(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    victim: Victim,
+    rounds: u32,
+) -> Result<()> {
     let (mut first, mut again) = (Vec::new(), Vec::new());
     for round in 0..rounds {
         let name = format!("{victim}-{round}");
@@ -151,38 +142,18 @@ pub(crate) fn kill_in_servants(daemon: &Daemon, victim: Victim, rounds: u32) -> 
         drop(robot);
         greeters::stop_all(daemon)?;
     }
-    Ok(KillResult {
-        victim,
-        rounds,
-        first,
-        again,
-    })
-}
-
-impl KillResult {
-    /// Adds the figures to the report.
-    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
-        let victim = self.victim;
-        let recovered = u32::try_from(self.again.len()).unwrap_or(u32::MAX);
-        report_recovered(
-            report,
-            &format!("a servant's {victim}"),
-            recovered,
-            self.rounds,
-        );
-        report
-            .figure(
-                format!("from kill -9 of the {victim} to the next answer"),
-                "ms",
-                median(&self.again),
-            )
-            .relative_to("a robot's first answer", median(&self.first))
-            .note(format!(
-                "medians; at worst {:.0} ms beside {:.0} ms",
-                worst(&self.again),
-                worst(&self.first)
-            ));
-    }
+    let recovered = u32::try_from(again.len()).unwrap_or(u32::MAX);
+    report_recovered(report, &format!("a servant's {victim}"), recovered, rounds);
+    let title = format!("from kill -9 of the {victim} to the next answer");
+    report
+        .figure(title, "ms", median(&again))
+        .relative_to("a robot's first answer", median(&first))
+        .note(format!(
+            "medians; at worst {:.0} ms beside {:.0} ms",
+            worst(&again),
+            worst(&first)
+        ));
+    Ok(())
 }
 
 fn report_recovered<'a>(
@@ -191,11 +162,8 @@ fn report_recovered<'a>(
     recovered: u32,
     rounds: u32,
 ) -> &'a mut bench_report::Figure {
+    let title = format!("kill -9 of {victim}, recovered of {rounds}");
     report
-        .figure(
-            format!("kill -9 of {victim}, recovered of {rounds}"),
-            "",
-            f64::from(recovered),
-        )
+        .figure(title, "", f64::from(recovered))
         .require(Target::AtLeast(f64::from(rounds)))
 }

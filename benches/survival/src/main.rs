@@ -29,7 +29,8 @@ mod wear;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use bench_report::BenchReport;
+use bench_report::{BenchReport, create_directory};
+
 /// Kills of each kind.
 const ROUNDS: u32 = 50;
 /// Upper limit of the kills of kinds that take longer.
@@ -56,9 +57,7 @@ fn main() -> Result<()> {
         Ok(rounds) => rounds.parse().context("CLOUDROID_BENCH_ROUNDS")?,
         Err(_) => ROUNDS,
     };
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
+    let place = create_directory()?;
     let mut report = BenchReport::new("survival");
     let measured = measure(&mut report, place.path(), &parts, rounds);
     greeters::end_leftovers(&place.path().join(HOME))?;

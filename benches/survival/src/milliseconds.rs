@@ -1,18 +1,18 @@
-//! Durations as figures in milliseconds.
+//! Quantiles of durations in milliseconds.
 
 use std::time::Duration;
 
-/// Median.
+/// Returns the quantile of durations in milliseconds.
+pub(crate) fn quantile(times: &[Duration], fraction: f64) -> f64 {
+    bench_report::quantile_seconds(times, fraction) * 1e3
+}
+
+/// Returns the median in milliseconds.
 pub(crate) fn median(times: &[Duration]) -> f64 {
     quantile(times, 0.5)
 }
 
-/// Maximum.
+/// Returns the maximum in milliseconds.
 pub(crate) fn worst(times: &[Duration]) -> f64 {
     quantile(times, 1.0)
-}
-
-/// Quantile at `fraction`.
-pub(crate) fn quantile(times: &[Duration], fraction: f64) -> f64 {
-    bench_report::quantile(times, fraction).map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
 }

@@ -1,10 +1,9 @@
 //! Resources of the daemon's process, from the kernel's counters: they should not grow, however long it works.
 
-use std::fs;
 use std::time::Duration;
 
-use anyhow::{Context, Result};
-use bench_report::{BenchReport, Target};
+use anyhow::Result;
+use bench_report::{BenchReport, Process, Target};
 
 /// Idle threads of a pool end after 10 s, and freed memory is returned every 30 s.
 const REST: Duration = Duration::from_secs(45);
@@ -32,14 +31,13 @@ pub(crate) struct Resources {
 impl Resources {
     /// Reads the resources of a process.
     pub(crate) fn read(pid: i32) -> Result<Self> {
-        let megabytes =
-            |file, name| Ok::<f64, anyhow::Error>(field(pid, file, name)? * 1024.0 / 1e6);
+        let process = Process::from_pid(pid);
         Ok(Self {
-            resident: megabytes("status", "VmRSS:")?,
-            anonymous: megabytes("status", "RssAnon:")?,
-            proportional: megabytes("smaps_rollup", "Pss:")?,
-            descriptors: fs::read_dir(format!("/proc/{pid}/fd"))?.count() as f64,
-            threads: field(pid, "status", "Threads:")?,
+            resident: process.resident()?,
+            anonymous: process.anonymous()?,
+            proportional: process.proportional()?,
+            descriptors: process.descriptors()? as f64,
+            threads: process.threads()? as f64,
         })
     }
 
@@ -76,35 +74,20 @@ impl Resources {
         what: &str,
         (when, before): (&str, Self),
     ) {
+        let title = format!("memory of the daemon after {what}, resident");
         report
-            .figure(
-                format!("memory of the daemon after {what}, resident"),
-                "MB",
-                self.resident,
-            )
+            .figure(title, "MB", self.resident)
             .relative_to(when, before.resident)
             .require(Target::RatioAtMost(FLAT))
             .note(format!(
                 "allocated {:.1} MB after {:.1} MB; PSS {:.1} MB after {:.1} MB",
                 self.anonymous, before.anonymous, self.proportional, before.proportional
             ));
+        let title = format!("open descriptors of the daemon after {what}");
         report
-            .figure(
-                format!("open descriptors of the daemon after {what}"),
-                "",
-                self.descriptors,
-            )
+            .figure(title, "", self.descriptors)
             .relative_to(when, before.descriptors)
             .require(Target::RatioAtMost(FLAT))
             .note(format!("{} threads after {}", self.threads, before.threads));
     }
-}
-
-/// Reads a number from a file below `/proc/PID`.
-fn field(pid: i32, file: &str, name: &str) -> Result<f64> {
-    let path = format!("/proc/{pid}/{file}");
-    let text = fs::read_to_string(&path).with_context(|| path.clone())?;
-    let line = text.lines().find_map(|line| line.strip_prefix(name));
-    let line = line.with_context(|| format!("{name} in {path}"))?;
-    Ok(line.trim().trim_end_matches("kB").trim().parse()?)
 }

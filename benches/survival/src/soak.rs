@@ -107,12 +107,9 @@ fn report_soak(
         some.map(|call| call.took).collect()
     };
     let (second, last) = (calls_in(2), calls_in(4));
+    let title = "a call in its last quarter, p99";
     report
-        .figure(
-            "a call in its last quarter, p99",
-            "ms",
-            quantile(&last, 0.99),
-        )
+        .figure(title, "ms", quantile(&last, 0.99))
         .relative_to("in its second quarter", quantile(&second, 0.99))
         .note(format!(
             "p50 {:.2} ms beside {:.2} ms",

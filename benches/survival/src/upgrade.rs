@@ -68,26 +68,17 @@ pub(crate) fn measure(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32
     }
     greeters::stop_all(&daemon)?;
     daemon.stop()?;
+    let title = format!("{rounds} upgrades with {SERVANTS} servants at work, servants lost");
     report
-        .figure(
-            format!("{rounds} upgrades with {SERVANTS} servants at work, servants lost"),
-            "",
-            lost as f64,
-        )
+        .figure(title, "", lost as f64)
         .require(Target::AtMost(0.0));
+    let title = "nodes that had forgotten what they knew by then";
     report
-        .figure(
-            "nodes that had forgotten what they knew by then",
-            "",
-            f64::from(forgotten),
-        )
+        .figure(title, "", f64::from(forgotten))
         .require(Target::AtMost(0.0));
+    let title = "longest time between two answers to a robot";
     report
-        .figure(
-            "longest time between two answers to a robot",
-            "ms",
-            median(&gaps),
-        )
+        .figure(title, "ms", median(&gaps))
         .relative_to("end and start of a daemon with no servants", median(&alone))
         .note(format!(
             "medians; at worst {:.0} ms beside {:.0} ms",

@@ -6,17 +6,9 @@ use anyhow::Result;
 use bench_report::BenchReport;
 use support::daemon::Daemon;
 
-use crate::crowds::{self, CrowdResults};
-use crate::half_open::{self, HalfOpenResult};
-use crate::kills::{self, KillResult, Victim};
+use crate::kills::{self, Victim};
 use crate::resources::Resources;
-
-/// Results of one pass.
-struct WearRun {
-    kills: Vec<KillResult>,
-    crowds: CrowdResults,
-    half_open: HalfOpenResult,
-}
+use crate::{crowds, half_open};
 
 /// Makes both passes, the second with `kills` kills of each kind; kinds that take longer are limited to `few`.
 pub(crate) fn measure(
@@ -25,41 +17,26 @@ pub(crate) fn measure(
     kills: u32,
     few: u32,
 ) -> Result<()> {
-    WearRun::run(daemon, few, few)?;
+    // The figures of the first pass are nobody's.
+    make_pass(&mut BenchReport::new("first"), daemon, few, few)?;
     let before = Resources::read_at_rest(daemon.pid())?;
-    let wear = WearRun::run(daemon, kills, few)?;
+    make_pass(report, daemon, kills, few)?;
     let after = Resources::read_at_rest(daemon.pid())?;
-    for kills in &wear.kills {
-        kills.add_figures(report);
-    }
-    wear.crowds.add_figures(report);
-    wear.half_open.add_figures(report);
-    after.add_figures(
-        report,
-        "all this a second time",
-        ("after the first time", before),
-    );
+    let before = ("after the first time", before);
+    after.add_figures(report, "all this a second time", before);
     Ok(())
 }
 
-impl WearRun {
-    fn run(daemon: &Daemon, kills: u32, few: u32) -> Result<Self> {
-        print_resources(daemon, "before")?;
-        let mut all = Vec::new();
-        for victim in Victim::ALL {
-            all.push(kills::kill_in_servants(daemon, victim, kills)?);
-            print_resources(daemon, &format!("{kills} kills of a servant's {victim}"))?;
-        }
-        let crowds = crowds::measure(daemon)?;
-        print_resources(daemon, "crowds")?;
-        let half_open = half_open::measure(daemon, few)?;
-        print_resources(daemon, "half-open connections")?;
-        Ok(Self {
-            kills: all,
-            crowds,
-            half_open,
-        })
+fn make_pass(report: &mut BenchReport, daemon: &Daemon, kills: u32, few: u32) -> Result<()> {
+    print_resources(daemon, "before")?;
+    for victim in Victim::ALL {
+        kills::kill_in_servants(report, daemon, victim, kills)?;
+        print_resources(daemon, &format!("{kills} kills of a servant's {victim}"))?;
     }
+    crowds::measure(report, daemon)?;
+    print_resources(daemon, "crowds")?;
+    half_open::measure(report, daemon, few)?;
+    print_resources(daemon, "half-open connections")
 }
 
 /// Prints the resources, to show which part made them grow.

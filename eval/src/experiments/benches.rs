@@ -4,7 +4,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use serde::{Deserialize, Serialize};
+use bench_report::BenchReport;
 use support::binaries;
 
 use crate::cells::{CachedResult, RunCache};
@@ -14,62 +14,21 @@ use crate::words::digits;
 /// Maximum time for one part of a benchmark, which takes some minutes.
 const LONGEST: Duration = Duration::from_secs(900);
 
-/// Output of a benchmark: `bench_report::BenchReport`.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct BenchOutput {
-    /// Figures in the order in which they were measured.
-    pub figures: Vec<Figure>,
-    /// Measurements that could not be made.
-    #[serde(default)]
-    pub left_out: Vec<SkippedFigure>,
-}
-
-/// One measured number: `bench_report::Figure`.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct Figure {
-    /// Name of the figure.
-    pub figure: String,
-    /// Unit.
-    pub unit: String,
-    /// Value.
-    pub value: Option<f64>,
-    /// Name of the peer or floor.
-    pub peer: Option<String>,
-    /// The peer's value, in the same unit.
-    pub floor: Option<f64>,
-    ratio: Option<f64>,
-    to_reach: Option<String>,
-    met: Option<bool>,
-    note: Option<String>,
-}
-
-/// Something that could not be measured on this machine: `bench_report::SkippedMeasurement`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct SkippedFigure {
-    /// Name of the measurement.
-    pub what: String,
-    /// Reason.
-    pub why: String,
-}
-
-impl BenchOutput {
-    /// Returns a sentence for each target that was not met.
-    pub fn unmet(&self) -> Vec<String> {
-        let unmet = self
-            .figures
-            .iter()
-            .filter(|figure| figure.met == Some(false));
-        let sentence = |figure: &Figure| {
-            format!(
-                "{}: {} {}, which is not {}.",
-                figure.figure,
-                figure.value.map(digits).unwrap_or_default(),
-                figure.unit,
-                figure.to_reach.as_deref().unwrap_or_default()
-            )
-        };
-        unmet.map(sentence).collect()
-    }
+/// Returns a sentence for each target that a benchmark did not meet.
+pub fn unmet_targets(report: &BenchReport) -> impl Iterator<Item = String> {
+    let unmet = report
+        .figures
+        .iter()
+        .filter(|figure| figure.met == Some(false));
+    unmet.map(|figure| {
+        format!(
+            "{}: {} {}, which is not {}.",
+            figure.figure,
+            digits(figure.value),
+            figure.unit,
+            figure.to_reach.as_deref().unwrap_or_default()
+        )
+    })
 }
 
 /// Runs the part of a benchmark that `arguments` select, unless there is a stored result.
@@ -77,7 +36,7 @@ pub fn run_part(
     cells: &RunCache,
     name: &str,
     arguments: &[&str],
-) -> Result<CachedResult<BenchOutput>> {
+) -> Result<CachedResult<BenchReport>> {
     let cell = [&["bench", name], arguments].concat().join(" ");
     cells.measure(&cell, &name, || {
         let program = binaries::path(&format!("bench-{name}"));
@@ -105,7 +64,7 @@ mod tests {
 
     #[test]
     fn what_was_not_reached_is_a_finding() {
-        let mut report = bench_report::BenchReport::new("codecs");
+        let mut report = BenchReport::new("codecs");
         report
             .figure("saved", "%", 50.0)
             .require(bench_report::Target::AtLeast(70.0));
@@ -113,7 +72,8 @@ mod tests {
             .figure("fast", "MB/s", 50.0)
             .relative_to("zlib", 25.0);
         let text = serde_json::to_string(&report).expect("JSON");
-        let written: BenchOutput = serde_json::from_str(&text).expect("what a benchmark writes");
-        assert_eq!(written.unmet(), ["saved: 50.0 %, which is not ≥ 70."]);
+        let written: BenchReport = serde_json::from_str(&text).expect("what a benchmark writes");
+        let unmet: Vec<String> = unmet_targets(&written).collect();
+        assert_eq!(unmet, ["saved: 50.0 %, which is not ≥ 70."]);
     }
 }

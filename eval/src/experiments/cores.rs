@@ -5,12 +5,12 @@ mod drawn;
 mod model;
 mod told;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
 use crate::cells::{CachedResult, RunCache};
 use crate::examples::{DETECTOR, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
-use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::place::{NetworkProfile, RobotHardware, RunCost};
 use crate::robot::NodeUnderTest;
 use crate::trace::Trace;
 
@@ -136,12 +136,11 @@ fn measure_study(
 }
 
 fn measure_native(workshop: &EvalFixtures, subject: &Subject) -> Result<Trace> {
-    workshop.publish(&subject.example)?;
-    let directory = workshop.directory()?;
-    let mut plan = workshop.plan(&subject.example, ExecutionSite::Native, directory.path())?;
-    plan.most = subject.requests;
-    let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NETWORK)?;
-    Ok(place.run(&plan, directory.path())?.0)
+    let robot = (RobotHardware::PI, NETWORK);
+    let ran = workshop.run(&subject.example, ExecutionSite::Native, robot, |plan| {
+        plan.most = subject.requests;
+    });
+    Ok(ran?.0)
 }
 
 /// Measures in the cloud. The robot's stub states the servant's cores; the enforced limit is read from the daemon while
@@ -151,22 +150,15 @@ fn measure_outsourced(
     subject: &Subject,
     cores: f64,
 ) -> Result<CoreLimitRun> {
-    workshop.publish(&subject.example)?;
-    let directory = workshop.directory()?;
-    let mut plan = workshop.plan(
-        &subject.example,
-        ExecutionSite::Outsourced,
-        directory.path(),
-    )?;
-    plan.most = subject.requests;
     let robot = format!("cores-{}-{cores}-{}", subject.threads, std::process::id());
-    let NodeUnderTest::Stub { argv, settings, .. } = &mut plan.node else {
-        bail!("a robot that asks the cloud has a stub");
-    };
-    argv.extend(subject.arguments.iter().map(|word| (*word).to_owned()));
-    settings.push_str(&format!("\nrobot = \"{robot}\"\ncpus = {cores:?}"));
-    let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NETWORK)?;
-    let (trace, cost) = place.run(&plan, directory.path())?;
+    let (at, place) = (ExecutionSite::Outsourced, (RobotHardware::PI, NETWORK));
+    let (trace, cost) = workshop.run(&subject.example, at, place, |plan| {
+        plan.most = subject.requests;
+        if let NodeUnderTest::Stub { argv, settings, .. } = &mut plan.node {
+            argv.extend(subject.arguments.iter().map(|word| (*word).to_owned()));
+            settings.push_str(&format!("\nrobot = \"{robot}\"\ncpus = {cores:?}"));
+        }
+    })?;
     let servant = workshop.daemon.servant_of(subject.example.name, &robot)?;
     let enforced = servant["enforced"]["cpus"].as_f64();
     let enforced = enforced.context("the servant's cores are not limited")?;

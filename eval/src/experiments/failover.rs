@@ -1,5 +1,5 @@
 //! Experiment 6: the detector gets requests at a fixed rate while the robot's network is degraded at times: through the
-//! stub with a warm local original, from the cloud alone, and from the original alone.
+//! stub with a warm and with a cold local original, from the cloud alone, and from the original alone.
 
 mod told;
 
@@ -74,6 +74,8 @@ impl FaultSchedule {
 pub enum FailoverSetUp {
     /// The cloud, and a warm original on the robot.
     Stub,
+    /// The cloud, and an original on the robot that is started when it is needed.
+    Cold,
     /// The cloud.
     Cloud,
     /// The original on the robot, without a stub.
@@ -85,6 +87,7 @@ impl FailoverSetUp {
     pub fn name(self) -> &'static str {
         match self {
             Self::Stub => "stub, warm local original",
+            Self::Cold => "stub, cold local original",
             Self::Cloud => "cloud alone",
             Self::Local => "local original alone",
         }
@@ -103,7 +106,7 @@ pub struct FailoverRuns {
     runs: Vec<FailoverRun>,
 }
 
-/// Measures all set-ups; a quick evaluation has one degraded phase and no run of the original alone.
+/// Measures all set-ups; a quick evaluation has one degraded phase, and neither a cold original nor one alone.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<FailoverRuns> {
     let (course, set_ups) = if quick {
         (
@@ -113,6 +116,7 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result
     } else {
         let all = &[
             FailoverSetUp::Stub,
+            FailoverSetUp::Cold,
             FailoverSetUp::Cloud,
             FailoverSetUp::Local,
         ][..];
@@ -142,6 +146,7 @@ fn run_once(
     let mut plan = match set_up {
         FailoverSetUp::Local => native,
         FailoverSetUp::Stub => stub_plan(workshop, "warm", Some(&native), directory.path())?,
+        FailoverSetUp::Cold => stub_plan(workshop, "cold", Some(&native), directory.path())?,
         FailoverSetUp::Cloud => stub_plan(workshop, "none", None, directory.path())?,
     };
     plan.pace = RequestPacing::Rate {

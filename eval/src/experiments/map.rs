@@ -10,14 +10,14 @@ use crate::cells::{CachedResult, RunCache};
 use crate::examples::{
     EvalFixtures, EvalPackage, ExecutionSite, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED,
 };
-use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::place::{NetworkProfile, RobotHardware, RunCost};
 use crate::plots::{self, Series};
 use crate::recording::Recording;
 use crate::robot::RequestPacing;
-use crate::section::{Figure, MissingMeasurement, Section, Table};
+use crate::section::{AGAIN, Figure, MissingMeasurement, Section, Table};
 use crate::statistics::trajectory_error;
 use crate::trace::{MapGrid, Trace};
-use crate::words::{digits, percent};
+use crate::words::{digits, or_dash, percent};
 
 /// Topic of the reference in the recording.
 const REFERENCE: &str = "/ground_truth";
@@ -150,21 +150,17 @@ fn measure_play(
         &format!("map {name}"),
         &(RobotHardware::PI, speed, most),
         || {
-            let directory = workshop.directory()?;
-            let mut plan = workshop.plan(&drive.example, at, directory.path())?;
-            plan.pace = RequestPacing::Recorded(speed);
-            plan.most = most.unwrap_or(match drive.example.input {
-                InputRecording::Simulated => drive.example.requests,
-                _ => usize::MAX,
-            });
-            plan.patience = 1200.0;
-            let truth = Recording::read(&plan.recording)?.positions(REFERENCE);
-            let place = RobotSandbox::new(
-                &workshop.daemon.address,
-                RobotHardware::PI,
-                NetworkProfile::Wifi,
-            )?;
-            let (trace, cost) = place.run(&plan, directory.path())?;
+            let input = drive.example.input;
+            let truth = Recording::read(&workshop.recording(input)?)?.positions(REFERENCE);
+            let robot = (RobotHardware::PI, NetworkProfile::Wifi);
+            let (trace, cost) = workshop.run(&drive.example, at, robot, |plan| {
+                plan.pace = RequestPacing::Recorded(speed);
+                plan.most = most.unwrap_or(match input {
+                    InputRecording::Simulated => drive.example.requests,
+                    _ => usize::MAX,
+                });
+                plan.patience = 1200.0;
+            })?;
             Ok(MapPlay { trace, cost, truth })
         },
     )
@@ -202,33 +198,21 @@ pub fn section(runs: &MapRuns) -> Result<Section> {
 fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()> {
     let mut table = Table::new(
         format!("laser_slam on a robot of the class Pi: {}", drive.title),
-        [
-            "where and how fast".to_owned(),
-            "scans".to_owned(),
-            "worked at".to_owned(),
-            "share".to_owned(),
-            format!("distance from the {}, RMS, m", drive.reference),
-            format!("distance from the {}, most, m", drive.reference),
-            "published (Fig. 8)".to_owned(),
-        ],
+        &format!(
+            "where and how fast | scans | worked at | share | distance from the {0}, RMS, m | \
+             distance from the {0}, most, m | published (Fig. 8)",
+            drive.reference
+        ),
     );
     let mut paths = Vec::new();
     let mut maps: Vec<(&str, &MapGrid)> = Vec::new();
     for (name, play) in runs.for_drive(drive) {
-        let play = match play {
-            CachedResult::Done(play) => play,
-            CachedResult::Missing(why) => {
-                section.missing.push(MissingMeasurement {
-                    what: name.clone(),
-                    why: why.clone(),
-                    next: "run make eval again: what was measured stays".to_owned(),
-                });
-                continue;
-            }
+        let Some(play) = play.require(section, name, AGAIN) else {
+            continue;
         };
         let (trace, estimate) = (&play.trace, play.trace.trajectory());
         let error = trajectory_error(&estimate, &play.truth);
-        let metres = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), digits);
+        let metres = |value| or_dash(value, digits);
         table.push([
             name.clone(),
             trace.requests.len().to_string(),
@@ -241,13 +225,7 @@ fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()>
                 _ => "drawn only".to_owned(),
             },
         ]);
-        if let Some(why) = &trace.node_ended {
-            section.missing.push(MissingMeasurement::new(
-                format!("{name}: to its end"),
-                why,
-                "look at what the node printed",
-            ));
-        }
+        section.note_early_end(format!("{name}: to its end"), trace);
         if paths.is_empty() && !play.truth.is_empty() {
             let last = trace.requests.last().map_or(0.0, |last| last.stamp);
             let driven = play.truth.iter().filter(|(at, _, _)| *at <= last);
@@ -354,6 +332,7 @@ fn path_series(name: &str, path: &[(f64, f64, f64)]) -> Series {
 mod tests {
     use super::*;
     use crate::trace::RequestSample;
+    use crate::words::assert_tells;
 
     fn play(poses: &[Option<[f64; 3]>]) -> MapPlay {
         let request = |(number, pose): (u32, &Option<[f64; 3]>)| RequestSample {
@@ -408,7 +387,7 @@ mod tests {
             "50.0 % through the stub (",
             "worse than hoped",
         ] {
-            assert!(told.contains(words), "{words}: {told}");
+            assert_tells(told, words);
         }
     }
 
@@ -460,7 +439,7 @@ mod tests {
             "a simulated drive, at its own rate,",
             "(0.00 m from the truth, RMS)",
         ] {
-            assert!(told.contains(words), "{words}: {told}");
+            assert_tells(told, words);
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::cells::{CachedResult, RunCache};
 use crate::examples::{DETECTOR, EvalFixtures, EvalPackage, ExecutionSite};
 use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
 use crate::robot::NodeUnderTest;
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{AGAIN, Section, Table};
 use crate::statistics::quantile;
 use crate::trace::Trace;
 use crate::words::milliseconds;
@@ -88,29 +88,20 @@ pub fn section(runs: &MemoryRuns) -> Section {
     ];
     let mut table = Table::new(
         "object_detector on a robot of the class Pi",
-        [
-            "where",
-            "requests answered",
-            "published",
-            "processes ended for want of memory",
-            "median (ms)",
-        ],
+        "where | requests answered | published | processes ended for want of memory | median (ms)",
     );
     for (name, published, run) in [
         ("native", "SSD could not be run", &runs.native),
         ("outsourced, LAN", "SSD answered", &runs.outsourced),
     ] {
-        match run {
-            CachedResult::Done((trace, cost)) => table.push([
+        if let Some((trace, cost)) = run.require(&mut section, name, AGAIN) {
+            table.push([
                 name.to_owned(),
                 format!("{} of {REQUESTS}", trace.answered_count()),
                 published.to_owned(),
                 cost.killed_for_memory.to_string(),
                 milliseconds(quantile(&trace.responses(), 0.5)),
-            ]),
-            CachedResult::Missing(why) => section
-                .missing
-                .push(MissingMeasurement::retryable(name, why)),
+            ]);
         }
     }
     section.tables.push(table);
@@ -136,6 +127,7 @@ pub fn section(runs: &MemoryRuns) -> Section {
 mod tests {
     use super::*;
     use crate::trace::RequestSample;
+    use crate::words::assert_tells;
 
     #[test]
     fn who_was_killed_is_told() {
@@ -159,15 +151,7 @@ mod tests {
             section.tables[0].rows[0][1..4],
             ["0 of 5", "SSD could not be run", "1"].map(str::to_owned)
         );
-        assert!(
-            section.findings[0].contains("want of memory"),
-            "{:?}",
-            section.findings
-        );
-        assert!(
-            section.findings[0].contains("5 of 5"),
-            "{:?}",
-            section.findings
-        );
+        assert_tells(&section.findings[0], "want of memory");
+        assert_tells(&section.findings[0], "5 of 5");
     }
 }

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::cells::{CachedResult, RunCache};
 use crate::examples::{ALL, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
-use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
-use crate::section::{MissingMeasurement, Section};
+use crate::place::{NetworkProfile, RobotHardware, RunCost};
+use crate::section::{AGAIN, Section};
 use crate::trace::Trace;
 
 pub use jitter::jitter;
@@ -75,7 +75,11 @@ pub fn measure(
                 let name = format!("{} {} {}", example.name, class.name(), set_up.name());
                 let most = most.unwrap_or(example.requests).min(example.requests);
                 let measured = cells.measure(&name, &(class, set_up, most), || {
-                    run_once(workshop, &example, class, set_up, most)
+                    let (at, network) = match set_up {
+                        OutsourcingSetUp::Native => (ExecutionSite::Native, NetworkProfile::Lan),
+                        OutsourcingSetUp::Behind(network) => (ExecutionSite::Outsourced, network),
+                    };
+                    workshop.run(&example, at, (class, network), |plan| plan.most = most)
                 })?;
                 runs.push(OutsourcingRun {
                     example,
@@ -87,25 +91,6 @@ pub fn measure(
         }
     }
     Ok(runs)
-}
-
-fn run_once(
-    workshop: &EvalFixtures,
-    example: &EvalPackage,
-    class: RobotHardware,
-    set_up: OutsourcingSetUp,
-    most: usize,
-) -> Result<(Trace, RunCost)> {
-    workshop.publish(example)?;
-    let (at, network) = match set_up {
-        OutsourcingSetUp::Native => (ExecutionSite::Native, NetworkProfile::Lan),
-        OutsourcingSetUp::Behind(network) => (ExecutionSite::Outsourced, network),
-    };
-    let directory = workshop.directory()?;
-    let mut plan = workshop.plan(example, at, directory.path())?;
-    plan.most = most;
-    let place = RobotSandbox::new(&workshop.daemon.address, class, network)?;
-    place.run(&plan, directory.path())
 }
 
 /// Returns the result of one package, robot and set-up.
@@ -136,19 +121,9 @@ fn add_missing<R: std::borrow::Borrow<OutsourcingRun>>(section: &mut Section, ru
             run.class.name(),
             run.set_up.name()
         );
-        match &run.measured {
-            CachedResult::Missing(why) => section
-                .missing
-                .push(MissingMeasurement::retryable(what, why)),
-            CachedResult::Done((trace, _)) => {
-                if let Some(why) = &trace.node_ended {
-                    section.missing.push(MissingMeasurement {
-                        what: format!("{what}: after request {}", trace.requests.len()),
-                        why: why.clone(),
-                        next: "look at what the node printed".to_owned(),
-                    });
-                }
-            }
+        if let Some((trace, _)) = run.measured.require(section, &what, AGAIN) {
+            let answered = trace.requests.len();
+            section.note_early_end(format!("{what}: after request {answered}"), trace);
         }
     }
 }

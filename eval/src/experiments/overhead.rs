@@ -2,13 +2,14 @@
 //! container engine of this distribution. Runs the relevant parts of the project's benchmarks.
 
 use anyhow::Result;
+use bench_report::BenchReport;
 
 use crate::cells::{CachedResult, RunCache};
 use crate::plots::{self, Bar};
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{AGAIN, MissingMeasurement, Section, Table};
 use crate::words::{digits, or_dash, ratio};
 
-use super::benches::{self, BenchOutput};
+use super::benches::{run_part, unmet_targets};
 
 /// Start time of a servant in the publication: more than this, in milliseconds.
 const PUBLISHED: f64 = 5000.0;
@@ -18,19 +19,19 @@ const SUITE: &str = "rosbridge_suite";
 /// Output of the benchmarks.
 pub struct OverheadRuns {
     /// Output of `bench-servant starts`.
-    starts: CachedResult<BenchOutput>,
+    starts: CachedResult<BenchReport>,
     /// Output of `bench-portal`, restricted to round trips.
-    portal: CachedResult<BenchOutput>,
+    portal: CachedResult<BenchReport>,
     /// Output of `bench-link strings`.
-    link: CachedResult<BenchOutput>,
+    link: CachedResult<BenchReport>,
 }
 
 /// Runs the benchmarks, unless there are stored results.
 pub fn measure(cells: &RunCache) -> Result<OverheadRuns> {
     Ok(OverheadRuns {
-        starts: benches::run_part(cells, "servant", &["starts"])?,
-        portal: benches::run_part(cells, "portal", &["String there and back"])?,
-        link: benches::run_part(cells, "link", &["strings"])?,
+        starts: run_part(cells, "servant", &["starts"])?,
+        portal: run_part(cells, "portal", &["String there and back"])?,
+        link: run_part(cells, "link", &["strings"])?,
     })
 }
 
@@ -63,37 +64,28 @@ pub fn section(runs: &OverheadRuns) -> Result<Section> {
 fn require_measured<'a>(
     section: &mut Section,
     what: &str,
-    measured: &'a CachedResult<BenchOutput>,
-) -> Option<&'a BenchOutput> {
-    match measured {
-        CachedResult::Done(written) => {
-            for one in written.left_out.iter().filter(|one| one.what != SUITE) {
-                section.missing.push(MissingMeasurement::new(
-                    &one.what,
-                    &one.why,
-                    "scripts/deps engines installs it",
-                ));
-            }
-            section.findings.extend(written.unmet());
-            Some(written)
-        }
-        CachedResult::Missing(why) => {
-            section
-                .missing
-                .push(MissingMeasurement::retryable(what, why));
-            None
-        }
+    measured: &'a CachedResult<BenchReport>,
+) -> Option<&'a BenchReport> {
+    let written = measured.require(section, what, AGAIN)?;
+    for one in written.left_out.iter().filter(|one| one.what != SUITE) {
+        section.missing.push(MissingMeasurement::new(
+            &one.what,
+            &one.why,
+            "scripts/deps engines installs it",
+        ));
     }
+    section.findings.extend(unmet_targets(written));
+    Some(written)
 }
 
-fn find_value(written: &BenchOutput, figure: &str) -> Option<f64> {
+fn find_value(written: &BenchReport, figure: &str) -> Option<f64> {
     let mut all = written.figures.iter();
-    all.find(|one| one.figure == figure)?.value
+    Some(all.find(|one| one.figure == figure)?.value).filter(|value| value.is_finite())
 }
 
 /// Returns the peers of a figure with their values.
 fn find_floors<'a>(
-    written: &'a BenchOutput,
+    written: &'a BenchReport,
     figure: &'a str,
 ) -> impl Iterator<Item = (&'a str, f64)> + 'a {
     let all = written
@@ -121,19 +113,13 @@ const SERVED: [(&str, &str); 3] = [
 const NODE: &str = "node alone: exec → registered";
 const RUNNING: &str = "create → running";
 
-fn add_start_times(section: &mut Section, measured: &CachedResult<BenchOutput>) -> Result<()> {
+fn add_start_times(section: &mut Section, measured: &CachedResult<BenchReport>) -> Result<()> {
     let Some(written) = require_measured(section, "start times", measured) else {
         return Ok(());
     };
     let mut table = Table::new(
         "Start times, medians (milliseconds)",
-        [
-            "from, to",
-            "what starts",
-            "time",
-            "published",
-            "times as fast",
-        ],
+        "from, to | what starts | time | published | times as fast",
     );
     let mut bars = Vec::new();
     let mut bar = |group: &str, name: &str, value| {
@@ -219,13 +205,13 @@ const DIRECT: &str = "TCPROS, no hop between";
 
 fn add_round_trips(
     section: &mut Section,
-    portal: &CachedResult<BenchOutput>,
-    link: &CachedResult<BenchOutput>,
+    portal: &CachedResult<BenchReport>,
+    link: &CachedResult<BenchReport>,
 ) {
     let portal = require_measured(section, "round trips by the portal", portal);
     let link = require_measured(section, "round trips by the link", link);
     let [p50, p99] = ["p50", "p99"].map(|quantile| format!("{TRIP}, {quantile}"));
-    let none = BenchOutput::default();
+    let none = BenchReport::new("portal");
     let written = portal.unwrap_or(&none);
     let other = |figure: &str, way: &str| {
         let mut all = find_floors(written, figure);
@@ -234,13 +220,7 @@ fn add_round_trips(
     let direct = other(&p50, DIRECT);
     let mut table = Table::new(
         "A String there and back (microseconds)",
-        [
-            "way",
-            "median",
-            "99 %",
-            "added to raw TCPROS",
-            "times raw TCPROS",
-        ],
+        "way | median | 99 % | added to raw TCPROS | times raw TCPROS",
     );
     let mut row = |way: &str, median: Option<f64>, late: Option<f64>| {
         let told = |time: Option<f64>| or_dash(time, digits);
@@ -318,9 +298,8 @@ fn add_round_trips(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use bench_report::BenchReport;
 
-    fn bench_output(report: &BenchReport) -> CachedResult<BenchOutput> {
+    fn bench_output(report: &BenchReport) -> CachedResult<BenchReport> {
         let text = serde_json::to_string(report).expect("JSON");
         CachedResult::Done(serde_json::from_str(&text).expect("what a benchmark writes"))
     }

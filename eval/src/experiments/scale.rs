@@ -8,13 +8,14 @@ mod tell;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use rand::rngs::StdRng;
+use rand::{Rng, SeedableRng};
 use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 use support::robot::Robot;
 
 use crate::cells::{CachedResult, RunCache};
 use crate::experiments::crowd::{self, Controller, CrowdDaemon, SHORT};
-use crate::statistics::Xorshift;
 use counters::{CoreUsage, TimeCounters, available_memory};
 
 pub use tell::section;
@@ -157,8 +158,9 @@ fn ask(
             .zip(0..)
             .map(|(robot, seed)| {
                 scope.spawn(move || {
-                    let mut random = Xorshift::new(seed);
-                    crowd::time_calls(robot, (from, to), || random.exponential(plan.think))
+                    let mut random = StdRng::seed_from_u64(seed);
+                    let pause = || -plan.think * (1.0 - random.random::<f64>()).ln();
+                    crowd::time_calls(robot, (from, to), pause)
                 })
             })
             .collect();

@@ -12,11 +12,11 @@ use crate::cells::{CachedResult, RunCache};
 use crate::examples::{
     ALL, DISPARITY, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM, Origin, PEOPLE,
 };
-use crate::place::{NetworkProfile, RobotHardware, RobotSandbox};
+use crate::place::{NetworkProfile, RobotHardware};
 use crate::robot::RequestPacing;
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{AGAIN, Section, Table};
 use crate::trace::{MapGrid, Trace};
-use crate::words::digits;
+use crate::words::{digits, or_dash};
 
 /// A fast robot, because answers are compared and not times.
 const FAST: RobotHardware = RobotHardware {
@@ -107,8 +107,15 @@ pub fn measure(
         let measured = cells.measure(&name, &(requests, seconds, times), || {
             workshop.publish(&example)?;
             let before = application.checksums()?;
-            let run = |at: ExecutionSite| {
-                run_once(workshop, &example, at, application, (requests, seconds))
+            let run = |at: ExecutionSite| -> Result<Trace> {
+                let robot = (FAST, NetworkProfile::Lan);
+                let ran = workshop.run(&example, at, robot, |plan| {
+                    plan.most = requests;
+                    if application == RobotApplication::Rosbag {
+                        plan.pace = RequestPacing::Played(seconds);
+                    }
+                });
+                Ok(ran?.0)
             };
             let natives = (0..times).map(|_| run(ExecutionSite::Native));
             let natives = natives.collect::<Result<_>>()?;
@@ -134,23 +141,6 @@ fn package_title(example: &EvalPackage) -> String {
         Origin::Checkout => example.name.to_owned(),
         Origin::Debian => format!("{}/{} of Debian", example.name, example.executable),
     }
-}
-
-fn run_once(
-    workshop: &EvalFixtures,
-    example: &EvalPackage,
-    at: ExecutionSite,
-    application: RobotApplication,
-    (requests, seconds): (usize, f64),
-) -> Result<Trace> {
-    let directory = workshop.directory()?;
-    let mut plan = workshop.plan(example, at, directory.path())?;
-    plan.most = requests;
-    if application == RobotApplication::Rosbag {
-        plan.pace = RequestPacing::Played(seconds);
-    }
-    let place = RobotSandbox::new(&workshop.daemon.address, FAST, NetworkProfile::Lan)?;
-    Ok(place.run(&plan, directory.path())?.0)
 }
 
 /// Differences between runs.
@@ -285,44 +275,20 @@ pub fn section(runs: &TransparencyRuns) -> Section {
     ];
     let mut answers = Table::new(
         "Answers to the same requests",
-        [
-            "package",
-            "the robot's application",
-            "compared",
-            "answered by both",
-            "equal to the byte",
-            "equal but for the order of boxes",
-            "largest distance of positions, m",
-            "cells of the map that differ, %",
-        ],
+        "package | the robot's application | compared | answered by both | equal to the byte | \
+         equal but for the order of boxes | largest distance of positions, m | cells of the map that differ, %",
     );
     let mut files = Table::new(
         "The robot's application, before and after its run",
-        ["asked", "file", "SHA-256 before", "SHA-256 after"],
+        "asked | file | SHA-256 before | SHA-256 after",
     );
     for (pair, measured) in &runs.compared {
-        let compared = match measured {
-            CachedResult::Done(compared) => compared,
-            CachedResult::Missing(why) => {
-                section.missing.push(MissingMeasurement {
-                    what: format!("{}, asked by {}", pair.package, pair.application.name()),
-                    why: why.clone(),
-                    next: "run make eval again: what was measured stays".to_owned(),
-                });
-                continue;
-            }
+        let name = format!("{}, asked by {}", pair.package, pair.application.name());
+        let Some(compared) = measured.require(&mut section, &name, AGAIN) else {
+            continue;
         };
-        let ended = compared.natives.iter().chain([&compared.outsourced]);
-        for why in ended.filter_map(|trace| trace.node_ended.as_ref()) {
-            section.missing.push(MissingMeasurement::new(
-                format!(
-                    "{}, asked by {}: a run to its end",
-                    pair.package,
-                    pair.application.name()
-                ),
-                why,
-                "look at what the node printed",
-            ));
+        for trace in compared.natives.iter().chain([&compared.outsourced]) {
+            section.note_early_end(format!("{name}: a run to its end"), trace);
         }
         let own = Difference::compare_pairs(&compared.natives);
         let natives = compared.natives.iter();
@@ -331,16 +297,14 @@ pub fn section(runs: &TransparencyRuns) -> Section {
         );
         let published = "published: the same, without figures".to_owned();
         for (name, difference) in [("native runs", own), ("native and stub", through)] {
-            let said = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), digits);
+            let said = |value| or_dash(value, digits);
             answers.push([
                 pair.package.clone(),
                 pair.application.name().to_owned(),
                 name.to_owned(),
                 difference.both.to_string(),
                 difference.equal.to_string(),
-                difference
-                    .boxes
-                    .map_or_else(|| "–".to_owned(), |boxes| boxes.to_string()),
+                or_dash(difference.boxes, |boxes| boxes.to_string()),
                 said(difference.distance),
                 said(difference.map.map(|share| 100.0 * share)),
             ]);

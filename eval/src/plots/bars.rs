@@ -26,7 +26,8 @@ struct BarGroup<'a> {
     bars: Vec<(usize, &'a Bar)>,
 }
 
-pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<String> {
+/// Draws grouped bars with whiskers and values. `name` is the label of the axis, with its unit.
+pub fn bars(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<String> {
     // A zero has no height on a logarithmic axis, but its value is known and written.
     let known: Vec<&Bar> = bars
         .iter()

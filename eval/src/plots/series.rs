@@ -18,97 +18,56 @@ const AXIS: f64 = 48.0;
 /// Minimum and maximum height of a map's plot, in shown pixels.
 const MAP_HEIGHT: (f64, f64) = (220.0, 640.0);
 
-#[derive(Clone, Copy, PartialEq)]
-enum SeriesShape {
-    Lines,
-    Points,
-    /// This number of lines, then points.
-    Curves(usize),
-}
-
-impl SeriesShape {
-    /// Returns the shape of a single series.
-    fn for_series(self, index: usize) -> Self {
-        match self {
-            Self::Curves(lines) if index < lines => Self::Lines,
-            Self::Curves(_) => Self::Points,
-            same => same,
-        }
-    }
-}
-
 /// Positions on both axes; `None` for points that cannot be shown.
 type AxisPositions = Vec<Option<(f64, f64)>>;
 
-pub(super) fn lines(
-    title: &str,
-    names: (&str, &str),
-    series: &[Series],
-    log: bool,
-) -> Result<String> {
-    plot(title, names, series, log, SeriesShape::Lines)
+/// Draws lines through the points in their order; an omitted value interrupts its line. `x` and `y` are the labels of
+/// the axes, with units.
+pub fn lines(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
+    curves(title, x, y, series, &[], log_y)
 }
 
-pub(super) fn points(
-    title: &str,
-    names: (&str, &str),
-    series: &[Series],
-    log: bool,
-) -> Result<String> {
-    plot(title, names, series, log, SeriesShape::Points)
+/// Draws points without lines.
+pub fn points(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
+    curves(title, x, y, &[], series, log_y)
 }
 
-/// Draws the first `curves` series as lines, the others as points.
-pub(super) fn curves(
+/// Draws curves, such as those of a model, as lines, and measurements as points.
+pub fn curves(
     title: &str,
-    names: (&str, &str),
-    series: &[Series],
-    curves: usize,
-    log: bool,
+    x_name: &str,
+    y_name: &str,
+    curves: &[Series],
+    points: &[Series],
+    log_y: bool,
 ) -> Result<String> {
-    plot(title, names, series, log, SeriesShape::Curves(curves))
-}
-
-fn plot(
-    title: &str,
-    names: (&str, &str),
-    series: &[Series],
-    log: bool,
-    shape: SeriesShape,
-) -> Result<String> {
-    let usable = usable_points(series, log);
+    let series = [curves, points].concat();
+    let usable = usable_points(&series, log_y);
     let x = Axis::for_values(usable.iter().map(|point| point.0), false);
-    let y = Axis::for_values(usable.iter().map(|point| point.1), log);
-    let omitted = count(series) - usable.len();
+    let y = Axis::for_values(usable.iter().map(|point| point.1), log_y);
+    let omitted = count(&series) - usable.len();
     let (Some(x), Some(y)) = (x, y) else {
         return empty_plot(title, omitted);
     };
-    let placed: Vec<AxisPositions> = series
-        .iter()
-        .map(|one| to_positions(&one.points, &x, &y))
-        .collect();
-    let mut legend = legend(series, LegendSymbol::Line);
-    for entry in &mut legend {
-        entry.sign = match shape.for_series(entry.index) {
-            SeriesShape::Points => LegendSymbol::Point,
-            _ => LegendSymbol::Line,
-        };
+    let placed = to_positions(&series, &x, &y);
+    let mut legend = legend(&series);
+    for entry in legend
+        .iter_mut()
+        .filter(|entry| entry.index >= curves.len())
+    {
+        entry.sign = LegendSymbol::Point;
     }
     let head = PlotHeader::new(title, legend, WIDTH);
     document(&head, (WIDTH, HEIGHT), omission_note(omitted), |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
-        let chart = chart(
-            area,
-            rows,
-            &PlotMargins::for_axis(&y),
-            (&x, names.0),
-            (&y, names.1),
-        )?;
-        draw(area, &chart, &placed, shape)
+        let margins = PlotMargins::for_axis(&y);
+        let chart = chart(area, rows, &margins, (&x, x_name), (&y, y_name))?;
+        draw(area, &chart, &placed, curves.len())
     })
 }
 
-pub(super) fn map(title: &str, names: (&str, &str), series: &[Series]) -> Result<String> {
+/// Draws trajectories as lines, with the same scale for x and y.
+pub fn map(title: &str, x_name: &str, y_name: &str, series: &[Series]) -> Result<String> {
     let usable = usable_points(series, false);
     let x = Axis::for_values(usable.iter().map(|point| point.0), false);
     let y = Axis::for_values(usable.iter().map(|point| point.1), false);
@@ -129,28 +88,28 @@ pub(super) fn map(title: &str, names: (&str, &str), series: &[Series]) -> Result
         )
     };
     let (x, y) = (around(&x, width), around(&y, height));
-    let placed: Vec<AxisPositions> = series
-        .iter()
-        .map(|one| to_positions(&one.points, &x, &y))
-        .collect();
-    let head = PlotHeader::new(title, legend(series, LegendSymbol::Line), WIDTH);
+    let placed = to_positions(series, &x, &y);
+    let head = PlotHeader::new(title, legend(series), WIDTH);
     let plot = (height + AXIS) as u32;
     document(&head, (WIDTH, plot + 12), omission_note(omitted), |area| {
         let rows = (head.height, head.height + plot);
-        let chart = chart(area, rows, &sides, (&x, names.0), (&y, names.1))?;
-        draw(area, &chart, &placed, SeriesShape::Lines)
+        let chart = chart(area, rows, &sides, (&x, x_name), (&y, y_name))?;
+        draw(area, &chart, &placed, placed.len())
     })
 }
 
-pub(super) fn distribution(
+/// Draws the empirical cumulative distribution of each series: for each value, the percentage of the series that is at
+/// most as large. `x` is the label of the axis, with its unit. Values that the axis cannot show, such as infinite ones,
+/// still count in the percentages; NaN does not.
+pub fn distribution(
     title: &str,
-    name: &str,
+    x_name: &str,
     series: &[(String, Vec<f64>)],
-    log: bool,
+    log_x: bool,
 ) -> Result<String> {
     let values = || series.iter().flat_map(|one| one.1.iter().copied());
     let y = Axis::with_bounds(0.0, 102.0);
-    let Some(x) = Axis::for_values(values(), log) else {
+    let Some(x) = Axis::for_values(values(), log_x) else {
         return empty_plot(title, values().count());
     };
     let omitted = values().filter(|value| x.position(*value).is_none());
@@ -165,8 +124,14 @@ pub(super) fn distribution(
     document(&head, (WIDTH, HEIGHT), note, |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
         let vertical = (&y, "share of values at most as large (%)");
-        let chart = chart(area, rows, &PlotMargins::for_axis(&y), (&x, name), vertical)?;
-        draw(area, &chart, &placed, SeriesShape::Lines)
+        let chart = chart(
+            area,
+            rows,
+            &PlotMargins::for_axis(&y),
+            (&x, x_name),
+            vertical,
+        )?;
+        draw(area, &chart, &placed, placed.len())
     })
 }
 
@@ -206,8 +171,9 @@ fn steps(values: &[f64], x: &Axis) -> AxisPositions {
 }
 
 /// Returns the legend; a single series without a name needs none.
-fn legend(series: &[Series], sign: LegendSymbol) -> Vec<LegendEntry<'_>> {
-    let mut entries = entries(series.iter().map(|one| one.name.as_str()), sign);
+fn legend(series: &[Series]) -> Vec<LegendEntry<'_>> {
+    let names = series.iter().map(|one| one.name.as_str());
+    let mut entries = entries(names, LegendSymbol::Line);
     entries.retain(|entry| !entry.name.is_empty());
     entries
 }
@@ -226,30 +192,27 @@ fn usable_points(series: &[Series], log: bool) -> Vec<(f64, f64)> {
         .collect()
 }
 
-fn to_positions(points: &[(f64, f64)], x: &Axis, y: &Axis) -> AxisPositions {
-    points
-        .iter()
-        .map(|point| Some((x.position(point.0)?, y.position(point.1)?)))
-        .collect()
+fn to_positions(series: &[Series], x: &Axis, y: &Axis) -> Vec<AxisPositions> {
+    let position = |point: &(f64, f64)| Some((x.position(point.0)?, y.position(point.1)?));
+    let one = |one: &Series| -> AxisPositions { one.points.iter().map(position).collect() };
+    series.iter().map(one).collect()
 }
 
-fn draw(area: &Area, chart: &Chart, placed: &[AxisPositions], shape: SeriesShape) -> Result<()> {
+/// Draws the first `lines` series as lines, the others as points.
+fn draw(area: &Area, chart: &Chart, placed: &[AxisPositions], lines: usize) -> Result<()> {
     for (index, points) in placed.iter().enumerate() {
         let pixels: Vec<Option<(i32, i32)>> = points
             .iter()
             .map(|point| point.map(|at| chart.backend_coord(&at)))
             .collect();
-        match shape.for_series(index) {
-            SeriesShape::Lines | SeriesShape::Curves(_) => {
-                draw_series_line(area, &pixels, index, placed.len())?
-            }
-            SeriesShape::Points => {
-                let mut drawn = HashSet::new();
-                for at in pixels.into_iter().flatten() {
-                    if drawn.insert(at) {
-                        draw_marker(area, at, index, 3)?;
-                    }
-                }
+        if index < lines {
+            draw_series_line(area, &pixels, index, placed.len())?;
+            continue;
+        }
+        let mut drawn = HashSet::new();
+        for at in pixels.into_iter().flatten() {
+            if drawn.insert(at) {
+                draw_marker(area, at, index, 3)?;
             }
         }
     }

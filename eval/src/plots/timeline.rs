@@ -16,7 +16,9 @@ const LEVEL: RGBColor = RGBColor(0x33, 0x33, 0x33);
 /// Minimum distance between the labels of two levels, in shown pixels.
 const APART: i32 = TEXT + 2;
 
-pub(super) fn draw(title: &str, names: (&str, &str), given: &TimelineData) -> Result<String> {
+/// Draws classified points over shaded ranges, on a logarithmic axis, with horizontal levels and Q below. `x_name` and
+/// `y_name` are the labels of the axes, with units.
+pub fn timeline(title: &str, x_name: &str, y_name: &str, given: &TimelineData) -> Result<String> {
     let fits = |value: f64, log| Axis::for_values([value], log).is_some();
     let mut points = given.points.clone();
     points.retain(|point| fits(point.0, false) && fits(point.1, true));
@@ -69,7 +71,7 @@ pub(super) fn draw(title: &str, names: (&str, &str), given: &TimelineData) -> Re
             // Drawn first, so that grid and points are above it; it covers the area of the charts.
             let upper = (top, end - strip);
             draw_shading(area, given, &sides, &x, (top, end))?;
-            let plot = chart(area, upper, &sides, (&x, names.0), (&y, names.1))?;
+            let plot = chart(area, upper, &sides, (&x, x_name), (&y, y_name))?;
             let edge = plot.backend_coord(&(x.high, y.low)).0;
             let begin = plot.backend_coord(&(x.low, y.low)).0;
             let mut lines: Vec<(i32, &str)> = given
@@ -99,7 +101,7 @@ pub(super) fn draw(title: &str, names: (&str, &str), given: &TimelineData) -> Re
                     ..sides
                 };
                 let rows = (end - strip + 6, end);
-                let plot = chart(area, rows, &sides, (&x, names.0), (axis, "Q"))?;
+                let plot = chart(area, rows, &sides, (&x, x_name), (axis, "Q"))?;
                 let path: Vec<(i32, i32)> = q.iter().map(|at| plot.backend_coord(at)).collect();
                 draw_line(area, &path, LEVEL, 2)?;
             }

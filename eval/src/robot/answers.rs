@@ -6,7 +6,8 @@ use std::time::Duration;
 use ros::bus::SerializedMessage;
 use tokio::time::Instant as At;
 
-use super::{FIRST, boxes};
+use super::boxes;
+use super::numbers::FIRST;
 use crate::recording::{read_floats, read_header, read_pose};
 use crate::trace::{MapGrid, RequestSample};
 

@@ -11,7 +11,8 @@ use tokio::time::{Instant as At, timeout};
 
 use super::answers::fill_answer;
 use super::ends::RobotEndpoints;
-use super::{FIRST, RequestPacing, RobotPlan, WARM_UP, carried};
+use super::numbers::{FIRST, WARM_UP};
+use super::{RequestPacing, RobotPlan, carried};
 use crate::recording::RecordedStep;
 use crate::trace::{RequestSample, Trace};
 

@@ -9,9 +9,10 @@ use ros::ros1::Ros1Bus;
 use support::site::{NodeProcess, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
+use super::RobotPlan;
 use super::answers::{read_grid, record_answer, request_number};
 use super::asking::{LOOK, has_ended};
-use super::{FIRST, RobotPlan};
+use super::numbers::FIRST;
 use crate::recording::{
     RecordedStep, Recording, read_floats, read_header, with_relative_stamp, with_stamp,
 };

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::place::NetworkProfile;
+use crate::network::NetworkProfile;
 
 /// A robot's plan.
 #[derive(Debug, Clone, Serialize, Deserialize)]

@@ -6,10 +6,11 @@ use anyhow::Result;
 use support::site::NodeProcess;
 use tokio::time::Instant as At;
 
+use super::RobotPlan;
 use super::answers::record_answer;
 use super::asking::note_node_exit;
 use super::ends::RobotEndpoints;
-use super::{FIRST, RobotPlan, WARM_UP};
+use super::numbers::{FIRST, WARM_UP};
 use crate::place::request_network;
 use crate::recording::RecordedStep;
 use crate::trace::{RequestSample, Trace};
@@ -116,6 +117,19 @@ pub(super) fn apply_stub_log(log: &str, requests: &mut [RequestSample]) {
     }
 }
 
+/// Counts in the stub's log, from the first measured request on, how often it asked the local original as well, no
+/// longer asked it, started its process, and stopped it.
+pub(super) fn count_handovers(log: &str) -> [usize; 4] {
+    let begins = log.find(&format!("stamp=Some(({FIRST},")).unwrap_or(0);
+    [
+        "the local original answers, too",
+        "the cloud answers alone",
+        "the local original is started",
+        "the local original is stopped",
+    ]
+    .map(|words| log[begins..].matches(words).count())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -135,5 +149,12 @@ mod tests {
         assert_eq!(requests[0], RequestSample::default());
         assert!(requests[1].local);
         assert_eq!(requests[1].satisfaction, Some(7.5));
+    }
+
+    #[test]
+    fn handovers_count_from_the_first_measured_request_on() {
+        let log = "INFO the cloud answers alone\nDEBUG requests: stamp=Some((1000, 0)) answer=None\n\
+            INFO the local original is started\nINFO the local original answers, too\nINFO the cloud answers alone\n";
+        assert_eq!(count_handovers(log), [1, 1, 1, 0]);
     }
 }

@@ -1,8 +1,10 @@
-//! Descriptive statistics: means, deviations, quantiles, and linear regression.
+//! Descriptive statistics: means, deviations, intervals, and linear regression.
 
 use std::iter::repeat_n;
 
-use super::random::Xorshift;
+use bench_report::{quantile, quantile_of_sorted, sort_values};
+use rand::rngs::StdRng;
+use rand::{Rng, SeedableRng};
 
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
@@ -21,48 +23,17 @@ pub fn standard_deviation(values: &[f64]) -> Option<f64> {
     (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
 }
 
-/// Quantile at a fraction `0.0..=1.0`, linearly interpolated between two values: type 7 of Hyndman and Fan, "Sample
-/// Quantiles in Statistical Packages", The American Statistician 50 (1996).
-pub fn quantile(values: &[f64], fraction: f64) -> Option<f64> {
-    quantile_of_sorted(&sort_values(values)?, fraction)
-}
-
-/// The quantile at one half.
-pub fn median(values: &[f64]) -> Option<f64> {
-    quantile(values, 0.5)
-}
-
-/// Returns the values in ascending order; `None` if one is NaN.
-fn sort_values(values: &[f64]) -> Option<Vec<f64>> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    (!sorted.iter().any(|value| value.is_nan())).then_some(sorted)
-}
-
-fn quantile_of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
-    let last = sorted.len().checked_sub(1)?;
-    let place = fraction.clamp(0.0, 1.0) * last as f64;
-    let lower = *sorted.get(place.floor() as usize)?;
-    let upper = *sorted.get(place.ceil() as usize)?;
-    // The difference of two infinite values would be NaN.
-    Some(if lower == upper || place.fract() == 0.0 {
-        lower
-    } else {
-        lower + (upper - lower) * place.fract()
-    })
-}
-
 /// Confidence interval of the median, low and high, by the percentile bootstrap (Efron and Tibshirani, "An Introduction
 /// to the Bootstrap", 1993, chapter 13). `confidence` is between 0 and 1, such as 0.95. The same values give the same
 /// interval.
 pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
     let values = sort_values(values)?;
-    let mut random = Xorshift::new(0);
+    let mut random = StdRng::seed_from_u64(0);
     let mut medians = Vec::with_capacity(RESAMPLES);
     for _ in 0..RESAMPLES {
         let mut drawn = vec![0; values.len()];
         for _ in 0..values.len() {
-            drawn[random.index_below(values.len())] += 1;
+            drawn[random.random_range(0..values.len())] += 1;
         }
         let times = values.iter().zip(drawn);
         let resample: Vec<f64> = times
@@ -77,15 +48,13 @@ pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
     ))
 }
 
-/// A straight line, and how well it fits the points.
+/// A straight line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FittedLine {
     /// Change of y per unit of x.
     pub slope: f64,
     /// y at x = 0.
     pub intercept: f64,
-    /// Fraction of the variance of y that the line explains, 0 to 1 (coefficient of determination).
-    pub r2: f64,
 }
 
 /// Fits a line through (x, y) by least squares of vertical distances. `None` unless there are two different x.
@@ -98,16 +67,10 @@ pub fn least_squares(points: &[(f64, f64)]) -> Option<FittedLine> {
             .map(|point| term(point.0 - x, point.1 - y))
             .sum()
     };
-    let (xx, xy, yy) = (
-        sum(&|dx, _| dx * dx),
-        sum(&|dx, dy| dx * dy),
-        sum(&|_, dy| dy * dy),
-    );
-    (xx > 0.0 && yy.is_finite()).then(|| FittedLine {
+    let (xx, xy) = (sum(&|dx, _| dx * dx), sum(&|dx, dy| dx * dy));
+    (xx > 0.0 && xy.is_finite()).then(|| FittedLine {
         slope: xy / xx,
         intercept: y - xy / xx * x,
-        // A line through points of equal y leaves no variance unexplained.
-        r2: if yy > 0.0 { xy * xy / (xx * yy) } else { 1.0 },
     })
 }
 
@@ -137,27 +100,6 @@ mod tests {
         assert_eq!(standard_deviation(&[1.0, f64::INFINITY]), None);
     }
 
-    #[test]
-    fn quantiles_are_interpolated() {
-        let values = [40.0, 10.0, 30.0, 20.0];
-        assert_eq!(median(&values), Some(25.0));
-        // (4 − 1) · 0.9 = 2.7: seven tenths of the way from 30 to 40.
-        assert_near(quantile(&values, 0.9).expect("values"), 37.0);
-        assert_eq!(quantile(&values, 0.0), Some(10.0));
-        assert_eq!(quantile(&values, 1.0), Some(40.0));
-        assert_eq!(quantile(&[7.0], 0.3), Some(7.0));
-        assert_eq!(quantile(&[], 0.5), None);
-        assert_eq!(median(&[1.0, f64::NAN]), None);
-    }
-
-    #[test]
-    fn unanswered_requests_keep_their_place_in_quantiles() {
-        let values = [1.0, f64::INFINITY, 2.0, f64::INFINITY];
-        assert_eq!(quantile(&values, 0.9), Some(f64::INFINITY));
-        assert_eq!(quantile(&values, 1.0 / 3.0), Some(2.0));
-        assert_eq!(median(&values), Some(f64::INFINITY));
-    }
-
     /// For the median of 1…100 the interval by order statistics (binomial) is from the 40th to the 61st value.
     #[test]
     fn the_medians_interval_is_that_of_order_statistics() {
@@ -172,15 +114,14 @@ mod tests {
 
     #[test]
     fn a_line_is_fitted() {
-        // Means 2 and 4: Σdx² = 2, Σdx·dy = 3, Σdy² = 6.
+        // Means 2 and 4: Σdx² = 2, Σdx·dy = 3.
         let line = least_squares(&[(1.0, 2.0), (2.0, 5.0), (3.0, 5.0)]).expect("two x");
         assert_near(line.slope, 1.5);
         assert_near(line.intercept, 1.0);
-        assert_near(line.r2, 9.0 / (2.0 * 6.0));
         assert_eq!(least_squares(&[(1.0, 2.0), (1.0, 3.0)]), None);
         assert_eq!(least_squares(&[]), None);
         let level = least_squares(&[(0.0, 3.0), (1.0, 3.0)]).expect("two x");
-        assert_eq!((level.slope, level.r2), (0.0, 1.0));
+        assert_eq!((level.slope, level.intercept), (0.0, 3.0));
     }
 
     #[test]

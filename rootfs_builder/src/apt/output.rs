@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Deb, Relations};
+use crate::debian_package::{Deb, Relations};
 
 /// Parses a line `'https://…/libfoo1_1.2-3_amd64.deb' libfoo1_1%3a1.2-3_amd64.deb 12345 SHA256:…`.
 pub(super) fn parse_uri(line: &str) -> Option<Deb> {

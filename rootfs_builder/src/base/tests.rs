@@ -98,7 +98,7 @@ fn mistakes_are_named_with_their_line() {
         ),
     ];
     for (text, line) in cases {
-        let problem = parse(&text).expect_err("a mistake");
+        let problem = parse(&text).expect_err("a mistake").to_string();
         assert!(problem.starts_with(line), "{problem}");
     }
 }
@@ -164,6 +164,6 @@ fn wheels_are_those_of_the_lists_beside_a_definition() {
         );
     }
     let elsewhere = text.replace("/opt/ros/jazzy", "opt/../x");
-    let problem = parse(&elsewhere).expect_err("no absolute path");
+    let problem = parse(&elsewhere).expect_err("no absolute path").to_string();
     assert!(problem.contains("opt/../x"), "{problem}");
 }

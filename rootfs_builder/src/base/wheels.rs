@@ -5,6 +5,7 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::base_file_error::WheelsError;
 use crate::error::{Error, IoContext};
 use crate::requirements::Requirements;
 
@@ -55,29 +56,27 @@ impl Wheels {
         all.into_iter()
     }
 
-    pub(super) fn check(&self) -> Result<(), String> {
+    pub(super) fn check(&self) -> Result<(), WheelsError> {
         let numbers = |text: &str, first: &str| {
             text.strip_prefix(first)
                 .is_some_and(|rest| !rest.is_empty() && rest.bytes().all(|b| b.is_ascii_digit()))
         };
         if !numbers(&self.python, "3.") {
-            return Err(format!("{:?} is not a version of Python 3", self.python));
+            return Err(WheelsError::Python(self.python.clone()));
         }
         if !numbers(&self.glibc, "2.") {
-            return Err(format!("{:?} is not a version of glibc", self.glibc));
+            return Err(WheelsError::Glibc(self.glibc.clone()));
         }
         let below = |path: &PathBuf| {
             let plain = |part| matches!(part, Component::Normal(_));
             path.file_name().is_some() && path.components().all(plain)
         };
         if let Some(path) = self.files.keys().find(|path| !below(path)) {
-            return Err(format!("{path:?} is not a path below the prefix"));
+            return Err(WheelsError::File(path.clone()));
         }
         for file in [&self.runtime, &self.build] {
             if file.is_empty() || file.starts_with('.') || file.contains('/') {
-                return Err(format!(
-                    "{file:?} is not the name of a file beside this one"
-                ));
+                return Err(WheelsError::Requirements(file.clone()));
             }
         }
         Ok(())
@@ -96,7 +95,7 @@ impl RequiredWheels {
         let read = |file: &String| {
             let path = directory.join(file);
             let text = std::fs::read_to_string(&path).io_context("reading", &path)?;
-            Requirements::parse(&text).map_err(|problem| Error::BadBase { path, problem })
+            Requirements::parse(&text).map_err(|problem| Error::BadRequirements { path, problem })
         };
         Ok(Self {
             runtime: read(&wheels.runtime)?,
@@ -177,7 +176,7 @@ mod tests {
                 "below the prefix",
             ),
         ] {
-            let problem = bad.check().expect_err(words);
+            let problem = bad.check().expect_err(words).to_string();
             assert!(problem.contains(words), "{problem}");
         }
     }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use package::interface::qos::{from_bus, to_bus};
 use package::interface::{Action, Direction, Interface, Need, Parameter, Qos, Service, Topic};
 use package::names;
 use ros::bus::{
@@ -282,7 +283,7 @@ fn describe_topic(
         .cloned()
         .collect();
     let qos = combined_qos(&seen.graph, &name, direction, &nodes);
-    let keeps = qos.is_some_and(|qos| qos.to_bus_qos(1).is_latching());
+    let keeps = qos.is_some_and(|qos| to_bus(&qos, 1).is_latching());
     Ok(Topic {
         latched: direction == Direction::Output && (keeps || seen.latched.contains(&name)),
         qos,
@@ -307,7 +308,7 @@ fn combined_qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[Strin
             Direction::Output => publishers,
             Direction::Input => subscribers,
         };
-        ends.get(topic).map(|(_, qos)| Qos::from(qos))
+        ends.get(topic).map(|(_, qos)| from_bus(qos))
     });
     ends.reduce(|all, one| match direction {
         Direction::Output => all.common_offer(one),

@@ -16,12 +16,12 @@ use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, Graph, ParamValue, Publisher, QosProfile, RosVersion, Subscription, WireType,
+    Bus, BusError, Graph, ParamValue, Publisher, QosProfile, RosVersion, Subscription, WireType,
     wait_for_connected,
 };
 use ros::codec::{self, FillOptions, JsonOptions, Time};
 use ros::plumbing;
-use ros::schema::{MessageType, Registry};
+use ros::schema::{MessageType, Registry, SchemaError};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
@@ -44,6 +44,17 @@ pub(super) const ANY: &str = "std_msgs/Empty";
 const TRANSFORMS: [&str; 2] = ["/tf", "/tf_static"];
 const CLOCK: &str = "/clock";
 const LOG: &str = "/rosout";
+
+/// Reason why a topic cannot be published.
+#[derive(Debug, thiserror::Error)]
+enum AdvertiseError {
+    #[error("no response about its type within {ANSWER:?}")]
+    NoResponse,
+    #[error(transparent)]
+    Type(#[from] SchemaError),
+    #[error(transparent)]
+    Bus(#[from] BusError),
+}
 
 /// Publishers and services provided so far; removed on drop.
 pub(super) struct InputFeed<'a> {
@@ -313,8 +324,8 @@ impl<'a> InputFeed<'a> {
         let (message, publisher) = match self.advertise(topic, Some(usual), false).await {
             Ok(Some(pair)) => pair,
             Ok(None) => return false,
-            Err(reason) => {
-                self.refused.insert(topic.to_owned(), reason);
+            Err(error) => {
+                self.refused.insert(topic.to_owned(), error.to_string());
                 return false;
             }
         };
@@ -394,8 +405,8 @@ impl<'a> InputFeed<'a> {
                 Ok(None) => {
                     self.goals.insert(name.clone());
                 }
-                Err(reason) => {
-                    self.refused.insert(name.clone(), reason);
+                Err(error) => {
+                    self.refused.insert(name.clone(), error.to_string());
                 }
             }
         }
@@ -413,12 +424,9 @@ impl<'a> InputFeed<'a> {
         topic: &str,
         usual: Option<&str>,
         latching: bool,
-    ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
-        let asked = match self.await_answer(self.bus.topic_type(topic)).await {
-            Some(Ok(wire)) => wire.name,
-            Some(Err(error)) => return Err(error.to_string()),
-            None => return Err(format!("no response about its type within {ANSWER:?}")),
-        };
+    ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, AdvertiseError> {
+        let wire = self.await_answer(self.bus.topic_type(topic)).await;
+        let asked = wire.ok_or(AdvertiseError::NoResponse)??.name;
         let stated = self.options.types.get(topic).map(String::as_str);
         let name = match asked.as_str() {
             "*" => stated.or(usual).unwrap_or_else(|| {
@@ -430,10 +438,7 @@ impl<'a> InputFeed<'a> {
         if ros::ros1::actions::is_command_type(name) {
             return Ok(None);
         }
-        let message = self
-            .registry
-            .message(name)
-            .map_err(|error| error.to_string())?;
+        let message = self.registry.message(name)?;
         let publisher = self
             .bus
             .advertise(
@@ -441,11 +446,8 @@ impl<'a> InputFeed<'a> {
                 WireType::from_message(&message),
                 QosProfile::keep_last(10).latching(latching),
             )
-            .await;
-        Ok(Some((
-            message,
-            publisher.map_err(|error| error.to_string())?,
-        )))
+            .await?;
+        Ok(Some((message, publisher)))
     }
 }
 

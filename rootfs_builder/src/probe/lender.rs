@@ -6,7 +6,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Lender, LentService, ServiceHandler, ServiceType};
+use ros::bus::{Digest, FailureReason, Lender, LentService, ServiceHandler, ServiceType};
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use tokio::sync::watch;
@@ -107,11 +107,11 @@ struct DefaultAnswers {
 
 #[async_trait]
 impl ServiceHandler for DefaultAnswers {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let unknown = || "the image has no definition of this service".to_owned();
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
+        let unknown = || FailureReason::new("the image has no definition of this service");
         let service = self.service.as_ref().ok_or_else(unknown)?;
         plausible::default_message(&service.response, Time::now())
-            .map_err(|error| error.to_string())
+            .map_err(|error| FailureReason::new(error.to_string()))
     }
 
     fn for_type(&self, digest: &Digest) -> Option<Arc<dyn ServiceHandler>> {

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use package::interface::Direction;
-use ros::bus::{Publisher, QosProfile, ServiceHandler, ServiceType, WireType};
+use ros::bus::{FailureReason, Publisher, QosProfile, ServiceHandler, ServiceType, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -132,7 +132,11 @@ struct Sum;
 
 #[async_trait::async_trait]
 impl ServiceHandler for Sum {
-    async fn call(&self, _request: bytes::Bytes, _caller: &str) -> Result<bytes::Bytes, String> {
+    async fn call(
+        &self,
+        _request: bytes::Bytes,
+        _caller: &str,
+    ) -> Result<bytes::Bytes, FailureReason> {
         Ok(bytes::Bytes::from_static(&[0; 8]))
     }
 }

@@ -18,7 +18,6 @@ pub mod guesses;
 pub mod host;
 pub mod policy;
 pub mod principal;
-pub mod sparing;
 
 pub use decide::{AccessAction, AccessDenied, AccessObject, decide};
 pub use glob::Glob;
@@ -27,7 +26,6 @@ pub use guesses::{GuessLimiter, GuessSource};
 pub use host::{Host, largest_network};
 pub use policy::{AccessPolicy, AccessRule, ConnectionAccess, Grants, RuleSubject};
 pub use principal::{Principal, Role, Scope};
-pub use sparing::NoticeThrottle;
 
 /// Error for text that cannot be parsed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -137,6 +137,11 @@ impl Principal {
         }
     }
 
+    /// Returns the role of a token or a person, which have one; that of a viewer without any.
+    pub fn first_role(&self) -> Role {
+        self.roles.first().copied().unwrap_or(Role::Viewer)
+    }
+
     /// Returns true if the principal has the role.
     pub fn has_role(&self, role: Role) -> bool {
         self.roles.contains(&role)

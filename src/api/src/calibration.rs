@@ -166,6 +166,7 @@ pub struct Point {
     /// Number of requests that were answered.
     pub answered: usize,
     /// Time from the arrival of a request at the node to its answer; absent if nothing was answered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub compute: Option<TimeSpread>,
     /// Mean CPU time per request.
     pub running: f64,

@@ -22,15 +22,16 @@ impl CpuSet {
     }
 }
 
+/// Error of parsing a [`CpuSet`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0:?} is not a set of cores; write numbers below {CORES} and ranges, such as 0-3,6")]
+pub struct ParseCpuSetError(String);
+
 impl FromStr for CpuSet {
-    type Err = String;
+    type Err = ParseCpuSetError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let refused = || {
-            format!(
-                "{text:?} is not a set of cores; write numbers below {CORES} and ranges, such as 0-3,6"
-            )
-        };
+        let refused = || ParseCpuSetError(text.to_owned());
         let mut set = CpuSet([0; CORES / 64]);
         for part in text.trim().split(',') {
             let (first, last) = part.split_once('-').unwrap_or((part, part));
@@ -99,7 +100,7 @@ mod tests {
         }
         for wrong in ["", "a", "3-1", "256", "1,", "-1"] {
             let refused = wrong.parse::<CpuSet>().expect_err(wrong);
-            assert!(refused.contains("0-3,6"), "{refused}");
+            assert!(refused.to_string().contains("0-3,6"), "{refused}");
         }
     }
 }

@@ -67,40 +67,47 @@ pub struct Link {
     /// True if the connection is established and has not gone silent.
     pub up: bool,
     /// Latest round-trip time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub round_trip: Option<f64>,
     /// Offset of the robot's clock from this machine's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clock: Option<f64>,
     /// Measured downlink throughput in bytes per second, when the link was saturated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub throughput: Option<f64>,
     /// Number of messages dropped on either side.
     pub dropped: u64,
     /// Dropped messages by topic, place and reason, one sentence each.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub drops: Vec<String>,
     /// T_desire of the response time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub desire: Option<f64>,
     /// T_max of the response time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max: Option<f64>,
     /// Q threshold Q_t, if the robot states one.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub threshold: Option<f64>,
     /// Lowest acceptable rate of an output in frames per second, if a rate is promised instead of a response time.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frames_per_second: Option<f64>,
     /// Desired rate of the output, if it differs from the lowest acceptable one.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub desired_frames_per_second: Option<f64>,
     /// Highest acceptable age of an output, if an age is promised instead of a response time.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub age: Option<f64>,
     /// Desired age of the output, if it differs from the highest acceptable one.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub desired_age: Option<f64>,
     /// If no response time is promised: time in seconds for which the link must be down before the local original takes
     /// over. Such links have no Q, and none of their requests counts as late.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fallback_after: Option<f64>,
     /// Q after the latest request.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub satisfaction: Option<f64>,
     /// Number of requests in the statistics.
     pub requests: usize,
@@ -111,27 +118,33 @@ pub struct Link {
     /// Response time of these requests by phase.
     pub phases: Vec<Part>,
     /// Phase in which late requests spent most of their time; absent if none of them was answered.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub late_in: Option<Part>,
     /// Number of messages that the robot discarded in the last minute because they were superseded or too old.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub unsent: u64,
     /// Number of recent stamped inputs delivered to the node.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub given: usize,
     /// Number of these inputs that the node skipped in favour of newer ones.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub left_out: usize,
     /// Inputs of the node that nobody on the robot publishes.
     pub unfed: Vec<String>,
     /// Services that the node looked up without success.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub unserved: Vec<String>,
     /// Nodes of the robot that cannot exchange messages with this node, with the reason, one sentence each.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub refused: Vec<String>,
     /// Other machines that are connected as the same robot.
     #[serde(default, alias = "twins")]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub duplicates: Vec<String>,
 }
 

@@ -27,7 +27,7 @@ pub struct Fit {
     pub never: Option<String>,
     /// True if the admission queue is full: a servant that would have to wait is refused.
     #[serde(default)]
-    #[cfg_attr(feature = "schema", schema(required = false))]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub full: bool,
     /// True if the servant would be admitted immediately.
     pub now: bool,
@@ -44,11 +44,11 @@ pub struct Fit {
     pub more: Option<u64>,
     /// CPU missing for one more than these, in cores.
     #[serde(default)]
-    #[cfg_attr(feature = "schema", schema(required = false))]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub beyond_cpus: f64,
     /// Memory missing for one more than these.
     #[serde(default = "nothing")]
-    #[cfg_attr(feature = "schema", schema(required = false))]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub beyond_memory: Size,
     /// Expected response time of one more servant, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -96,29 +96,34 @@ pub struct Topic {
     pub qos: Option<Qos>,
 }
 
-/// Quality of service of a topic. Times are in seconds; absent if unspecified.
+/// QoS offered by the publishers of a topic or requested by its subscribers. The history depth is not announced to
+/// others. Times are in seconds; absent if unspecified.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(default)]
 pub struct Qos {
     /// Reliability policy.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub reliability: Reliability,
     /// Durability policy.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub durability: Durability,
     /// Maximum time between two messages.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline: Option<f64>,
     /// Time after which a message expires.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub lifespan: Option<f64>,
     /// Liveliness policy.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub liveliness: Liveliness,
     /// Liveliness lease duration.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub lease: Option<f64>,
 }
 
-/// Reliability policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+/// Reliability policy, in ascending order of strictness.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Reliability {
@@ -129,8 +134,8 @@ pub enum Reliability {
     Reliable,
 }
 
-/// Durability policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+/// Durability policy, in ascending order of strictness.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Durability {
@@ -141,8 +146,8 @@ pub enum Durability {
     TransientLocal,
 }
 
-/// Liveliness policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+/// Liveliness policy, in ascending order of strictness.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Liveliness {
@@ -151,6 +156,44 @@ pub enum Liveliness {
     Automatic,
     /// The publisher is alive as long as it publishes.
     ManualByTopic,
+}
+
+impl Qos {
+    /// Returns the QoS that both offer: a subscriber that requests it receives from either of them.
+    pub fn common_offer(self, other: Self) -> Self {
+        Self {
+            reliability: self.reliability.min(other.reliability),
+            durability: self.durability.min(other.durability),
+            deadline: longest(self.deadline, other.deadline),
+            lifespan: shortest(self.lifespan, other.lifespan),
+            liveliness: self.liveliness.min(other.liveliness),
+            lease: longest(self.lease, other.lease),
+        }
+    }
+
+    /// Returns the QoS that satisfies both requests: a publisher that offers it is received by either of them.
+    pub fn common_request(self, other: Self) -> Self {
+        Self {
+            reliability: self.reliability.max(other.reliability),
+            durability: self.durability.max(other.durability),
+            deadline: shortest(self.deadline, other.deadline),
+            lifespan: longest(self.lifespan, other.lifespan),
+            liveliness: self.liveliness.max(other.liveliness),
+            lease: shortest(self.lease, other.lease),
+        }
+    }
+}
+
+/// Returns the longer time; `None` means infinite.
+fn longest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    Some(one?.max(other?))
+}
+
+fn shortest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
+    }
 }
 
 /// Writes the policies as ROS 2's tools do; liveliness and times only if they are not the default.
@@ -326,5 +369,44 @@ mod tests {
         assert_eq!(qos.to_string(), "reliable, transient_local, deadline 0.1 s");
         let json = serde_json::to_string(&qos).expect("JSON");
         assert_eq!(serde_json::from_str::<Qos>(&json).expect("the same"), qos);
+        let unusual = Qos {
+            reliability: Reliability::BestEffort,
+            liveliness: Liveliness::ManualByTopic,
+            lifespan: Some(3.0),
+            lease: Some(1.25),
+            ..Qos::default()
+        };
+        assert_eq!(
+            unusual.to_string(),
+            "best_effort, volatile, liveliness manual_by_topic, lifespan 3 s, liveliness lease 1.25 s"
+        );
+    }
+
+    #[test]
+    fn ends_of_one_topic_have_in_common_what_suits_all_of_them() {
+        let strict = Qos {
+            durability: Durability::TransientLocal,
+            deadline: Some(0.1),
+            ..Qos::default()
+        };
+        let loose = Qos {
+            reliability: Reliability::BestEffort,
+            lease: Some(2.0),
+            ..Qos::default()
+        };
+        assert_eq!(
+            strict.common_offer(loose),
+            Qos {
+                reliability: Reliability::BestEffort,
+                ..Qos::default()
+            }
+        );
+        assert_eq!(
+            strict.common_request(loose),
+            Qos {
+                lease: Some(2.0),
+                ..strict
+            }
+        );
     }
 }

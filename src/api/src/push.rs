@@ -10,6 +10,7 @@ use crate::limits::{Caps, Limits};
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
 use crate::sla::Sla;
+pub use qos::ParsePairError;
 
 /// Options of a push (`POST /api/v1/push?options=JSON`; the body is a tar archive, gzipped or not; empty with `apt`).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -86,8 +87,8 @@ impl PushOptions {
     /// Parses [`requests`](Self::requests).
     ///
     /// # Errors
-    /// Returns a description of the first malformed request pair, with the expected format.
-    pub fn parse_requests(&self) -> Result<Vec<qos::TopicPair>, String> {
+    /// Returns the error of the first malformed request pair, with the expected format.
+    pub fn parse_requests(&self) -> Result<Vec<qos::TopicPair>, ParsePairError> {
         self.requests
             .iter()
             .map(|text| parse_request(text))
@@ -98,8 +99,8 @@ impl PushOptions {
 /// Parses a request pair in the format of `--request`.
 ///
 /// # Errors
-/// Returns a description of the error, with the expected format.
-pub fn parse_request(text: &str) -> Result<qos::TopicPair, String> {
+/// The pair is malformed; the error has the expected format.
+pub fn parse_request(text: &str) -> Result<qos::TopicPair, ParsePairError> {
     match text.split_once('=') {
         Some((input, outputs)) if !text.contains("->") => format!("{input} -> {outputs}").parse(),
         _ => text.parse(),
@@ -201,10 +202,8 @@ mod tests {
             ),
             ("/image -> /boxes by stamp", "/image -> /boxes by stamp"),
         ] {
-            assert_eq!(
-                parse_request(text).map(|pair| pair.to_string()).as_deref(),
-                Ok(expected)
-            );
+            let pair = parse_request(text).expect(text);
+            assert_eq!(pair.to_string(), expected);
         }
         for text in [
             "/image",
@@ -218,7 +217,7 @@ mod tests {
                 ..PushOptions::default()
             };
             let refused = options.parse_requests().expect_err(text);
-            assert!(refused.contains("write it as"), "{refused}");
+            assert!(refused.to_string().contains("write it as"), "{refused}");
         }
     }
 

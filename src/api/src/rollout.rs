@@ -27,10 +27,17 @@ impl utoipa::PartialSchema for Share {
 #[cfg(feature = "schema")]
 impl utoipa::ToSchema for Share {}
 
-impl FromStr for Share {
-    type Err = String;
+/// Error of parsing a [`Share`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{0:?} is not a share of robots; write a number of robots, such as 3, or a percentage, such as 10%"
+)]
+pub struct ParseShareError(String);
 
-    fn from_str(text: &str) -> Result<Share, String> {
+impl FromStr for Share {
+    type Err = ParseShareError;
+
+    fn from_str(text: &str) -> Result<Share, ParseShareError> {
         let share = match text.trim().strip_suffix('%') {
             Some(percent) => percent.trim().parse().ok().map(Share::Percent),
             None => text.trim().parse().ok().map(Share::Robots),
@@ -40,19 +47,14 @@ impl FromStr for Share {
                 Share::Robots(robots) => *robots > 0,
                 Share::Percent(percent) => *percent > 0.0 && *percent <= 100.0,
             })
-            .ok_or_else(|| {
-                format!(
-                    "{text:?} is not a share of robots; write a number of robots, such as 3, or a percentage, such as \
-                        10%"
-                )
-            })
+            .ok_or_else(|| ParseShareError(text.to_owned()))
     }
 }
 
 impl TryFrom<String> for Share {
-    type Error = String;
+    type Error = ParseShareError;
 
-    fn try_from(text: String) -> Result<Share, String> {
+    fn try_from(text: String) -> Result<Share, ParseShareError> {
         text.parse()
     }
 }
@@ -78,6 +80,7 @@ impl From<Share> for String {
 #[serde(default, deny_unknown_fields)]
 pub struct RolloutTerms {
     /// Share of robots that the revision serves before it is promoted (default: promoted at once).
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub canary: Option<Share>,
     /// Allowed regression of the canary before it is rolled back: difference of the failure rates, or relative increase
     /// of the response time (0.1 = 10 %; default: 0.1).
@@ -86,9 +89,11 @@ pub struct RolloutTerms {
     pub samples: u32,
     /// Time in seconds after promotion until servants of other revisions are ended (default: when their robots
     /// disconnect).
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline: Option<f64>,
     /// Time in seconds after which a canary without regression is promoted if it had at least `samples` requests
     /// (default: only by hand).
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub promote_after: Option<f64>,
 }
 
@@ -142,16 +147,22 @@ impl fmt::Display for RolloutState {
 #[serde(default)]
 pub struct Arm {
     /// Number of servants that became ready or failed.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub servants: u64,
     /// Number of servants that failed.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub servants_failed: u64,
     /// Number of requests that were answered, failed or were late.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub requests: u64,
     /// Number of requests that failed or were not answered within T_max.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub requests_failed: u64,
     /// Median response time of answered requests, in milliseconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub p50: Option<f64>,
     /// 95th percentile of the response time of answered requests, in milliseconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub p95: Option<f64>,
 }
 
@@ -225,7 +236,7 @@ mod tests {
             "0", "0%", "101%", "-1", "-1%", "1.5", "NaN%", "%", "", "ten",
         ] {
             let refused = text.parse::<Share>().expect_err(text);
-            assert!(refused.contains("10%"), "{refused}");
+            assert!(refused.to_string().contains("10%"), "{refused}");
         }
     }
 

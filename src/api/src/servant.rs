@@ -194,6 +194,7 @@ pub struct BackOff {
 #[serde(default)]
 pub struct Terms {
     /// Statements by the node that a stub stands for; the empty key is a rosbridge client.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub stated: BTreeMap<String, Stated>,
     /// Auxiliary parameters of the dictionary as measured on the clients' messages. Stated values take precedence.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -203,12 +204,14 @@ pub struct Terms {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub class: Option<String>,
     /// Priority of the class; higher values are admitted first.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub priority: i32,
     /// Dictionary rows that were chosen.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub rows: Vec<Row>,
     /// Resulting limits, including those of the push. They are reserved.
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub limits: Limits,
     /// Explanation of the limits, one sentence each.
     #[serde(skip_serializing_if = "Vec::is_empty")]

@@ -92,5 +92,6 @@ pub struct Node {
 #[serde(default, deny_unknown_fields)]
 pub struct Rollback {
     /// Target revision (default: the one before the current revision).
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub revision: Option<u64>,
 }

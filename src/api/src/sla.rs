@@ -25,9 +25,10 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::size::Size;
-use agreement::parse_rate;
-pub use agreement::{Goal, Measure, Sla};
+use crate::limits::{LEAST_CPUS, LEAST_MEMORY, MOST_CPUS};
+use crate::size::{NotASize, Size};
+pub use agreement::{Goal, Measure, ParseRateError, ParseValueError, Sla};
+use agreement::{describe_contradiction, parse_rate};
 pub use qos::{ParseSpanError, Span};
 
 /// Prefix of the keys of auxiliary parameters.
@@ -37,9 +38,58 @@ pub const AUX: &str = "aux.";
 const MOST_AUX: usize = 16;
 /// Maximum length of a name or of an auxiliary parameter's value, in bytes.
 const LONGEST: usize = 64;
-/// Allowed range of cores, and minimum memory; servants do not work outside these bounds.
-const CPUS: (f64, f64) = (0.01, 4096.0);
-const LEAST_MEMORY: Size = Size(4 << 20);
+
+/// A key of a statement.
+#[derive(Debug, Clone, Copy)]
+pub struct StatedKey {
+    /// The key as written.
+    pub name: &'static str,
+    /// Description of the value.
+    pub description: &'static str,
+    /// True if only a number is accepted.
+    pub is_number: bool,
+}
+
+const fn key(name: &'static str, description: &'static str, is_number: bool) -> StatedKey {
+    StatedKey {
+        name,
+        description,
+        is_number,
+    }
+}
+
+/// All keys except those of auxiliary parameters, in the order in which they are written.
+pub static KEYS: [StatedKey; 9] = [
+    key(
+        "rrt",
+        "Desired response time (T_desire), such as `100ms`.",
+        false,
+    ),
+    key(
+        "max_rrt",
+        "Maximum acceptable response time (T_max), such as `300ms`.",
+        false,
+    ),
+    key("fps", "Desired frames per second of an output.", true),
+    key(
+        "min_fps",
+        "Minimum acceptable frames per second of an output.",
+        true,
+    ),
+    key("age", "Desired age of an output, such as `100ms`.", false),
+    key(
+        "max_age",
+        "Maximum acceptable age of an output, such as `300ms`.",
+        false,
+    ),
+    key("class", "Class of the configuration.", false),
+    key("cpus", "CPU limit in cores, stated directly.", true),
+    key(
+        "memory",
+        "Memory limit, such as `512M`, stated directly.",
+        false,
+    ),
+];
 
 /// Statement of a robot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -66,37 +116,92 @@ pub struct Stated {
 }
 
 /// An invalid key or value in a statement.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{key} {reason}")]
 pub struct Unstatable {
     /// Key that is invalid.
     pub key: String,
     /// Reason, and what to write instead.
-    pub reason: String,
+    pub reason: UnstatableReason,
 }
 
 impl Unstatable {
-    fn new(key: &str, reason: String) -> Unstatable {
+    fn new(key: &str, reason: impl Into<UnstatableReason>) -> Unstatable {
         Unstatable {
             key: key.to_owned(),
-            reason,
+            reason: reason.into(),
         }
     }
 }
 
-impl fmt::Display for Unstatable {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{} {}", self.key, self.reason)
-    }
+/// Reason why a key or its value is invalid. Its text continues a sentence that begins with the key.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum UnstatableReason {
+    /// The key was given before.
+    #[error("is given twice; give it once")]
+    Repeated,
+    /// The key is a misspelling of this one.
+    #[error("is not a key; write {0}")]
+    Misspelled(&'static str),
+    /// The statement has this many auxiliary parameters.
+    #[error("makes {0} auxiliary parameters; give at most {MOST_AUX}")]
+    TooManyAux(usize),
+    /// The value is no time.
+    #[error("= {0}")]
+    Span(#[from] ParseSpanError),
+    /// The value is no rate.
+    #[error(transparent)]
+    Rate(#[from] ParseRateError),
+    /// The value is not the name of a class.
+    #[error(transparent)]
+    ClassName(#[from] ClassNameError),
+    /// The key or the value is not that of an auxiliary parameter.
+    #[error(transparent)]
+    Aux(#[from] AuxError),
+    /// The value is not a number of cores in the allowed range.
+    #[error(
+        "= {0:?} is not a number of cores between {LEAST_CPUS} and {MOST_CPUS}; write one such as 1.5"
+    )]
+    Cores(String),
+    /// The value is no size.
+    #[error("= {0}")]
+    Size(#[from] NotASize),
+    /// The value is less memory than any node needs.
+    #[error("= {0} is too little for any node; write at least {LEAST_MEMORY}")]
+    TooLittleMemory(Size),
+    /// The desired value is worse than the acceptable one.
+    #[error("{}", describe_contradiction(.measure, .desire, .bound))]
+    WorseThanBound {
+        /// The measure.
+        measure: Measure,
+        /// Desired value: seconds, or frames per second.
+        desire: f64,
+        /// Acceptable value.
+        bound: f64,
+    },
 }
 
-impl std::error::Error for Unstatable {}
+/// Error of a text that is not the name of a class. Its text continues a sentence that begins with `class`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("= {0:?} is not a name; write letters, digits, - and _, at most {LONGEST}")]
+pub struct ClassNameError(String);
+
+/// Error of an auxiliary parameter. Its text continues a sentence that begins with the parameter's key.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum AuxError {
+    /// Invalid key.
+    #[error(
+        "is not an auxiliary parameter; write {AUX}KEY=VALUE, KEY of letters, digits, -, _ and ., at most {LONGEST}"
+    )]
+    Key,
+    /// Missing or invalid value of this key.
+    #[error(
+        "has no value, or one of more than {LONGEST} bytes; write {AUX}{0}=VALUE, such as {AUX}width=640"
+    )]
+    Value(String),
+}
 
 impl Stated {
-    /// All keys except those of auxiliary parameters.
-    pub const KEYS: [&str; 9] = [
-        "rrt", "max_rrt", "fps", "min_fps", "age", "max_age", "class", "cpus", "memory",
-    ];
-
     /// Returns whether nothing is stated.
     pub fn is_empty(&self) -> bool {
         *self == Stated::default()
@@ -114,24 +219,20 @@ impl Stated {
         for (key, text) in pairs {
             let (key, text) = (key.as_ref(), text.as_ref().trim());
             let is_aux = key.starts_with(AUX);
-            if !is_aux && !Stated::KEYS.contains(&key) {
+            if !is_aux && !KEYS.iter().any(|known| known.name == key) {
                 reject_misspelled_key(key)?;
                 continue;
             }
             if seen.iter().any(|earlier| earlier == key) {
-                return Err(Unstatable::new(key, "is given twice; give it once".into()));
+                return Err(Unstatable::new(key, UnstatableReason::Repeated));
             }
             seen.push(key.to_owned());
             stated.set(key, text)?;
         }
         if stated.aux.len() > MOST_AUX {
-            let reason = format!(
-                "makes {} auxiliary parameters; give at most {MOST_AUX}",
-                stated.aux.len()
-            );
             return Err(Unstatable::new(
                 seen.last().map_or(AUX, String::as_str),
-                reason,
+                UnstatableReason::TooManyAux(stated.aux.len()),
             ));
         }
         stated.sla.check()?;
@@ -139,12 +240,14 @@ impl Stated {
     }
 
     fn set(&mut self, key: &str, text: &str) -> Result<(), Unstatable> {
-        let refused = |reason: String| Unstatable::new(key, reason);
         let span = || {
-            let span = Span::from_str(text).map_err(|error| refused(format!("= {error}")))?;
-            Ok(Some(span))
+            let span = Span::from_str(text).map(Some);
+            span.map_err(|error| Unstatable::new(key, error))
         };
-        let rate = || parse_rate(text).map(Some).map_err(refused);
+        let rate = || {
+            let rate = parse_rate(text).map(Some);
+            rate.map_err(|error| Unstatable::new(key, error))
+        };
         match key {
             "rrt" => self.sla.rrt = span()?,
             "max_rrt" => self.sla.max_rrt = span()?,
@@ -153,35 +256,29 @@ impl Stated {
             "age" => self.sla.age = span()?,
             "max_age" => self.sla.max_age = span()?,
             "class" => {
-                check_name(text).map_err(refused)?;
+                check_name(text).map_err(|error| Unstatable::new(key, error))?;
                 self.class = Some(text.to_owned());
             }
             "cpus" => {
-                let (least, most) = CPUS;
                 let cpus = text
                     .parse()
                     .ok()
-                    .filter(|cpus| (least..=most).contains(cpus));
-                let reason = || {
-                    refused(format!(
-                        "= {text:?} is not a number of cores between {least} and {most}; write one such as 1.5"
-                    ))
-                };
-                self.cpus = Some(cpus.ok_or_else(reason)?);
+                    .filter(|cpus| (LEAST_CPUS..=MOST_CPUS).contains(cpus));
+                let refused = || Unstatable::new(key, UnstatableReason::Cores(text.to_owned()));
+                self.cpus = Some(cpus.ok_or_else(refused)?);
             }
             "memory" => {
                 let memory = text.parse::<Size>();
-                let memory = memory.map_err(|error| refused(format!("= {error}")))?;
+                let memory = memory.map_err(|error| Unstatable::new(key, error))?;
                 if memory < LEAST_MEMORY {
-                    return Err(refused(format!(
-                        "= {memory} is too little for any node; write at least {LEAST_MEMORY}"
-                    )));
+                    let reason = UnstatableReason::TooLittleMemory(memory);
+                    return Err(Unstatable::new(key, reason));
                 }
                 self.memory = Some(memory);
             }
             _ => {
                 let aux = key.strip_prefix(AUX).unwrap_or(key);
-                check_aux(aux, text).map_err(refused)?;
+                check_aux(aux, text).map_err(|error| Unstatable::new(key, error))?;
                 self.aux.insert(aux.to_owned(), text.to_owned());
             }
         }
@@ -204,10 +301,10 @@ impl Stated {
             number(self.cpus),
             self.memory.map(format_exact),
         ];
-        let own = Stated::KEYS
-            .into_iter()
+        let own = KEYS
+            .iter()
             .zip(own)
-            .filter_map(|(key, value)| Some((key.to_owned(), value?)));
+            .filter_map(|(key, value)| Some((key.name.to_owned(), value?)));
         let aux = self.aux.iter();
         own.chain(aux.map(|(key, value)| (format!("{AUX}{key}"), value.clone())))
             .collect()
@@ -266,7 +363,7 @@ fn format_exact(size: Size) -> String {
 }
 
 /// Validates the name of a class.
-pub fn check_name(text: &str) -> Result<(), String> {
+pub fn check_name(text: &str) -> Result<(), ClassNameError> {
     let fits = !text.is_empty()
         && text.len() <= LONGEST
         && text
@@ -275,30 +372,24 @@ pub fn check_name(text: &str) -> Result<(), String> {
     if fits {
         Ok(())
     } else {
-        Err(format!(
-            "= {text:?} is not a name; write letters, digits, - and _, at most {LONGEST}"
-        ))
+        Err(ClassNameError(text.to_owned()))
     }
 }
 
 /// Validates the key and value of an auxiliary parameter.
-pub fn check_aux(key: &str, value: &str) -> Result<(), String> {
+pub fn check_aux(key: &str, value: &str) -> Result<(), AuxError> {
     let key_fits = !key.is_empty()
         && key.len() <= LONGEST
         && key
             .bytes()
             .all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte));
     if !key_fits {
-        return Err(format!(
-            "is not an auxiliary parameter; write {AUX}KEY=VALUE, KEY of letters, digits, -, _ and ., at most {LONGEST}"
-        ));
+        return Err(AuxError::Key);
     }
     let value_fits =
         !value.is_empty() && value.len() <= LONGEST && !value.chars().any(char::is_control);
     if !value_fits {
-        return Err(format!(
-            "has no value, or one of more than {LONGEST} bytes; write {AUX}{key}=VALUE, such as {AUX}width=640"
-        ));
+        return Err(AuxError::Value(key.to_owned()));
     }
     Ok(())
 }
@@ -322,13 +413,14 @@ fn reject_misspelled_key(key: &str) -> Result<(), Unstatable> {
         ("cpu", "cpus"),
         ("mem", "memory"),
     ];
-    let known = Stated::KEYS.into_iter().find(|known| bare(known) == told);
+    let mut names = KEYS.iter().map(|known| known.name);
+    let known = names.find(|known| bare(known) == told);
     let known = known.or_else(|| {
         let other = other.into_iter().find(|(word, _)| *word == told);
         other.map(|(_, key)| key)
     });
     match known {
-        Some(known) => Err(Unstatable::new(key, format!("is not a key; write {known}"))),
+        Some(known) => Err(Unstatable::new(key, UnstatableReason::Misspelled(known))),
         None => Ok(()),
     }
 }

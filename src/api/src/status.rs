@@ -38,15 +38,18 @@ pub struct Status {
     pub servants: usize,
     /// Number of warm containers, created ahead of demand.
     #[serde(default, alias = "spares")]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub warm_pool: usize,
     /// Number of warm containers whose nodes are running.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub warm_nodes: usize,
     /// Number of connected robots.
     pub connections: usize,
     /// Resource usage of all running servants together; the pressure is that of the whole machine, absent if the kernel
     /// does not report it.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
     pub usage: Usage,
     /// Problems of this machine.
     pub warnings: Vec<String>,

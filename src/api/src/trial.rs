@@ -21,6 +21,7 @@ pub struct Trial {
     /// Number of these that were answered.
     pub answered: usize,
     /// Response times; absent if nothing was answered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rrt: Option<Times>,
 }
 

@@ -12,12 +12,31 @@ use rcgen::{
     KeyUsagePurpose, SanType, date_time_ymd,
 };
 use tokio_rustls::rustls::pki_types::CertificateDer;
-use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
 
-use crate::{CertificateRequest, Error, Millis, SCHEME, VerifiedCertificate, shown};
+use crate::{
+    CertificateRequest, Error, Millis, SCHEME, UnreadableCertificate, VerifiedCertificate, shown,
+};
 
 /// Time by which a certificate's validity starts earlier, because clocks of other machines may be behind.
 const BEFORE: Duration = Duration::from_secs(300);
+
+/// Reason why a text (PEM) is no authority.
+#[derive(Debug, thiserror::Error)]
+pub enum AuthorityPemError {
+    /// The certificate is missing or malformed.
+    #[error("{0}")]
+    Certificate(pem::Error),
+    /// The private key is missing.
+    #[error("it has no BEGIN PRIVATE KEY")]
+    NoKey,
+    /// The private key is unusable, or the certificate is not that of an authority.
+    #[error(transparent)]
+    Issuer(#[from] rcgen::Error),
+    /// The certificate cannot be read.
+    #[error(transparent)]
+    Unreadable(#[from] UnreadableCertificate),
+}
 
 /// Certificate authority that signs robots' certificates.
 pub struct Authority {
@@ -86,13 +105,12 @@ impl Authority {
     }
 
     /// Parses a certificate and its key.
-    fn from_pem(text: &str) -> Result<Authority, String> {
-        let certificate =
-            CertificateDer::from_pem_slice(text.as_bytes()).map_err(|error| error.to_string())?;
-        let key = KeyPair::from_pem(&find_private_key(text)?).map_err(|error| error.to_string())?;
+    fn from_pem(text: &str) -> Result<Authority, AuthorityPemError> {
+        let certificate = CertificateDer::from_pem_slice(text.as_bytes())
+            .map_err(AuthorityPemError::Certificate)?;
+        let key = KeyPair::from_pem(find_private_key(text)?)?;
         let name = shown::subject_der(&certificate)?;
-        let issuer =
-            Issuer::from_ca_cert_der(&certificate, key).map_err(|error| error.to_string())?;
+        let issuer = Issuer::from_ca_cert_der(&certificate, key)?;
         Ok(Authority {
             certificate,
             issuer,
@@ -150,11 +168,11 @@ impl Authority {
     }
 }
 
-/// Returns the private key section of a PEM file.
-fn find_private_key(text: &str) -> Result<String, String> {
+/// Returns a PEM file from its private key on.
+fn find_private_key(text: &str) -> Result<&str, AuthorityPemError> {
     const BEGIN: &str = "-----BEGIN PRIVATE KEY-----";
-    let at = text.find(BEGIN).ok_or("it has no BEGIN PRIVATE KEY")?;
-    Ok(text[at..].to_owned())
+    let at = text.find(BEGIN).ok_or(AuthorityPemError::NoKey)?;
+    Ok(&text[at..])
 }
 
 /// Generates a self-signed authority. It does not expire, like the daemon's own certificate, because robots know it

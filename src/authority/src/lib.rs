@@ -16,9 +16,12 @@ mod shown;
 
 use std::path::PathBuf;
 
-pub use issue::{Authority, IssuedRobotCertificate};
+pub use issue::{Authority, AuthorityPemError, IssuedRobotCertificate};
 pub use request::{CertificateRequest, LONGEST};
-pub use shown::{ValidityPeriod, VerifiedCertificate, read_robot_certificate, read_validity};
+pub use shown::{
+    UnreadableCertificate, ValidityPeriod, VerifiedCertificate, read_robot_certificate,
+    read_validity,
+};
 
 /// Milliseconds since 1970.
 pub type Millis = u64;
@@ -49,7 +52,7 @@ pub enum Error {
         /// Path of the authority's file.
         path: PathBuf,
         /// Description of what is wrong.
-        reason: String,
+        reason: AuthorityPemError,
     },
     /// A certificate could not be created.
     #[error("cannot create a certificate for {what}: {source}")]

@@ -3,7 +3,9 @@
 use sha2::{Digest, Sha256};
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use x509_parser::certificate::X509Certificate;
+use x509_parser::error::X509Error;
 use x509_parser::extensions::GeneralName;
+use x509_parser::nom;
 use x509_parser::prelude::FromDer;
 
 use crate::{Error, Millis, SCHEME};
@@ -25,17 +27,22 @@ pub(crate) fn hash_key(key: &[u8]) -> [u8; 32] {
     Sha256::digest(key).into()
 }
 
+/// The error of bytes that are no certificate.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct UnreadableCertificate(nom::Err<X509Error>);
+
 fn parse_certificate<'a>(
     certificate: &'a CertificateDer<'_>,
-) -> Result<X509Certificate<'a>, String> {
-    match X509Certificate::from_der(certificate) {
-        Ok((_, parsed)) => Ok(parsed),
-        Err(error) => Err(error.to_string()),
-    }
+) -> Result<X509Certificate<'a>, UnreadableCertificate> {
+    let (_, parsed) = X509Certificate::from_der(certificate).map_err(UnreadableCertificate)?;
+    Ok(parsed)
 }
 
 /// Returns the subject of a certificate (DER).
-pub(crate) fn subject_der(certificate: &CertificateDer<'_>) -> Result<Vec<u8>, String> {
+pub(crate) fn subject_der(
+    certificate: &CertificateDer<'_>,
+) -> Result<Vec<u8>, UnreadableCertificate> {
     Ok(parse_certificate(certificate)?.subject().as_raw().to_vec())
 }
 
@@ -50,7 +57,9 @@ pub struct ValidityPeriod {
 }
 
 /// Reads the validity period of any certificate. Times before 1970 count as 1970.
-pub fn read_validity(certificate: &CertificateDer<'_>) -> Result<ValidityPeriod, String> {
+pub fn read_validity(
+    certificate: &CertificateDer<'_>,
+) -> Result<ValidityPeriod, UnreadableCertificate> {
     Ok(validity_period(&parse_certificate(certificate)?))
 }
 
@@ -68,7 +77,8 @@ fn validity_period(parsed: &X509Certificate<'_>) -> ValidityPeriod {
 pub fn read_robot_certificate(
     certificate: &CertificateDer<'_>,
 ) -> Result<VerifiedCertificate, Error> {
-    let parsed = parse_certificate(certificate).map_err(Error::Nameless)?;
+    let parsed =
+        parse_certificate(certificate).map_err(|error| Error::Nameless(error.to_string()))?;
     let mut names: Vec<&str> = Vec::new();
     let alternative = parsed
         .subject_alternative_name()

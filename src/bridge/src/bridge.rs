@@ -12,6 +12,7 @@ use tokio::sync::watch;
 use crate::connection::BridgeConnection;
 use crate::lease::Lease;
 use crate::outbox::CloseReason;
+use crate::session::{SessionCount, SessionEnd};
 use crate::shared::BridgeShared;
 use crate::waiting::WaitingConnection;
 use crate::{BridgeOptions, Metrics, SessionOptions};
@@ -19,36 +20,6 @@ use crate::{BridgeOptions, Metrics, SessionOptions};
 /// The bridge of one servant.
 pub struct Bridge {
     shared: Arc<BridgeShared>,
-}
-
-/// Number of sessions of a bridge.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct SessionCount {
-    /// Sessions that are connected.
-    pub connected: usize,
-    /// Sessions that are disconnected, but still within their grace period.
-    pub away: usize,
-}
-
-/// The end of a connection.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum SessionEnd {
-    /// The client closed it.
-    Client {
-        /// WebSocket close code; 1005 if the client gave none.
-        code: u16,
-        /// Close reason given by the client.
-        reason: String,
-    },
-    /// The bridge closed it.
-    Closed {
-        /// WebSocket close code.
-        code: u16,
-        /// Close reason sent to the client.
-        reason: String,
-    },
-    /// The socket failed or ended without a close frame.
-    Lost(String),
 }
 
 impl Bridge {
@@ -83,9 +54,9 @@ impl Bridge {
         let shared = &self.shared;
         let client = match shared.client_for(&options) {
             Ok(client) => client,
-            Err(reason) => {
-                waiting.refuse(1012, &reason).await;
-                return SessionEnd::Closed { code: 1012, reason };
+            Err(CloseReason { code, reason }) => {
+                waiting.refuse(code, &reason).await;
+                return SessionEnd::Closed { code, reason };
             }
         };
         let lease = Lease::take(shared.clone(), client.clone(), options.resume);
@@ -103,13 +74,13 @@ impl Bridge {
     /// Closes every session, connected or not, with this reason (a status message and a close frame with code 1012);
     /// later connections are refused the same way. Used when the servant ends or is replaced.
     pub fn close(&self, reason: &str) {
-        let clients = self.shared.close(reason);
-        for client in clients {
+        let goodbye = CloseReason {
+            code: 1012,
+            reason: reason.to_owned(),
+        };
+        for client in self.shared.close(&goodbye) {
             client.send_status(StatusLevel::Error, None, Format::Json, reason);
-            client.outbox.request_close(CloseReason {
-                code: 1012,
-                reason: reason.to_owned(),
-            });
+            client.outbox.request_close(goodbye.clone());
             client.end();
         }
     }

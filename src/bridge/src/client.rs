@@ -15,7 +15,6 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
 
-use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::RosVersion;
@@ -26,13 +25,19 @@ use rosbridge::{
 };
 use tokio_util::sync::CancellationToken;
 
-use crate::names;
+pub(crate) use crate::client_state::{BridgeClient, ReplyTarget};
+use crate::names::{self, ResolveNameError};
 use crate::outbox::{CloseReason, ControlMessage, Outbox};
 use crate::quality::ignored_policies;
 use crate::sample::EncodedFrame;
 use crate::shared::BridgeShared;
 use crate::{ClientGrants, SessionOptions};
+use actions::ClientActionError;
 pub(crate) use inbox::Inbox;
+use inbox::WrappedMessageError;
+use publishing::PublishError;
+use serving::ServingError;
+use subscribing::SubscribeError;
 use under_way::InFlightGuard;
 
 /// Removes the entries whose names match.
@@ -48,34 +53,21 @@ fn remove_matching<T>(
 /// Maximum length, in characters, of an unknown field's name in a status message.
 const SHOWN: usize = 48;
 
-/// A client of the bridge.
-pub(crate) struct BridgeClient {
-    pub(crate) shared: Arc<BridgeShared>,
-    pub(crate) name: String,
-    pub(crate) outbox: Arc<Outbox>,
-    /// Counts the data queued for the client.
-    pub(crate) budget: Budget,
-    /// Grants of the client.
-    granted: Mutex<ClientGrants>,
-    hears_clients: bool,
-    resumable: bool,
-    level: AtomicU8,
-    /// Number of calls and goals in progress.
-    under_way: AtomicUsize,
-    /// Bytes of their arguments.
-    under_way_bytes: AtomicUsize,
-    ended: CancellationToken,
-    subscriptions: Mutex<subscribing::ClientSubscriptions>,
-    topic_publishers: Mutex<publishing::TopicPublishers>,
-    services: Mutex<serving::ClientServices>,
-    actions: Mutex<actions::Actions>,
-}
-
-/// Destination of an answer: the interaction and the format.
-#[derive(Debug, Clone)]
-pub(crate) struct ReplyTarget {
-    pub(crate) id: Option<Id<'static>>,
-    pub(crate) format: Format,
+/// Reasons why an operation is refused, of which the client is told.
+#[derive(Debug, thiserror::Error)]
+enum OperationError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    Publish(#[from] PublishError),
+    #[error(transparent)]
+    Subscribe(#[from] SubscribeError),
+    #[error(transparent)]
+    Serving(#[from] ServingError),
+    #[error(transparent)]
+    Action(#[from] ClientActionError),
+    #[error(transparent)]
+    Wrapped(#[from] WrappedMessageError),
 }
 
 impl BridgeClient {
@@ -85,7 +77,7 @@ impl BridgeClient {
     }
 
     /// Resolves a name written by the client to its absolute form.
-    fn resolve<'n>(&self, name: &'n str) -> Result<Cow<'n, str>, String> {
+    fn resolve<'n>(&self, name: &'n str) -> Result<Cow<'n, str>, ResolveNameError> {
         names::resolve(self.version(), name)
     }
 
@@ -201,41 +193,35 @@ impl BridgeClient {
         reply: &ReplyTarget,
         source: Option<&Bytes>,
         wrapping: usize,
-    ) -> Result<(), String> {
+    ) -> Result<(), OperationError> {
         match op {
-            Op::Publish(op) => self.publish(op, reply, source),
-            Op::Fragment(op) => self.fragment(inbox, &op, wrapping),
-            Op::Png(op) => self.png(inbox, &op, wrapping),
+            Op::Publish(op) => self.publish(op, reply, source)?,
+            Op::Fragment(op) => self.fragment(inbox, &op, wrapping)?,
+            Op::Png(op) => self.png(inbox, &op, wrapping)?,
             Op::CallService(op) => self.call_service(op, reply),
-            Op::ServiceResponse(op) => self.service_response(op),
-            Op::Subscribe(op) => self.subscribe(op, reply),
+            Op::ServiceResponse(op) => self.service_response(op)?,
+            Op::Subscribe(op) => self.subscribe(op, reply)?,
             Op::Unsubscribe(op) => self.unsubscribe(&op, reply),
-            Op::Advertise(op) => self.advertise(&op, reply),
-            Op::Unadvertise(op) => self.unadvertise(&op, reply),
-            Op::AdvertiseService(op) => self.advertise_service(&op, reply),
-            Op::UnadvertiseService(op) => self.unadvertise_service(&op, reply),
-            Op::SendActionGoal(op) => self.send_action_goal(op, reply),
-            Op::CancelActionGoal(op) => self.cancel_action_goal(&op),
-            Op::ActionFeedback(op) => self.action_feedback(&op),
-            Op::ActionResult(op) => self.action_result(&op),
-            Op::AdvertiseAction(op) => self.advertise_action(&op, reply),
-            Op::UnadvertiseAction(op) => self.unadvertise_action(&op, reply),
-            Op::SetLevel(op) => {
-                self.level.store(op.level as u8, Ordering::Relaxed);
-                Ok(())
-            }
+            Op::Advertise(op) => self.advertise(&op, reply)?,
+            Op::Unadvertise(op) => self.unadvertise(&op, reply)?,
+            Op::AdvertiseService(op) => self.advertise_service(&op, reply)?,
+            Op::UnadvertiseService(op) => self.unadvertise_service(&op, reply)?,
+            Op::SendActionGoal(op) => self.send_action_goal(op, reply)?,
+            Op::CancelActionGoal(op) => self.cancel_action_goal(&op)?,
+            Op::ActionFeedback(op) => self.action_feedback(&op)?,
+            Op::ActionResult(op) => self.action_result(&op)?,
+            Op::AdvertiseAction(op) => self.advertise_action(&op, reply)?,
+            Op::UnadvertiseAction(op) => self.unadvertise_action(&op, reply)?,
+            Op::SetLevel(op) => self.level.store(op.level as u8, Ordering::Relaxed),
             Op::Status(op) => {
                 tracing::debug!(client = %self.name, level = op.level.name(), "{}", op.msg);
-                Ok(())
             }
-            Op::Auth(_) => {
-                self.info(
-                    reply,
-                    "auth: ignored, this server knows its clients by the token of their connection",
-                );
-                Ok(())
-            }
+            Op::Auth(_) => self.info(
+                reply,
+                "auth: ignored, this server knows its clients by the token of their connection",
+            ),
         }
+        Ok(())
     }
 
     /// Reports a message that cannot be parsed; if the client waits for an answer to it, also reports the call as
@@ -380,7 +366,9 @@ impl BridgeClient {
         };
         match wrapped {
             Ok(frame) => self.send_frame(frame, fragment_size, true),
-            Err(reason) => self.send_status(StatusLevel::Error, None, Format::Json, &reason),
+            Err(error) => {
+                self.send_status(StatusLevel::Error, None, Format::Json, &error.to_string());
+            }
         }
     }
 

@@ -15,6 +15,19 @@ pub struct ClientGrants {
     used: Option<Arc<OperationObserver>>,
 }
 
+/// An operation that is not granted to a client.
+#[derive(Debug, Clone, thiserror::Error)]
+#[error(
+    "{asked} is not granted to this client (granted: {granted}); the operator can grant it with cloudroidctl policy \
+        allow"
+)]
+pub struct NotGrantedError {
+    /// The operation and the name: `publish:/cmd_vel`.
+    pub asked: String,
+    /// Everything that is granted.
+    pub granted: Arc<Grants>,
+}
+
 /// Callback for an operation, such as `publish:/cmd_vel`.
 type OperationObserver = dyn Fn(&str) + Send + Sync;
 
@@ -74,8 +87,11 @@ impl ClientGrants {
         }
     }
 
-    /// Refuses, with an explanation, what is not granted.
-    pub fn check(&self, operation: Operation, name: &str) -> Result<(), String> {
+    /// Refuses what is not granted.
+    ///
+    /// # Errors
+    /// Fails, with an explanation for the client, if the operation on this name is not granted.
+    pub fn check(&self, operation: Operation, name: &str) -> Result<(), NotGrantedError> {
         let grants = self.grants();
         let asked = || format!("{}:{name}", operation.name());
         if grants.permits(operation, name) {
@@ -90,10 +106,10 @@ impl ClientGrants {
         if let Some(hears) = &self.refused {
             hears(&asked);
         }
-        Err(format!(
-            "{asked} is not granted to this client (granted: {grants}); the operator can grant it with cloudroidctl \
-                policy allow"
-        ))
+        Err(NotGrantedError {
+            asked,
+            granted: grants,
+        })
     }
 
     /// Returns the reason why the connection must end, if it must.

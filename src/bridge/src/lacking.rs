@@ -26,9 +26,26 @@ const OF_DEBIAN: [&str; 16] = [
 /// Suffixes of the names of messages that actions of ROS 1 consist of.
 const OF_ACTIONLIB: [&str; 3] = ["ActionGoal", "ActionResult", "ActionFeedback"];
 
-/// Formats the error, with advice for the deployer of the service, or for the client itself.
-pub(crate) fn explain_schema_error(version: RosVersion, error: SchemaError) -> String {
-    let (what, name) = match &error {
+/// A definition that is not available, explained with advice for the deployer of the service, or for the client itself.
+#[derive(Debug, thiserror::Error)]
+#[error("{}", explain_schema_error(.version, .source))]
+pub(crate) struct DefinitionError {
+    /// ROS version of the servant.
+    version: RosVersion,
+    source: Box<SchemaError>,
+}
+
+impl DefinitionError {
+    pub(crate) fn new(version: RosVersion, error: SchemaError) -> Self {
+        Self {
+            version,
+            source: Box::new(error),
+        }
+    }
+}
+
+fn explain_schema_error(version: &RosVersion, error: &SchemaError) -> String {
+    let (what, name) = match error {
         SchemaError::Unknown(name) => (format!("no definition of {name} is known here"), name),
         SchemaError::Missing { name, needed_by } => (
             format!("{needed_by} needs {name}, of which no definition is known here"),
@@ -37,7 +54,7 @@ pub(crate) fn explain_schema_error(version: RosVersion, error: SchemaError) -> S
         _ => return error.to_string(),
     };
     let package = name.split('/').next().unwrap_or_default();
-    if version == RosVersion::Two
+    if *version == RosVersion::Two
         && (package == "actionlib_msgs" || OF_ACTIONLIB.iter().any(|end| name.ends_with(end)))
     {
         return format!(
@@ -45,7 +62,7 @@ pub(crate) fn explain_schema_error(version: RosVersion, error: SchemaError) -> S
                 send_action_goal and advertise_action"
         );
     }
-    if version == RosVersion::One && OF_DEBIAN.contains(&package) {
+    if *version == RosVersion::One && OF_DEBIAN.contains(&package) {
         let debian = package.replace('_', "-");
         return format!(
             "{what}; the deployer of this service can add it: cloudroidctl push … --with ros-{debian}"
@@ -63,7 +80,7 @@ mod tests {
     #[test]
     fn who_deploys_is_told_what_to_add() {
         let of = |version, name: &str| {
-            explain_schema_error(version, SchemaError::Unknown(name.to_owned()))
+            DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string()
         };
         assert_eq!(
             of(RosVersion::One, "nav_msgs/Path"),
@@ -81,21 +98,24 @@ mod tests {
             needed_by: "arm_msgs/Arm".to_owned(),
         };
         assert_eq!(
-            explain_schema_error(RosVersion::One, missing),
+            DefinitionError::new(RosVersion::One, missing).to_string(),
             "arm_msgs/Arm needs arm_msgs/Joint, of which no definition is known here; the deployer of this service can \
                 add it: cloudroidctl push … of a workspace that also has arm_msgs"
         );
         let other = SchemaError::BadName("x".to_owned());
         assert_eq!(
-            explain_schema_error(RosVersion::One, other.clone()),
+            DefinitionError::new(RosVersion::One, other.clone()).to_string(),
             other.to_string()
         );
     }
 
     #[test]
     fn who_uses_actions_by_topics_is_told_how_ros_2_has_them() {
+        let of = |version, name: &str| {
+            DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string()
+        };
         for name in ["x_msgs/msg/CountActionGoal", "actionlib_msgs/msg/GoalID"] {
-            let two = explain_schema_error(RosVersion::Two, SchemaError::Unknown(name.to_owned()));
+            let two = of(RosVersion::Two, name);
             assert_eq!(
                 two,
                 format!(
@@ -103,7 +123,7 @@ mod tests {
                         this servant uses ROS 2; use send_action_goal and advertise_action"
                 )
             );
-            let one = explain_schema_error(RosVersion::One, SchemaError::Unknown(name.to_owned()));
+            let one = of(RosVersion::One, name);
             assert!(one.contains("cloudroidctl push"), "{one}");
         }
     }

@@ -29,6 +29,7 @@
 mod acks;
 mod bridge;
 mod client;
+mod client_state;
 mod clock;
 mod connection;
 mod counted;
@@ -43,13 +44,16 @@ mod names;
 mod options;
 mod outbox;
 mod own;
+mod own_service;
 mod presence;
 mod quality;
 mod refusals;
 mod registrations;
+mod republisher;
 mod rosapi;
 mod sample;
 mod service_types;
+mod session;
 mod shared;
 mod tf;
 mod topic_publisher;
@@ -61,8 +65,9 @@ mod waiting;
 /// Name of the node by which people inspect a servant. Messages of robots do not wait for it.
 pub const INSIDE: &str = "/cloudroid_inside";
 
-pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
-pub use granted::ClientGrants;
+pub use bridge::{Bridge, refuse};
+pub use granted::{ClientGrants, NotGrantedError};
 pub use metrics::{Counter, Drops, Metrics};
 pub use options::{BridgeOptions, RequestObserver, SessionOptions};
+pub use session::{SessionCount, SessionEnd};
 pub use waiting::WaitingConnection;

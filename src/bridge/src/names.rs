@@ -4,8 +4,42 @@ use std::borrow::Cow;
 
 use ros::bus::{RosVersion, WireFormat, WireType};
 
+/// Reasons why the name of a topic, service or action cannot be resolved.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum ResolveNameError {
+    #[error("{0:?} is a private name, which a client does not have; write the full name")]
+    Private(String),
+    #[error("{shown:?} is not a ROS name: letters, digits, _ and / are allowed, {rule}")]
+    Malformed {
+        /// The name, shortened.
+        shown: String,
+        /// The rule on first characters in this version of ROS.
+        rule: &'static str,
+    },
+}
+
+/// A topic, service or action that has another type than the client gives.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{what} has type {theirs}, not {said}; use the type that it has")]
+pub(crate) struct DeclaredTypeError {
+    what: String,
+    theirs: String,
+    said: String,
+}
+
+impl DeclaredTypeError {
+    /// Creates the error of `what`, such as `topic /text`, whose type is `theirs` instead of `said`.
+    pub(crate) fn new(what: String, theirs: &str, said: &str) -> Self {
+        Self {
+            what,
+            theirs: theirs.to_owned(),
+            said: said.to_owned(),
+        }
+    }
+}
+
 /// Resolves the name of a topic, service or action to its absolute form; clients are in the namespace `/`.
-pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, String> {
+pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, ResolveNameError> {
     let well_formed = |part: &str| {
         let mut characters = part.chars();
         characters
@@ -14,9 +48,7 @@ pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, S
             && characters.all(|other| other.is_ascii_alphanumeric() || other == '_')
     };
     if name.starts_with('~') {
-        return Err(format!(
-            "{name:?} is a private name, which a client does not have; write the full name"
-        ));
+        return Err(ResolveNameError::Private(name.to_owned()));
     }
     if name
         .strip_prefix('/')
@@ -50,14 +82,12 @@ pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, S
             parts.iter().flat_map(|part| ["/", part]).collect(),
         ));
     }
-    let shown: String = name.chars().take(64).collect();
+    let shown = name.chars().take(64).collect();
     let rule = match version {
         RosVersion::One => "a letter comes first",
         RosVersion::Two => "no part begins with a digit",
     };
-    Err(format!(
-        "{shown:?} is not a ROS name: letters, digits, _ and / are allowed, {rule}"
-    ))
+    Err(ResolveNameError::Malformed { shown, rule })
 }
 
 /// Converts the name of a type, as written by clients and either ROS, to `package/Type`: `package/msg/Type` means the
@@ -74,11 +104,6 @@ pub(crate) fn short_type_name(name: &str) -> Cow<'_, str> {
 /// Returns whether both names mean the same type, however they are spelled.
 pub(crate) fn is_same_type(one: &str, other: &str) -> bool {
     one == other || short_type_name(one) == short_type_name(other)
-}
-
-/// Formats the error that a topic, service or action has another type than the client gives.
-pub(crate) fn type_mismatch(what: &str, theirs: &str, said: &str) -> String {
-    format!("{what} has type {theirs}, not {said}; use the type that it has")
 }
 
 /// Returns the name of a type as spelled by the servant's ROS: `package/Type` in ROS 1, `package/KIND/Type` in ROS 2,
@@ -140,7 +165,7 @@ mod tests {
                 assert!(resolve(version, name).is_err(), "{name}");
             }
         }
-        let reason = |version, name| resolve(version, name).unwrap_err();
+        let reason = |version, name| resolve(version, name).unwrap_err().to_string();
         assert_eq!(resolve(RosVersion::One, "/a/2").unwrap(), "/a/2");
         assert_eq!(
             reason(RosVersion::Two, "/a/2"),

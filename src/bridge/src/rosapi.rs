@@ -4,6 +4,7 @@
 mod definitions;
 mod graph;
 mod node_params;
+mod param_error;
 mod params;
 mod typedefs;
 
@@ -14,13 +15,14 @@ use async_trait::async_trait;
 use budget::Budget;
 use ros::bus::RosVersion;
 use ros::codec::Time;
-use ros::schema::{Registry, ServiceDef};
+use ros::schema::{Registry, SchemaError, ServiceDef};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::clock;
-use crate::own::{Caller, OwnService};
+use crate::own_service::{Caller, OwnService, OwnServiceError};
 use crate::shared::BridgeShared;
+pub(crate) use param_error::ParamRequestError;
 use typedefs::Definitions;
 
 /// Node that appears to serve these services.
@@ -82,7 +84,7 @@ impl RosapiService {
         shared: &Arc<BridgeShared>,
         args: &Args,
         caller: &Caller<'_>,
-    ) -> Result<Value, String> {
+    ) -> Result<Value, OwnServiceError> {
         let (version, grants) = (shared.bus.version(), caller.grants);
         let now = graph::with_own_topics(version, &shared.bus.graph().borrow());
         let now = graph::filter_by_grants(now, grants);
@@ -125,7 +127,7 @@ impl RosapiService {
                 "version": version.number(),
                 "distro": shared.bus.distribution().await,
             }),
-            other => return Err(format!("rosapi has no service {other}")),
+            other => return Err(OwnServiceError::Unknown(other)),
         })
     }
 
@@ -135,7 +137,7 @@ impl RosapiService {
         shared: &Arc<BridgeShared>,
         args: &Args,
         budget: &Budget,
-    ) -> Result<Value, String> {
+    ) -> Result<Value, ParamRequestError> {
         match self.name {
             "get_param" => params::get(shared, args).await,
             "set_param" => params::set(shared, args, budget).await,
@@ -152,7 +154,7 @@ impl RosapiService {
         shared: &Arc<BridgeShared>,
         args: &Args,
         budget: &Budget,
-    ) -> Result<Value, String> {
+    ) -> Result<Value, ParamRequestError> {
         match self.name {
             "get_param" => node_params::get(shared, args).await,
             "set_param" => node_params::set(shared, args, budget).await,
@@ -178,11 +180,9 @@ impl OwnService for RosapiService {
             || self.name == "node_details"
     }
 
-    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, String> {
+    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, SchemaError> {
         let version = shared.bus.version();
-        definitions::registry(version)
-            .service(&self.type_name(version))
-            .map_err(|error| error.to_string())
+        definitions::registry(version).service(&self.type_name(version))
     }
 
     async fn answer(
@@ -190,8 +190,8 @@ impl OwnService for RosapiService {
         shared: &Arc<BridgeShared>,
         args: &[u8],
         caller: &Caller<'_>,
-    ) -> Result<Vec<u8>, String> {
-        let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
+    ) -> Result<Vec<u8>, OwnServiceError> {
+        let args: Args = serde_json::from_slice(args).map_err(OwnServiceError::Args)?;
         let values = self.call(shared, &args, caller).await?;
         Ok(values.to_string().into_bytes())
     }

@@ -8,9 +8,9 @@ use std::sync::{Arc, Weak};
 use budget::{Exceeded, Permit, UNCOUNTED};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{PeerId, WireType};
-use ros::codec::{self, CborOptions, JsonOptions, Time};
-use ros::schema::{MessageType, Registry};
+use ros::bus::{Digest, PeerId, WireType};
+use ros::codec::{self, CborOptions, CodecError, JsonOptions, Time};
+use ros::schema::{MessageType, Registry, SchemaError};
 use rosbridge::{Compression, Format, Publish};
 
 use crate::names::digest_word;
@@ -23,6 +23,55 @@ const SHORT: usize = 4 * 1024;
 /// Number of encodings kept per topic, and their bytes. For a client so far behind that it needs an older one, the
 /// message is encoded again: only the message from ROS waits in its queue.
 const WARM: (usize, usize) = (256, 16 << 20);
+
+/// A frame that cannot be packed as a PNG image: it is not text, or the image cannot be encoded.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot be packed as png: {0}")]
+pub(crate) struct PackError(#[source] Box<dyn std::error::Error + Send + Sync>);
+
+/// Reasons why messages that are announced with a type have no definition.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TopicTypeError {
+    #[error("its type {name} has {word} {theirs}, ours has {ours}")]
+    Differs {
+        name: String,
+        /// Term for the digests.
+        word: &'static str,
+        theirs: Digest,
+        ours: Digest,
+    },
+    /// The publisher sends a definition of another digest than it announces.
+    #[error("the publisher's definition of {name} has {word} {found}, not {announced} as it says")]
+    FalseDigest {
+        name: String,
+        /// Term for the digests.
+        word: &'static str,
+        found: Digest,
+        announced: Digest,
+    },
+    #[error(transparent)]
+    Schema(#[from] SchemaError),
+}
+
+/// Reasons why a message does not reach a client.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SampleError {
+    #[error(transparent)]
+    Type(#[from] Arc<TopicTypeError>),
+    #[error("{error} (from {publisher})")]
+    Codec {
+        error: Box<CodecError>,
+        publisher: PeerId,
+    },
+    #[error(transparent)]
+    Pack(#[from] PackError),
+    /// The encoding does not fit into the servant's budget.
+    #[error("a message from {publisher} was dropped: {full}")]
+    NoRoom { publisher: PeerId, full: Exceeded },
+    /// It does not fit into the client's budget.
+    #[error("a message was dropped: {0}")]
+    NoRoomAtClient(Exceeded),
+}
 
 /// A whole WebSocket message, which can be sent to any client.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -70,11 +119,11 @@ impl EncodedFrame {
 
     /// Encodes JSON text as the pixels of a PNG image; in ASCII, since browsers interpret each byte of it as a
     /// character.
-    pub(crate) fn into_png(self) -> Result<EncodedFrame, String> {
-        let failed = |error: &dyn std::fmt::Display| format!("cannot be packed as png: {error}");
-        let text = std::str::from_utf8(&self.bytes).map_err(|error| failed(&error))?;
+    pub(crate) fn into_png(self) -> Result<EncodedFrame, PackError> {
+        let text = std::str::from_utf8(&self.bytes).map_err(|error| PackError(error.into()))?;
         let ascii = rosbridge::to_ascii(text);
-        let data = rosbridge::encode_png(ascii.as_bytes()).map_err(|error| failed(&error))?;
+        let data = rosbridge::encode_png(ascii.as_bytes());
+        let data = data.map_err(|error| PackError(error.into()))?;
         let mut out = Vec::with_capacity(data.len() + 64);
         rosbridge::Op::from(rosbridge::Png {
             id: None,
@@ -102,7 +151,11 @@ struct RecentEncodings {
     bytes: usize,
 }
 
-type FoundType = Result<Arc<MessageType>, Arc<str>>;
+/// The definition of an announced type, or the reason why there is none, the same for all of its messages.
+type FoundType = Result<Arc<MessageType>, Arc<TopicTypeError>>;
+
+/// The `publish` frame of a message, the same for all clients that use its encoding.
+type SharedFrame = Result<EncodedFrame, Arc<SampleError>>;
 
 impl TopicTypes {
     pub(crate) fn new(registry: Arc<Registry>) -> Self {
@@ -142,7 +195,7 @@ impl TopicTypes {
         if let Some((_, result)) = found.iter().find(|(known, _)| same(known)) {
             return result.clone();
         }
-        let result = find_type(&self.registry, wire_type).map_err(Arc::from);
+        let result = find_type(&self.registry, wire_type).map_err(Arc::new);
         // Publishers come and go, and one could announce a new type each time.
         if found.len() >= 16 {
             found.drain(..1);
@@ -153,7 +206,7 @@ impl TopicTypes {
 }
 
 /// Finds the registry's type if its digest matches, otherwise builds one from the definition sent by the publisher.
-fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, String> {
+fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, TopicTypeError> {
     let agrees = |found: &MessageType| wire.digest.is_compatible_with(&found.digest().into());
     let word = digest_word(wire.format.version());
     let ours = match registry.message(&wire.name) {
@@ -162,13 +215,13 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
     };
     if wire.definition.is_empty() {
         return Err(match ours {
-            Ok(found) => format!(
-                "its type {} has {word} {}, ours has {}",
-                wire.name,
-                wire.digest,
-                found.digest()
-            ),
-            Err(error) => error.to_string(),
+            Ok(found) => TopicTypeError::Differs {
+                name: wire.name.clone(),
+                word,
+                theirs: wire.digest.clone(),
+                ours: found.digest().into(),
+            },
+            Err(error) => error.into(),
         });
     }
     let theirs = if ours.is_err() {
@@ -178,16 +231,16 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
     } else {
         wire.schema()
     };
-    match theirs {
-        Ok(found) if agrees(&found) => Ok(found),
-        Ok(found) => Err(format!(
-            "the publisher's definition of {} has {word} {}, not {} as it says",
-            wire.name,
-            found.digest(),
-            wire.digest
-        )),
-        Err(error) => Err(error.to_string()),
+    let found = theirs?;
+    if agrees(&found) {
+        return Ok(found);
     }
+    Err(TopicTypeError::FalseDigest {
+        name: wire.name.clone(),
+        word,
+        found: found.digest().into(),
+        announced: wire.digest.clone(),
+    })
 }
 
 /// A message and its encodings so far.
@@ -214,7 +267,7 @@ enum Encodings {
 struct CachedEncoding {
     compression: Compression,
     topic: Arc<str>,
-    frame: Result<EncodedFrame, Arc<str>>,
+    frame: SharedFrame,
     /// Permit in the servant's budget alone; the frame holds the one of its ancestors.
     _permit: Permit,
 }
@@ -248,7 +301,7 @@ impl TopicSample {
     }
 
     /// Returns the definition of its bytes, or the reason why it is unknown.
-    pub(crate) fn schema(&self) -> Result<Arc<MessageType>, Arc<str>> {
+    pub(crate) fn schema(&self) -> FoundType {
         self.types.find(&self.wire_type)
     }
 
@@ -267,7 +320,7 @@ impl TopicSample {
         topic: &Arc<str>,
         options: &BridgeOptions,
         metrics: &Metrics,
-    ) -> Result<EncodedFrame, Arc<str>> {
+    ) -> SharedFrame {
         // Held while encoding, so that a second subscriber waits for the first one's result instead of encoding again.
         let mut encoded = self.encoded.lock();
         let same =
@@ -281,7 +334,7 @@ impl TopicSample {
         let mut permit = options.budget.permit();
         let made = self.encode(compression, topic, options, &mut permit);
         let (own, above) = permit.split();
-        let frame = made.map(|frame| {
+        let frame = made.map_err(Arc::new).map(|frame| {
             if frame.is_big() {
                 frame.with_permit(above)
             } else {
@@ -309,7 +362,7 @@ impl TopicSample {
         topic: &str,
         options: &BridgeOptions,
         permit: &mut Permit,
-    ) -> Result<EncodedFrame, Arc<str>> {
+    ) -> Result<EncodedFrame, SampleError> {
         let slot = match compression {
             Compression::None | Compression::Png => 0,
             Compression::Cbor => 1,
@@ -319,11 +372,9 @@ impl TopicSample {
         let last = self.types.sizes[slot].load(Ordering::Relaxed);
         // The last one may have had a very different size.
         let hint = last.min(LONGEST * length + SHORT).max(length) + 128;
-        let full = |full: budget::Exceeded| {
-            Arc::<str>::from(format!(
-                "a message from {} was dropped: {full}",
-                self.publisher
-            ))
+        let full = |full: Exceeded| SampleError::NoRoom {
+            publisher: self.publisher.clone(),
+            full,
         };
         if hint > UNCOUNTED {
             permit.resize(hint).map_err(full)?;
@@ -332,8 +383,9 @@ impl TopicSample {
         let left = permit.bytes().saturating_add(options.budget.available());
         let max_bytes = max_bytes.min(left.max(UNCOUNTED));
         let mut out = Vec::with_capacity(hint);
-        let failed = |error: codec::CodecError| {
-            Arc::<str>::from(format!("{error} (from {})", self.publisher))
+        let failed = |error: CodecError| SampleError::Codec {
+            error: Box::new(error),
+            publisher: self.publisher.clone(),
         };
         match compression {
             Compression::CborRaw => {
@@ -374,7 +426,7 @@ impl TopicSample {
         };
         let mut frame = EncodedFrame::new(format, out);
         if compression == Compression::Png {
-            frame = frame.into_png().map_err(Arc::from)?;
+            frame = frame.into_png()?;
         }
         let counted = if frame.is_big() { frame.bytes.len() } else { 0 };
         permit.resize(counted).map_err(full)?;

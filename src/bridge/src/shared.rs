@@ -10,14 +10,16 @@ use ros::schema::{MessageType, Registry};
 use ros::sizes::InputSizes;
 use tokio::sync::watch;
 
-use crate::bridge::SessionCount;
-use crate::client::BridgeClient;
+use crate::client_state::BridgeClient;
 use crate::fanout::Fanout;
+use crate::outbox::CloseReason;
 use crate::presence::{self, Presence};
 use crate::quality::default_subscription_qos;
 use crate::registrations::Registrations;
+use crate::republisher::Republisher;
 use crate::service_types::ServiceTypes;
-use crate::tf::{self, Republisher};
+use crate::session::SessionCount;
+use crate::tf;
 use crate::topic_publisher::TopicPublisher;
 use crate::topic_requests::TopicRequests;
 use crate::{BridgeOptions, Metrics, SessionOptions};
@@ -78,7 +80,7 @@ struct ClientRegistry {
     all: Vec<Weak<BridgeClient>>,
     /// Clients that can be resumed, by token.
     resumable: HashMap<String, Arc<BridgeClient>>,
-    closed: Option<String>,
+    closed: Option<CloseReason>,
 }
 
 impl BridgeShared {
@@ -111,9 +113,9 @@ impl BridgeShared {
     }
 
     /// Refuses clients from now on; returns the existing ones.
-    pub(crate) fn close(&self, reason: &str) -> Vec<Arc<BridgeClient>> {
+    pub(crate) fn close(&self, reason: &CloseReason) -> Vec<Arc<BridgeClient>> {
         let mut clients = self.clients.lock();
-        clients.closed.get_or_insert_with(|| reason.to_owned());
+        clients.closed.get_or_insert_with(|| reason.clone());
         clients.resumable.clear();
         clients
             .all
@@ -127,11 +129,12 @@ impl BridgeShared {
         clients.all.iter().filter_map(Weak::upgrade).collect()
     }
 
-    /// Returns the client of a connection: a resumed one, or a new one.
+    /// Returns the client of a connection: a resumed one, or a new one. Fails after [`close`](Self::close), with the
+    /// reason for closing the connection.
     pub(crate) fn client_for(
         self: &Arc<Self>,
         options: &SessionOptions,
-    ) -> Result<Arc<BridgeClient>, String> {
+    ) -> Result<Arc<BridgeClient>, CloseReason> {
         let mut clients = self.clients.lock();
         if let Some(reason) = &clients.closed {
             return Err(reason.clone());

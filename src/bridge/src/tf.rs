@@ -14,20 +14,15 @@ mod republish;
 mod sending;
 mod transform;
 
-use std::sync::{Arc, Weak};
-
-use parking_lot::Mutex;
 use ros::bus::RosVersion;
 use ros::codec::{self, CodecError, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
 
 pub(crate) use action::own_action_client;
-use buffer::TransformBuffer;
-pub(crate) use republish::{
-    ACTION, GOAL_TOPIC, RepublishTfs, Republisher, SERVICE, STATUS_TOPIC, TOPICS,
-};
-use transform::Transform;
+pub(crate) use republish::{ACTION, GOAL_TOPIC, RepublishTfs, SERVICE, STATUS_TOPIC, TOPICS};
+pub(crate) use sending::TransformRequestError;
+pub(crate) use transform::Transform;
 
 /// Definitions of transforms, which mean the same in both versions of ROS.
 const DEFINITIONS: &[(&str, &str)] = &[
@@ -109,21 +104,6 @@ pub(crate) fn define_types(version: RosVersion, registry: &Registry) {
         {
             tracing::warn!(%error, "{key} cannot be defined");
         }
-    }
-}
-
-/// The buffer of a bridge, shared for as long as it is used.
-#[derive(Default)]
-struct SharedBuffer(Mutex<Weak<TransformBuffer>>);
-
-impl SharedBuffer {
-    fn get(&self, make: impl FnOnce() -> TransformBuffer) -> Arc<TransformBuffer> {
-        let mut buffer = self.0.lock();
-        buffer.upgrade().unwrap_or_else(|| {
-            let made = Arc::new(make());
-            *buffer = Arc::downgrade(&made);
-            made
-        })
     }
 }
 

@@ -1,12 +1,46 @@
 //! Compatibility of a stub with a later revision than the one it was built from: it remains usable unless the interface
 //! that it relies on has changed.
 
-use package::difference::Difference;
+use package::difference::{Change, Difference};
 
 use store::{RevisionRecord, State};
 
 /// Maximum number of differences named in an error.
 const NAMED: usize = 8;
+
+/// Reason why a stub cannot be used with a service.
+#[derive(Debug, thiserror::Error)]
+pub enum StubError {
+    /// The interface that the stub relies on has changed.
+    #[error(
+        "service {service} is at revision {current}, but this robot's stub was made from revision {made_of}, and they \
+            differ: {}; install the stub again from /stubs/{service}.tar.gz, or roll the server back: cloudroidctl \
+            rollback {service} {made_of}", join_changes(.breaking)
+    )]
+    Incompatible {
+        /// Name of the service.
+        service: String,
+        /// Current revision.
+        current: u64,
+        /// Revision that the stub was made from.
+        made_of: u64,
+        /// Incompatible differences.
+        breaking: Vec<Change>,
+    },
+    /// Error of the state database.
+    #[error(transparent)]
+    State(#[from] store::Error),
+}
+
+fn join_changes(changes: &[Change]) -> String {
+    let mut words: Vec<String> = changes.iter().map(ToString::to_string).collect();
+    if words.len() > NAMED {
+        let more = words.len() - NAMED;
+        words.truncate(NAMED);
+        words.push(format!("{more} more"));
+    }
+    words.join("; ")
+}
 
 /// Checks whether a stub built from revision `made_of`, with this image, is compatible with `now`. Otherwise returns
 /// the incompatible differences and the next step.
@@ -15,14 +49,12 @@ pub fn check_stub_compatibility(
     now: &RevisionRecord,
     made_of: Option<u64>,
     image: &str,
-) -> Result<(), String> {
+) -> Result<(), StubError> {
     let Some(number) = made_of.filter(|_| image != now.image) else {
         return Ok(());
     };
     let service = &now.service;
-    let earlier = state
-        .revision(service, number)
-        .map_err(|error| error.to_string())?;
+    let earlier = state.revision(service, number)?;
     let Some(earlier) = earlier.filter(|earlier| earlier.image == image) else {
         tracing::warn!(
             "a stub of {service} was made from revision {number} of another server, so it may not match revision {}",
@@ -34,23 +66,13 @@ pub fn check_stub_compatibility(
     if difference.compatible() {
         return Ok(());
     }
-    let breaking = difference
-        .changes
-        .iter()
-        .filter(|change| !change.compatible);
-    let mut words: Vec<String> = breaking.map(ToString::to_string).collect();
-    if words.len() > NAMED {
-        let more = words.len() - NAMED;
-        words.truncate(NAMED);
-        words.push(format!("{more} more"));
-    }
-    Err(format!(
-        "service {service} is at revision {}, but this robot's stub was made from revision {number}, and they differ: \
-            {}; install the stub again from /stubs/{service}.tar.gz, or roll the server back: cloudroidctl rollback \
-            {service} {number}",
-        now.number,
-        words.join("; "),
-    ))
+    let changes = difference.changes.into_iter();
+    Err(StubError::Incompatible {
+        service: service.clone(),
+        current: now.number,
+        made_of: number,
+        breaking: changes.filter(|change| !change.compatible).collect(),
+    })
 }
 
 #[cfg(test)]
@@ -104,16 +126,15 @@ mod tests {
         let fits = |now: usize, image: &str| {
             super::check_stub_compatibility(&state, &all[now], Some(1), image)
         };
-        assert_eq!(fits(1, "sha256:1"), Ok(()), "something is new");
-        let refused = fits(2, "sha256:1").expect_err("something is gone");
+        fits(1, "sha256:1").expect("something is new");
+        let refused = fits(2, "sha256:1")
+            .expect_err("something is gone")
+            .to_string();
         assert!(
             refused.contains("output topic /a was removed") && refused.contains("/stubs/s.tar.gz"),
             "{refused}"
         );
-        assert_eq!(fits(2, "sha256:of another server"), Ok(()));
-        assert_eq!(
-            super::check_stub_compatibility(&state, &all[2], None, ""),
-            Ok(())
-        );
+        fits(2, "sha256:of another server").expect("nothing is known of it");
+        super::check_stub_compatibility(&state, &all[2], None, "").expect("it names no revision");
     }
 }

@@ -24,6 +24,7 @@ use std::sync::Arc;
 use store::{RevisionRecord, State};
 
 pub use error::Error;
+pub use fit::StubError;
 pub use inventory::RevisionContents;
 pub use publish::{RollbackResult, WithdrawnService};
 
@@ -103,7 +104,7 @@ impl Catalogue {
         now: &RevisionRecord,
         made_of: Option<u64>,
         image: &str,
-    ) -> Result<(), String> {
+    ) -> Result<(), StubError> {
         fit::check_stub_compatibility(&self.state, now, made_of, image)
     }
 

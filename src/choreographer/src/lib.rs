@@ -61,10 +61,10 @@ pub use decide::Amount;
 pub use decide::admission::{AdmissionError, Position};
 pub use decide::back_off::seconds;
 pub use decide::controller;
-pub use decide::dictionary::{MOST_ROWS, check as check_row};
+pub use decide::dictionary::{MOST_ROWS, RowError, check as check_row};
 pub use decide::terms::{Cap, CapSource, TermsError};
 pub use error::{Error, ResizeError, with_last_log_line};
-pub use limits::engine_limits;
+pub use lives::Choreographer;
 pub use lives::adoption::AdoptionResult;
 pub use lives::calibration::CalibrationRequests;
 pub use lives::capture::CaptureBounds;
@@ -94,12 +94,6 @@ use lives::warm_pool::{self, WarmPool};
 const TRIED: Duration = Duration::from_secs(2);
 /// Number of requests with which a picture is tried.
 const SHOWN: usize = 20;
-
-/// Decides which servants live. Cheap to clone.
-#[derive(Clone)]
-pub struct Choreographer {
-    inner: Arc<ChoreographerInner>,
-}
 
 impl Choreographer {
     /// Creates a choreographer that starts servants by `engine` and reaches them by `opener`.
@@ -231,8 +225,8 @@ impl Choreographer {
             // At once: if this daemon is killed, the next one would otherwise give the canary's place to another robot.
             inner.write_changed();
         }
-        let beginning = ServantSource::Asked(warm);
-        tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
+        let beginning = ServantSource::Asked(warm.map(Box::new));
+        driver::start(inner, handle, beginning);
         Ok(lease)
     }
 

@@ -22,6 +22,7 @@ pub(crate) mod reaching;
 pub(crate) mod recent;
 pub(crate) mod rollouts;
 pub(crate) mod shadow;
+mod shared_group;
 mod starting;
 mod visits;
 pub(crate) mod waiting;
@@ -49,11 +50,17 @@ use crate::memory::SharedMemory;
 use crate::options::Options;
 use crate::{Error, ServantRequest};
 use back_off::BackOffs;
-use group::Groups;
 use recent::RecentRequests;
 use rollouts::Rollouts;
+use shared_group::Groups;
 use waiting::Admission;
 use warm_pool::WarmPool;
+
+/// Decides which servants live. Cheap to clone.
+#[derive(Clone)]
+pub struct Choreographer {
+    pub(crate) inner: Arc<ChoreographerInner>,
+}
 
 /// State shared by the choreographer and its tasks.
 pub(crate) struct ChoreographerInner {

@@ -5,21 +5,14 @@
 //!              └─ servant cam-1      frames of its nodes, records of its links, JSON made of its messages
 //! ```
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use budget::{Budget, Exceeded, Shares};
 use parking_lot::Mutex;
 
-use store::Journal;
-use store::NewEvent;
-
-/// Minimum time between two events about the same client or servant.
-const TOLD_AGAIN: Duration = Duration::from_secs(60);
-/// Maximum number of clients and servants remembered for that.
-const REMEMBERED: usize = 1000;
+use store::{Journal, NewEvent, NoticeThrottle};
 
 /// Limits on memory outside of servants' containers.
 #[derive(Debug, Clone)]
@@ -51,19 +44,12 @@ impl Memory {
         let bytes = |size: u64| usize::try_from(size).unwrap_or(usize::MAX);
         let refused = Arc::<AtomicU64>::default();
         let count = Arc::clone(&refused);
-        let told: Mutex<HashMap<String, Instant>> = Mutex::default();
+        let throttle: Mutex<NoticeThrottle> = Mutex::default();
         let observer = move |who: &str, full: &Exceeded| {
             count.fetch_add(1, Ordering::Relaxed);
             tracing::debug!(who, %full, "memory limit reached");
-            let mut told = told.lock();
-            let known = told.get(who);
-            if known.is_some_and(|at| at.elapsed() < TOLD_AGAIN) {
-                return;
-            }
-            told.retain(|_, at| at.elapsed() < TOLD_AGAIN);
-            if told.len() < REMEMBERED {
-                told.insert(who.to_owned(), Instant::now());
-                drop(told);
+            let admitted = throttle.lock().admit(who, store::now());
+            if admitted.is_some() {
                 report(&journal, who, full);
             }
         };

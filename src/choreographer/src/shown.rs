@@ -4,7 +4,7 @@ use api::Phase;
 use reach::Reach;
 use tokio::time::Instant;
 
-use crate::{Choreographer, Handle, limits};
+use crate::{Choreographer, Handle};
 
 /// Maximum number of topics with drops that are shown.
 const SHOWN_DROPS: usize = 10;
@@ -45,7 +45,7 @@ impl Choreographer {
             cgroup_version: enforced
                 .as_ref()
                 .map_or(0, |enforced| enforced.cgroup_version),
-            enforced: enforced.map(|enforced| limits::to_api_limits(&enforced.limits)),
+            enforced: enforced.map(|enforced| enforced.limits),
             usage: usage(handle).await,
             response: inner
                 .recent

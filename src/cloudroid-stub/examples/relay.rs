@@ -18,8 +18,8 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, ActionServer, Bus, GoalEnd, GoalOutcome, ParamValue, QosProfile, RosVersion,
-    ServiceHandler, ServiceType, WireType,
+    ActionHandler, ActionServer, Bus, FailureReason, GoalEnd, GoalOutcome, ParamValue, QosProfile,
+    RosVersion, ServiceHandler, ServiceType, WireType,
 };
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::names::{self, PeerUri};
@@ -30,7 +30,7 @@ struct Echo;
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         Ok(request)
     }
 }
@@ -39,9 +39,9 @@ impl ServiceHandler for Echo {
 struct RelayGoals(mpsc::UnboundedSender<(String, Bytes)>);
 
 impl ActionHandler for RelayGoals {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
         let sent = self.0.send((id.to_owned(), goal));
-        sent.map_err(|error| error.to_string())
+        sent.map_err(|error| FailureReason::new(error.to_string()))
     }
     fn on_cancel(&self, _: &str) {}
     fn on_failed(&self, reason: &str) {

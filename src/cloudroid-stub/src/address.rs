@@ -13,6 +13,27 @@ pub struct Address {
     pub authority: String,
 }
 
+/// Error of a text that is not the address of a portal.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("server is {server:?}: {fault}, such as ws://host:9090 or wss://host")]
+pub struct ParseAddressError {
+    server: String,
+    fault: AddressFault,
+}
+
+/// The part of an address that is wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+enum AddressFault {
+    #[error("expected a URL")]
+    NoUrl,
+    #[error("expected ws:// or wss:// at its start")]
+    Scheme,
+    #[error("expected only a host and a port")]
+    Authority,
+    #[error("its port is not a number")]
+    Port,
+}
+
 impl Address {
     /// Returns the name under which its certificate is stored: host and port.
     pub fn known_server_name(&self) -> String {
@@ -24,30 +45,29 @@ impl Address {
     }
 
     /// Parses an address; the error describes the mistake.
-    pub fn parse(server: &str) -> Result<Self, String> {
-        let wrong = |what: &str| {
-            format!("server is {server:?}: {what}, such as ws://host:9090 or wss://host")
+    pub fn parse(server: &str) -> Result<Self, ParseAddressError> {
+        let wrong = |fault| ParseAddressError {
+            server: server.to_owned(),
+            fault,
         };
         let (scheme, authority) = server
             .split_once("://")
-            .ok_or_else(|| wrong("expected a URL"))?;
+            .ok_or_else(|| wrong(AddressFault::NoUrl))?;
         let secure = match scheme {
             "ws" => false,
             "wss" => true,
-            _ => return Err(wrong("expected ws:// or wss:// at its start")),
+            _ => return Err(wrong(AddressFault::Scheme)),
         };
         let authority = authority.trim_end_matches('/');
         if authority.is_empty()
             || authority.contains(['/', '?', '#', '@'])
             || authority.contains(char::is_whitespace)
         {
-            return Err(wrong("expected only a host and a port"));
+            return Err(wrong(AddressFault::Authority));
         }
         let (host, port) = match authority.rsplit_once(':') {
             Some((host, port)) if !port.contains(']') => {
-                let port = port
-                    .parse()
-                    .map_err(|_| wrong("its port is not a number"))?;
+                let port = port.parse().map_err(|_| wrong(AddressFault::Port))?;
                 (host, port)
             }
             _ => (authority, if secure { 443 } else { 80 }),
@@ -91,7 +111,7 @@ mod tests {
             "ws://a:b",
             "ws://me@a",
         ] {
-            let words = Address::parse(server).unwrap_err();
+            let words = Address::parse(server).unwrap_err().to_string();
             assert!(
                 words.contains(server) && words.contains("ws://host:9090"),
                 "{words}"

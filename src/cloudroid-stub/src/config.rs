@@ -59,11 +59,13 @@
 
 mod aux_parameters;
 mod check;
+mod goals;
 mod parameters;
 mod requests;
 mod sources;
 
 pub use aux_parameters::{Aux, Scalar};
+pub use goals::OUTPUT_MEASURES;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -74,7 +76,7 @@ use serde::{Deserialize, Serialize};
 
 use tls::{Fingerprint, KnownServers, Trust};
 
-use crate::address::Address;
+use crate::address::{Address, ParseAddressError};
 use crate::pairing;
 use crate::revision::Defaults;
 
@@ -260,7 +262,7 @@ impl Config {
     }
 
     /// Returns the parsed address of the portal.
-    pub fn address(&self) -> Result<Address, String> {
+    pub fn address(&self) -> Result<Address, ParseAddressError> {
         Address::parse(&self.server)
     }
 

@@ -48,7 +48,8 @@ pub async fn open(
     token: Option<&str>,
     patience: Duration,
 ) -> Result<WebSocket<PortalStream>, Error> {
-    let address = config.address().map_err(Error::Refused)?;
+    let address = config.address();
+    let address = address.map_err(|error| Error::Refused(error.to_string()))?;
     let trust = config
         .trust()
         .map_err(|error| Error::Refused(format!("{error:#}")))?;

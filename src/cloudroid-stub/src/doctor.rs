@@ -1,5 +1,6 @@
 //! `cloudroid-stub doctor`: checks everything that a stub needs, and shows the commands that fix problems.
 
+mod check;
 mod overlay;
 mod server;
 
@@ -8,72 +9,7 @@ use std::process::ExitCode;
 use foreign::terminal;
 
 use crate::arguments::{DoctorPart, StubDoctorArgs};
-
-/// Result of a check.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum CheckVerdict {
-    Good,
-    /// It works, but not as well as it could.
-    Warning,
-    Bad,
-}
-
-/// A check and its result.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Check {
-    name: &'static str,
-    verdict: CheckVerdict,
-    /// Observed state.
-    found: String,
-    /// Command that fixes the problem.
-    fix: Option<String>,
-}
-
-impl Check {
-    fn good(name: &'static str, found: impl Into<String>) -> Check {
-        Check {
-            name,
-            verdict: CheckVerdict::Good,
-            found: found.into(),
-            fix: None,
-        }
-    }
-
-    fn bad(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
-        Check {
-            name,
-            verdict: CheckVerdict::Bad,
-            found: found.into(),
-            fix: Some(fix.into()),
-        }
-    }
-
-    fn warning(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
-        Check {
-            verdict: CheckVerdict::Warning,
-            ..Check::bad(name, found, fix)
-        }
-    }
-
-    /// Formats the check for printing.
-    fn render(&self) -> String {
-        let mark = match self.verdict {
-            CheckVerdict::Good => "ok  ",
-            CheckVerdict::Warning => "warn",
-            CheckVerdict::Bad => "FAIL",
-        };
-        let fix = self
-            .fix
-            .iter()
-            .map(|fix| format!("\n                 fix it:  {fix}"));
-        format!(
-            "{mark}  {:<10} {}{}",
-            self.name,
-            self.found,
-            fix.collect::<String>()
-        )
-    }
-}
+use check::CheckVerdict;
 
 /// Runs the checks and prints them; fails if any is bad.
 pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
@@ -102,7 +38,7 @@ pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::check::Check;
 
     #[test]
     fn a_check_names_the_command_that_mends_it() {

@@ -17,6 +17,7 @@ use link::control::{Hello, Resume, Welcome};
 use link::session::{receive_open, send_open};
 use link::{DisconnectReason, RobotSession};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tracing::Instrument;
 use ws::WebSocket;
 
 use crate::config::{self, Config};
@@ -68,7 +69,11 @@ enum LinkEnd {
 /// accepted once may be refused for a while, by a proxy before the server or during maintenance, and the robot's nodes
 /// go on meanwhile.
 pub async fn run_link(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
-    run_link_with(config, mirror, hello, &PAUSES).await
+    let (robot, node) = (config.robot_id(), hello.node.name.clone());
+    let span = tracing::error_span!("link", robot, node);
+    run_link_with(config, mirror, hello, &PAUSES)
+        .instrument(span)
+        .await
 }
 
 async fn run_link_with(

@@ -11,10 +11,12 @@
 //! of its topics, tf or logs can reach the robot's graph except through the [`Keeper`], and it receives no backlog. See
 //! docs/adr/015-a-master-for-the-local-original.md.
 
+mod expected;
 mod keeper;
 mod latched;
 mod lender;
 mod original;
+mod pending_answer;
 mod private_domain;
 mod private_master;
 mod private_system;
@@ -26,9 +28,11 @@ mod stamp;
 #[cfg(test)]
 pub mod tests;
 
-pub use keeper::{Application, Cloud, Keeper, PendingAnswer};
-pub use lender::{call_limit_for, report_timeout};
-pub use original::{ExpectedInterface, Original, OriginalSetup, QUEUE};
+pub use expected::ExpectedInterface;
+pub use keeper::{Application, Cloud, Keeper};
+pub use lender::{call_limit_for, describe_failure};
+pub use original::{Original, OriginalSetup, QUEUE};
+pub use pending_answer::PendingAnswer;
 #[cfg(test)]
 pub use private_domain::PrivateDomain;
 pub use private_system::RegisteredInterface;

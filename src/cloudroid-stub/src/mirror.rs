@@ -24,10 +24,11 @@ mod reports;
 pub mod requests;
 mod safe_stop;
 mod stand_in;
+mod state;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
@@ -42,45 +43,12 @@ use ros::bus::{Bus, NodeNames, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
 
 use crate::output;
-use calls::Calls;
-use inputs::Inputs;
-use lent::LentServices;
 use outputs::Outputs;
-use parameters::Parameters;
-use promise::Promise;
-use refusals::Refusals;
+pub use state::Mirror;
+use state::{AppliedGraph, Calls, Inputs, KnownType, LentServices, Parameters};
 
 /// Time that a node of a new session has to register again what it had registered before.
 const SETTLE: Duration = Duration::from_secs(3);
-
-/// The node on the robot.
-pub struct Mirror {
-    /// Passed to the tasks that it starts.
-    this: Weak<Mirror>,
-    bus: Arc<dyn Bus>,
-    /// Label by which stubs of one servant recognize each other.
-    label: String,
-    session: watch::Sender<Arc<RobotSession>>,
-    inputs: Inputs,
-    outputs: Outputs,
-    calls: Calls,
-    lent: LentServices,
-    parameters: Parameters,
-    /// Messages dropped on this side, without the session's own.
-    drops: DropCounters,
-    /// Endpoints with incompatible quality of service.
-    refusals: Arc<Refusals>,
-    promise: OnceLock<Promise>,
-    /// Time limit for calls of the robot's services.
-    call_limit: Duration,
-    /// The interface registered here; locked while it is changed.
-    applied: tokio::sync::Mutex<AppliedGraph>,
-    /// Definitions by name and MD5 sum.
-    types: Mutex<HashMap<(String, String), KnownType>>,
-    siblings: RwLock<BTreeSet<String>>,
-    exit: watch::Sender<Option<Exit>>,
-    orders: mpsc::UnboundedSender<(FromCloud, Permit)>,
-}
 
 impl Mirror {
     /// Starts a mirror on `bus`, labeled with `label`; its tasks end with it. `call_limit` is the time limit for calls
@@ -237,28 +205,6 @@ impl SessionHandler<FromCloud> for Mirror {
             Record::Control(order) => drop(self.orders.send((order, held))),
         }
     }
-}
-
-/// A type by name and MD5 sum, with its definition.
-struct KnownType {
-    of: WireType,
-    /// Memory of a type sent by the server counts against the server's budget, since it may send any number of them.
-    _held: Option<Permit>,
-}
-
-/// The interface that the cloud has told the mirror to register.
-#[derive(Default)]
-struct AppliedGraph {
-    /// The session that sent it.
-    session: Weak<RobotSession>,
-    /// The session has had time to list everything; what it does not list is removed.
-    settled: bool,
-    /// The last one received, if any.
-    graph: Option<Graph>,
-    /// Names that belong to each node, together with those retained from the last session.
-    nodes: BTreeMap<String, NodeNames>,
-    /// Something was registered without the cloud's instruction.
-    stood_in: bool,
 }
 
 impl AppliedGraph {

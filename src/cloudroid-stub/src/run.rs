@@ -14,7 +14,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use budget::Budget;
 use futures_util::FutureExt;
-use link::control::{Exit, Hello, SlaTargets};
+use link::control::{Exit, Hello};
 use link::{RobotSession, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
@@ -198,7 +198,7 @@ async fn start(
         host: machine::host(),
         roscore: machine::roscore_id(&*bus).await,
         node: robot.to_cloud_node(&asked.node.package, &asked.node.node, &asked.node.share),
-        sla: stated_sla(&config),
+        sla: config.targets(),
         codecs: match config.codec {
             config::CodecSetting::None => Vec::new(),
             wanted => link::packing::supported_codecs(|codec| wanted.lossy() == Some(codec)),
@@ -340,20 +340,6 @@ fn session_options(config: &Config) -> SessionOptions {
         .promise_timeout()
         .and_then(|max| Duration::try_from_secs_f64(max).ok());
     SessionOptions::for_silence(max.unwrap_or(SILENT), max)
-}
-
-fn stated_sla(config: &Config) -> SlaTargets {
-    SlaTargets {
-        desire: config.desire,
-        max: config.max,
-        frames_per_second: config.frames_per_second,
-        desired_frames_per_second: config.desired_frames_per_second,
-        age: config.age,
-        desired_age: config.desired_age,
-        threshold: config.threshold,
-        fallback_after: (!config.has_promise() && config.local != LocalMode::None)
-            .then_some(config.fallback_after),
-    }
 }
 
 /// Streams of the signals that end a node.

@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use crate::config::{Aux, Config, Scalar};
+use crate::config::{Aux, Config, OUTPUT_MEASURES, Scalar};
 
 /// Maximum length of a name or of an auxiliary parameter's value in bytes; the server has the same limit.
 const LONGEST: usize = 64;
@@ -53,7 +53,8 @@ pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
         }
     }
     if let Some(aux) = &config.aux {
-        let pairs = aux.pairs().map_err(|reason| ("aux", reason))?;
+        let pairs = aux.pairs();
+        let pairs = pairs.map_err(|error| ("aux", error.to_string()))?;
         if pairs.len() > MOST_AUX {
             let reason = format!("has {} parameters; give at most {MOST_AUX}", pairs.len());
             return Err(("aux", reason));
@@ -99,13 +100,13 @@ fn parse_size(size: &Scalar) -> Option<f64> {
 pub fn to_query(config: &Config, node: &str) -> String {
     let number = |value: Option<f64>| value.map(|value| value.to_string());
     let mut pairs = vec![("node".to_owned(), node.to_owned())];
-    for (key, value) in [
-        ("rrt", number(config.desire)),
-        ("max_rrt", number(config.max)),
-        ("fps", number(config.desired_frames_per_second)),
-        ("min_fps", number(config.frames_per_second)),
-        ("age", number(config.desired_age)),
-        ("max_age", number(config.age)),
+    let times = [("rrt", config.desire), ("max_rrt", config.max)];
+    let measured = OUTPUT_MEASURES
+        .iter()
+        .flat_map(|measure| measure.stated_keys.into_iter().zip(measure.values(config)));
+    let numbers = times.into_iter().chain(measured);
+    let numbers = numbers.map(|(key, value)| (key, number(value)));
+    let others = [
         ("class", config.class.clone()),
         ("cpus", number(config.cpus)),
         (
@@ -115,7 +116,8 @@ pub fn to_query(config: &Config, node: &str) -> String {
                 text => text.to_string(),
             }),
         ),
-    ] {
+    ];
+    for (key, value) in numbers.chain(others) {
         pairs.extend(value.map(|value| (key.to_owned(), value)));
     }
     let aux = config.aux.as_ref().map(Aux::pairs);

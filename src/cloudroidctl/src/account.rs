@@ -6,6 +6,7 @@ use api::people::{Account, AccountChange, NewAccount, SessionLine};
 
 use crate::client::{DaemonClient, percent_encode};
 use crate::output::{self, OutputFormat, Table};
+use crate::token::parse_patterns;
 
 /// Manage accounts: people who sign in to the portal's page with a name and a password.
 #[derive(Debug, clap::Args)]
@@ -103,11 +104,6 @@ struct ListSessions {
 struct LogoutAccount {
     /// Name of the account; oidc:NAME for a person known by the identity provider.
     name: String,
-}
-
-fn parse_patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
-    let patterns = texts.iter().map(|text| text.parse());
-    Ok(patterns.collect::<Result<_, _>>()?)
 }
 
 fn account_path(name: &str) -> String {
@@ -217,14 +213,12 @@ fn list(accounts: &[Account], format: OutputFormat) -> anyhow::Result<()> {
         "STATE",
     ]);
     for account in accounts {
-        let services: Vec<String> = account.services.iter().map(ToString::to_string).collect();
-        let last = account.last_login;
         table.row([
             account.name.clone(),
             account.role.to_string(),
-            services.join(","),
+            output::patterns(&account.services),
             output::age(account.created),
-            last.map_or_else(|| "never".into(), |at| format!("{} ago", output::age(at))),
+            output::last_use(account.last_login),
             account.sessions.to_string(),
             account.disabled.map_or_else(
                 || "active".into(),

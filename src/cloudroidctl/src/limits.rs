@@ -1,5 +1,6 @@
 //! Flags for limits, of `push` and `set`, and for caps.
 
+use anyhow::bail;
 use api::{Caps, CpuSet, Limits, Size};
 
 /// Resource limits of a servant.
@@ -67,9 +68,9 @@ impl From<LimitFlags> for Limits {
     }
 }
 
-fn cores(text: &str) -> Result<f64, String> {
+fn cores(text: &str) -> anyhow::Result<f64> {
     match text.parse::<f64>() {
         Ok(cores) if cores.is_finite() && cores > 0.0 => Ok(cores),
-        _ => Err("write a number of cores such as 1.5".to_owned()),
+        _ => bail!("write a number of cores such as 1.5"),
     }
 }

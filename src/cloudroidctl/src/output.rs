@@ -134,20 +134,35 @@ impl Table {
     }
 }
 
+/// Returns the clock of this machine.
+fn now() -> Millis {
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |since| since.as_millis() as u64)
+}
+
 /// Returns the time since `then`, rounded down to its largest unit.
 pub fn age(then: Millis) -> String {
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_millis() as u64);
-    span(now.saturating_sub(then))
+    span(now().saturating_sub(then))
+}
+
+/// Formats the time of the last use, for a table cell.
+pub fn last_use(at: Option<Millis>) -> String {
+    at.map_or_else(|| "never".into(), |at| format!("{} ago", age(at)))
+}
+
+/// Formats patterns, for a table cell.
+pub fn patterns(patterns: &[access::Glob]) -> String {
+    if patterns.is_empty() {
+        return "-".to_owned();
+    }
+    let texts: Vec<String> = patterns.iter().map(ToString::to_string).collect();
+    texts.join(",")
 }
 
 /// Returns the time until `then`, rounded down to its largest unit.
 pub fn time_until(then: Millis) -> String {
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_millis() as u64);
-    span(then.saturating_sub(now).next_multiple_of(1000))
+    span(then.saturating_sub(now()).next_multiple_of(1000))
 }
 
 fn span(millis: u64) -> String {

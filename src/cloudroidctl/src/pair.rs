@@ -147,22 +147,12 @@ fn list(pairings: &[Pairing], format: OutputFormat) -> anyhow::Result<()> {
     }
     let mut table = Table::new(&["ROBOT", "SERVICES", "CLASSES", "AGE", "CAME", "STATE"]);
     for pairing in pairings {
-        let texts = |patterns: &[access::Glob]| match patterns {
-            [] => "-".to_owned(),
-            patterns => patterns
-                .iter()
-                .map(ToString::to_string)
-                .collect::<Vec<_>>()
-                .join(","),
-        };
         table.row([
             pairing.robot.clone(),
-            texts(&pairing.services),
-            texts(&pairing.classes),
+            output::patterns(&pairing.services),
+            output::patterns(&pairing.classes),
             output::age(pairing.created),
-            pairing
-                .last_used
-                .map_or_else(|| "never".into(), |at| format!("{} ago", output::age(at))),
+            output::last_use(pairing.last_used),
             state(pairing),
         ]);
     }

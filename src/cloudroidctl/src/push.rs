@@ -7,7 +7,8 @@ mod shared;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
+use api::push::ParsePairError;
 use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
@@ -106,28 +107,26 @@ pub struct PushArgs {
     egress: Vec<String>,
 }
 
-fn parameter(text: &str) -> Result<(String, serde_json::Value), String> {
-    let (key, value) = text.split_once('=').ok_or("write K=V")?;
-    if key.is_empty() {
-        return Err("write K=V".to_owned());
-    }
+fn parameter(text: &str) -> anyhow::Result<(String, serde_json::Value)> {
+    let (key, value) = text.split_once('=').context("write K=V")?;
+    ensure!(!key.is_empty(), "write K=V");
     let value =
         serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
     Ok((key.to_owned(), value))
 }
 
-fn assignment(text: &str) -> Result<(String, String), String> {
+fn assignment(text: &str) -> anyhow::Result<(String, String)> {
     match text.split_once(":=") {
         Some((from, to)) if !from.is_empty() => Ok((from.to_owned(), to.to_owned())),
-        _ => Err("write A:=B".to_owned()),
+        _ => bail!("write A:=B"),
     }
 }
 
-fn request(text: &str) -> Result<String, String> {
+fn request(text: &str) -> Result<String, ParsePairError> {
     api::push::parse_request(text).map(|pair| pair.to_string())
 }
 
-fn volume(text: &str) -> Result<Volume, String> {
+fn volume(text: &str) -> anyhow::Result<Volume> {
     match text.split_once(':') {
         Some((source, target)) if source.starts_with('/') && target.starts_with('/') => {
             Ok(Volume {
@@ -135,16 +134,16 @@ fn volume(text: &str) -> Result<Volume, String> {
                 target: target.to_owned(),
             })
         }
-        _ => Err("write SOURCE:TARGET, both absolute".to_owned()),
+        _ => bail!("write SOURCE:TARGET, both absolute"),
     }
 }
 
-fn mapping(text: &str) -> Result<(String, String), String> {
+fn mapping(text: &str) -> anyhow::Result<(String, String)> {
     match text.split_once('=') {
         Some((key, package)) if !key.is_empty() && !package.is_empty() => {
             Ok((key.to_owned(), package.to_owned()))
         }
-        _ => Err("write KEY=DEB".to_owned()),
+        _ => bail!("write KEY=DEB"),
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{bail, ensure};
 use foxglove::ws_protocol::client::advertise::Channel;
 use foxglove::ws_protocol::client::{Advertise, MessageData};
 use foxglove::ws_protocol::schema::Schema;
@@ -40,13 +40,12 @@ pub struct ReplayArgs {
     again: bool,
 }
 
-fn rate(text: &str) -> Result<f64, String> {
-    let rate: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if rate.is_finite() && rate > 0.0 {
-        Ok(rate)
-    } else {
-        Err("must be greater than 0".to_owned())
-    }
+fn rate(text: &str) -> anyhow::Result<f64> {
+    let Ok(rate) = text.parse::<f64>() else {
+        bail!("not a number");
+    };
+    ensure!(rate.is_finite() && rate > 0.0, "must be greater than 0");
+    Ok(rate)
 }
 
 impl ReplayArgs {
@@ -226,7 +225,7 @@ mod tests {
 
     #[test]
     fn a_rate_is_more_than_nothing() {
-        assert_eq!(rate("0.5"), Ok(0.5));
+        assert_eq!(rate("0.5").ok(), Some(0.5));
         for wrong in ["0", "-1", "nan", "inf", "fast"] {
             rate(wrong).expect_err(wrong);
         }

@@ -77,7 +77,7 @@ impl TermFlags {
 }
 
 /// Parses `500ms`, `30s`, `5m`, `1h`, or a number of seconds.
-fn time(text: &str) -> Result<Duration, String> {
+fn time(text: &str) -> anyhow::Result<Duration> {
     let end = text
         .find(|c: char| !c.is_ascii_digit() && c != '.')
         .unwrap_or(text.len());
@@ -90,8 +90,10 @@ fn time(text: &str) -> Result<Duration, String> {
         _ => f64::NAN,
     };
     let seconds = number.parse::<f64>().unwrap_or(f64::NAN) * factor;
-    Duration::try_from_secs_f64(seconds)
-        .map_err(|_| "write a number with ms, s, m or h, such as 10m".to_owned())
+    let Ok(time) = Duration::try_from_secs_f64(seconds) else {
+        bail!("write a number with ms, s, m or h, such as 10m");
+    };
+    Ok(time)
 }
 
 impl RolloutArgs {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use anyhow::bail;
 use api::dictionary::{Explained, NewRows, Row, Spread};
+use api::sla::ParseValueError;
 use api::{Limits, Measure};
 
 use crate::client::{DaemonClient, percent_encode};
@@ -78,15 +79,15 @@ struct ExplainRow {
     stated: StatedFlags,
 }
 
-fn rrt(text: &str) -> Result<f64, String> {
+fn rrt(text: &str) -> Result<f64, ParseValueError> {
     Measure::Rrt.parse_value(text)
 }
 
-fn fps(text: &str) -> Result<f64, String> {
+fn fps(text: &str) -> Result<f64, ParseValueError> {
     Measure::Fps.parse_value(text)
 }
 
-fn age(text: &str) -> Result<f64, String> {
+fn age(text: &str) -> Result<f64, ParseValueError> {
     Measure::Age.parse_value(text)
 }
 
@@ -179,7 +180,7 @@ fn parse_spread(measure: Measure, text: &str) -> anyhow::Result<Spread> {
     let read = |text| {
         measure
             .parse_value(text)
-            .map_err(|reason| anyhow::anyhow!("--spread {reason}"))
+            .map_err(|error| anyhow::anyhow!("--spread {error}"))
     };
     let Ok(requests) = requests.parse() else {
         bail!("--spread: {requests:?} is not a number of requests; write one such as 200");

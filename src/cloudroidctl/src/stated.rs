@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use api::Stated;
 use api::sla::{AUX, check_aux};
 
@@ -44,8 +44,8 @@ pub struct StatedFlags {
 }
 
 /// Parses an auxiliary parameter.
-pub fn aux(text: &str) -> Result<(String, String), String> {
-    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE")?;
+pub fn aux(text: &str) -> anyhow::Result<(String, String)> {
+    let (key, value) = text.split_once('=').context("write KEY=VALUE")?;
     check_aux(key, value)?;
     Ok((key.to_owned(), value.to_owned()))
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use anyhow::{Context, bail};
 use api::access::{NewToken, Secret, Token};
 
 use crate::client::{DaemonClient, percent_encode};
@@ -64,21 +65,23 @@ struct RotateToken {
 }
 
 /// Parses `90s`, `30m`, `12h` or `30d`.
-pub fn lifetime(text: &str) -> Result<Duration, String> {
-    let bad = || "write a whole number with s, m, h or d, such as 30d".to_owned();
+pub fn lifetime(text: &str) -> anyhow::Result<Duration> {
+    const ADVICE: &str = "write a whole number with s, m, h or d, such as 30d";
     let (number, unit) = text.split_at(text.len() - text.chars().last().map_or(0, char::len_utf8));
     let seconds: u64 = match unit {
         "s" => 1,
         "m" => 60,
         "h" => 3600,
         "d" => 86_400,
-        _ => return Err(bad()),
+        _ => bail!(ADVICE),
     };
-    let number: u64 = number.parse().map_err(|_| bad())?;
-    let length = number.checked_mul(seconds).filter(|length| *length > 0);
-    length.map(Duration::from_secs).ok_or_else(bad)
+    let number: Option<u64> = number.parse().ok();
+    let length = number.and_then(|number| number.checked_mul(seconds));
+    let length = length.filter(|length| *length > 0).context(ADVICE)?;
+    Ok(Duration::from_secs(length))
 }
 
+/// Parses patterns of services or classes.
 pub fn parse_patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
     Ok(texts
         .iter()
@@ -141,24 +144,14 @@ fn list(tokens: &[Token], format: OutputFormat) -> anyhow::Result<()> {
         "NAME", "ROLE", "SERVICES", "ROBOT", "CLASSES", "AGE", "USED", "STATE",
     ]);
     for token in tokens {
-        let texts = |patterns: &[access::Glob]| match patterns {
-            [] => "-".to_owned(),
-            patterns => patterns
-                .iter()
-                .map(ToString::to_string)
-                .collect::<Vec<_>>()
-                .join(","),
-        };
         table.row([
             token.name.clone(),
             token.role.to_string(),
-            texts(&token.services),
+            output::patterns(&token.services),
             token.robot.clone().unwrap_or_else(|| "-".into()),
-            texts(&token.classes),
+            output::patterns(&token.classes),
             output::age(token.created),
-            token
-                .last_used
-                .map_or_else(|| "never".into(), |at| format!("{} ago", output::age(at))),
+            output::last_use(token.last_used),
             state(token),
         ]);
     }
@@ -190,7 +183,8 @@ mod tests {
             ("12h", 43_200),
             ("30d", 2_592_000),
         ] {
-            assert_eq!(lifetime(text), Ok(Duration::from_secs(seconds)), "{text}");
+            let length = lifetime(text).expect(text);
+            assert_eq!(length, Duration::from_secs(seconds), "{text}");
         }
         for text in [
             "",

@@ -27,9 +27,9 @@ use ::portal::{Proxies, Tokens};
 use ::servant::local::grants::Allow;
 use anyhow::{Context, anyhow, bail};
 use api::{Limits, Size};
-use choreographer::limits::check as check_limits;
 use serde::Deserialize;
 
+use crate::log::LogFormat;
 use crate::machine;
 
 pub use self::oidc::OidcConfig;
@@ -75,6 +75,8 @@ pub struct Config {
     pub isolation: IsolationMode,
     /// Keep servants when the daemon ends (default: yes under systemd, otherwise no).
     pub keep_servants: Option<bool>,
+    /// Format of the log's lines, if the command line names none.
+    pub log_format: LogFormat,
     /// Directory of base image definitions, searched before the built-in ones.
     pub definitions: Option<PathBuf>,
     /// Package archives of the bases.
@@ -140,6 +142,7 @@ impl Default for Config {
             default_robot: None,
             isolation: IsolationMode::default(),
             keep_servants: None,
+            log_format: LogFormat::default(),
             definitions: None,
             archives: ArchivesConfig::default(),
             limits: Limits {
@@ -213,7 +216,9 @@ impl Config {
         if let Some(oidc) = &self.oidc {
             oidc.check().context("[oidc] of the configuration")?;
         }
-        check_limits(&self.limits).context("[limits] of the configuration")?;
+        self.limits
+            .check()
+            .context("[limits] of the configuration")?;
         self.servant.check()?;
         for (name, class) in &self.class {
             class
@@ -334,6 +339,18 @@ mod tests {
             refused.contains("trusted_proxies") && refused.contains("proxy.lab"),
             "{refused}"
         );
+    }
+
+    #[test]
+    fn a_log_format_that_does_not_exist_is_refused_with_those_that_do() {
+        let refused = Config::parse("log_format = \"xml\"").expect_err("no such format");
+        let refused = format!("{refused:#}");
+        assert!(
+            refused.contains("text") && refused.contains("json"),
+            "{refused}"
+        );
+        let config = Config::parse("log_format = \"json\"").expect("a format");
+        assert_eq!(config.log_format, LogFormat::Json);
     }
 
     #[test]

@@ -228,12 +228,15 @@ fn landlock() -> Check {
     )
 }
 
+/// Returns the directory, or the nearest one above it that exists.
+fn find_existing(home: &Path) -> &Path {
+    let mut above = home.ancestors();
+    above.find(|path| path.is_dir()).unwrap_or(Path::new("/"))
+}
+
 fn idmapped_mounts(home: &Path) -> Check {
     const NAME: &str = "idmapped mounts";
-    let existing = home
-        .ancestors()
-        .find(|path| path.is_dir())
-        .unwrap_or(Path::new("/"));
+    let existing = find_existing(home);
     if !nix::unistd::geteuid().is_root() {
         return warning(NAME, "can only be tested as root", "sudo cloudroidd doctor");
     }
@@ -299,10 +302,7 @@ fn apt_lists() -> Check {
 
 fn disk_space(home: &Path) -> Check {
     const NAME: &str = "disk space";
-    let existing = home
-        .ancestors()
-        .find(|path| path.is_dir())
-        .unwrap_or(Path::new("/"));
+    let existing = find_existing(home);
     let Ok(found) = nix::sys::statvfs::statvfs(existing) else {
         return warning(
             NAME,

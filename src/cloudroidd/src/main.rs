@@ -16,13 +16,13 @@ mod config;
 mod doctor;
 mod freed;
 mod home;
+mod log;
 mod machine;
 mod shim;
 mod supervision;
 mod wiring;
 
 use std::ffi::OsString;
-use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -34,10 +34,10 @@ use clap::{Parser, Subcommand};
 use portal::MachineChecks;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
-use tracing_subscriber::EnvFilter;
 
 use config::{Config, IsolationMode};
 use home::Home;
+use log::LogFormat;
 
 /// Runs ROS packages as services for robots, on this machine.
 #[derive(Debug, Parser)]
@@ -52,6 +52,9 @@ struct DaemonArguments {
     /// Configuration file (TOML).
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Format of the log's lines (default: text).
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    log_format: Option<LogFormat>,
     #[command(subcommand)]
     verb: Option<DaemonCommand>,
 }
@@ -76,34 +79,30 @@ fn main() -> ExitCode {
         let directory = PathBuf::from(words.next().unwrap_or_default());
         return servant::shim::run(&directory, Box::new(shim::MasterResident::default()));
     }
-    let arguments = DaemonArguments::parse();
-    let filter =
-        EnvFilter::try_from_env("CLOUDROID_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_target(false)
-        .init();
-    let outcome = match &arguments.verb {
-        Some(DaemonCommand::Doctor { json }) => examine(&arguments, *json),
-        None => prepare(arguments).and_then(|(config, home, machine)| {
-            let (engine, portal) = start_threads(&config)?;
-            let outcome = portal.block_on(run(config, home, machine));
-            // Threads that still work for a cancelled push are not waited for: what they make is unfinished, and the
-            // next daemon removes it.
-            portal.shutdown_timeout(LAST_WORK);
-            engine.end(LAST_WORK);
-            outcome
-        }),
-    };
-    match outcome {
+    match run_command(DaemonArguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
         }
     }
+}
+
+/// Does what the command line says, until that is done or the daemon is stopped.
+fn run_command(arguments: DaemonArguments) -> anyhow::Result<()> {
+    let config = Config::read(arguments.config.as_deref())?;
+    log::start(arguments.log_format.unwrap_or(config.log_format));
+    if let Some(DaemonCommand::Doctor { json }) = arguments.verb {
+        return examine(&arguments, &config, json);
+    }
+    let (config, home, machine) = prepare(arguments, config)?;
+    let (engine, portal) = start_threads(&config)?;
+    let outcome = portal.block_on(run(config, home, machine));
+    // Threads that still work for a cancelled push are not waited for: what they make is unfinished, and the next
+    // daemon removes it.
+    portal.shutdown_timeout(LAST_WORK);
+    engine.end(LAST_WORK);
+    outcome
 }
 
 /// Starts the engine's threads, which keep the capabilities that containers need, and the portal's, which have none and
@@ -137,8 +136,7 @@ fn home_path(arguments: &DaemonArguments) -> anyhow::Result<PathBuf> {
     }
 }
 
-fn examine(arguments: &DaemonArguments, json: bool) -> anyhow::Result<()> {
-    let config = Config::read(arguments.config.as_deref())?;
+fn examine(arguments: &DaemonArguments, config: &Config, json: bool) -> anyhow::Result<()> {
     let doubts = config.machine_warnings(machine::resources());
     let doctor = doctor::examine(&home_path(arguments)?, None, &doubts);
     if json {
@@ -164,11 +162,13 @@ fn examine(arguments: &DaemonArguments, json: bool) -> anyhow::Result<()> {
 }
 
 /// Makes all checks that need no change except to the state directory.
-fn prepare(arguments: DaemonArguments) -> anyhow::Result<(Config, Home, MachineChecks)> {
+fn prepare(
+    arguments: DaemonArguments,
+    mut config: Config,
+) -> anyhow::Result<(Config, Home, MachineChecks)> {
     if let Err(error) = machine::raise_descriptor_limit() {
         tracing::warn!("cannot raise the limit of open files: {error}");
     }
-    let mut config = Config::read(arguments.config.as_deref())?;
     config.listen = arguments.listen.unwrap_or(config.listen);
     config.check()?;
     let path = home_path(&arguments)?;
@@ -342,6 +342,19 @@ mod tests {
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
         DaemonArguments::command().debug_assert();
+    }
+
+    #[test]
+    fn a_log_format_that_does_not_exist_is_refused_with_those_that_do() {
+        let parse =
+            |format: &str| DaemonArguments::try_parse_from(["cloudroidd", "--log-format", format]);
+        let refused = parse("xml").expect_err("no such format").to_string();
+        assert!(
+            refused.contains("text") && refused.contains("json"),
+            "{refused}"
+        );
+        let arguments = parse("json").expect("a format");
+        assert_eq!(arguments.log_format, Some(LogFormat::Json));
     }
 
     #[test]

@@ -161,11 +161,11 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
     let init = doctor::find_init().context("cloudroid-init is not beside cloudroidd")?;
     let servants = home.path().join("servants");
     let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
-    engine.default_limits = choreographer::engine_limits(&config.limits);
-    engine.shim_limits = servant::spec::ResourceLimits {
+    engine.default_limits = config.limits;
+    engine.shim_limits = api::Limits {
         cpus: Some(config.memory.shim_cpus),
-        memory: Some(config.memory.shim.0),
-        ..servant::spec::ResourceLimits::default()
+        memory: Some(config.memory.shim),
+        ..api::Limits::default()
     };
     engine.quotas = servant::quotas::Quotas {
         scratch: config.servant.scratch.map(|size| size.0),

@@ -1,11 +1,16 @@
-//! Compares the documentation with the repository: ARCHITECTURE.md (dependencies between crates), docs/security.md
-//! (stories that security rests on) and tests/subjects.rs (crates that stories are about).
+//! Compares the documentation with the repository: ARCHITECTURE.md (dependencies between crates, circles of files),
+//! docs/security.md (stories that security rests on) and tests/subjects.rs (crates that stories are about).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+#[path = "architecture/imports.rs"]
+mod imports;
 #[path = "../../../tests/subjects.rs"]
 mod subjects;
+
+/// Largest number of files of one folder that may import one another.
+const LARGEST_CIRCLE: usize = 5;
 
 /// Returns the root of the repository.
 fn root() -> PathBuf {
@@ -101,6 +106,45 @@ fn the_map_says_what_the_manifests_say() {
         .filter(|name| !above.contains(**name))
         .collect();
     assert!(untold.is_empty(), "the map has no row for {untold:?}");
+}
+
+/// Circles make files that cannot be read, tested or moved alone. How imports are read is said in `imports`.
+#[test]
+fn files_that_import_one_another_are_few_and_in_one_folder() {
+    let home = root();
+    let mut wrong = Vec::new();
+    let roots = members().into_keys().flat_map(|directory| {
+        let sources = home.join(directory).join("src");
+        ["lib.rs", "main.rs"].map(|name| sources.join(name))
+    });
+    for file in roots.filter(|file| file.exists()) {
+        let imports = imports::read_imports(&file);
+        assert!(!imports.is_empty(), "{} was read", file.display());
+        for circle in imports::find_circles(&imports) {
+            if circle.len() <= LARGEST_CIRCLE && imports::is_in_one_folder(&circle) {
+                continue;
+            }
+            let name = |file: &PathBuf| {
+                let inside = file.strip_prefix(&home).expect("a file of ours");
+                inside.display().to_string()
+            };
+            let names: Vec<String> = circle.iter().map(name).collect();
+            let shortest = imports::shortest_cycle(&circle, &imports);
+            let shortest: Vec<String> = shortest.iter().map(name).collect();
+            wrong.push(format!(
+                "{} files: {}; the shortest circle is {}",
+                names.len(),
+                names.join(", "),
+                shortest.join(" -> ")
+            ));
+        }
+    }
+    assert!(
+        wrong.is_empty(),
+        "more than {LARGEST_CIRCLE} files import one another, or files of several folders do; move what both need to a \
+            file below them:\n{}",
+        wrong.join("\n")
+    );
 }
 
 /// Returns whether a cell names unit tests, such as "`one`, `two` (crate `of_these`)", and checks that all of them

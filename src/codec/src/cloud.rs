@@ -10,7 +10,7 @@ mod ratio;
 
 use crate::Error;
 use crate::column::{self, Shape, put_packed, take_packed};
-use crate::layout::{CloudLayout, FieldMeaning, NumberType, PointField};
+use crate::layout::{CloudLayout, FieldMeaning, NumberType, PointField, take_ends};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::rows::{put_padding, take_padding};
@@ -91,12 +91,13 @@ pub(crate) fn decode(
     total: usize,
     out: &mut Vec<u8>,
 ) -> Result<(), Error> {
-    let ends = input.block()?;
-    let layout = CloudLayout::read(ends, total)
-        .filter(|layout| layout.head + layout.tail == ends.len())
-        .ok_or(Error::Corrupt("a head that is not a cloud's"))?;
+    let (layout, ends) = take_ends(input, "a head that is not a cloud's", |ends| {
+        let layout = CloudLayout::read(ends, total)?;
+        let (head, tail) = (layout.head, layout.tail);
+        Some((layout, head, tail))
+    })?;
     let length = layout.row_step * layout.height;
-    let data = MessageEnds::from_joined(ends, layout.head).restore(length + 1, out);
+    let data = ends.restore(length + 1, out);
     let (data, dense) = data.split_at_mut(length);
     dense.copy_from_slice(&[input.byte()?]);
     let row = layout.width * layout.point_step;

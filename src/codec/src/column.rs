@@ -472,29 +472,23 @@ fn decode(
         0
     };
     let missing = gaps.then(|| shape.lanes());
-    if flags & WIDE != 0 {
-        let (samples, missing) = decode_plane::<u32>(input, shape, missing)?;
-        return Ok(DecodedColumn {
-            flags,
-            scale,
-            apart,
-            offset,
-            samples,
-            missing,
-        });
-    }
-    let values = if flags & RANKS != 0 {
-        Some(take_ranks(input)?)
+    let (samples, missing) = if flags & WIDE != 0 {
+        decode_plane::<u32>(input, shape, missing)?
     } else {
-        None
-    };
-    let (samples, missing) = decode_plane::<u16>(input, shape, missing)?;
-    let samples = match values {
-        None => samples.into_iter().map(u32::from).collect(),
-        Some(values) => samples
-            .into_iter()
-            .map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen())
-            .collect(),
+        let values = if flags & RANKS != 0 {
+            Some(take_ranks(input)?)
+        } else {
+            None
+        };
+        let (samples, missing) = decode_plane::<u16>(input, shape, missing)?;
+        let samples = match values {
+            None => samples.into_iter().map(u32::from).collect(),
+            Some(values) => samples
+                .into_iter()
+                .map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen())
+                .collect(),
+        };
+        (samples, missing)
     };
     Ok(DecodedColumn {
         flags,

@@ -10,7 +10,7 @@ mod ladder;
 
 use crate::Error;
 use crate::generic::{ZstdCompressor, unzstd};
-use crate::layout::GridLayout;
+use crate::layout::{GridLayout, take_ends};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::wire::{FrameCursor, MessageEnds};
@@ -94,11 +94,10 @@ pub(crate) fn decode(
     total: usize,
     out: &mut Vec<u8>,
 ) -> Result<(), Error> {
-    let ends = input.block()?;
-    let layout = GridLayout::read(ends, total)
-        .filter(|layout| layout.head + layout.tail == ends.len())
-        .ok_or(Error::Corrupt("a head that is not a grid's"))?;
-    let ends = MessageEnds::from_joined(ends, layout.head);
+    let (layout, ends) = take_ends(input, "a head that is not a grid's", |ends| {
+        let layout = GridLayout::read(ends, total)?;
+        Some((layout, layout.head, layout.tail))
+    })?;
     let mode = input.byte()?;
     let background = input.byte()?;
     let count = layout.width * layout.height;

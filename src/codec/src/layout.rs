@@ -174,11 +174,10 @@ impl ImageLayout {
         input: &mut FrameCursor<'a>,
         total: usize,
     ) -> Result<(Self, MessageEnds<'a>), Error> {
-        let ends = input.block()?;
-        let layout = Self::read(ends, total)
-            .filter(|layout| layout.head + layout.tail == ends.len())
-            .ok_or(Error::Corrupt("a head that is not an image's"))?;
-        Ok((layout, MessageEnds::from_joined(ends, layout.head)))
+        take_ends(input, "a head that is not an image's", |ends| {
+            let layout = Self::read(ends, total)?;
+            Some((layout, layout.head, layout.tail))
+        })
     }
 
     /// Returns the samples with the padding between their rows.
@@ -190,6 +189,20 @@ impl ImageLayout {
     pub(crate) fn row_bytes(&self) -> usize {
         self.width * self.pixel.bytes()
     }
+}
+
+/// Reads the head and tail of a message from a frame. `read` returns the layout that they describe, with the lengths of
+/// both; `wrong` is the error if it cannot.
+pub(crate) fn take_ends<'a, L>(
+    input: &mut FrameCursor<'a>,
+    wrong: &'static str,
+    read: impl FnOnce(&[u8]) -> Option<(L, usize, usize)>,
+) -> Result<(L, MessageEnds<'a>), Error> {
+    let ends = input.block()?;
+    let (layout, head, _) = read(ends)
+        .filter(|(_, head, tail)| head + tail == ends.len())
+        .ok_or(Error::Corrupt(wrong))?;
+    Ok((layout, MessageEnds::from_joined(ends, head)))
 }
 
 /// `nav_msgs/OccupancyGrid`; the cells are the end of the message.

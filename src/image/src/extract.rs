@@ -142,7 +142,9 @@ impl Store {
     /// Flushes the file system in the background. Nothing is lost if that never completes, since the marker remains.
     fn flush_later(&self, diff_id: Digest) {
         let (mark, layers) = (self.volatile_path(&diff_id), self.layers_dir().to_owned());
+        let span = tracing::Span::current();
         let flush = move || {
+            let _entered = span.entered();
             let flushed =
                 File::open(&layers).and_then(|directory| Ok(rustix::fs::syncfs(&directory)?));
             match flushed.and_then(|()| std::fs::remove_file(&mark)) {

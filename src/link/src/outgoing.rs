@@ -37,11 +37,9 @@ use encoding::Encoding;
 use gate::Gate;
 use lanes::{LineQueue, RecordLane, RecordLanes};
 pub use out::DeliveryMode;
-use out::OutgoingRecord;
+use out::{InFlightRecord, OutgoingRecord, SMALL};
 use retransmit::RetransmitBuffer;
 
-/// Records up to this size are sent in one piece and kept until they are acknowledged.
-pub(crate) const SMALL: usize = 32 * 1024;
 /// Target transmission time of a piece at the measured throughput, in seconds.
 const PIECE_TIME: f64 = 0.008;
 /// Minimum and maximum size of a piece in bytes.
@@ -57,16 +55,6 @@ const TURN_OF_DATA: u32 = 4;
 /// Divisor of the peer's limit on numbers ahead: the part that may be used for records that are not kept for
 /// retransmission.
 const UNKEPT_AHEAD: usize = 4;
-
-#[derive(Debug)]
-struct InFlightRecord {
-    stream: u32,
-    number: u64,
-    /// The record is sent again after a lost connection.
-    again: bool,
-    at: usize,
-    out: OutgoingRecord,
-}
 
 /// Send state of a session.
 #[derive(Debug)]

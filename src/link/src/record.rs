@@ -11,6 +11,7 @@
 
 use budget::Permit;
 use bytes::{Buf, BufMut, Bytes, BytesMut};
+use ros::bus::FailureReason;
 
 use crate::Error;
 
@@ -53,7 +54,7 @@ pub enum Record<C = Bytes> {
         /// Time at which the response was available, on the same clock.
         given: i64,
         /// Serialized response, or the reason why there is none.
-        response: Result<Bytes, String>,
+        response: Result<Bytes, FailureReason>,
     },
 }
 
@@ -198,7 +199,7 @@ impl Record {
                 head.put_i64_le(*given);
                 match response {
                     Ok(response) => response.clone(),
-                    Err(reason) => Bytes::copy_from_slice(reason.as_bytes()),
+                    Err(reason) => Bytes::copy_from_slice(reason.as_str().as_bytes()),
                 }
             }
         };
@@ -261,7 +262,7 @@ impl Record {
                     response: if ok {
                         Ok(bytes)
                     } else {
-                        Err(String::from_utf8_lossy(&bytes).into_owned())
+                        Err(FailureReason::new(String::from_utf8_lossy(&bytes)))
                     },
                 }
             }
@@ -333,7 +334,7 @@ mod tests {
                 "03 06000000 01 0700000000000000 0800000000000000 796573",
             ),
             (
-                answer(Err("no".into())),
+                answer(Err(FailureReason::new("no"))),
                 "03 06000000 00 0700000000000000 0800000000000000 6e6f",
             ),
         ];
@@ -388,7 +389,7 @@ mod tests {
                 id: 1,
                 taken: 2,
                 given: 3,
-                response: Err("no".into()),
+                response: Err(FailureReason::new("no")),
             },
         ] {
             let (mut head, payload) = record.to_parts();

@@ -13,6 +13,7 @@ use std::time::Duration;
 use budget::{Budget, JsonWeight, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
+use ros::bus::FailureReason;
 use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use tokio::time::{Instant, timeout};
@@ -339,12 +340,12 @@ impl<O: ControlMessage> Session<O> {
     }
 
     /// Answers a call that was received at `taken` (nanoseconds since the Unix epoch).
-    pub fn answer(&self, id: u32, taken: i64, response: Result<Bytes, String>) {
+    pub fn answer(&self, id: u32, taken: i64, response: Result<Bytes, FailureReason>) {
         let response = response.and_then(|response| match response.len() {
             0..MAX_RESPONSE => Ok(response),
-            bytes => Err(format!(
+            bytes => Err(FailureReason::new(format!(
                 "the response has {bytes} bytes, more than a link carries ({MAX_RESPONSE})"
-            )),
+            ))),
         });
         let answer = Record::Answer {
             id,

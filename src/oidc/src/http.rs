@@ -28,6 +28,26 @@ pub enum ProviderRequestError {
     Outbound(#[from] outbound::Error),
 }
 
+/// Reason why a person's claims cannot be fetched from the userinfo endpoint.
+#[derive(Debug, thiserror::Error)]
+pub enum UserinfoError {
+    /// The access token cannot be part of a header.
+    #[error("its access token cannot be sent")]
+    UnsendableToken,
+    /// The request cannot be made.
+    #[error(transparent)]
+    Invalid(#[from] openidconnect::http::Error),
+    /// The request failed.
+    #[error(transparent)]
+    Request(#[from] ProviderRequestError),
+    /// The endpoint refused.
+    #[error("its userinfo endpoint answered {0}")]
+    Status(StatusCode),
+    /// The response cannot be read.
+    #[error("its userinfo is not a JSON object with a sub ({0}); signed userinfo is not supported")]
+    Unreadable(serde_json::Error),
+}
+
 /// HTTP client for the provider.
 pub struct Http {
     client: outbound::OutboundClient,
@@ -59,27 +79,22 @@ impl Http {
     }
 
     /// Fetches the claims of the access token's owner (section 5.3.1).
-    pub async fn fetch_userinfo(&self, url: &Url, access_token: &str) -> Result<Claims, String> {
+    pub async fn fetch_userinfo(
+        &self,
+        url: &Url,
+        access_token: &str,
+    ) -> Result<Claims, UserinfoError> {
         let shown = HeaderValue::from_str(&format!("Bearer {access_token}"))
-            .map_err(|_| "its access token cannot be sent".to_owned())?;
+            .map_err(|_| UserinfoError::UnsendableToken)?;
         let request = Request::get(url.as_str())
             .header(AUTHORIZATION, shown)
             .header(ACCEPT, "application/json")
-            .body(Vec::new())
-            .map_err(|error| error.to_string())?;
-        let answer = self
-            .send(request)
-            .await
-            .map_err(|error| error.to_string())?;
+            .body(Vec::new())?;
+        let answer = self.send(request).await?;
         if answer.status() != StatusCode::OK {
-            return Err(format!(
-                "its userinfo endpoint answered {}",
-                answer.status()
-            ));
+            return Err(UserinfoError::Status(answer.status()));
         }
-        Claims::from_slice(answer.body()).map_err(|error| {
-            format!("its userinfo is not a JSON object with a sub ({error}); signed userinfo is not supported")
-        })
+        Claims::from_slice(answer.body()).map_err(UserinfoError::Unreadable)
     }
 }
 

@@ -186,7 +186,7 @@ impl Provider {
     ) -> Result<SignInRedirect, Error> {
         let _turn = self.acquire_permit()?;
         let known = self.metadata.get(&self.issuer, &self.http).await;
-        let known = known.map_err(|reason| self.unreachable(reason))?;
+        let known = known.map_err(|error| self.unreachable(error.to_string()))?;
         let (challenge, verifier) = PkceCodeChallenge::new_random_sha256();
         let flow = CoreAuthenticationFlow::AuthorizationCode;
         let state = || CsrfToken::new_random_len(SECRET);
@@ -251,7 +251,7 @@ impl Provider {
         }
         let _turn = self.acquire_permit()?;
         let known = self.metadata.get(&self.issuer, &self.http).await;
-        let known = known.map_err(|reason| self.unreachable(reason))?;
+        let known = known.map_err(|error| self.unreachable(error.to_string()))?;
         let response = self.exchange(&known, code, started.verifier).await?;
         let Some(id_token) = response.id_token() else {
             return Err(self.token_error("there is none".into()));
@@ -266,7 +266,7 @@ impl Provider {
             // The provider may have rotated its keys since they were fetched.
             Err(refused) if refused.is_unknown_key() => {
                 let fresh = self.metadata.refresh_keys(&known, &self.http).await;
-                match fresh.map_err(|reason| self.unreachable(reason))? {
+                match fresh.map_err(|error| self.unreachable(error.to_string()))? {
                     Some(fresh) => checks.verify(id_token, &fresh),
                     None => Err(refused),
                 }
@@ -334,7 +334,7 @@ impl Provider {
         let more = match known.userinfo_endpoint().filter(|_| lacks) {
             Some(url) => {
                 let told = self.http.fetch_userinfo(url, access_token).await;
-                let told = told.map_err(|reason| self.unreachable(reason))?;
+                let told = told.map_err(|error| self.unreachable(error.to_string()))?;
                 if told.subject() != subject {
                     return Err(self.token_error("its userinfo is of another person".into()));
                 }

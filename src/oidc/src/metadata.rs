@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use openidconnect::IssuerUrl;
 use openidconnect::core::{CoreClientAuthMethod, CoreJsonWebKeySet, CoreProviderMetadata};
 use openidconnect::url::Url;
+use openidconnect::{DiscoveryError, IssuerUrl};
 use tokio::sync::Mutex;
 
 use crate::error::with_causes;
-use crate::http::Http;
+use crate::http::{Http, ProviderRequestError};
 
 /// Time for which the metadata is cached.
 const AGE: Duration = Duration::from_secs(3600);
@@ -38,10 +38,21 @@ impl DiscoveredProvider {
     }
 }
 
+/// Reason why the metadata or the keys of the provider cannot be fetched.
+#[derive(Debug, Clone, thiserror::Error)]
+#[error("{}", with_causes(.0))]
+pub struct MetadataError(Arc<DiscoveryError<ProviderRequestError>>);
+
+impl MetadataError {
+    fn new(error: DiscoveryError<ProviderRequestError>) -> MetadataError {
+        MetadataError(Arc::new(error))
+    }
+}
+
 #[derive(Default)]
 struct State {
     known: Option<Arc<DiscoveredProvider>>,
-    failed: Option<(Instant, String)>,
+    failed: Option<(Instant, MetadataError)>,
     /// Time when the keys were last refreshed.
     keys: Option<Instant>,
 }
@@ -51,12 +62,12 @@ struct State {
 pub struct MetadataCache(Mutex<State>);
 
 impl MetadataCache {
-    /// Returns the cached metadata, or fetches it; otherwise the reason why it cannot be fetched.
+    /// Returns the cached metadata, or fetches it.
     pub async fn get(
         &self,
         issuer: &IssuerUrl,
         http: &Http,
-    ) -> Result<Arc<DiscoveredProvider>, String> {
+    ) -> Result<Arc<DiscoveredProvider>, MetadataError> {
         // Concurrent callers wait for the same response.
         let asked = Instant::now();
         let mut state = self.0.lock().await;
@@ -67,10 +78,10 @@ impl MetadataCache {
         {
             return Ok(Arc::clone(known));
         }
-        if let Some((at, reason)) = &state.failed
+        if let Some((at, error)) = &state.failed
             && (*at >= asked || at.elapsed() < FAILED)
         {
-            return Err(reason.clone());
+            return Err(error.clone());
         }
         match CoreProviderMetadata::discover_async(issuer.clone(), http).await {
             Ok(metadata) => {
@@ -81,9 +92,9 @@ impl MetadataCache {
                 Ok(known)
             }
             Err(error) => {
-                let reason = with_causes(&error);
-                state.failed = Some((Instant::now(), reason.clone()));
-                Err(reason)
+                let error = MetadataError::new(error);
+                state.failed = Some((Instant::now(), error.clone()));
+                Err(error)
             }
         }
     }
@@ -93,7 +104,7 @@ impl MetadataCache {
         &self,
         before: &DiscoveredProvider,
         http: &Http,
-    ) -> Result<Option<Arc<DiscoveredProvider>>, String> {
+    ) -> Result<Option<Arc<DiscoveredProvider>>, MetadataError> {
         let mut state = self.0.lock().await;
         // Another caller has refreshed them while this one waited.
         if let Some(known) = state.known.as_ref().filter(|known| known.at > before.at) {
@@ -104,7 +115,7 @@ impl MetadataCache {
         }
         state.keys = Some(Instant::now());
         let asked = CoreJsonWebKeySet::fetch_async(before.metadata.jwks_uri(), http).await;
-        let keys = asked.map_err(|error| with_causes(&error))?;
+        let keys = asked.map_err(MetadataError::new)?;
         let known = Arc::new(DiscoveredProvider {
             metadata: before.metadata.clone().set_jwks(keys),
             at: Instant::now(),

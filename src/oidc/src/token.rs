@@ -135,7 +135,9 @@ impl IdTokenChecks<'_> {
         let verifier = IdTokenVerifier::new_public_client(client, self.issuer.clone(), keys)
             .set_allowed_algs(ALGORITHMS)
             .set_time_fn(|| Utc::now() - SKEW)
-            .set_issue_time_verifier_fn(check_issue_time)
+            .set_issue_time_verifier_fn(|issued| {
+                check_issue_time(issued).map_err(|error| error.to_string())
+            })
             // With several audiences, azp decides.
             .set_other_audience_verifier_fn(|_| true);
         let claims = token
@@ -163,10 +165,15 @@ impl IdTokenChecks<'_> {
     }
 }
 
-fn check_issue_time(issued: DateTime<Utc>) -> Result<(), String> {
+/// An ID token whose time of issue is in the future.
+#[derive(Debug, thiserror::Error)]
+#[error("issued at {0}, which is in the future")]
+struct FutureIssueTime(DateTime<Utc>);
+
+fn check_issue_time(issued: DateTime<Utc>) -> Result<(), FutureIssueTime> {
     if issued <= Utc::now() + SKEW {
         Ok(())
     } else {
-        Err(format!("issued at {issued}, which is in the future"))
+        Err(FutureIssueTime(issued))
     }
 }

@@ -29,8 +29,8 @@ impl Variables {
         self.0.get(name).map_or("", String::as_str)
     }
 
-    /// Evaluates a condition; returns a description of the error if it cannot be parsed.
-    pub fn evaluate(&self, condition: &str) -> Result<bool, String> {
+    /// Evaluates a condition. Fails if it cannot be parsed.
+    pub fn evaluate(&self, condition: &str) -> Result<bool, ConditionError> {
         let tokens = tokenize(condition)?;
         let mut parser = Parser {
             tokens: &tokens,
@@ -40,7 +40,7 @@ impl Variables {
         let holds = parser.or_expression()?;
         match parser.tokens {
             [] => Ok(holds),
-            [extra, ..] => Err(format!("unexpected {extra:?}")),
+            [extra, ..] => Err(ConditionError::UnexpectedToken(extra.clone())),
         }
     }
 }
@@ -56,13 +56,49 @@ impl<K: Into<String>, V: Into<String>> FromIterator<(K, V)> for Variables {
     }
 }
 
+/// Error of parsing a condition.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ConditionError {
+    /// The condition ends where more is expected.
+    #[error("it ends too early")]
+    EndsEarly,
+    /// This quote is not closed.
+    #[error("the quote {0} is not closed")]
+    OpenQuote(char),
+    /// No token begins with this character.
+    #[error("unexpected {0:?}")]
+    UnexpectedCharacter(char),
+    /// The condition is complete before this token.
+    #[error("unexpected {0:?}")]
+    UnexpectedToken(Token),
+    /// There are too many nested brackets.
+    #[error("more than {MAX_DEPTH} nested brackets")]
+    TooDeep,
+    /// A closing bracket is missing before this token.
+    #[error("a closing bracket is missing before {0:?}")]
+    NoBracket(Token),
+    /// A comparison operator is missing before this token.
+    #[error("a comparison is missing before {0:?}")]
+    NoComparison(Token),
+    /// A value is missing before this token.
+    #[error("a value is missing before {0:?}")]
+    NoValue(Token),
+}
+
+/// A token of a condition.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Token {
+pub enum Token {
+    /// A bare word: a value, `and` or `or`.
     Word(String),
+    /// A value, without its quotes.
     Quoted(String),
+    /// A variable, without its `$`.
     Variable(String),
+    /// A comparison operator.
     Operator(&'static str),
+    /// An opening bracket.
     Open,
+    /// A closing bracket.
     Close,
 }
 
@@ -71,7 +107,7 @@ const MAX_DEPTH: usize = 32;
 
 const OPERATORS: [&str; 6] = ["==", "!=", "<=", ">=", "<", ">"];
 
-fn tokenize(text: &str) -> Result<Vec<Token>, String> {
+fn tokenize(text: &str) -> Result<Vec<Token>, ConditionError> {
     let mut tokens = Vec::new();
     let mut rest = text.trim_start();
     while let Some(first) = rest.chars().next() {
@@ -85,7 +121,7 @@ fn tokenize(text: &str) -> Result<Vec<Token>, String> {
             (_, quote @ ('"' | '\'')) => {
                 let end = rest[1..]
                     .find(quote)
-                    .ok_or_else(|| format!("the quote {quote} is not closed"))?;
+                    .ok_or(ConditionError::OpenQuote(quote))?;
                 (Token::Quoted(rest[1..=end].to_owned()), end + 2)
             }
             (_, '$') => {
@@ -98,7 +134,7 @@ fn tokenize(text: &str) -> Result<Vec<Token>, String> {
             }
         };
         if matches!(&token, Token::Word(name) | Token::Variable(name) if name.is_empty()) {
-            return Err(format!("unexpected {first:?}"));
+            return Err(ConditionError::UnexpectedCharacter(first));
         }
         tokens.push(token);
         rest = rest[length..].trim_start();
@@ -118,8 +154,8 @@ struct Parser<'a> {
 }
 
 impl Parser<'_> {
-    fn next(&mut self) -> Result<&Token, String> {
-        let (first, rest) = self.tokens.split_first().ok_or("it ends too early")?;
+    fn next(&mut self) -> Result<&Token, ConditionError> {
+        let (first, rest) = self.tokens.split_first().ok_or(ConditionError::EndsEarly)?;
         self.tokens = rest;
         Ok(first)
     }
@@ -132,7 +168,7 @@ impl Parser<'_> {
         there
     }
 
-    fn or_expression(&mut self) -> Result<bool, String> {
+    fn or_expression(&mut self) -> Result<bool, ConditionError> {
         let mut holds = self.and_expression()?;
         while self.take_word("or") {
             holds |= self.and_expression()?;
@@ -140,7 +176,7 @@ impl Parser<'_> {
         Ok(holds)
     }
 
-    fn and_expression(&mut self) -> Result<bool, String> {
+    fn and_expression(&mut self) -> Result<bool, ConditionError> {
         let mut holds = self.comparison()?;
         while self.take_word("and") {
             holds &= self.comparison()?;
@@ -148,24 +184,24 @@ impl Parser<'_> {
         Ok(holds)
     }
 
-    fn comparison(&mut self) -> Result<bool, String> {
+    fn comparison(&mut self) -> Result<bool, ConditionError> {
         if self.tokens.first() == Some(&Token::Open) {
             self.tokens = &self.tokens[1..];
             self.depth += 1;
             if self.depth > MAX_DEPTH {
-                return Err(format!("more than {MAX_DEPTH} nested brackets"));
+                return Err(ConditionError::TooDeep);
             }
             let holds = self.or_expression()?;
             self.depth -= 1;
             return match self.next()? {
                 Token::Close => Ok(holds),
-                other => Err(format!("a closing bracket is missing before {other:?}")),
+                other => Err(ConditionError::NoBracket(other.clone())),
             };
         }
         let left = self.value()?;
         let operator = match self.next()? {
             Token::Operator(operator) => *operator,
-            other => return Err(format!("a comparison is missing before {other:?}")),
+            other => return Err(ConditionError::NoComparison(other.clone())),
         };
         let right = self.value()?;
         let order = left.cmp(&right);
@@ -179,12 +215,12 @@ impl Parser<'_> {
         })
     }
 
-    fn value(&mut self) -> Result<String, String> {
+    fn value(&mut self) -> Result<String, ConditionError> {
         let variables = self.variables;
         match self.next()? {
             Token::Word(text) | Token::Quoted(text) => Ok(text.clone()),
             Token::Variable(name) => Ok(variables.get(name).to_owned()),
-            other => Err(format!("a value is missing before {other:?}")),
+            other => Err(ConditionError::NoValue(other.clone())),
         }
     }
 }
@@ -227,7 +263,10 @@ mod tests {
             ("== 1", "value is missing"),
             (&"(".repeat(1000), "brackets"),
         ] {
-            let problem = Variables::default().evaluate(condition).unwrap_err();
+            let problem = Variables::default()
+                .evaluate(condition)
+                .unwrap_err()
+                .to_string();
             assert!(problem.contains(reason), "{condition}: {problem}");
         }
     }

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::requests::Request;
+use crate::request::Request;
 
 mod descriptor;
-mod qos;
+pub mod qos;
 
 pub use descriptor::{Descriptor, Range};
 pub use qos::{Durability, Liveliness, Qos, Reliability};

@@ -34,6 +34,7 @@ mod merged;
 pub mod names;
 mod order;
 mod read;
+mod request;
 pub mod requests;
 pub mod stub;
 mod supplement;

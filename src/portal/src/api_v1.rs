@@ -1,14 +1,12 @@
 //! Handlers of `/api/v1`, used by cloudroidctl and the page.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use access::{AccessAction, AccessObject};
-use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
+use api::{Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
-use axum::extract::{Path, State};
-use axum::http::header;
-use axum::response::{IntoResponse, Response};
+use axum::extract::{OriginalUri, Path, State};
+use axum::response::Response;
 use axum::{Extension, Json};
 use futures_util::StreamExt;
 use reach::{Material, Picture};
@@ -18,14 +16,13 @@ use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
 use super::audit::AuditObject;
-use super::body::{self, BufferedBody};
-use super::guard::Caller;
+use super::body::{BufferedBody, LARGEST_WORDS, read_body, read_recording};
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::query::Query;
+use crate::json::{JsonResult, json_lines};
+use crate::query::{Query, query_pairs};
 use crate::{recordings, views};
-
-pub(super) type JsonResult<T> = Result<Json<T>, Error>;
 
 /// Default number of log lines.
 const LOG_LINES: usize = 10_000;
@@ -188,38 +185,6 @@ pub async fn order_rollout(
     }))
 }
 
-/// Maximum size of a recording for a trial or a calibration, if its sender's budget allows: it is held in memory.
-const LARGEST_TRIAL: usize = 512 << 20;
-/// Maximum size of other bodies.
-pub(super) const LARGEST_WORDS: usize = 64 << 10;
-
-/// Reads a body within its sender's memory budget.
-pub(super) async fn read_body(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-    max: usize,
-) -> Result<BufferedBody, Error> {
-    let memory = app.choreographer.memory();
-    let budget = memory.client(&caller.peer.budget_name(None));
-    body::read(body, max, &budget, memory.unfinished).await
-}
-
-/// Reads a body that is a recording or pictures.
-pub(super) async fn read_recording(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-) -> Result<BufferedBody, Error> {
-    let memory = app.choreographer.memory();
-    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.budget_name(None)).max_permit());
-    let read = read_body(app, caller, body, max).await;
-    read.map_err(|error| match error {
-        Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
-        error => error,
-    })
-}
-
 /// Query of a trial.
 #[derive(Debug, Deserialize, IntoParams)]
 pub struct TrialQuery {
@@ -237,54 +202,16 @@ enum Kind {
     Image,
 }
 
-/// Query: requirements as a robot would state them; auxiliary parameters are `aux.KEY`.
-#[derive(Debug, Deserialize, IntoParams)]
-pub struct StatementQuery {
-    /// Desired response time (T_desire), such as `100ms`.
-    rrt: Option<String>,
-    /// Maximum acceptable response time (T_max), such as `300ms`.
-    max_rrt: Option<String>,
-    /// Desired frames per second.
-    fps: Option<String>,
-    /// Desired maximum age of an output, such as `100ms`.
-    age: Option<String>,
-    /// Class of the configuration.
-    class: Option<String>,
-    /// CPU limit in cores, stated directly.
-    cpus: Option<String>,
-    /// Memory limit, such as `512M`, stated directly.
-    memory: Option<String>,
-    #[serde(flatten)]
-    #[param(ignore)]
-    others: BTreeMap<String, String>,
-}
-
-impl StatementQuery {
-    fn parse(self) -> Result<api::Stated, Error> {
-        let known = [
-            ("rrt", self.rrt),
-            ("max_rrt", self.max_rrt),
-            ("fps", self.fps),
-            ("age", self.age),
-            ("class", self.class),
-            ("cpus", self.cpus),
-            ("memory", self.memory),
-        ];
-        let known = known
-            .into_iter()
-            .filter_map(|(key, value)| Some((key.to_owned(), value?)));
-        api::Stated::read(known.chain(self.others)).map_err(Error::Unstatable)
-    }
-}
-
 /// Tells whether another servant of a service would fit.
 pub async fn fit(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Query(statement): Query<StatementQuery>,
+    OriginalUri(uri): OriginalUri,
     Extension(caller): Extension<Caller>,
 ) -> JsonResult<api::Fit> {
-    let mut fit = app.choreographer.fit(&name, statement.parse()?).await?;
+    let stated = query_pairs(uri.query());
+    let stated = api::Stated::read(stated).map_err(Error::Unstatable)?;
+    let mut fit = app.choreographer.fit(&name, stated).await?;
     let sees = |id: &str| {
         let servant = app.choreographer.servant(id);
         servant.is_ok_and(|servant| caller.can_see_servant(&app, &servant))
@@ -364,7 +291,9 @@ pub async fn set_limits(
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
     about.set_value(&format!("servant {id}"), &change);
-    choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
+    change
+        .check()
+        .map_err(|error| Error::BadRequest(error.to_string()))?;
     let moves_cores = change.cpu_weight.is_some() || change.cpus.is_some();
     if moves_cores && !caller.who.principal.is_unscoped() {
         let asked = app
@@ -485,16 +414,4 @@ pub async fn logs(
         views::log_line(line)
     });
     Ok(json_lines(past))
-}
-
-/// Builds a response that streams values as JSON lines.
-pub fn json_lines<T: serde::Serialize + Send + 'static>(
-    values: impl futures_util::Stream<Item = T> + Send + 'static,
-) -> Response {
-    let encoded = values.map(|value| {
-        let mut line = serde_json::to_vec(&value)?;
-        line.push(b'\n');
-        Ok::<_, serde_json::Error>(line)
-    });
-    ([(header::CONTENT_TYPE, NDJSON)], Body::from_stream(encoded)).into_response()
 }

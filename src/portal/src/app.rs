@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use api::Millis;
+use authority::Authority;
 use catalogue::Catalogue;
 use choreographer::Choreographer;
 use push::Pusher;
@@ -12,14 +13,14 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
-use crate::inside::InsideConnections;
-use crate::observers::{BlackBoxOptions, Observers};
+use crate::inside::connections::InsideConnections;
+use crate::observers::servants::{BlackBoxOptions, Observers};
+use crate::people::identity_provider::IdentityProvider;
 use crate::people::passwords::Passwords;
-use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
 use crate::strangers::Strangers;
-use crate::stream::LiveSamples;
+use crate::stream::live::LiveSamples;
 use crate::tls::Tls;
 
 /// Operator's settings of the portal.
@@ -54,6 +55,14 @@ pub struct MachineChecks {
     pub warnings: Vec<String>,
 }
 
+/// Authority for robots' certificates and their lifetime.
+pub struct RobotAuthority {
+    /// The daemon's own authority.
+    pub authority: Authority,
+    /// Lifetime of a certificate.
+    pub lifetime: Duration,
+}
+
 /// Shared state of all request handlers.
 pub struct App {
     /// Operator's settings.
@@ -73,7 +82,7 @@ pub struct App {
     /// TLS of the TCP listener; `None` for plain text.
     pub tls: Option<Arc<Tls>>,
     /// Authority that signs robots' certificates, if TLS is used.
-    pub robots: Option<crate::machines::RobotAuthority>,
+    pub robots: Option<RobotAuthority>,
     /// Key that signs stubs.
     pub signing: Arc<sign::SigningKey>,
     /// State directory.

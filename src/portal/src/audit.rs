@@ -1,34 +1,22 @@
 //! The audit log: who did what to what from where. It never contains secrets: of a request, only the method and the
 //! path (which consists of names) are recorded, never its query, headers or body.
 
+pub mod records;
+
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
-use access::{AccessAction, NoticeThrottle};
-use axum::Extension;
-use axum::extract::State as AxumState;
+use access::AccessAction;
 use axum::http::Method;
-use axum::response::Response;
-use futures_util::StreamExt;
 use parking_lot::Mutex;
-use serde::{Deserialize, Serialize};
-use store::{NewAuditRecord, State};
+use serde::Serialize;
+use store::{NewAuditRecord, NoticeThrottle, State};
 use tokio::sync::watch;
-use utoipa::IntoParams;
 
-use super::api_v1::json_lines;
-use super::guard::Caller;
-use crate::app::App;
-use crate::errors::Error;
-use crate::query::Query;
+use crate::caller::Caller;
 
 /// Maximum length of an object's text, since some contain names chosen by a client.
 const LONGEST: usize = 300;
-/// Default number of records.
-const RECORDS: u32 = 100;
-/// Number of records read at once for a follower.
-const AT_ONCE: u32 = 1_000;
-
 /// Object of an action, set by the handler if the path does not name it.
 #[derive(Debug, Clone, Default)]
 pub struct AuditObject(Arc<OnceLock<String>>);
@@ -192,63 +180,6 @@ struct AuditEntry<'a> {
     object: &'a str,
     status: u16,
     more: u64,
-}
-
-/// Query of the audit log.
-#[derive(Debug, Deserialize, IntoParams)]
-pub struct AuditQuery {
-    /// Keep the response open and send new records as they come.
-    #[serde(default)]
-    follow: bool,
-    /// Only records with a greater number.
-    #[serde(default)]
-    since: i64,
-    /// Number of records, the newest ones (default: 100).
-    limit: Option<u32>,
-}
-
-/// The audit log, as JSON lines.
-pub async fn audit(
-    AxumState(app): AxumState<Arc<App>>,
-    Query(which): Query<AuditQuery>,
-    Extension(caller): Extension<Caller>,
-) -> Result<Response, Error> {
-    let told = app.audit.last.subscribe();
-    let past = app
-        .state
-        .audit_records(which.since, which.limit.unwrap_or(RECORDS))?;
-    if !which.follow {
-        return Ok(json_lines(futures_util::stream::iter(past)));
-    }
-    let since = past.last().map_or(which.since, |record| record.id);
-    let reader = Arc::clone(&app);
-    let coming = futures_util::stream::try_unfold((since, told), move |(since, mut told)| {
-        let app = Arc::clone(&reader);
-        async move {
-            loop {
-                told.borrow_and_update();
-                // A follower too slow for a thousand records at a time misses the older ones and notices by their
-                // numbers.
-                let new = app.state.audit_records(since, AT_ONCE)?;
-                if let Some(last) = new.last() {
-                    let since = last.id;
-                    return Ok::<_, store::Error>(Some((new, (since, told))));
-                }
-                if told.changed().await.is_err() {
-                    return Ok(None);
-                }
-            }
-        }
-    });
-    let coming = coming
-        .take_while(|new| std::future::ready(new.is_ok()))
-        .flat_map(|new| futures_util::stream::iter(new.unwrap_or_default()));
-    let ending = caller.wait_for_end(&app, "");
-    Ok(json_lines(
-        futures_util::stream::iter(past)
-            .chain(coming)
-            .take_until(ending),
-    ))
 }
 
 #[cfg(test)]

@@ -3,35 +3,66 @@
 //! It is parsed as a frame here, not as a message of a `WebSocket`: the bridge takes over the connection at the next
 //! byte, with what was read ahead.
 
+use std::io;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytes::{Buf, Bytes, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt};
+use ws::WsError;
 use ws::frame::{Header, TEXT, unmask};
 
+use crate::principals::refusals::AuthMessageError;
 use crate::tokens::AuthMessage;
 
 /// Maximum size of an auth message in bytes; it has a few short fields.
 const LONGEST: usize = 16 << 10;
+
+/// Reason why the first message of a connection does not authenticate its sender.
+#[derive(Debug, thiserror::Error)]
+pub enum FirstMessageError {
+    /// Nothing can be read from the connection.
+    #[error(transparent)]
+    Connection(#[from] io::Error),
+    /// The connection ended.
+    #[error("the connection ended before its auth message")]
+    Ended,
+    /// The message is not a WebSocket frame.
+    #[error(transparent)]
+    Frame(#[from] WsError),
+    /// The message is not one text frame.
+    #[error("the first message must be one text frame, an auth operation")]
+    NotText,
+    /// The message is too long.
+    #[error("an auth message has at most {LONGEST} bytes")]
+    TooLong,
+    /// The message is no rosbridge operation.
+    #[error("the first message must be an auth operation, because no token was given")]
+    NotAnOperation,
+    /// The message is this other operation.
+    #[error("{0} before auth: no token was given, so the first message must be auth")]
+    AnotherOperation(String),
+    /// The fields of the operation are invalid.
+    #[error("the auth message cannot be read: {0}")]
+    Unreadable(serde_json::Error),
+    /// The message is not accepted.
+    #[error(transparent)]
+    Refused(#[from] AuthMessageError),
+}
 
 /// Reads the auth message. Returns what `recognise` makes of it and of the time (seconds since 1970), and the bytes
 /// read beyond it.
 pub async fn read_auth_message<S: AsyncRead + Unpin, T>(
     io: &mut S,
     read_ahead: Bytes,
-    recognise: impl Fn(&AuthMessage, f64) -> Result<T, String>,
-) -> Result<(T, Bytes), String> {
+    recognise: impl Fn(&AuthMessage, f64) -> Result<T, AuthMessageError>,
+) -> Result<(T, Bytes), FirstMessageError> {
     let mut buffer = BytesMut::from(read_ahead);
     let payload = loop {
         match take_frame(&mut buffer)? {
             Some(payload) => break payload,
             None => {
-                let read = io
-                    .read_buf(&mut buffer)
-                    .await
-                    .map_err(|error| error.to_string())?;
-                if read == 0 {
-                    return Err("the connection ended before its auth message".to_owned());
+                if io.read_buf(&mut buffer).await? == 0 {
+                    return Err(FirstMessageError::Ended);
                 }
             }
         }
@@ -43,35 +74,29 @@ pub async fn read_auth_message<S: AsyncRead + Unpin, T>(
     Ok((who, buffer.freeze()))
 }
 
-fn parse_auth_message(payload: &[u8]) -> Result<AuthMessage, String> {
+fn parse_auth_message(payload: &[u8]) -> Result<AuthMessage, FirstMessageError> {
     #[derive(serde::Deserialize)]
     struct Operation {
         op: String,
     }
-    let operation: Operation = serde_json::from_slice(payload).map_err(|_| {
-        "the first message must be an auth operation, because no token was given".to_owned()
-    })?;
+    let operation: Operation =
+        serde_json::from_slice(payload).map_err(|_| FirstMessageError::NotAnOperation)?;
     if operation.op != "auth" {
-        return Err(format!(
-            "{} before auth: no token was given, so the first message must be auth",
-            operation.op
-        ));
+        return Err(FirstMessageError::AnotherOperation(operation.op));
     }
-    serde_json::from_slice(payload)
-        .map_err(|error| format!("the auth message cannot be read: {error}"))
+    serde_json::from_slice(payload).map_err(FirstMessageError::Unreadable)
 }
 
 /// Takes the payload of one complete text frame out of `buffer`; `None` if it is incomplete.
-fn take_frame(buffer: &mut BytesMut) -> Result<Option<BytesMut>, String> {
-    let header = Header::parse(buffer).map_err(|error| error.to_string())?;
-    let Some((header, size)) = header else {
+fn take_frame(buffer: &mut BytesMut) -> Result<Option<BytesMut>, FirstMessageError> {
+    let Some((header, size)) = Header::parse(buffer)? else {
         return Ok(None);
     };
     let Some(mask) = header.mask.filter(|_| header.last && header.opcode == TEXT) else {
-        return Err("the first message must be one text frame, an auth operation".to_owned());
+        return Err(FirstMessageError::NotText);
     };
     if header.length > LONGEST as u64 {
-        return Err(format!("an auth message has at most {LONGEST} bytes"));
+        return Err(FirstMessageError::TooLong);
     }
     let length = header.length as usize;
     if buffer.len() < size + length {
@@ -106,13 +131,13 @@ mod tests {
         frame
     }
 
-    async fn first(sent: &[u8]) -> Result<(TokenHash, Bytes), String> {
+    async fn first(sent: &[u8]) -> Result<(TokenHash, Bytes), FirstMessageError> {
         let tokens = Tokens::new(&["open sesame".to_owned()]).expect("a token");
         let (ahead, rest) = sent.split_at(sent.len().min(3));
         let mut rest = rest;
         let recognise = |message: &AuthMessage, now| {
             let known = tokens.recognise_auth(message, now);
-            known.map_err(|refusal| refusal.to_string())
+            known.map_err(AuthMessageError::from)
         };
         read_auth_message(&mut rest, Bytes::copy_from_slice(ahead), recognise).await
     }
@@ -152,7 +177,7 @@ mod tests {
             ),
         ];
         for (sent, words) in cases {
-            let refused = first(&sent).await.expect_err(words);
+            let refused = first(&sent).await.expect_err(words).to_string();
             assert!(refused.contains(words), "{refused}");
         }
     }

@@ -6,10 +6,17 @@ use axum::body::{Body, Bytes};
 use budget::{Budget, Permit, UNCOUNTED};
 use futures_util::StreamExt;
 
+use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
 
 /// Larger bodies are charged in steps of this size.
 const STEP: usize = 1 << 20;
+
+/// Maximum size of a recording for a trial or a calibration, if its sender's budget allows: it is held in memory.
+const LARGEST_TRIAL: usize = 512 << 20;
+/// Maximum size of other bodies.
+pub const LARGEST_WORDS: usize = 64 << 10;
 
 /// A body in memory, with its budget permit.
 #[derive(Debug)]
@@ -62,6 +69,29 @@ pub async fn read(
         Ok(held) => held,
         Err(_) => Err(Error::Unfinished { after: unfinished }),
     }
+}
+
+/// Reads a body within its sender's memory budget.
+pub async fn read_body(
+    app: &App,
+    caller: &Caller,
+    body: Body,
+    max: usize,
+) -> Result<BufferedBody, Error> {
+    let memory = app.choreographer.memory();
+    let budget = memory.client(&caller.peer.budget_name(None));
+    read(body, max, &budget, memory.unfinished).await
+}
+
+/// Reads a body that is a recording or pictures.
+pub async fn read_recording(app: &App, caller: &Caller, body: Body) -> Result<BufferedBody, Error> {
+    let memory = app.choreographer.memory();
+    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.budget_name(None)).max_permit());
+    let read = read_body(app, caller, body, max).await;
+    read.map_err(|error| match error {
+        Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
+        error => error,
+    })
 }
 
 #[cfg(test)]

@@ -17,11 +17,12 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::api_v1::{json_lines, read_recording};
-use super::guard::{Caller, query_value};
 use crate::app::App;
-use crate::body::BufferedBody;
+use crate::body::{BufferedBody, read_recording};
+use crate::caller::Caller;
 use crate::errors::Error;
+use crate::json::json_lines;
+use crate::query::query_value;
 
 /// Queue size of events that the client has not read.
 const EVENTS_AHEAD: usize = 64;
@@ -157,14 +158,15 @@ fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
         })?,
         None => CalibrationOptions::default(),
     };
-    check(&options).map_err(Error::BadRequest)?;
+    check(&options)?;
     Ok(options)
 }
 
 /// Refuses options that cannot be measured.
-fn check(options: &CalibrationOptions) -> Result<(), String> {
+fn check(options: &CalibrationOptions) -> Result<(), Error> {
+    let refused = |words: String| Err(Error::BadRequest(words));
     let positive = |name: &str, value: Option<f64>, least: f64, most: f64| match value {
-        Some(value) if !(least..=most).contains(&value) => Err(format!(
+        Some(value) if !(least..=most).contains(&value) => refused(format!(
             "{name} = {value} is not between {least} and {most}"
         )),
         _ => Ok(()),
@@ -173,7 +175,7 @@ fn check(options: &CalibrationOptions) -> Result<(), String> {
         positive("cpus", Some(*cpus), 0.01, 4096.0)?;
     }
     if options.cpus.len() > MOST_LIMITS {
-        return Err(format!("at most {MOST_LIMITS} limits are measured at once"));
+        return refused(format!("at most {MOST_LIMITS} limits are measured at once"));
     }
     positive("rate", options.rate, 0.01, 10_000.0)?;
     positive("seconds", options.seconds, 0.1, LONGEST)?;
@@ -184,15 +186,15 @@ fn check(options: &CalibrationOptions) -> Result<(), String> {
     let requests = options.requests.map(|requests| requests as f64);
     positive("requests", requests, 10.0, MOST_REQUESTS as f64)?;
     if options.own && !options.cpus.is_empty() {
-        return Err("own and cpus exclude each other".to_owned());
+        return refused("own and cpus exclude each other".to_owned());
     }
     if options.rate.is_some() && options.fast {
-        return Err("rate and fast exclude each other".to_owned());
+        return refused("rate and fast exclude each other".to_owned());
     }
     match (options.source, &options.robot) {
-        (Source::Live, None) => Err("live needs robot, whose requests are recorded".to_owned()),
+        (Source::Live, None) => refused("live needs robot, whose requests are recorded".to_owned()),
         (Source::Bag | Source::Frames, Some(_)) => {
-            Err("robot can be given with live only".to_owned())
+            refused("robot can be given with live only".to_owned())
         }
         _ => Ok(()),
     }

@@ -17,9 +17,10 @@ use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio_util::task::TaskTracker;
 
 use crate::app::App;
-use crate::guard::{self, Caller, ConnectionPeer, PortalConnection, User};
+use crate::caller::{Caller, ConnectionPeer, PortalConnection, User};
+use crate::guard;
 use crate::peer_groups;
-use crate::principals::Credential;
+use crate::principals::identity::Credential;
 use crate::tls::{self, AcceptedConnection, Tls};
 
 /// Delay after a failed accept, for example if no file descriptor is left.

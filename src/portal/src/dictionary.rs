@@ -4,19 +4,24 @@ use std::sync::Arc;
 
 use api::Stated;
 use api::dictionary::{Explained, NewRows, Row};
+use api::sla::KEYS;
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::{Extension, Json};
 use choreographer::{MOST_ROWS, check_row};
-use serde::Deserialize;
 use store::{Journal, NewEvent};
 use utoipa::IntoParams;
+use utoipa::openapi::Required;
+use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn};
+use utoipa::openapi::schema::{ObjectBuilder, Type};
 
-use super::api_v1::{JsonResult, read_body};
 use super::audit::AuditObject;
-use super::guard::{self, Caller};
 use crate::app::App;
+use crate::body::read_body;
+use crate::caller::Caller;
 use crate::errors::Error;
+use crate::json::JsonResult;
+use crate::query;
 
 /// Maximum size of a body with rows.
 const LARGEST: usize = 1 << 20;
@@ -100,28 +105,27 @@ pub async fn remove(
     Ok(Json(rows))
 }
 
-/// Query: requirements as in the query of a robot's handshake.
-#[derive(Debug, Deserialize, IntoParams)]
-#[allow(dead_code, reason = "it is for the document; what is read is `Stated`")]
-pub struct StatedQuery {
-    /// Desired response time (T_desire), such as `100ms`.
-    rrt: Option<String>,
-    /// Maximum acceptable response time (T_max), such as `300ms`.
-    max_rrt: Option<String>,
-    /// Desired frames per second.
-    fps: Option<f64>,
-    /// Minimum acceptable frames per second.
-    min_fps: Option<f64>,
-    /// Desired maximum age of an output, such as `100ms`.
-    age: Option<String>,
-    /// Maximum acceptable age of an output, such as `300ms`.
-    max_age: Option<String>,
-    /// Class of the configuration.
-    class: Option<String>,
-    /// CPU limit in cores, stated directly.
-    cpus: Option<f64>,
-    /// Memory limit, such as `512M`, stated directly.
-    memory: Option<String>,
+/// Query: requirements as in the query of a robot's handshake; auxiliary parameters are `aux.KEY`.
+pub struct StatedQuery;
+
+impl IntoParams for StatedQuery {
+    fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
+        let parameters = KEYS.iter().map(|key| {
+            let kind = if key.is_number {
+                Type::Number
+            } else {
+                Type::String
+            };
+            ParameterBuilder::new()
+                .name(key.name)
+                .parameter_in(ParameterIn::Query)
+                .required(Required::False)
+                .description(Some(key.description))
+                .schema(Some(ObjectBuilder::new().schema_type(kind)))
+                .build()
+        });
+        parameters.collect()
+    }
 }
 
 /// Explains what a robot that states these requirements would get.
@@ -130,6 +134,6 @@ pub async fn explain(
     Path(name): Path<String>,
     OriginalUri(uri): OriginalUri,
 ) -> JsonResult<Explained> {
-    let stated = Stated::read(guard::query_pairs(uri.query())).map_err(Error::Unstatable)?;
+    let stated = Stated::read(query::query_pairs(uri.query())).map_err(Error::Unstatable)?;
     Ok(Json(app.choreographer.explain_terms(&name, &stated)?))
 }

@@ -14,9 +14,9 @@ use serde_json::Value;
 use store::RevisionRecord;
 use utoipa::IntoParams;
 
-use crate::api_v1::JsonResult;
 use crate::app::App;
 use crate::errors::Error;
+use crate::json::JsonResult;
 use crate::query::Query;
 
 /// Query: which revisions.

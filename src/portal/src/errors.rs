@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
 use choreographer::{AdmissionError, ResizeError, TermsError, with_last_log_line};
 
-use crate::principals::{AuthenticationError, CertificateRefusal, PairingCodeRefusal};
+use crate::principals::refusals::{AuthenticationError, CertificateRefusal, PairingCodeRefusal};
 
 mod next;
 
@@ -614,6 +614,8 @@ pub fn respond(problem: &Problem) -> Response {
             .headers_mut()
             .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
     }
+    // Where clients read another format, the registry's, the problem is translated.
+    response.extensions_mut().insert(problem.clone());
     response
 }
 

@@ -11,10 +11,10 @@ use store::{EventFilter, EventVisibility};
 use tokio::sync::watch;
 use utoipa::IntoParams;
 
-use crate::api_v1::{JsonResult, json_lines};
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::Caller;
+use crate::json::{JsonResult, json_lines};
 use crate::query::Query;
 
 /// Default number of events in a response.

@@ -13,9 +13,9 @@ use link::control::{IncompatibleEndpoint, RequestTiming};
 use reach::links::LinkStatus;
 
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
 use crate::events::visible_services;
-use crate::guard::Caller;
 use choreographer::{Choreographer, Handle};
 use store::{EventFilter, EventVisibility};
 

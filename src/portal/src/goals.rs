@@ -12,10 +12,10 @@ use observe::{GoalMonitor, GoalSender};
 use ros::ros1::actions::messages::ActionlibStatus;
 use store::NewEvent;
 
-use crate::api_v1::JsonResult;
 use crate::app::App;
-use crate::guard::Caller;
+use crate::caller::Caller;
 use crate::inside::{self, InsideTarget};
+use crate::json::JsonResult;
 
 /// Event kind: a goal has ended.
 const GOAL_ENDED: &str = "goal-ended";

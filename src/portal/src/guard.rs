@@ -11,12 +11,9 @@
 //! the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS rebinding),
 //! with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
-mod caller;
-mod elsewhere;
+pub mod elsewhere;
 
-use std::borrow::Cow;
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::sync::{Arc, LazyLock};
 
 use access::{AccessAction, Principal};
 use axum::extract::{Request, State};
@@ -25,22 +22,20 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use catalogue::names;
 use parking_lot::Mutex;
+use store::NoticeThrottle;
 
 use crate::app::App;
+use crate::caller::{Caller, ConnectionPeer, PortalConnection, User};
 use crate::errors::Error;
-use crate::oci;
+use crate::headers::{BEARER, header_text, is_upgrade, protocols};
 use crate::people::cookies;
-use crate::principals::{CallerIdentity, CertificateRefusal, Credential, Recogniser};
-use crate::routes::{self, Access};
+use crate::principals::Recogniser;
+use crate::principals::identity::{CallerIdentity, Credential};
+use crate::principals::refusals::CertificateRefusal;
+use crate::query::query_value;
+use crate::registry_clients;
+use crate::route_access::{Access, FindAccess};
 use crate::tokens;
-
-pub use caller::{Caller, ConnectionPeer, PortalConnection, User};
-pub use elsewhere::check_not_embedded;
-
-/// Minimum interval between two log lines about the same refusal.
-const AGAIN: Duration = Duration::from_secs(60);
-/// Limit on the distinct refusals logged within that interval; their text is chosen by the client.
-const DIFFERENT: usize = 32;
 
 /// Settings that decide which requests are admitted.
 pub struct AdmissionRules<'a> {
@@ -50,10 +45,16 @@ pub struct AdmissionRules<'a> {
     pub known: Recogniser<'a>,
     /// Allowed origins besides loopback's.
     pub origins: &'a [String],
+    /// Looks up the route of a path.
+    pub find_access: FindAccess,
 }
 
 /// Middleware that passes a request on with its [`Caller`], or refuses it.
-pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next) -> Response {
+pub async fn guard(
+    State((app, find_access)): State<(Arc<App>, FindAccess)>,
+    mut request: Request,
+    next: Next,
+) -> Response {
     let Some(connection) = request.extensions().get::<PortalConnection>() else {
         return Error::Internal("identifying the caller").into_response();
     };
@@ -80,6 +81,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
             loopback: app.listen.ip().is_loopback(),
             known,
             origins: &app.options.origins,
+            find_access,
         };
         let (uri, headers) = (request.uri(), request.headers());
         if let Some(certified) = recognise_certificate(&app, &connection, known) {
@@ -117,11 +119,7 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
                 app.audit
                     .record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             }
-            if oci::is_registry_client(request.uri().path(), request.headers()) {
-                oci::unauthorised(&error)
-            } else {
-                error.into_response()
-            }
+            error.into_response()
         }
     }
 }
@@ -139,13 +137,11 @@ pub fn recognise_certificate(
     Some(shown.and_then(|shown| known.recognise_certificate(authority, &shown, store::now())))
 }
 
-/// Logs a refusal, so that the operator can allow it; at most once a minute, because pages repeat their requests.
+/// Logs a refusal, so that the operator can allow it. Pages repeat their requests, and clients choose the text.
 fn log_refusal(peer: ConnectionPeer, what: &str, next: &str) {
-    static TOLD: Mutex<Vec<(Instant, String)>> = Mutex::new(Vec::new());
-    let mut told = TOLD.lock();
-    told.retain(|(at, _)| at.elapsed() < AGAIN);
-    if told.len() < DIFFERENT && !told.iter().any(|(_, earlier)| earlier == what) {
-        told.push((Instant::now(), what.to_owned()));
+    static THROTTLE: LazyLock<Mutex<NoticeThrottle>> = LazyLock::new(Mutex::default);
+    let admitted = THROTTLE.lock().admit(what, store::now());
+    if admitted.is_some() {
         tracing::warn!("refused a request of {peer}: {what}; {next}");
     }
 }
@@ -192,9 +188,10 @@ impl AdmissionRules<'_> {
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Caller, Error> {
-        let open = is_open(method, uri, headers);
+        let access = (self.find_access)(uri.path());
+        let open = is_open(access, method, uri, headers);
         // During a sign-in, a session is ignored: another site may have planted it.
-        let signs_in = *method == Method::POST && routes::find_access(uri.path()) == Access::SignIn;
+        let signs_in = *method == Method::POST && access == Access::SignIn;
         let shown = if signs_in {
             None
         } else {
@@ -239,10 +236,10 @@ fn admit_user(connection: &PortalConnection, user: User) -> Result<Caller, Error
     })
 }
 
-/// Returns true if the route table admits the request without a credential.
-fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
+/// Returns true if the route's access admits the request without a credential.
+fn is_open(access: Access, method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
-    match (routes::find_access(path), is_upgrade(headers)) {
+    match (access, is_upgrade(headers)) {
         (Access::Connect | Access::ReadOrConnect, true) => {
             *method == Method::GET && (path == "/" || is_service_path(path))
         }
@@ -261,12 +258,6 @@ fn is_service_path(path: &str) -> bool {
     names::validate_service(name.strip_suffix('/').unwrap_or(name)).is_ok()
 }
 
-/// Returns true if the request asks for a WebSocket.
-pub fn is_upgrade(headers: &HeaderMap) -> bool {
-    header_text(headers, header::UPGRADE)
-        .is_some_and(|upgrade| upgrade.eq_ignore_ascii_case("websocket"))
-}
-
 /// Returns the token of `Authorization`: `Bearer` everywhere and, at the registry, whose clients know nothing else,
 /// also the password of `Basic`, whatever its user name. Browsers resend Basic credentials by themselves; the
 /// registry is read-only.
@@ -276,7 +267,7 @@ fn authorization(uri: &Uri, headers: &HeaderMap) -> Option<String> {
     if scheme.eq_ignore_ascii_case("bearer") {
         return Some(sent.to_owned());
     }
-    if scheme.eq_ignore_ascii_case("basic") && oci::is_registry_path(uri.path()) {
+    if scheme.eq_ignore_ascii_case("basic") && registry_clients::is_registry_path(uri.path()) {
         let pair = base64_simd::STANDARD.decode_to_vec(sent).ok()?;
         let (_, password) = std::str::from_utf8(&pair).ok()?.split_once(':')?;
         return Some(password.to_owned());
@@ -292,35 +283,6 @@ fn find_token(uri: &Uri, headers: &HeaderMap) -> Option<String> {
     authorization(uri, headers)
         .or_else(protocol)
         .or_else(|| query_value(uri.query(), "token"))
-}
-
-/// Prefix of a WebSocket subprotocol that is a token, for clients that can set no other header.
-pub const BEARER: &str = "bearer.";
-/// Subprotocol chosen if the client offers it.
-pub const ROSBRIDGE: &str = "rosbridge";
-
-/// Returns the WebSocket subprotocols offered.
-pub fn protocols(headers: &HeaderMap) -> impl Iterator<Item = &str> {
-    let offered = headers.get_all(header::SEC_WEBSOCKET_PROTOCOL).iter();
-    offered
-        .filter_map(|value| value.to_str().ok())
-        .flat_map(|value| value.split(','))
-        .map(str::trim)
-}
-
-/// Returns one decoded value of the query.
-pub fn query_value(query: Option<&str>, name: &str) -> Option<String> {
-    let (_, value) = query_pairs(query).find(|(key, _)| key == name)?;
-    Some(value.into_owned())
-}
-
-/// Returns all parameters of a query in order.
-pub fn query_pairs(query: Option<&str>) -> impl Iterator<Item = (Cow<'_, str>, Cow<'_, str>)> {
-    form_urlencoded::parse(query.unwrap_or_default().as_bytes())
-}
-
-fn header_text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
-    headers.get(name).and_then(|value| value.to_str().ok())
 }
 
 #[cfg(test)]

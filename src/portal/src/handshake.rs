@@ -1,7 +1,9 @@
 //! WebSocket opening handshake (RFC 6455, section 4.2).
 
+use axum::body::Body;
 use axum::extract::Request;
-use axum::http::{HeaderValue, Method, header};
+use axum::http::{HeaderValue, Method, StatusCode, header};
+use axum::response::Response;
 use base64_simd::STANDARD;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
@@ -46,9 +48,23 @@ pub fn accept(request: &Request) -> Result<HeaderValue, Error> {
         .map_err(|_| bad("Sec-WebSocket-Key is malformed"))
 }
 
+/// Creates the response that turns the connection into a WebSocket; `accepted` is the value of [`accept`].
+pub fn switch_protocols(accepted: HeaderValue, subprotocol: Option<&'static str>) -> Response {
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+    let headers = response.headers_mut();
+    headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
+    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accepted);
+    if let Some(subprotocol) = subprotocol {
+        let subprotocol = HeaderValue::from_static(subprotocol);
+        headers.insert(header::SEC_WEBSOCKET_PROTOCOL, subprotocol);
+    }
+    response
+}
+
 #[cfg(test)]
 mod tests {
-    use axum::body::Body;
     use axum::response::IntoResponse;
 
     use super::*;

@@ -14,10 +14,10 @@ use serde::Deserialize;
 use store::{EventVisibility, RecordedSeries, SeriesFilter};
 use utoipa::IntoParams;
 
-use crate::api_v1::JsonResult;
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::Caller;
+use crate::json::JsonResult;
 use crate::query::Query;
 pub use recorder::record_history;
 

@@ -6,93 +6,29 @@
 //! | may operate the service, or is the servant's robot | the operations that the policy grants |
 //! | may otherwise see the servant | list and subscribe |
 
-use std::collections::HashMap;
+pub mod connections;
+
 use std::sync::Arc;
 
 use access::{AccessAction, AccessDenied, ConnectionAccess, Grants, Role};
 use axum::Extension;
-use axum::body::Body;
 use axum::extract::{Path, Request, State};
-use axum::http::{HeaderValue, StatusCode, header};
+use axum::http::StatusCode;
 use axum::response::Response;
 use bridge::{ClientGrants, SessionOptions, WaitingConnection};
 use budget::Budget;
 use bytes::Bytes;
 use choreographer::Handle;
 use hyper::upgrade::{OnUpgrade, Upgraded};
-use parking_lot::Mutex;
 use reach::Reach;
 use tokio::sync::watch;
+use tracing::Instrument;
 
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::Caller;
 use crate::{handshake, robots};
-
-/// Limit on the connections that look into one servant.
-const MOST: usize = 16;
-/// Limit on one principal's share of them, so that nobody can lock others out.
-const MOST_EACH: usize = 4;
-
-/// Connections that look into servants.
-#[derive(Debug, Default)]
-pub struct InsideConnections {
-    /// Names of principals, by servant.
-    all: Arc<Mutex<HashMap<String, Vec<String>>>>,
-}
-
-/// Slot of one connection that looks into a servant; released when dropped.
-#[derive(Debug)]
-pub struct InsideSlot {
-    all: Arc<Mutex<HashMap<String, Vec<String>>>>,
-    servant: String,
-    who: String,
-}
-
-impl InsideConnections {
-    pub(crate) fn acquire(&self, servant: &str, who: &str) -> Result<InsideSlot, Error> {
-        let mut all = self.all.lock();
-        let there = all.entry(servant.to_owned()).or_default();
-        let own = there.iter().filter(|other| *other == who).count();
-        if there.len() >= MOST || own >= MOST_EACH {
-            return Err(Error::TooManyLook {
-                servant: servant.to_owned(),
-                most: MOST,
-                each: MOST_EACH,
-            });
-        }
-        there.push(who.to_owned());
-        Ok(InsideSlot {
-            all: Arc::clone(&self.all),
-            servant: servant.to_owned(),
-            who: who.to_owned(),
-        })
-    }
-}
-
-impl Drop for InsideSlot {
-    fn drop(&mut self) {
-        let mut all = self.all.lock();
-        let Some(there) = all.get_mut(&self.servant) else {
-            return;
-        };
-        if let Some(at) = there.iter().position(|other| *other == self.who) {
-            there.swap_remove(at);
-        }
-        if there.is_empty() {
-            all.remove(&self.servant);
-        }
-    }
-}
-
-/// Permission level inside a servant.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum InsideRole {
-    /// Everything that the policy grants.
-    Acts,
-    /// Subscribe only.
-    Looks,
-}
+use connections::InsideRole;
 
 /// Target of a request for access: a robot's servants, or a recording of them.
 #[derive(Debug, Clone, Copy)]
@@ -223,24 +159,16 @@ impl InsideAccess {
         };
         audit_recorder(&self.app, &self.caller, &self.handle)("looks inside");
         let sessions = self.app.sessions.clone();
-        sessions.spawn(async move {
+        let span = self.handle.span(self.caller.connection_span().id());
+        let serving = async move {
             match upgrade.await {
                 Ok(upgraded) => self.run(upgraded, reach, serve).await,
                 Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
             }
             drop(place);
-        });
-        let mut response = Response::new(Body::empty());
-        *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
-        let headers = response.headers_mut();
-        headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
-        headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-        headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
-        if let Some(protocol) = protocol {
-            let protocol = HeaderValue::from_static(protocol);
-            headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
-        }
-        Ok(response)
+        };
+        sessions.spawn(serving.instrument(span));
+        Ok(handshake::switch_protocols(accept, protocol))
     }
 
     async fn run<Served: Future<Output = ()>>(
@@ -326,29 +254,5 @@ fn audit_recorder(
         };
         app.audit
             .record_throttled(&caller, action, did, &object, status.as_u16());
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_servant_is_looked_into_by_so_many_and_nobody_keeps_the_others_out() {
-        let lookers = InsideConnections::default();
-        let mut eves: Vec<_> = (0..MOST_EACH)
-            .map(|_| lookers.acquire("s1", "eve").expect("room"))
-            .collect();
-        let refused = lookers.acquire("s1", "eve").expect_err("hers are taken");
-        assert!(matches!(refused, Error::TooManyLook { .. }), "{refused}");
-        let elsewhere = lookers.acquire("s2", "eve").expect("another servant");
-        let others: Vec<_> = (0..MOST - MOST_EACH)
-            .map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room"))
-            .collect();
-        lookers.acquire("s1", "late").expect_err("all are taken");
-        eves.pop();
-        let late = lookers.acquire("s1", "late").expect("room again");
-        drop((eves, elsewhere, others, late));
-        assert!(lookers.all.lock().is_empty(), "nothing is left behind");
     }
 }

@@ -19,6 +19,7 @@ mod audit;
 mod auth;
 mod body;
 mod calibration;
+mod caller;
 mod connections;
 mod dictionary;
 mod differences;
@@ -28,8 +29,10 @@ mod explain;
 mod goals;
 mod guard;
 mod handshake;
+mod headers;
 mod history;
 mod inside;
+mod json;
 mod looks;
 mod machines;
 mod metrics;
@@ -39,13 +42,16 @@ mod openapi;
 mod page;
 mod peer_groups;
 mod people;
+mod permissions;
 mod policy;
 mod principals;
 mod proxies;
 mod push;
 mod query;
 mod recordings;
+mod registry_clients;
 mod robots;
+mod route_access;
 mod routes;
 mod shadow;
 mod strangers;
@@ -59,39 +65,45 @@ mod views;
 
 use std::sync::Arc;
 
+use route_access::FindAccess;
+
 pub use axum::Router;
 pub use axum::http::Uri;
 
 pub use ::tls::Fingerprint;
-pub use app::{App, MachineChecks, Options};
+pub use app::{App, MachineChecks, Options, RobotAuthority};
 pub use audit::Audit;
 pub use connections::{serve_challenges, serve_tcp, serve_unix};
 pub use history::record_history as keep_history;
-pub use inside::InsideConnections;
-pub use machines::RobotAuthority;
-pub use observers::{BlackBoxOptions, Observers, run_observers as keep_observers};
+pub use inside::connections::InsideConnections;
+pub use observers::run_observers as keep_observers;
+pub use observers::servants::{BlackBoxOptions, Observers};
+pub use people::identity_provider::IdentityProvider;
 pub use people::passwords::Passwords;
-pub use people::provider::{CALLBACK, IdentityProvider};
+pub use people::provider::CALLBACK;
 pub use principals::{Principals, SessionLifetimes};
 pub use proxies::{IpNetwork, ParseIpNetworkError, Proxies};
 pub use strangers::Strangers;
-pub use stream::LiveSamples;
+pub use stream::live::LiveSamples;
 pub use tls::{Challenge, Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
 
 /// Builds the router, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
     let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
-        let allowed =
-            axum::middleware::from_fn_with_state((Arc::clone(&app), route), allowed::authorise);
+        let access = (Arc::clone(&app), route.access);
+        let allowed = axum::middleware::from_fn_with_state(access, allowed::authorise);
         router.route(route.path, (route.handler)().layer(allowed))
     });
     served
         .fallback(routes::not_found)
         .method_not_allowed_fallback(routes::other_method)
         .layer(axum::middleware::from_fn_with_state(
-            Arc::clone(&app),
+            (Arc::clone(&app), routes::find_access as FindAccess),
             guard::guard,
+        ))
+        .layer(axum::middleware::from_fn(
+            registry_clients::translate_problems,
         ))
         .with_state(app)
 }

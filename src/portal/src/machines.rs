@@ -1,11 +1,10 @@
 //! `/api/v1/pairings`, `/api/v1/pair`, `/api/v1/renew`: robots with a key of their own (docs/adr/086).
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use access::{AccessAction, Principal};
 use api::machines::{NewPairing, Pair, Pairing, PairingMade, Renew, RobotCertificate};
-use authority::{Authority, CertificateRequest, IssuedRobotCertificate};
+use authority::{CertificateRequest, IssuedRobotCertificate};
 use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, header};
@@ -13,21 +12,12 @@ use axum::{Extension, Json};
 use catalogue::{names, stubs};
 use tls::PairingLine;
 
-use super::api_v1::JsonResult;
-use super::guard::{Caller, ConnectionPeer};
-use super::policy::read_json;
-use crate::app::App;
+use crate::app::{App, RobotAuthority};
 use crate::audit::AuditObject;
+use crate::caller::{Caller, ConnectionPeer};
 use crate::errors::Error;
-use crate::principals::Credential;
-
-/// Authority for robots' certificates and their lifetime.
-pub struct RobotAuthority {
-    /// The daemon's own authority.
-    pub authority: Authority,
-    /// Lifetime of a certificate.
-    pub lifetime: Duration,
-}
+use crate::json::{JsonResult, read_json};
+use crate::principals::identity::Credential;
 
 /// Lists paired robots and pending pairing codes.
 pub async fn list(State(app): State<Arc<App>>) -> JsonResult<Vec<Pairing>> {

@@ -2,138 +2,28 @@
 //! file ([`crate::recordings`]) when a robot was answered later than it accepts, and goal monitors
 //! ([`crate::goals`]).
 
-use std::collections::HashMap;
+pub mod servants;
+
 use std::sync::Arc;
 use std::time::Duration;
 
 use choreographer::{AnsweredRequest, Handle};
 use observe::{BlackBox, BlackBoxSettings, GoalMonitor, ObservedServant};
-use parking_lot::Mutex;
 use reach::Reach;
 use tokio::sync::broadcast::error::RecvError;
-use tokio::time::{Instant, MissedTickBehavior};
+use tokio::time::MissedTickBehavior;
 use tokio_util::task::AbortOnDropHandle;
 
 use crate::app::App;
-use crate::errors::Error;
 use crate::{goals, recordings};
+use servants::ServantObservers;
 
 /// Interval at which new and ended servants are looked for.
 const LOOK: Duration = Duration::from_secs(1);
-/// Minimum interval between two automatic recordings of a servant.
-const PAUSE: Duration = Duration::from_secs(60);
-/// Minimum interval between two requested recordings of a servant.
-const TAKEN: Duration = Duration::from_secs(5);
 /// Timeout for joining a servant's ROS; then it is tried again.
 const JOINS: Duration = Duration::from_secs(60);
 /// Delay between attempts.
 const TRIES: Duration = Duration::from_secs(5);
-
-/// Black box settings of the configuration.
-#[derive(Debug, Clone)]
-pub struct BlackBoxOptions {
-    /// How far back messages are kept; zero disables black boxes.
-    pub span: Duration,
-    /// Memory limit per servant in bytes, including the overhead per message.
-    pub memory: usize,
-    /// Topics to record: names, or prefixes ending in `*`.
-    pub topics: Vec<String>,
-    /// Maximum number of files; beyond it, the service with most files loses its oldest.
-    pub files: usize,
-    /// Maximum size of all files in bytes.
-    pub disk: u64,
-}
-
-impl BlackBoxOptions {
-    fn matches_topic(&self, topic: &str) -> bool {
-        self.topics
-            .iter()
-            .any(|pattern| match pattern.strip_suffix('*') {
-                Some(begins) => topic.starts_with(begins),
-                None => topic == pattern,
-            })
-    }
-}
-
-/// Observers of all servants.
-#[derive(Default)]
-pub struct Observers {
-    all: Mutex<HashMap<String, ServantObservers>>,
-    /// Time of the last automatic recording, by servant or, for nameless robots, by service, because each of their
-    /// connections has a servant of its own.
-    written: Mutex<HashMap<String, Instant>>,
-    /// Held while a file is written: which files are removed for it depends on those that exist.
-    pub(crate) writing: tokio::sync::Mutex<()>,
-}
-
-#[derive(Default)]
-struct ServantObservers {
-    kept: Option<Arc<BlackBox>>,
-    goals: Option<Arc<GoalMonitor>>,
-    /// Time of the last requested recording.
-    taken: Option<Instant>,
-    /// Task that joins the servant's ROS; aborted when dropped.
-    _joining: Option<AbortOnDropHandle<()>>,
-}
-
-impl Observers {
-    /// Returns the black box of a servant.
-    pub(crate) fn black_box(&self, servant: &str) -> Option<Arc<BlackBox>> {
-        self.all.lock().get(servant)?.kept.clone()
-    }
-
-    /// Returns the goal monitor of a servant; `None` if the servant has no actions.
-    pub(crate) fn goals(&self, servant: &str) -> Option<Arc<GoalMonitor>> {
-        self.all.lock().get(servant)?.goals.clone()
-    }
-
-    /// Refuses requests for recordings of this servant that follow too closely.
-    pub(crate) fn check_take(&self, servant: &str) -> Result<(), Error> {
-        let mut all = self.all.lock();
-        let observed = all.get_mut(servant).filter(|one| one.kept.is_some());
-        let Some(observed) = observed else {
-            return Err(Error::NoBlackBox(servant.to_owned()));
-        };
-        match remaining(observed.taken, TAKEN) {
-            Some(left) => Err(Error::RecordedLately {
-                servant: servant.to_owned(),
-                again: left.as_secs() + 1,
-            }),
-            None => {
-                observed.taken = Some(Instant::now());
-                Ok(())
-            }
-        }
-    }
-
-    /// Returns true if an automatic recording of this servant may be written; the next one may be a minute later.
-    fn is_due(&self, handle: &Handle) -> bool {
-        // Without a black box there is nothing to write.
-        let is_heard = self.black_box(&handle.id).is_some();
-        let whose = if handle.robot.starts_with('~') {
-            format!("service {}", handle.service())
-        } else {
-            handle.id.clone()
-        };
-        is_heard && claim_interval(&mut self.written.lock(), whose)
-    }
-}
-
-/// Returns the time left until something may be done again, if any.
-fn remaining(last: Option<Instant>, pause: Duration) -> Option<Duration> {
-    let left = pause.checked_sub(last?.elapsed())?;
-    (!left.is_zero()).then_some(left)
-}
-
-/// Returns true if the last recording is long enough ago, and marks a new one.
-fn claim_interval(written: &mut HashMap<String, Instant>, whose: String) -> bool {
-    written.retain(|_, last| remaining(Some(*last), PAUSE).is_some());
-    let is_due = !written.contains_key(&whose);
-    if is_due {
-        written.insert(whose, Instant::now());
-    }
-    is_due
-}
 
 /// Runs the observers until the daemon stops, after removing orphaned files.
 pub async fn run_observers(app: Arc<App>) {
@@ -288,6 +178,8 @@ fn record_late_answer(app: &Arc<App>, answered: &AnsweredRequest) {
 mod tests {
     use std::cell::Cell;
 
+    use tokio::time::Instant;
+
     use super::*;
 
     #[tokio::test(start_paused = true)]
@@ -309,30 +201,5 @@ mod tests {
         let began = Instant::now();
         assert_eq!(retry_until_ready(joins).await, 3);
         assert_eq!(began.elapsed(), JOINS + TRIES * 2);
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn files_that_nobody_asked_for_are_a_minute_apart() {
-        let mut written = HashMap::new();
-        let mut is_due = |whose: &str| claim_interval(&mut written, whose.to_owned());
-        assert!(is_due("s1") && is_due("s2") && !is_due("s1"));
-        tokio::time::advance(PAUSE / 2).await;
-        assert!(!is_due("s1") && is_due("s3"));
-        tokio::time::advance(PAUSE / 2).await;
-        assert!(is_due("s1") && !is_due("s3"));
-        // Expired entries are removed.
-        assert_eq!(written.len(), 2);
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn whoever_asks_for_files_again_and_again_waits() {
-        assert_eq!(remaining(None, TAKEN), None);
-        let now = Some(Instant::now());
-        assert_eq!(remaining(now, TAKEN), Some(TAKEN));
-        tokio::time::advance(TAKEN).await;
-        assert_eq!(remaining(now, TAKEN), None);
-        let observers = Observers::default();
-        let refused = observers.check_take("s1").expect_err("nothing is kept");
-        assert!(matches!(refused, Error::NoBlackBox(_)), "{refused}");
     }
 }

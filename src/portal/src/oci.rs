@@ -4,38 +4,20 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Uri, header};
+use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde_json::json;
 use tokio_util::io::ReaderStream;
 
 use crate::app::App;
-use crate::errors::{self, Error};
-use crate::guard::Caller;
+use crate::caller::Caller;
+use crate::errors::Error;
+use crate::registry_clients::error_response;
 
 const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 const CHUNK: usize = 256 << 10;
-
-/// Challenge that makes registry clients ask for a token as the password of any user (RFC 7617). A bearer challenge
-/// would need the URL of a token server, but the daemon's tokens are created by an operator.
-const CHALLENGE: HeaderValue =
-    HeaderValue::from_static(r#"Basic realm="cloudroid", charset="UTF-8""#);
-
-/// Returns true if the path is the registry's.
-pub fn is_registry_path(path: &str) -> bool {
-    path == "/v2" || path.starts_with("/v2/")
-}
-
-/// Returns true if the request comes from a registry client, which must be challenged for a password. A browser would
-/// show a password dialog, which any page could trigger; all browsers identify themselves as Mozilla (RFC 9110,
-/// section 10.1.5).
-pub fn is_registry_client(path: &str, headers: &HeaderMap) -> bool {
-    let agent = headers.get(header::USER_AGENT);
-    let is_browser = agent.is_some_and(|agent| agent.as_bytes().starts_with(b"Mozilla/"));
-    is_registry_path(path) && !is_browser
-}
 
 /// `/v2/`: confirms that this is a registry.
 pub async fn version() -> Response {
@@ -186,63 +168,6 @@ pub fn other_method(method: &Method, uri: &Uri) -> Response {
     )
 }
 
-/// Refuses an unauthenticated request in the format of registry clients.
-pub fn unauthorised(error: &Error) -> Response {
-    let problem = error.problem();
-    let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-    if status != StatusCode::UNAUTHORIZED {
-        return errors::respond(&problem);
-    }
-    let detail = problem.detail;
-    let message = format!("{detail}; log in with a token as the password and any user name");
-    let mut response = error_response(status, "UNAUTHORIZED", &message);
-    let headers = response.headers_mut();
-    headers.insert(header::WWW_AUTHENTICATE, CHALLENGE);
-    response
-}
-
 fn not_found(code: &str, message: &str) -> Response {
     error_response(StatusCode::NOT_FOUND, code, message)
-}
-
-fn error_response(status: StatusCode, code: &str, message: &str) -> Response {
-    (
-        status,
-        Json(json!({ "errors": [{ "code": code, "message": message }] })),
-    )
-        .into_response()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn browsers_are_not_asked_for_a_password() {
-        let of = |path, agent: &'static str| {
-            let agent = (header::USER_AGENT, HeaderValue::from_static(agent));
-            is_registry_client(path, &HeaderMap::from_iter([agent]))
-        };
-        assert!(of("/v2/", "skopeo/1.9.3"));
-        assert!(is_registry_client("/v2/_catalog", &HeaderMap::new()));
-        assert!(!of("/v2/_catalog", "Mozilla/5.0 (X11; Linux x86_64)"));
-        assert!(!of("/api/v1/services", "skopeo/1.9.3"));
-    }
-
-    #[tokio::test]
-    async fn clients_of_registries_are_asked_for_a_password_in_their_words() {
-        let response = unauthorised(&Error::Unauthorised("a token is needed"));
-        assert_eq!(response.status(), StatusCode::UNAUTHORIZED);
-        // A `Bearer` challenge without the URL of a token server makes skopeo and containerd give up.
-        let challenges = response.headers().get_all(header::WWW_AUTHENTICATE);
-        assert_eq!(challenges.iter().collect::<Vec<_>>(), [&CHALLENGE]);
-        let body = axum::body::to_bytes(response.into_body(), 4096).await;
-        let body: serde_json::Value =
-            serde_json::from_slice(&body.expect("a body")).expect("a document");
-        assert_eq!(body["errors"][0]["code"], "UNAUTHORIZED");
-        let slowed = Error::from(crate::principals::AuthenticationError::Slowed(3_001));
-        let response = unauthorised(&slowed);
-        assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
-        assert_eq!(response.headers()[header::RETRY_AFTER], "4");
-    }
 }

@@ -25,7 +25,8 @@ use utoipa::openapi::{
 use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 use crate::errors::Error;
-use crate::routes::{Access, ROUTES, Route};
+use crate::route_access::Access;
+use crate::routes::{ROUTES, Route};
 
 /// Prefix of all described paths.
 const BASE: &str = "/api/v1";

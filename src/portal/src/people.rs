@@ -1,6 +1,7 @@
 //! `/api/v1/session`, `/api/v1/sessions`, `/api/v1/accounts`: people sign in and out, and admins manage accounts.
 
 pub mod cookies;
+pub mod identity_provider;
 mod lanes;
 pub mod passwords;
 pub mod provider;
@@ -18,12 +19,14 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use utoipa::IntoParams;
 
-use super::api_v1::{JsonResult, read_body};
-use super::guard::{Caller, ConnectionPeer, PortalConnection};
 use crate::app::App;
 use crate::audit::AuditObject;
+use crate::body::read_body;
+use crate::caller::{Caller, ConnectionPeer, PortalConnection};
 use crate::errors::Error;
-use crate::principals::{Credential, StartedSession};
+use crate::json::JsonResult;
+use crate::principals::StartedSession;
+use crate::principals::identity::Credential;
 use crate::query::Query;
 use passwords::{Attempt, PasswordVerdict};
 
@@ -276,7 +279,7 @@ pub async fn create(
     let new: NewAccount = read_json(&app, &caller, body, "account").await?;
     app.principals.check_account(&new)?;
     about.set(format!("account {} ({})", new.name, new.role));
-    passwords::check_strength(&new.name, &new.password).map_err(Error::BadRequest)?;
+    passwords::check_strength(&new.name, &new.password)?;
     let hash = app.passwords.hash(new.password.clone()).await?;
     let first = app.principals.has_no_credentials();
     app.principals.create_account(&new, &hash)?;
@@ -310,7 +313,7 @@ pub async fn change(
     about.set(format!("account {name}: {}", what.join(", ")));
     let hash = match &change.password {
         Some(password) => {
-            passwords::check_strength(&name, password).map_err(Error::BadRequest)?;
+            passwords::check_strength(&name, password)?;
             Some(app.passwords.hash(password.clone()).await?)
         }
         None => None,

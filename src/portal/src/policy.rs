@@ -6,27 +6,12 @@ use api::access::{NewRule, NewToken, Rule, Secret, Token, Whoami};
 use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::{Extension, Json};
-use serde::de::DeserializeOwned;
 
-use super::api_v1::{JsonResult, read_body};
-use super::guard::Caller;
 use crate::app::App;
 use crate::audit::AuditObject;
+use crate::caller::Caller;
 use crate::errors::Error;
-
-/// Maximum size of a body in bytes.
-const LARGEST: usize = 64 << 10;
-
-pub(super) async fn read_json<T: DeserializeOwned>(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-    what: &str,
-) -> Result<T, Error> {
-    let body = read_body(app, caller, body, LARGEST).await?.bytes;
-    serde_json::from_slice(&body)
-        .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
-}
+use crate::json::{JsonResult, read_json};
 
 /// Returns the caller's identity.
 pub async fn whoami(Extension(caller): Extension<Caller>) -> Json<Whoami> {

@@ -2,10 +2,12 @@
 //! database, and by the policy. Changes take effect at once, for open connections as well as for requests.
 
 mod changing;
+pub mod identity;
 mod pairings;
 mod people;
 mod provided;
 mod recognising;
+pub mod refusals;
 mod standing;
 mod stored;
 
@@ -13,109 +15,23 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use access::{GuessLimiter, Principal};
+use access::GuessLimiter;
 use api::Millis;
 use parking_lot::{Mutex, RwLock};
-use store::{Owner, State, TokenHash};
+use store::{Owner, State};
 use tokio::sync::watch;
 
 use crate::tokens::{AuthMessage, Tokens};
 
-pub use pairings::{CertificateRefusal, PairingCodeRefusal};
-use people::{KnownAccount, KnownSession};
-pub use people::{SessionLifetimes, StartedSession};
+use identity::{CallerIdentity, Credential};
+pub use people::StartedSession;
 pub use recognising::Recogniser;
-use stored::KnownToken;
-pub use stored::StoredPrincipals;
+use refusals::{AuthMessageError, AuthenticationError};
+use stored::{KnownAccount, KnownSession, KnownToken};
+pub use stored::{SessionLifetimes, StoredPrincipals};
 
 /// Minimum interval at which a token's last use is written.
 const USED: Millis = 60_000;
-
-/// Credential by which a caller is known.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Credential {
-    /// None: a local caller on a machine without any credentials, or an unauthenticated one.
-    Nothing,
-    /// A token of the configuration.
-    Configured,
-    /// A token of the database.
-    Stored {
-        /// Id of the token.
-        id: i64,
-        /// Hash of its secret, which changes on rotation.
-        hash: TokenHash,
-    },
-    /// A TLS client certificate.
-    Certificate {
-        /// Id of the robot's pairing.
-        pairing: i64,
-        /// SHA-256 hash of the paired key; `None` if an authority other than the daemon's signs the robot's
-        /// certificates.
-        key: Option<String>,
-        /// End of the certificate's validity.
-        until: Millis,
-    },
-    /// A session of the page.
-    Session {
-        /// Id of the session.
-        id: i64,
-    },
-    /// User id at the daemon's socket, from the kernel.
-    User,
-}
-
-/// An authenticated caller.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CallerIdentity {
-    /// The principal.
-    pub principal: Arc<Principal>,
-    /// The credential.
-    pub shown: Credential,
-    /// Hash of the token presented.
-    pub token: Option<TokenHash>,
-    /// Owner to which robot names are bound when the caller first uses them.
-    pub owner: Option<Owner>,
-}
-
-impl CallerIdentity {
-    /// Returns what the caller's resume tokens are bound to: a token of the database (whatever its current secret), a
-    /// pairing, a person, or else the hash of the token.
-    pub fn resume_binding(&self) -> Option<String> {
-        match &self.shown {
-            Credential::Stored { id, .. } => Some(format!("token {id}")),
-            Credential::Certificate { pairing, .. } => Some(format!("pairing {pairing}")),
-            // Shared by that person's next session.
-            Credential::Session { .. } => Some(format!("person {}", self.principal.name)),
-            _ => self.token.clone(),
-        }
-    }
-}
-
-/// Reason why a token, session or sign-in is not accepted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum AuthenticationError {
-    /// The token was revoked.
-    #[error("this token was revoked")]
-    Revoked,
-    /// The token has expired.
-    #[error("this token has expired")]
-    Expired,
-    /// The token is unknown.
-    #[error("this token is not known")]
-    Unknown,
-    /// The token was not looked at.
-    #[error("too many unknown tokens came from this address; tokens are not checked for {} s", .0.div_ceil(1000))]
-    Slowed(Millis),
-    /// The password, or the result of a provider's sign-in, was not looked at.
-    #[error(
-        "too many failed sign-ins from this address or for this account; sign-ins are not checked for {} s",
-        .0.div_ceil(1000)
-    )]
-    SlowedSignIn(Millis),
-    /// The session is unknown or over.
-    #[error("this session has ended")]
-    SessionOver,
-}
 
 /// All principals, their credentials and the policy.
 pub struct Principals {
@@ -257,7 +173,7 @@ impl Principals {
         message: &AuthMessage,
         from: IpAddr,
         seconds: f64,
-    ) -> Result<CallerIdentity, String> {
+    ) -> Result<CallerIdentity, AuthMessageError> {
         let now = (seconds * 1000.0) as Millis;
         let mut refusal = None;
         let identity = self.with_recogniser(|known| {
@@ -272,7 +188,7 @@ impl Principals {
                 Ok(identity)
             }
             // The refusal specific to `auth` messages says more.
-            Err(why) => Err(refusal.map_or_else(|| why.to_string(), |refusal| refusal.to_string())),
+            Err(why) => Err(refusal.map_or(why.into(), AuthMessageError::from)),
         }
     }
 

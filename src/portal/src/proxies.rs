@@ -11,8 +11,8 @@ use std::sync::Arc;
 
 use axum::http::HeaderMap;
 
+use crate::caller::{ConnectionPeer, PortalConnection};
 use crate::errors::Error;
-use crate::guard::{ConnectionPeer, PortalConnection};
 
 const FORWARDED: &str = "forwarded";
 const FORWARDED_FOR: &str = "x-forwarded-for";

@@ -15,10 +15,11 @@ use push::{Deployer, PushResult};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::api_v1::json_lines;
-use super::guard::{Caller, query_value};
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
+use crate::json::json_lines;
+use crate::query::query_value;
 use crate::views;
 
 /// Timeout for sending the last event to a client that does not read.
@@ -85,10 +86,10 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     let may = move |name: &str| {
         if let ConnectionAccess::Ended(reason) = app.principals.connection_access(&caller.who, name)
         {
-            return Err(reason);
+            return Err(push::Error::NotAllowed(reason));
         }
         let may = caller.check_service_access(&app, AccessAction::Deploy, name, None);
-        may.map_err(|error| error.to_string())
+        may.map_err(|error| push::Error::NotAllowed(error.to_string()))
     };
     Deployer {
         owner,

@@ -1,5 +1,6 @@
 //! Query parameters of a request.
 
+use std::borrow::Cow;
 use std::error::Error as _;
 
 use axum::extract::FromRequestParts;
@@ -29,4 +30,15 @@ impl<T: DeserializeOwned, S: Sync> FromRequestParts<S> for Query<T> {
             }
         }
     }
+}
+
+/// Returns one decoded value of the query.
+pub fn query_value(query: Option<&str>, name: &str) -> Option<String> {
+    let (_, value) = query_pairs(query).find(|(key, _)| key == name)?;
+    Some(value.into_owned())
+}
+
+/// Returns all parameters of a query in order.
+pub fn query_pairs(query: Option<&str>) -> impl Iterator<Item = (Cow<'_, str>, Cow<'_, str>)> {
+    form_urlencoded::parse(query.unwrap_or_default().as_bytes())
 }

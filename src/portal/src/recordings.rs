@@ -21,12 +21,12 @@ use tokio_util::io::ReaderStream;
 use tokio_util::task::TaskTracker;
 use utoipa::IntoParams;
 
-use crate::api_v1::JsonResult;
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::Caller;
 use crate::inside::{self, InsideTarget};
-use crate::observers::BlackBoxOptions;
+use crate::json::JsonResult;
+use crate::observers::servants::BlackBoxOptions;
 use crate::query::Query;
 
 /// Directory of the recordings, below the state directory.

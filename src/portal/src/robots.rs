@@ -10,9 +10,8 @@ use std::sync::Arc;
 use access::{AccessAction, ConnectionAccess};
 use api::Stated;
 use axum::Extension;
-use axum::body::Body;
 use axum::extract::{Path, Request, State};
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
+use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use bridge::{ClientGrants, SessionEnd, SessionOptions, WaitingConnection};
 use bytes::BytesMut;
@@ -24,11 +23,13 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::sync::{mpsc, watch};
 use tokio_rustls::server::TlsStream;
+use tracing::{Instrument, Span};
 
-use super::guard::{self, Caller, ConnectionPeer, PortalConnection};
-use super::{App, allowed, auth, handshake, page};
+use super::{App, auth, handshake, headers, page, query};
+use crate::caller::{Caller, ConnectionPeer, PortalConnection};
 use crate::errors::Error;
-use crate::principals::CallerIdentity;
+use crate::permissions::check_service_known;
+use crate::principals::identity::CallerIdentity;
 use crate::tokens::{self, AuthMessage};
 use choreographer::{Lease, ServantRequest};
 use store::Owner;
@@ -56,7 +57,7 @@ pub async fn root(
     Extension(caller): Extension<Caller>,
     request: Request,
 ) -> Response {
-    if !guard::is_upgrade(request.headers()) {
+    if !headers::is_upgrade(request.headers()) {
         return page::index(request.method(), request.headers());
     }
     match app.options.default_service.clone() {
@@ -66,7 +67,7 @@ pub async fn root(
         // Only authorised callers learn which services exist.
         None if !caller.is_known() => Error::Unauthorised("a token is needed").into_response(),
         None => {
-            let refusal = allowed::check_service_known(&app, &caller, "")
+            let refusal = check_service_known(&app, &caller, "")
                 .and_then(|()| Err(app.catalogue.unknown_service("")?.into()));
             refusal.map_or_else(IntoResponse::into_response, |()| {
                 StatusCode::NOT_FOUND.into_response()
@@ -96,7 +97,7 @@ pub async fn service(
     Extension(caller): Extension<Caller>,
     request: Request,
 ) -> Response {
-    let answer = if guard::is_upgrade(request.headers()) {
+    let answer = if headers::is_upgrade(request.headers()) {
         connect(app, service, caller, request).await
     } else {
         explain(&app, &service, &caller, request.method())
@@ -112,7 +113,7 @@ fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result
         )));
     }
     caller.check_service_access(app, AccessAction::See, service, None)?;
-    allowed::check_service_known(app, caller, service)?;
+    check_service_known(app, caller, service)?;
     let revision = app.catalogue.current_revision(service)?;
     let answer = serde_json::json!({
         "service": service,
@@ -148,7 +149,7 @@ struct RobotRequest {
 
 impl RobotRequest {
     fn parse(app: &App, service: String, link: bool, uri: &Uri) -> Result<RobotRequest, Error> {
-        let named = guard::query_value(uri.query(), "robot");
+        let named = query::query_value(uri.query(), "robot");
         let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
         let robot = if shared {
             app.options.default_robot.clone()
@@ -158,9 +159,9 @@ impl RobotRequest {
         if let Some(robot) = &robot {
             names::validate_robot(robot).map_err(catalogue::Error::from)?;
         }
-        let node = guard::query_value(uri.query(), "node").unwrap_or_default();
-        check_node(&node).map_err(Error::BadRequest)?;
-        let stated = Stated::read(guard::query_pairs(uri.query()));
+        let node = query::query_value(uri.query(), "node").unwrap_or_default();
+        check_node(&node)?;
+        let stated = Stated::read(query::query_pairs(uri.query()));
         Ok(RobotRequest {
             node,
             stated: stated.map_err(Error::Unstatable)?,
@@ -168,21 +169,21 @@ impl RobotRequest {
             service,
             robot,
             shared,
-            resume: guard::query_value(uri.query(), "resume").filter(|token| !token.is_empty()),
+            resume: query::query_value(uri.query(), "resume").filter(|token| !token.is_empty()),
         })
     }
 }
 
 /// Checks the name of a node; it is stored with the stub's requirements and displayed.
-fn check_node(node: &str) -> Result<(), String> {
+fn check_node(node: &str) -> Result<(), Error> {
     let is_name = |c: char| c.is_ascii_alphanumeric() || "_/".contains(c);
     if node.len() <= LONGEST_NODE && node.chars().all(is_name) {
         Ok(())
     } else {
-        Err(format!(
+        Err(Error::BadRequest(format!(
             "node={:?} does not name a node; write letters, digits, _ and /, at most {LONGEST_NODE}",
             node.chars().take(LONGEST_NODE).collect::<String>()
-        ))
+        )))
     }
 }
 
@@ -269,7 +270,8 @@ async fn connect(
     if let (Some(connection), Some(_)) = (&connection, &lease) {
         connection.admit();
     }
-    sessions.spawn(async move {
+    let span = caller.connection_span();
+    let serving = async move {
         match upgrade.await {
             Ok(upgraded) => {
                 let (io, read_ahead) = into_raw_stream(upgraded);
@@ -277,23 +279,14 @@ async fn connect(
             }
             Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
         }
-    });
-    let mut response = Response::new(Body::empty());
-    *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
-    let headers = response.headers_mut();
-    headers.insert(header::CONNECTION, HeaderValue::from_static("Upgrade"));
-    headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-    headers.insert(header::SEC_WEBSOCKET_ACCEPT, accept);
-    if let Some(protocol) = protocol {
-        let protocol = HeaderValue::from_static(protocol);
-        headers.insert(header::SEC_WEBSOCKET_PROTOCOL, protocol);
-    }
-    Ok(response)
+    };
+    sessions.spawn(serving.instrument(span));
+    Ok(handshake::switch_protocols(accept, protocol))
 }
 
 /// Returns true if a robot's stub asks in a version of the link protocol that is supported here.
 fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
-    let offered: Vec<&str> = guard::protocols(headers)
+    let offered: Vec<&str> = headers::protocols(headers)
         .filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS))
         .collect();
     match offered.as_slice() {
@@ -310,13 +303,13 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
 /// Returns the subprotocol to select. A browser gives up if it offered some and none is selected; one that is a token
 /// must not be written into a response.
 pub fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error> {
-    if guard::protocols(headers).any(|protocol| protocol == guard::ROSBRIDGE) {
-        return Ok(Some(guard::ROSBRIDGE));
+    if headers::protocols(headers).any(|protocol| protocol == headers::ROSBRIDGE) {
+        return Ok(Some(headers::ROSBRIDGE));
     }
-    if guard::protocols(headers).any(|protocol| protocol.starts_with(guard::BEARER)) {
+    if headers::protocols(headers).any(|protocol| protocol.starts_with(headers::BEARER)) {
         Err(Error::BadRequest(format!(
             "a token alone cannot be chosen as the subprotocol; offer {} before it",
-            guard::ROSBRIDGE
+            headers::ROSBRIDGE
         )))
     } else {
         Ok(None)
@@ -371,7 +364,7 @@ fn check_access(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), 
             ),
         });
     }
-    allowed::check_service_known(app, caller, &asked.service)?;
+    check_service_known(app, caller, &asked.service)?;
     match asked.own_name() {
         Some(robot) => check_owner(robot, app.state.find_robot_owner(robot)?, caller),
         None => Ok(()),
@@ -463,7 +456,7 @@ async fn recognise(
     let recognise = |message: &AuthMessage, now| app.principals.recognise_auth(message, from, now);
     let awaited = auth::read_auth_message(io, read_ahead, recognise);
     match tokio::time::timeout(app.options.handshake, awaited).await {
-        Ok(heard) => heard.map_err(|reason| (POLICY, reason)),
+        Ok(heard) => heard.map_err(|error| (POLICY, error.to_string())),
         Err(_) => Err((POLICY, "no auth message received; send a token".to_owned())),
     }
 }
@@ -498,6 +491,7 @@ async fn serve_session(
             Ok((who, rest)) => {
                 read_ahead = rest;
                 caller.who = who;
+                Span::current().record("principal", &*caller.who.principal.name);
             }
             Err((code, reason)) => return bridge::refuse(io, code, &reason).await,
         }
@@ -553,11 +547,12 @@ async fn serve_session(
             .with_refusal_observer(audit_refusal(&app, &asked, &caller)),
         ..SessionOptions::default()
     };
+    let handle = lease.handle();
+    let span = handle.span(Span::current().id());
     let end = tokio::select! {
-        end = reach.serve_rosbridge(waiting, options) => end,
+        end = reach.serve_rosbridge(waiting, options).instrument(span) => end,
         () = app.principals.follow_access(&caller.who, &asked.service, &standing) => return,
     };
-    let handle = lease.handle();
     match end {
         SessionEnd::Client { code, .. } => {
             tracing::debug!("{} left servant {} (code {code})", handle.robot, handle.id);
@@ -673,9 +668,11 @@ async fn serve_stub(
             return bridge::refuse(io, TRY_AGAIN_LATER, &error.one_line()).await;
         }
     };
-    let robot = asked.robot.as_deref().unwrap_or_default();
+    let (robot, node) = (asked.robot.as_deref().unwrap_or_default(), &*asked.node);
+    let servant = lease.handle().span(Span::current().id());
+    let span = tracing::error_span!(parent: &servant, "link", robot, node);
     let lost = tokio::select! {
-        lost = reach.serve_link(io, &read_ahead) => lost.to_string(),
+        lost = reach.serve_link(io, &read_ahead).instrument(span) => lost.to_string(),
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
         reason = app.principals.wait_for_end(&caller.who, &asked.service, true) => reason,
     };
@@ -697,16 +694,18 @@ async fn wait_for_close<S: AsyncRead + Unpin>(io: &mut S, kept: &mut BytesMut) {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::HeaderValue;
+
     use super::*;
 
     #[test]
     fn what_cannot_name_a_node_is_refused() {
         let long = "/".to_owned() + &"n".repeat(LONGEST_NODE - 1);
         for node in ["", "/detector", "ns/node_2", "/_anonymous_1", &long] {
-            assert_eq!(check_node(node), Ok(()), "{node}");
+            check_node(node).expect(node);
         }
         for node in ["/a b", "/a\nb", "<svg>", "/é", &(long + "n")] {
-            let refused = check_node(node).expect_err(node);
+            let refused = check_node(node).expect_err(node).to_string();
             assert!(refused.len() < LONGEST_NODE + 200, "{refused}");
         }
     }

@@ -22,42 +22,7 @@ use super::{
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
-
-/// Callers that may use a route, where tokens exist.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Access {
-    /// Callers that may perform this action on this object.
-    May(AccessAction, AccessTarget),
-    /// Anybody, read-only.
-    Read,
-    /// Whoever presents a pairing code.
-    Code,
-    /// Anybody, to query the session or to sign in.
-    SignIn,
-    /// Any robot; its first message must be rosbridge's `auth`.
-    Connect,
-    /// Anybody, read-only, and any robot.
-    ReadOrConnect,
-}
-
-/// The object of a route, and the path parameter that names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AccessTarget {
-    /// The machine, or all services.
-    Machine,
-    /// A service.
-    Service(&'static str),
-    /// The service of a stub's archive.
-    Stub(&'static str),
-    /// The service of a servant.
-    Servant(&'static str),
-    /// A robot.
-    Robot(&'static str),
-    /// The service and the robot of a recording.
-    Recording(&'static str),
-    /// Named by the query or the body: the handler decides.
-    Handler,
-}
+use crate::route_access::{Access, AccessTarget};
 
 use Access::{Code, Connect, May, Read, ReadOrConnect, SignIn};
 use AccessAction::{Deploy, Enter, Logs, Look, Operate, See, Try};
@@ -280,7 +245,7 @@ pub const ROUTES: &[Route] = &[
             "fit",
             "Whether one more servant would fit, how many more would, and what it would cost the others.",
         )
-        .asks::<api_v1::StatementQuery>()
+        .asks::<dictionary::StatedQuery>()
         .answers::<api::Fit>()
     }),
     route("POST", "/api/v1/services/{name}/rollback", service(Deploy), || {
@@ -497,9 +462,9 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::explain::Explanation>()
     }),
-    route("GET", "/api/v1/audit", ADMINISTER, || get(audit::audit)).with_operation(|| {
+    route("GET", "/api/v1/audit", ADMINISTER, || get(audit::records::audit)).with_operation(|| {
         operation("audit", "Audit log, oldest first.")
-            .asks::<audit::AuditQuery>()
+            .asks::<audit::records::AuditQuery>()
             .streams::<access::Audited>()
     }),
     route("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))

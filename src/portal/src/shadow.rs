@@ -12,10 +12,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::api_v1::{LARGEST_WORDS, json_lines, read_body};
-use super::guard::Caller;
 use crate::app::App;
+use crate::body::{LARGEST_WORDS, read_body};
+use crate::caller::Caller;
 use crate::errors::Error;
+use crate::json::json_lines;
 
 /// Queue size of events that the client has not read.
 const EVENTS_AHEAD: usize = 64;
@@ -34,7 +35,7 @@ pub async fn shadow(
     let body = read_body(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let options: ShadowOptions = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the options cannot be read: {error}")))?;
-    check(&options).map_err(Error::BadRequest)?;
+    check(&options)?;
     app.catalogue.current_revision(&name)?;
     let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
     let ending = caller.wait_for_end(&app, &name);
@@ -64,24 +65,27 @@ pub async fn shadow(
 }
 
 /// Refuses options that make no comparison possible.
-fn check(options: &ShadowOptions) -> Result<(), String> {
+fn check(options: &ShadowOptions) -> Result<(), Error> {
+    let refused = |words: String| Err(Error::BadRequest(words));
     let between = |name: &str, value: f64, least: f64, most: f64| match value {
         value if (least..=most).contains(&value) => Ok(()),
-        value => Err(format!(
+        value => refused(format!(
             "{name} = {value} is not between {least} and {most}"
         )),
     };
     if options.revision == 0 {
-        return Err("revision says which one is the candidate; they are counted from 1".to_owned());
+        return refused(
+            "revision says which one is the candidate; they are counted from 1".to_owned(),
+        );
     }
     between("seconds", options.seconds, 0.1, LONGEST)?;
     between("tolerance", options.tolerance, 0.0, 1e9)?;
     between("bound", options.bound, 0.0, 1e6)?;
     if options.requests == Some(0) {
-        return Err("requests = 0 would compare nothing".to_owned());
+        return refused("requests = 0 would compare nothing".to_owned());
     }
     if options.ignore.len() > MOST_FIELDS {
-        return Err(format!("at most {MOST_FIELDS} fields may be left out"));
+        return refused(format!("at most {MOST_FIELDS} fields may be left out"));
     }
     Ok(())
 }
@@ -96,7 +100,7 @@ mod tests {
             revision: 2,
             ..ShadowOptions::default()
         };
-        assert_eq!(check(&good), Ok(()));
+        check(&good).expect("a comparison");
         type Spoil = fn(&mut ShadowOptions);
         let spoilt: [(Spoil, &str); 8] = [
             (|options| options.revision = 0, "counted from 1"),
@@ -114,7 +118,7 @@ mod tests {
         for (spoil, words) in spoilt {
             let mut options = good.clone();
             spoil(&mut options);
-            let refused = check(&options).expect_err(words);
+            let refused = check(&options).expect_err(words).to_string();
             assert!(refused.contains(words), "{refused}");
         }
     }

@@ -15,8 +15,8 @@ use serde::Deserialize;
 use tokio::sync::Semaphore;
 use tokio_util::io::ReaderStream;
 
-use super::guard::{Caller, ConnectionPeer};
 use crate::app::App;
+use crate::caller::{Caller, ConnectionPeer};
 use crate::errors::Error;
 use crate::query::Query;
 

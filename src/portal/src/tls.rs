@@ -290,7 +290,7 @@ async fn refuse(uri: Uri, headers: HeaderMap) -> Response {
         .get(header::HOST)
         .and_then(|host| host.to_str().ok())
         .unwrap_or("HOST:PORT");
-    let scheme = if crate::guard::is_upgrade(&headers) {
+    let scheme = if crate::headers::is_upgrade(&headers) {
         "wss"
     } else {
         "https"

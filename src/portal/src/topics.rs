@@ -14,11 +14,11 @@ use observe::{Figures, TopicFigures};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::api_v1::json_lines;
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::Caller;
 use crate::inside::{self, InsideTarget};
+use crate::json::json_lines;
 use crate::observers;
 
 /// Period of one line.

@@ -10,15 +10,17 @@ use axum::response::Response;
 use viewer::{DEPTH, PROTOCOLS, ViewerOptions};
 
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::{self, Caller};
+use crate::headers;
 use crate::inside::InsideAccess;
+use crate::query;
 
 /// Returns the newest subprotocol that the viewer offers and this server supports.
 fn choose_protocol(headers: &HeaderMap) -> Result<&'static str, Error> {
     let spoken = PROTOCOLS
         .into_iter()
-        .find(|protocol| guard::protocols(headers).any(|offered| offered == *protocol));
+        .find(|protocol| headers::protocols(headers).any(|offered| offered == *protocol));
     spoken.ok_or_else(|| {
         Error::BadRequest(format!(
             "this address speaks {} to viewers, but the client offers none of these; Foxglove and Lichtblick do \
@@ -30,7 +32,7 @@ fn choose_protocol(headers: &HeaderMap) -> Result<&'static str, Error> {
 
 /// Parses the queue size per topic: `?depth=N`.
 fn parse_depth(query: Option<&str>) -> Result<usize, Error> {
-    let Some(said) = guard::query_value(query, "depth") else {
+    let Some(said) = query::query_value(query, "depth") else {
         return Ok(*DEPTH.start());
     };
     let depth = said.parse().ok().filter(|depth| DEPTH.contains(depth));

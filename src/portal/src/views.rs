@@ -137,28 +137,7 @@ fn topic(of: &recorded::Topic) -> api::interface::Topic {
         },
         latched: of.latched,
         lazy: of.lazy,
-        qos: of.qos.as_ref().map(qos),
-    }
-}
-
-fn qos(of: &recorded::Qos) -> api::interface::Qos {
-    use api::interface::{Durability, Liveliness, Reliability};
-    api::interface::Qos {
-        reliability: match of.reliability {
-            recorded::Reliability::BestEffort => Reliability::BestEffort,
-            recorded::Reliability::Reliable => Reliability::Reliable,
-        },
-        durability: match of.durability {
-            recorded::Durability::Volatile => Durability::Volatile,
-            recorded::Durability::TransientLocal => Durability::TransientLocal,
-        },
-        deadline: of.deadline,
-        lifespan: of.lifespan,
-        liveliness: match of.liveliness {
-            recorded::Liveliness::Automatic => Liveliness::Automatic,
-            recorded::Liveliness::ManualByTopic => Liveliness::ManualByTopic,
-        },
-        lease: of.lease,
+        qos: of.qos,
     }
 }
 

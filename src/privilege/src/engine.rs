@@ -1,4 +1,5 @@
-//! The engine's threads, and the handover of work to them.
+//! The engine's threads, and the handover of work to them. The work keeps the span of the log in which it was handed
+//! over.
 
 use std::cell::Cell;
 use std::future::Future;
@@ -9,6 +10,7 @@ use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::task::{JoinError, JoinHandle};
+use tracing::{Instrument, Span};
 
 use crate::{Account, Error};
 
@@ -81,6 +83,8 @@ impl<T> Future for Task<T> {
 
 /// Runs blocking `work` on a thread of the engine if there is one.
 pub fn spawn_blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Task<T> {
+    let span = Span::current();
+    let work = move || span.in_scope(work);
     Task(match handoff_target() {
         None => EngineHandle::Here(tokio::task::spawn_blocking(work)),
         // Spawned from there, since a thread inherits the privileges of the one that starts it.
@@ -104,7 +108,7 @@ pub async fn run<T: Send + 'static>(future: impl Future<Output = T> + Send + 'st
     let Some(engine) = handoff_target() else {
         return future.await;
     };
-    let mut task = AbortOnDrop(engine.spawn(future));
+    let mut task = AbortOnDrop(engine.spawn(future.in_current_span()));
     match (&mut task.0).await {
         Ok(outcome) => outcome,
         Err(error) => match error.try_into_panic() {
@@ -121,9 +125,10 @@ pub fn run_sync<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) ->
         return work();
     };
     let (sender, receiver) = mpsc::sync_channel(1);
-    engine.spawn(async move {
+    let handed_over = async move {
         let _ = sender.send(work());
-    });
+    };
+    engine.spawn(handed_over.in_current_span());
     receiver
         .recv()
         .expect("the engine's threads outlive the others, and their work does not panic")

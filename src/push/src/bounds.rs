@@ -15,7 +15,7 @@ use nix::sys::statvfs::statvfs;
 use rootfs_builder::blocking;
 use tokio::time::{Instant, MissedTickBehavior};
 
-use crate::room::Disks;
+use crate::disks::Disks;
 use crate::{Error, Options};
 
 /// Interval at which the usage of the file system is checked.

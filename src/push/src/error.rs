@@ -1,3 +1,10 @@
+use api::Size;
+use api::limits::UnusableLimits;
+use api::push::ParsePairError;
+use api::sla::Unstatable;
+
+use crate::supplement::SupplementError;
+
 /// Errors of pushing, rolling back and removing services.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -15,8 +22,8 @@ pub enum Error {
     #[error("{0}")]
     NotAllowed(String),
     /// Invalid options.
-    #[error("{0}")]
-    Options(String),
+    #[error(transparent)]
+    Options(#[from] OptionsError),
     /// The push failed.
     #[error("{message}")]
     Failed {
@@ -54,6 +61,85 @@ pub enum Error {
     /// A task of the daemon panicked.
     #[error("internal error of the daemon while {0}; see its log")]
     Internal(&'static str),
+}
+
+/// Options of a push that are invalid or exclude each other.
+#[derive(Debug, thiserror::Error)]
+pub enum OptionsError {
+    /// Invalid limits.
+    #[error(transparent)]
+    Limits(#[from] UnusableLimits),
+    /// Invalid upper limits on what robots may request.
+    #[error("max_{0}")]
+    Caps(UnusableLimits),
+    /// The cores are more than robots may request.
+    #[error("--cpus {cpus} is more than --max-cpus {most}; lower it, or raise --max-cpus")]
+    CpusAboveCap {
+        /// Number of cores.
+        cpus: f64,
+        /// Upper limit.
+        most: f64,
+    },
+    /// The memory is more than robots may request.
+    #[error("--memory {memory} is more than --max-memory {most}; lower it, or raise --max-memory")]
+    MemoryAboveCap {
+        /// Amount of memory.
+        memory: Size,
+        /// Upper limit.
+        most: Size,
+    },
+    /// Contradictory default SLA.
+    #[error("--{0}")]
+    Sla(Unstatable),
+    /// The default SLA has measures that no push can set.
+    #[error("sla may have only rrt and max_rrt; the robot sets rates and ages in its stub.toml")]
+    SlaMeasures,
+    /// Malformed request pair.
+    #[error("--request {0}")]
+    RequestPair(ParsePairError),
+    /// Request pairs that do not fit the interface.
+    #[error("--request: {0}")]
+    Requests(package::Error),
+    /// Invalid additions to the interface.
+    #[error("the interface supplement: {0}")]
+    Supplement(Box<SupplementError>),
+    /// A stateful service cannot be shared.
+    #[error(
+        "--stateful and --shared exclude each other: in a shared servant, answers would depend on other robots' \
+            earlier requests"
+    )]
+    StatefulShared,
+    /// Invalid number of servants to begin with.
+    #[error("--replicas {replicas} should be between 1 and --max, which is {max}")]
+    Replicas {
+        /// Number of servants.
+        replicas: u32,
+        /// Maximum number of servants.
+        max: u32,
+    },
+    /// Invalid range of the number of servants.
+    #[error("--min {min} and --max {max} should satisfy 1 <= MIN <= MAX <= {most}")]
+    ServantRange {
+        /// Minimum number of servants.
+        min: u32,
+        /// Maximum number of servants.
+        max: u32,
+        /// Upper limit of both.
+        most: u32,
+    },
+    /// Invalid number of concurrent calls.
+    #[error("--calls {calls} should be between 1 and {most}")]
+    Calls {
+        /// Number of concurrent calls of a servant.
+        calls: u32,
+        /// Upper limit.
+        most: u32,
+    },
+    /// Options that an exported service determines.
+    #[error(
+        "an exported service includes its start commands and limits; only its name and the rollout options can be given"
+    )]
+    Exported,
 }
 
 #[cfg(test)]

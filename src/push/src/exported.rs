@@ -22,8 +22,8 @@ use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
-use super::request::Reporter;
-use super::{Error, HOME_INSIDE, Options, PushedImage, Pusher};
+use super::reporter::Reporter;
+use super::{Error, HOME_INSIDE, Options, OptionsError, PushedImage, Pusher};
 
 /// Annotation of the image's index entry with the digest of the record.
 pub const RECORD: &str = "org.cloudroid.record";
@@ -104,30 +104,27 @@ impl ServiceRecord {
         }
         record
             .check()
-            .map_err(|problem| unreadable_record(&problem))?;
+            .map_err(|error| unreadable_record(&error.to_string()))?;
         Ok(record)
     }
 
     /// Checks what a regular push would have ensured.
-    fn check(&self) -> Result<(), String> {
+    fn check(&self) -> Result<(), RecordError> {
         if !is_package(&self.package) {
-            return Err(format!("{:?} is not a valid package name", self.package));
+            return Err(RecordError::Package(self.package.clone()));
         }
         let word = |text: &str| {
             let is_of_it = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
             !text.is_empty() && text.len() < 100 && text.chars().all(is_of_it)
         };
         if !word(&self.flavour.base) || !word(&self.flavour.distribution) {
-            return Err("its base or distribution is not a valid name".to_owned());
+            return Err(RecordError::Flavour);
         }
         if self.plan.nodes.is_empty() {
-            return Err("it starts no nodes".to_owned());
+            return Err(RecordError::NoNodes);
         }
         if self.plan.nodes.len() > MOST_NODES {
-            return Err(format!(
-                "it starts {} nodes; the limit is {MOST_NODES}",
-                self.plan.nodes.len()
-            ));
+            return Err(RecordError::TooManyNodes(self.plan.nodes.len()));
         }
         check_environment(&self.plan.environment)?;
         for node in &self.plan.nodes {
@@ -135,7 +132,7 @@ impl ServiceRecord {
         }
         let is_node = |name: &String| self.plan.nodes.iter().any(|node| node.name == *name);
         if let Some(problem) = find_components_problem(&self.plan.components, &is_node) {
-            return Err(problem);
+            return Err(RecordError::Components(problem));
         }
         if let Some(name) = self
             .plan
@@ -143,7 +140,7 @@ impl ServiceRecord {
             .keys()
             .find(|name| !is_graph_name(name))
         {
-            return Err(format!("{name:?} is not a valid parameter name"));
+            return Err(RecordError::Parameter(name.clone()));
         }
         Ok(())
     }
@@ -190,27 +187,52 @@ impl ServiceRecord {
     }
 }
 
-fn check_node(node: &NodeSpec) -> Result<(), String> {
+/// Reason why the record of an exported service cannot be used.
+#[derive(Debug, thiserror::Error)]
+enum RecordError {
+    #[error("{0:?} is not a valid package name")]
+    Package(String),
+    #[error("its base or distribution is not a valid name")]
+    Flavour,
+    #[error("it starts no nodes")]
+    NoNodes,
+    #[error("it starts {0} nodes; the limit is {MOST_NODES}")]
+    TooManyNodes(usize),
+    #[error("{0:?} is not a valid node name")]
+    NodeName(String),
+    #[error("node {0} has no valid program")]
+    Program(String),
+    #[error("node {0} has an invalid respawn delay")]
+    RespawnDelay(String),
+    #[error("{0}")]
+    Components(String),
+    #[error("{0:?} is not a valid parameter name")]
+    Parameter(String),
+    #[error("{0:?} is not a valid environment variable")]
+    Environment(String),
+}
+
+fn check_node(node: &NodeSpec) -> Result<(), RecordError> {
     if !is_graph_name(&node.name) {
-        return Err(format!("{:?} is not a valid node name", node.name));
+        return Err(RecordError::NodeName(node.name.clone()));
     }
     let argv = &node.argv;
     let is_program = argv.first().is_some_and(|program| program.starts_with('/'));
     if !is_program || argv.iter().any(|word| word.contains('\0')) {
-        return Err(format!("node {} has no valid program", node.name));
+        return Err(RecordError::Program(node.name.clone()));
     }
     if !(0.0..=1e6).contains(&node.respawn_delay) {
-        return Err(format!("node {} has an invalid respawn delay", node.name));
+        return Err(RecordError::RespawnDelay(node.name.clone()));
     }
     check_environment(&node.environment)
 }
 
-fn check_environment(variables: &BTreeMap<String, String>) -> Result<(), String> {
+fn check_environment(variables: &BTreeMap<String, String>) -> Result<(), RecordError> {
     let is_good = |(name, value): &(&String, &String)| {
         !name.is_empty() && !name.contains(['=', '\0']) && !value.contains('\0')
     };
     match variables.iter().find(|variable| !is_good(variable)) {
-        Some((name, _)) => Err(format!("{name:?} is not a valid environment variable")),
+        Some((name, _)) => Err(RecordError::Environment(name.clone())),
         None => Ok(()),
     }
 }
@@ -253,7 +275,7 @@ impl Pusher {
             _ if rows.rows.len() > choreographer::MOST_ROWS => {
                 Err("it has too many entries".to_owned())
             }
-            Err(reason) => Err(reason),
+            Err(error) => Err(error.to_string()),
             Ok(()) => (self.catalogue.initialize_dictionary(name, &rows))
                 .map_err(|error| error.to_string()),
         };
@@ -286,11 +308,7 @@ fn check_options(asked: &PushOptions) -> Result<(), Error> {
         ..asked.clone()
     };
     if left != PushOptions::default() {
-        return Err(Error::Options(
-            "an exported service includes its start commands and limits; only its name and the rollout options can be \
-                given"
-                .to_owned(),
-        ));
+        return Err(OptionsError::Exported.into());
     }
     Ok(())
 }

@@ -13,6 +13,8 @@
 #![forbid(unsafe_code)]
 
 mod bounds;
+mod deployer;
+mod disks;
 mod error;
 mod exported;
 mod interface_limits;
@@ -23,6 +25,7 @@ mod places;
 mod probe;
 mod publish;
 mod receive;
+mod reporter;
 mod request;
 mod room;
 mod shared;
@@ -49,22 +52,22 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use bounds::PushBudget;
+use disks::Disks;
 use exported::ImportedService;
 use places::PushQueue;
-use request::Reporter;
-use room::Disks;
+use reporter::Reporter;
 use store::{Journal, Plan, RevisionRecord};
+use told::PUSHED;
 
-pub use error::Error;
+pub use deployer::Deployer;
+pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
-pub use request::{Deployer, PushResult};
+pub use request::PushResult;
 
 /// Capacity of the event queue of a client; a build blocks when a slow client lets it fill up.
 pub const EVENTS_AHEAD: usize = 256;
-/// Name of the unpacked archive in the build directory.
-const PUSHED: &str = "pushed";
 /// Home directory of nodes in the container, a tmpfs.
 const HOME_INSIDE: &str = "/root";
 
@@ -162,7 +165,8 @@ impl Pusher {
         report: &Reporter,
     ) -> Result<PushResult, Error> {
         let began = Instant::now();
-        let known = options.name.as_deref().or(options.apt.as_deref());
+        let asked_name = options.name.as_deref();
+        let known = asked_name.or(options.apt.as_deref());
         let mut admitted = self.places.admit(known, report).await?;
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
@@ -195,6 +199,9 @@ impl Pusher {
             .clone()
             .unwrap_or_else(|| built.package.clone());
         names::validate_service(&name).map_err(catalogue::Error::from)?;
+        if asked_name.is_none() {
+            tracing::Span::current().record("service", &*name);
+        }
         admitted.assign_service(&name, report).await?;
         // Pushes of one service are serialized, so its owner does not change until this push is done.
         by.check_may_publish(&name)?;
@@ -294,14 +301,16 @@ impl Pusher {
                 &built.inventory.definitions,
             );
             supplement::add(&mut interface, text, known)
-                .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
+                .map_err(|error| OptionsError::Supplement(Box::new(error)))?;
         }
         interface_limits::check_interface(&interface)?;
         let ros = built.flavour.ros.ros_version();
         let decided = requests::decide_requests(ros, &interface, &found.watched);
-        let stated = options.parse_requests().map_err(Error::Options)?;
+        let stated = options
+            .parse_requests()
+            .map_err(OptionsError::RequestPair)?;
         let decided = requests::apply_stated(ros, &interface, &stated, decided)
-            .map_err(|error| Error::Options(format!("--request: {error}")))?;
+            .map_err(OptionsError::Requests)?;
         for request in &decided {
             report.request(request).await;
         }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use parking_lot::Mutex;
 use tokio::sync::{OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
-use super::request::Reporter;
+use super::reporter::Reporter;
 use crate::{Error, Options};
 
 /// Limits the number of concurrent and waiting builds, and serializes pushes of the same service.

@@ -15,8 +15,9 @@ use rootfs_builder::probe::{CpuTime, CpuTimeSource, ProbeOptions, ProbeResult};
 use ros::schema::Registry;
 use servant::engine::{ContainerState, NodeExit, ServantHandle};
 use servant::spec::Spec;
+use tracing::Instrument;
 
-use super::request::Reporter;
+use super::reporter::Reporter;
 use super::{Pusher, naming, supplement};
 use crate::Error;
 use choreographer::Permit;
@@ -81,9 +82,7 @@ async fn probe_once(
     let marks = naming::mark_nodes_without_namespace(&mut marked, &built.flavour);
     let spec = self::probe_spec(pusher, id, built, &marked, options);
     let (servant, trial) = start(pusher, spec, alive).await?;
-    let unmet = servant
-        .enforced_limits()
-        .unmet_limits(&choreographer::engine_limits(&options.limits));
+    let unmet = servant.enforced_limits().unmet_limits(&options.limits);
     let found = observe_interface(pusher, &servant, built, plan, marks, options).await;
     trial.end().await?;
     let mut found = match found {
@@ -107,12 +106,12 @@ pub(super) async fn start(
 ) -> Result<(Arc<dyn ServantHandle>, ProbeServant), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
     let alive = alive.clone();
-    let starting = pusher.tasks.spawn(async move {
+    let starting = async move {
         let servant = engine.start(spec).await?;
         let trial = ProbeServant::new(Arc::clone(&servant), tasks, alive);
         Ok::<_, servant::Error>((servant, trial))
-    });
-    let started = starting.await;
+    };
+    let started = pusher.tasks.spawn(starting.in_current_span()).await;
     Ok(started.map_err(|_| Error::Internal("starting the image once"))??)
 }
 
@@ -302,10 +301,10 @@ pub(super) fn probe_spec(
     Spec {
         id: format!("{id}-probe"),
         image: built.image.to_string(),
-        limits: choreographer::engine_limits(&options.limits.or(api::Limits {
+        limits: options.limits.or(api::Limits {
             cpu_weight: Some(WEIGHT),
             ..pusher.choreographer.default_limits()
-        })),
+        }),
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         grants: plan.grants.clone(),

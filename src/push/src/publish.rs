@@ -8,7 +8,7 @@ use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
 
 use super::Pusher;
-use super::request::Reporter;
+use super::reporter::Reporter;
 use crate::Error;
 
 impl Pusher {

@@ -18,7 +18,7 @@ use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
 use super::patience::{self, BodyRateLimit, StallFlag, TooSlow};
-use super::request::Reporter;
+use super::reporter::Reporter;
 use crate::Error;
 use crate::Options;
 

@@ -7,88 +7,15 @@ use std::time::Duration;
 
 use api::{Limits, PushEvent, PushOptions, Sla};
 use catalogue::names;
-use futures_util::future::BoxFuture;
-use package::requests::{Reason, Request};
 use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
-use tokio_util::task::TaskTracker;
+use tracing::Instrument;
 
-use super::{Archive, Error, Pusher, receive, shared};
-
-/// Reports progress to the client. A client that has disconnected cancels the push separately.
-#[derive(Clone)]
-pub(super) struct Reporter {
-    events: mpsc::Sender<PushEvent>,
-    /// Tracks the build of this push while it runs.
-    pub(super) building: TaskTracker,
-    /// Cancelled when the push begins to publish, after which it can no longer be cancelled.
-    pub(super) publishing: CancellationToken,
-}
-
-impl Reporter {
-    pub(super) fn new(events: mpsc::Sender<PushEvent>) -> Self {
-        Self {
-            events,
-            building: TaskTracker::new(),
-            publishing: CancellationToken::new(),
-        }
-    }
-
-    pub(super) async fn step(&self, title: &str) {
-        self.event(PushEvent::Step {
-            title: title.to_owned(),
-        })
-        .await;
-    }
-
-    pub(super) async fn warning(&self, message: String) {
-        self.event(PushEvent::Warning { message }).await;
-    }
-
-    /// Sends a warning if the client keeps up; publication does not wait for a slow client.
-    pub(super) fn try_warning(&self, message: String) {
-        let _ = self.events.try_send(PushEvent::Warning { message });
-    }
-
-    /// Reports a request pair.
-    pub(super) async fn request(&self, request: &Request) {
-        let words = request.to_string();
-        match request.reason {
-            Reason::Guessed => self.warning(words).await,
-            Reason::Stated | Reason::Watched | Reason::Alone => {
-                self.event(PushEvent::Log { line: words }).await;
-            }
-        }
-    }
-
-    pub(super) async fn event(&self, event: PushEvent) {
-        let _ = self.events.send(event).await;
-    }
-}
-
-/// Checks whether a service name may be published; returns the reason if not.
-type PublishCheck = dyn Fn(&str) -> Result<(), String> + Send + Sync;
-
-/// Future that resolves with the reason when the deployer's credentials are revoked.
-type Revocation = dyn Fn() -> BoxFuture<'static, String> + Send + Sync;
-
-/// Principal that pushes.
-pub struct Deployer {
-    /// Owner of services that are published for the first time; `None` for operators.
-    pub owner: Option<String>,
-    /// Check of the services that it may publish.
-    pub may: Box<PublishCheck>,
-    /// Resolves with the reason when its credentials are no longer valid.
-    pub over: Box<Revocation>,
-}
-
-impl Deployer {
-    pub(super) fn check_may_publish(&self, name: &str) -> Result<(), Error> {
-        (self.may)(name).map_err(Error::NotAllowed)
-    }
-}
+use super::deployer::Deployer;
+use super::reporter::Reporter;
+use super::{Archive, Error, OptionsError, Pusher, receive, shared};
 
 /// Result of a push.
 #[derive(Debug)]
@@ -118,9 +45,13 @@ impl Pusher {
         let cancel = self.cancel.child_token();
         let guard = cancel.clone().drop_guard();
         let pusher = Arc::clone(self);
-        self.tasks.spawn(async move {
+        let id = format!("push-{}", names::random(8));
+        // Of a push that names no service, the name is known once the package was read.
+        let span = tracing::error_span!(parent: None, "push", service = options.name, id);
+        let work = async move {
+            let report = Reporter::new(events);
             let outcome = pusher
-                .run(&options, &by, archive, &Reporter::new(events), cancel)
+                .run(&id, &options, &by, archive, &report, cancel)
                 .await;
             let failed = outcome.is_err();
             finished(outcome).await;
@@ -128,7 +59,8 @@ impl Pusher {
                 // The layers of a failed push are no longer needed.
                 pusher.collect_garbage().await;
             }
-        });
+        };
+        self.tasks.spawn(work.instrument(span));
         guard
     }
 
@@ -149,17 +81,15 @@ impl Pusher {
             names::validate_service(name).map_err(catalogue::Error::from)?;
             by.check_may_publish(name)?;
         }
-        choreographer::limits::check(&options.limits)
-            .map_err(|error| Error::Options(error.to_string()))?;
+        options.limits.check().map_err(OptionsError::from)?;
         if by.owner.is_some() {
-            choreographer::limits::check_weight(&options.limits)
-                .map_err(|error| Error::Options(error.to_string()))?;
+            choreographer::limits::check_weight(&options.limits).map_err(OptionsError::from)?;
         }
-        check_caps(options).map_err(Error::Options)?;
-        check_sla(options).map_err(Error::Options)?;
+        check_caps(options)?;
+        check_sla(options)?;
         options
             .parse_requests()
-            .map_err(|error| Error::Options(format!("--request {error}")))?;
+            .map_err(OptionsError::RequestPair)?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;
         }
@@ -171,14 +101,14 @@ impl Pusher {
     /// Runs a push from start to end.
     async fn run(
         &self,
+        id: &str,
         options: &PushOptions,
         by: &Deployer,
         archive: Archive,
         report: &Reporter,
         cancel: CancellationToken,
     ) -> Result<PushResult, Error> {
-        let id = format!("push-{}", names::random(8));
-        let push = Box::pin(self.push(&id, options, by, archive, report));
+        let push = Box::pin(self.push(id, options, by, archive, report));
         let work = blocking::cancellable(push);
         let over = async {
             tokio::select! {
@@ -190,11 +120,11 @@ impl Pusher {
         // The builder first: it removes its files when its containers have ended.
         report.building.close();
         report.building.wait().await;
-        self.builder.wait_removed(&id).await;
-        let build = self.home.join("build").join(&id);
+        self.builder.wait_removed(id).await;
+        let build = self.home.join("build").join(id);
         let removed = privilege::spawn_blocking(move || foreign::remove(&build)).await;
         if let Ok(Err(error)) = removed {
-            tracing::warn!("leftovers of the push {id} remain until the next start: {error}");
+            tracing::warn!("leftovers of the push remain until the next start: {error}");
         }
         match outcome {
             Ok(published) => {
@@ -238,35 +168,31 @@ async fn run_until_revoked<T>(
 }
 
 /// Rejects caps that contradict the limits.
-fn check_caps(options: &PushOptions) -> Result<(), String> {
+fn check_caps(options: &PushOptions) -> Result<(), OptionsError> {
     let PushOptions { caps, limits, .. } = options;
     let most = Limits {
         cpus: caps.cpus,
         memory: caps.memory,
         ..Limits::default()
     };
-    choreographer::limits::check(&most).map_err(|error| format!("max_{error}"))?;
+    most.check().map_err(OptionsError::Caps)?;
     if let (Some(cpus), Some(most)) = (limits.cpus, caps.cpus)
         && cpus > most
     {
-        return Err(format!(
-            "--cpus {cpus} is more than --max-cpus {most}; lower it, or raise --max-cpus"
-        ));
+        return Err(OptionsError::CpusAboveCap { cpus, most });
     }
     if let (Some(memory), Some(most)) = (limits.memory, caps.memory)
         && memory > most
     {
-        return Err(format!(
-            "--memory {memory} is more than --max-memory {most}; lower it, or raise --max-memory"
-        ));
+        return Err(OptionsError::MemoryAboveCap { memory, most });
     }
     Ok(())
 }
 
 /// Rejects an SLA that cannot be a default for stubs.
-fn check_sla(options: &PushOptions) -> Result<(), String> {
+fn check_sla(options: &PushOptions) -> Result<(), OptionsError> {
     let sla = &options.sla;
-    sla.check().map_err(|error| format!("--{error}"))?;
+    sla.check().map_err(OptionsError::Sla)?;
     let times = Sla {
         rrt: sla.rrt,
         max_rrt: sla.max_rrt,
@@ -275,10 +201,7 @@ fn check_sla(options: &PushOptions) -> Result<(), String> {
     if *sla == times {
         Ok(())
     } else {
-        Err(
-            "sla may have only rrt and max_rrt; the robot sets rates and ages in its stub.toml"
-                .into(),
-        )
+        Err(OptionsError::SlaMeasures)
     }
 }
 
@@ -329,9 +252,9 @@ mod tests {
                 ..PushOptions::default()
             })
         };
-        assert_eq!(check(None, None, None, None), Ok(()));
-        assert_eq!(check(Some(1.0), Some(1.0), Some(64), Some(64)), Ok(()));
-        assert_eq!(check(Some(9.0), None, None, Some(64)), Ok(()));
+        check(None, None, None, None).expect("nothing is limited");
+        check(Some(1.0), Some(1.0), Some(64), Some(64)).expect("they are equal");
+        check(Some(9.0), None, None, Some(64)).expect("they are of different resources");
         for (refused, words) in [
             (
                 check(Some(2.0), Some(1.5), None, None),
@@ -344,7 +267,7 @@ mod tests {
             (check(None, Some(0.0), None, None), "max_cpus = 0 is not"),
             (check(None, None, None, Some(1)), "max_memory = 1M is too"),
         ] {
-            let refused = refused.expect_err(words);
+            let refused = refused.expect_err(words).to_string();
             assert!(refused.starts_with(words), "{refused}");
         }
     }
@@ -362,8 +285,8 @@ mod tests {
             max_rrt: Span::from_millis(max_rrt),
             ..Sla::default()
         };
-        assert_eq!(check(times(100, 300)), Ok(()));
-        let refused = check(times(300, 100)).expect_err("in disorder");
+        check(times(100, 300)).expect("times in order");
+        let refused = check(times(300, 100)).expect_err("in disorder").to_string();
         assert!(
             refused.starts_with("--rrt (300ms) is greater than"),
             "{refused}"
@@ -372,7 +295,7 @@ mod tests {
             fps: Some(5.0),
             ..times(100, 300)
         };
-        let refused = check(rate).expect_err("a rate");
+        let refused = check(rate).expect_err("a rate").to_string();
         assert!(refused.contains("stub.toml"), "{refused}");
     }
 }

@@ -5,41 +5,37 @@ use package::interface::Interface;
 use reach::group::shareable;
 use ros::bus::RosVersion;
 
-use crate::Error;
+use crate::{Error, OptionsError};
 
 /// Maximum number of servants of a service, and of concurrent calls of a servant.
 const MOST: u32 = 64;
 
 /// Rejects contradictory numbers of servants.
-pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
+pub(crate) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
     let Some(shared) = &options.shared else {
         return Ok(());
     };
-    let refused = |words: String| Err(Error::Options(words));
     if options.stateful {
-        return refused(
-            "--stateful and --shared exclude each other: in a shared servant, answers would depend on other robots' \
-                earlier requests".to_owned(),
-        );
+        return Err(OptionsError::StatefulShared);
     }
     let (min, max) = (shared.min, shared.max);
     // Checked first: it is the default of --min.
     if !(1..=max).contains(&shared.replicas) {
-        return refused(format!(
-            "--replicas {} should be between 1 and --max, which is {max}",
-            shared.replicas
-        ));
+        let replicas = shared.replicas;
+        return Err(OptionsError::Replicas { replicas, max });
     }
     if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
-        return refused(format!(
-            "--min {min} and --max {max} should satisfy 1 <= MIN <= MAX <= {MOST}"
-        ));
+        return Err(OptionsError::ServantRange {
+            min,
+            max,
+            most: MOST,
+        });
     }
     if !(1..=MOST).contains(&shared.calls) {
-        return refused(format!(
-            "--calls {} should be between 1 and {MOST}",
-            shared.calls
-        ));
+        return Err(OptionsError::Calls {
+            calls: shared.calls,
+            most: MOST,
+        });
     }
     Ok(())
 }

@@ -21,7 +21,7 @@ use ros::schema::{Base, MessageType, Registry, SchemaError};
 
 /// Errors of an interface supplement.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum SupplementError {
+pub enum SupplementError {
     /// Neither valid TOML nor valid JSON.
     #[error("{0}")]
     Unreadable(String),

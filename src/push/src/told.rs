@@ -5,7 +5,10 @@ use std::path::Path;
 use api::PushEvent;
 use rootfs_builder::BuildEvent;
 
-use super::{Deployer, Error, PUSHED};
+use super::{Deployer, Error};
+
+/// Name of the unpacked archive in the build directory.
+pub(super) const PUSHED: &str = "pushed";
 
 /// Converts a build event for the deployer. Services of others are named only if the deployer may publish them.
 pub(super) fn to_push_event(event: BuildEvent, by: &Deployer) -> PushEvent {
@@ -100,7 +103,7 @@ mod tests {
                 if name.starts_with("lab_") {
                     Ok(())
                 } else {
-                    Err("not yours".to_owned())
+                    Err(Error::NotAllowed("not yours".to_owned()))
                 }
             }),
             over: Box::new(|| Box::pin(std::future::pending())),

@@ -49,7 +49,7 @@ pub use governor::{Effect, Governor};
 pub use hand_over::{HandOver, HandOverLedger, MissedInputs};
 pub use measure::Meter;
 pub use outcome::RequestOutcome;
-pub use pair::{Correlation, TopicPair};
+pub use pair::{Correlation, ParsePairError, TopicPair};
 pub use phases::{PhaseHistory, Phases, Quantiles};
 pub use quantile::nearest_rank;
 pub use report::{QosReport, RequestCounts, TimedEvent};

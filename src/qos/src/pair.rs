@@ -20,6 +20,37 @@ pub enum Correlation {
     Arrival,
 }
 
+/// Examples of the text form of a pair, for errors.
+const FORMS: &str = "write it as \"/input -> /output\", \"/input -> /output, /other by stamp\" or \
+                     \"/input -> /output by arrival\"";
+
+/// The error of a text that is not a pair of an input and its outputs.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ParsePairError {
+    /// Nothing separates the input from the outputs.
+    #[error("{0:?} has no arrow; {FORMS}")]
+    NoArrow(
+        /// The text.
+        String,
+    ),
+    /// The way of correlation does not exist.
+    #[error("{text:?} correlates by {by:?}, which is neither stamp nor goal nor arrival; {FORMS}")]
+    UnknownCorrelation {
+        /// The text.
+        text: String,
+        /// The way of correlation that it names.
+        by: String,
+    },
+    /// A name cannot be that of a topic.
+    #[error("{text:?} names {name:?}, which is not an absolute topic name; {FORMS}")]
+    InvalidTopic {
+        /// The text.
+        text: String,
+        /// The name.
+        name: String,
+    },
+}
+
 /// An input and the outputs that it triggers. Its text form is one line: `/image -> /found, /marked by stamp`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
@@ -81,15 +112,12 @@ impl fmt::Display for TopicPair {
 }
 
 impl FromStr for TopicPair {
-    type Err = String;
+    type Err = ParsePairError;
 
-    fn from_str(text: &str) -> Result<Self, String> {
-        let example = "write it as \"/input -> /output\", \"/input -> /output, /other by stamp\" or \
-                       \"/input -> /output by arrival\"";
-        let refuse = |why: &str| format!("{text:?} {why}; {example}");
+    fn from_str(text: &str) -> Result<Self, ParsePairError> {
         let (input, rest) = text
             .split_once("->")
-            .ok_or_else(|| refuse("has no arrow"))?;
+            .ok_or_else(|| ParsePairError::NoArrow(text.to_owned()))?;
         let (outputs, by) = match rest.rsplit_once(" by ") {
             None => (rest, None),
             Some((outputs, by)) => match by.trim() {
@@ -97,9 +125,10 @@ impl FromStr for TopicPair {
                 "goal" => (outputs, Some(Correlation::Goal)),
                 "arrival" => (outputs, Some(Correlation::Arrival)),
                 other => {
-                    return Err(refuse(&format!(
-                        "correlates by {other:?}, which is neither stamp nor goal nor arrival"
-                    )));
+                    return Err(ParsePairError::UnknownCorrelation {
+                        text: text.to_owned(),
+                        by: other.to_owned(),
+                    });
                 }
             },
         };
@@ -108,9 +137,10 @@ impl FromStr for TopicPair {
             if Self::is_valid_topic(name) {
                 Ok(name.to_owned())
             } else {
-                Err(refuse(&format!(
-                    "names {name:?}, which is not an absolute topic name"
-                )))
+                Err(ParsePairError::InvalidTopic {
+                    text: text.to_owned(),
+                    name: name.to_owned(),
+                })
             }
         };
         Ok(Self {
@@ -122,9 +152,9 @@ impl FromStr for TopicPair {
 }
 
 impl TryFrom<String> for TopicPair {
-    type Error = String;
+    type Error = ParsePairError;
 
-    fn try_from(text: String) -> Result<Self, String> {
+    fn try_from(text: String) -> Result<Self, ParsePairError> {
         text.parse()
     }
 }
@@ -158,7 +188,7 @@ mod tests {
             ("/image -> ", "\"\""),
             ("/image -> /found by luck", "\"luck\""),
         ] {
-            let error = text.parse::<TopicPair>().unwrap_err();
+            let error = text.parse::<TopicPair>().unwrap_err().to_string();
             assert!(error.contains(named), "{text}: {error}");
             assert!(error.contains("write it as"), "{text}: {error}");
         }

@@ -12,10 +12,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros::bus::{Bus, Graph};
-use ros::ros2::composition::{Component, ComponentContainer};
-use ros::schema::Registry;
+use ros::ros2::composition::{Component, ComponentContainer, NotLoaded};
+use ros::schema::{Registry, SchemaError};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
+use tracing::Instrument;
 
 use crate::links::NodeController;
 use crate::{Observer, StubNode, following};
@@ -33,6 +34,22 @@ pub enum ContainerLoad {
     Loaded(Vec<String>),
     /// A component could not be loaded, for this reason.
     Refused(String),
+}
+
+/// Error of loading the components of a container.
+#[derive(Debug, thiserror::Error)]
+enum ContainerLoadError {
+    /// The image has no definitions of what a container is asked.
+    #[error("nothing can be loaded into the container {container}: {source}")]
+    NoDefinitions {
+        /// Absolute name of the container.
+        container: String,
+        /// Error of the definitions.
+        source: SchemaError,
+    },
+    /// The container does not load a component.
+    #[error(transparent)]
+    NotLoaded(Box<NotLoaded>),
 }
 
 /// Running containers by name.
@@ -95,7 +112,7 @@ impl ComponentLoader {
         });
         Some(ComponentLoader {
             shown: followed.shown.subscribe(),
-            task: tokio::spawn(followed.run()).abort_handle(),
+            task: tokio::spawn(followed.run().in_current_span()).abort_handle(),
         })
     }
 
@@ -138,10 +155,11 @@ impl ContainerFollower {
         self.show_load(&name, ContainerLoad::Loading);
         let load = match self.load_components(&name).await {
             Ok(loaded) => {
-                tracing::debug!(container = name, ?loaded, "its nodes are loaded");
+                tracing::debug!(?loaded, "its nodes are loaded");
                 ContainerLoad::Loaded(loaded)
             }
-            Err(why) => {
+            Err(error) => {
+                let why = error.to_string();
                 let observer = &self.observer;
                 observer.record_event(api::Level::Error, "component-refused", &why, None);
                 ContainerLoad::Refused(why)
@@ -150,18 +168,20 @@ impl ContainerFollower {
         self.show_load(&name, load);
     }
 
-    async fn load_components(&self, name: &str) -> Result<Vec<String>, String> {
+    async fn load_components(&self, name: &str) -> Result<Vec<String>, ContainerLoadError> {
         let ComponentPlan {
             components,
             registry,
             patience,
         } = &self.wanted;
         let container = ComponentContainer::new(Arc::clone(&self.bus), registry, name);
-        let container = container
-            .map_err(|error| format!("nothing can be loaded into the container {name}: {error}"))?;
+        let container = container.map_err(|source| ContainerLoadError::NoDefinitions {
+            container: name.to_owned(),
+            source,
+        })?;
         let components = components.get(name).map_or(&[][..], Vec::as_slice);
         let loaded = container.load_all(components, *patience).await;
-        loaded.map_err(|error| error.to_string())
+        loaded.map_err(|error| ContainerLoadError::NotLoaded(Box::new(error)))
     }
 
     fn show_load(&self, name: &str, load: ContainerLoad) {

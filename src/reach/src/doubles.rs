@@ -5,10 +5,10 @@ use std::time::SystemTime;
 use async_trait::async_trait;
 use link::control::{Exit, NodeLaunch, RequestTiming};
 use parking_lot::Mutex;
-use ros::bus::ParamValue;
+use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
-use crate::links::{NodeController, RequestUpdate};
+use crate::links::{NodeController, NodeError, RequestUpdate};
 use crate::{Observer, StubNode};
 
 /// Nodes started by stubs, and nothing else.
@@ -29,10 +29,10 @@ impl StubNodesDouble {
 
 #[async_trait]
 impl NodeController for StubNodesDouble {
-    async fn start(&self, _node: &NodeLaunch, _run: &str) -> Result<(), String> {
+    async fn start(&self, _node: &NodeLaunch, _run: &str) -> Result<(), NodeError> {
         Ok(())
     }
-    async fn signal(&self, _node: &str, _signal: i32) -> Result<(), String> {
+    async fn signal(&self, _node: &str, _signal: i32) -> Result<(), NodeError> {
         Ok(())
     }
     async fn wait_exit(&self, _node: &str) -> Exit {
@@ -61,7 +61,7 @@ impl NodeController for StubNodesDouble {
 pub struct RecordedEvents(pub Mutex<Vec<(String, String)>>);
 
 impl Observer for RecordedEvents {
-    fn check_stub(&self, _made_of: Option<u64>, _image: &str) -> Result<(), String> {
+    fn check_stub(&self, _made_of: Option<u64>, _image: &str) -> Result<(), FailureReason> {
         Ok(())
     }
     fn record_event(&self, _level: api::Level, kind: &str, message: &str, _robot: Option<&str>) {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use ros::bus::Graph;
 use tokio::sync::watch;
 use tokio::task::{AbortHandle, JoinSet};
+use tracing::Instrument;
 
 /// Starts a task when a node named by `of_interest` appears, except the node `ours`, and aborts it when the node is
 /// gone, after which `gone` is called. Returns when the graph is no longer updated; dropping the future aborts all
@@ -41,7 +42,10 @@ pub(crate) async fn run_for_each_node<F>(
         while tasks.try_join_next().is_some() {}
         for one in there {
             let node = one.0.clone();
-            known.entry(one).or_insert_with(|| tasks.spawn(begin(node)));
+            known.entry(one).or_insert_with(|| {
+                let span = tracing::error_span!("node", node);
+                tasks.spawn(begin(node).instrument(span))
+            });
         }
         if graph.changed().await.is_err() {
             return;

@@ -161,7 +161,8 @@ impl Reach for InProcess {
                 parameters.set(&key, value).await?;
             }
         }
-        self.nodes.start(node, "").await.map_err(Error::Linked)
+        let started = self.nodes.start(node, "").await;
+        started.map_err(|error| Error::Linked(Box::new(error)))
     }
 
     fn links(&self) -> Vec<LinkStatus> {

@@ -34,6 +34,7 @@ mod memory_bus;
 #[path = "../../../tests/support/memory_container.rs"]
 mod memory_container;
 mod nodes;
+mod observer;
 pub mod readiness;
 mod request_times;
 mod sockets;
@@ -43,13 +44,13 @@ mod trial;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, WaitingConnection};
 use budget::Budget;
 use futures_util::future::BoxFuture;
-use link::control::{NodeLaunch, RequestTiming};
+use link::control::NodeLaunch;
 use link::session::DisconnectReason;
 use package::interface::Interface;
 use package::inventory::Inventory;
@@ -66,13 +67,15 @@ use tokio::sync::watch;
 use components::Loads;
 use egress::Relays;
 use lifecycle::Stages;
-use links::{LinkStatus, RequestUpdate};
+use links::{LinkStatus, NodeError};
 use tap::Tap;
 
 pub use ends::describe_exit;
 pub use inside::InsideView;
+pub use links::StubNode;
 pub use local::LocalOpener;
 pub use nodes::LinkedNodes;
+pub use observer::{Observer, Tenant};
 pub use request_times::RequestTimes;
 pub use trial::{Material, Picture, RECORDED, Replay, ReplayPace, RequestGap, check_material};
 
@@ -101,29 +104,6 @@ pub struct RecordedRevision {
     pub egress: Vec<String>,
 }
 
-/// The daemon as seen from one servant's reach.
-pub trait Observer: Send + Sync + 'static {
-    /// Checks that a stub generated from this revision and image can use the servant; otherwise returns the reason.
-    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), String>;
-    /// Records an event about the servant and its robot for the operator.
-    fn record_event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
-    /// Records that from `at` on a node of the robot is served by its local original, with the reason; `None`: by the
-    /// cloud again.
-    fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
-    /// Records an update about a request; an answered one has its response time and phases.
-    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate);
-}
-
-/// The user of a servant. A warm container has none.
-pub trait Tenant: Send + Sync + 'static {
-    /// Returns the name of the robot.
-    fn robot(&self) -> &str;
-    /// Returns the limits of the servant.
-    fn limits(&self) -> api::Limits;
-    /// Hands the control of nodes to the robot's stubs; returns whether the revision's own nodes were running before.
-    fn take_over(&self) -> bool;
-}
-
 /// Options of one servant's reach.
 #[derive(Debug, Clone)]
 pub struct ReachOptions {
@@ -150,15 +130,6 @@ pub struct FlowCounts {
     pub inputs: u64,
     /// Messages and responses received.
     pub outputs: u64,
-}
-
-/// A node started by a stub.
-#[derive(Debug, Clone)]
-pub struct StubNode {
-    /// Description given by the stub.
-    pub node: NodeLaunch,
-    /// Parameters given by its push.
-    pub given: Vec<(String, ParamValue)>,
 }
 
 /// A connection after its WebSocket upgrade.
@@ -214,10 +185,9 @@ pub trait Reach: Send + Sync + 'static {
     }
     /// Starts a node as a stub would, with the parameters from the push of this servant's revision.
     async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
-        Err(Error::Linked(format!(
-            "{} is started only by stubs",
-            node.name
-        )))
+        Err(Error::Linked(Box::new(NodeError::OnlyByStubs(
+            node.name.clone(),
+        ))))
     }
     /// Returns the counts of messages and calls by user.
     fn flows(&self) -> Vec<FlowCounts> {
@@ -305,8 +275,8 @@ pub enum Error {
     #[error("servant {0} does not run here")]
     Elsewhere(String),
     /// A stub's node cannot be started.
-    #[error("{0}")]
-    Linked(String),
+    #[error(transparent)]
+    Linked(Box<NodeError>),
     /// The material of a trial does not fit.
     #[error("{0}")]
     Trial(String),

@@ -15,6 +15,7 @@ use ros::bus::{Bus, RosVersion};
 use ros::ros2::lifecycle::{BeginOutcome, LifecycleNode, State};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
+use tracing::Instrument;
 
 use crate::links::NodeController;
 use crate::{Observer, StubNode, following};
@@ -70,7 +71,7 @@ impl LifecycleDriver {
         };
         Some(LifecycleDriver {
             shown: followed.shown.subscribe(),
-            task: tokio::spawn(Arc::new(followed).run()).abort_handle(),
+            task: tokio::spawn(Arc::new(followed).run().in_current_span()).abort_handle(),
         })
     }
 
@@ -109,7 +110,7 @@ impl LifecycleFollower {
         let changes = node.watch().await;
         match node.state().await {
             Ok(state) => self.show_state(&name, state),
-            Err(error) => tracing::debug!(node = name, %error, "its state is unknown"),
+            Err(error) => tracing::debug!(%error, "its state is unknown"),
         }
         match changes {
             Ok(mut changes) => {
@@ -118,7 +119,7 @@ impl LifecycleFollower {
                 }
             }
             Err(error) => {
-                tracing::debug!(node = name, %error, "it does not report changes of its state")
+                tracing::debug!(%error, "it does not report changes of its state")
             }
         }
     }
@@ -129,7 +130,7 @@ impl LifecycleFollower {
             Ok(BeginOutcome::Now) => self.show_state(name, State::Active),
             Ok(BeginOutcome::Left(state)) => self.show_state(name, state),
             Ok(BeginOutcome::DrivenBy(driver)) => {
-                tracing::debug!(node = name, driver, "another program drives it");
+                tracing::debug!(driver, "another program drives it");
             }
             Err(refused) => {
                 let why = refused.to_string();

@@ -28,12 +28,13 @@ mod requests;
 mod retry;
 mod runs;
 mod seen;
+mod state;
 mod status;
 mod turns;
 mod types;
 mod unsent;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -48,6 +49,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::runtime::Handle;
 use tokio::sync::{OnceCell, watch};
 use tokio::time::timeout;
+use tracing::Instrument;
 use ws::WebSocket;
 
 use link::control::{FromCloud, Hello, SlaTargets, Welcome};
@@ -58,10 +60,10 @@ use link::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 
 use crate::FlowCounts;
 use attempts::Attempts;
-use duplicates::RobotMachine;
-use node_link::NodeLink;
-pub use nodes::NodeController;
+pub use nodes::{NodeController, NodeError, StubNode};
 pub use requests::RequestUpdate;
+pub use state::{Hub, HubOptions};
+use state::{NodeLink, ParameterMirror, RobotMachine};
 pub use status::LinkStatus;
 use turns::NodeTurns;
 
@@ -76,21 +78,6 @@ const STOP: [(i32, Duration); 3] = [
     (9, Duration::from_secs(5)),
 ];
 
-/// Options of a hub.
-#[derive(Debug, Clone)]
-pub struct HubOptions {
-    /// Time for which a link outlives its connection.
-    pub grace: Duration,
-    /// Timeout of service calls.
-    pub call_timeout: Duration,
-    /// Time for which first messages wait until the node connects to their topic.
-    pub warm_up: Duration,
-    /// Budget for incomplete frames and records of robots; one that does not fit ends its connection.
-    pub budget: Budget,
-    /// Time after which an incomplete frame ends its connection.
-    pub unfinished: Duration,
-}
-
 impl Default for HubOptions {
     fn default() -> Self {
         Self {
@@ -101,31 +88,6 @@ impl Default for HubOptions {
             unfinished: Duration::from_secs(300),
         }
     }
-}
-
-/// The links of one servant.
-pub struct Hub {
-    servant: String,
-    bus: Arc<dyn Bus>,
-    registry: Arc<Registry>,
-    nodes: Arc<dyn NodeController>,
-    options: HubOptions,
-    links: Mutex<BTreeMap<String, Arc<NodeLink>>>,
-    /// Incremented when links are added or removed or change their subscriptions.
-    changes: watch::Sender<u64>,
-    /// Serializes the start and end of links per node.
-    turns: NodeTurns,
-    parameters: parameters::ParameterMirror,
-    /// Set once services of the robot are being lent.
-    lends: OnceCell<()>,
-    /// Difference between the robot's clock and ours.
-    skew: Skew,
-    attempts: Attempts,
-    /// Pairs of machines that were warned of each other.
-    duplicates: Mutex<BTreeSet<(String, String)>>,
-    /// Sizes of what robots send to nodes.
-    inputs: InputSizes,
-    closed: watch::Sender<Option<String>>,
 }
 
 impl Hub {
@@ -143,10 +105,11 @@ impl Hub {
             registry,
             nodes,
             options,
+            log_span: tracing::Span::current(),
             links: Mutex::default(),
             changes: watch::Sender::new(0),
             turns: NodeTurns::default(),
-            parameters: parameters::ParameterMirror::default(),
+            parameters: ParameterMirror::default(),
             lends: OnceCell::new(),
             skew: Skew::default(),
             attempts: Attempts::default(),
@@ -216,16 +179,10 @@ impl Hub {
             };
             return send_refusal(&mut socket, DisconnectReason::Protocol(error)).await;
         }
-        let name = hello.node.name.clone();
         let (link, resumed, turn) = match self.attach(&hello).await {
             Ok(attached) => attached,
             Err(refusal) => {
-                tracing::info!(
-                    servant = self.servant,
-                    node = name,
-                    "a link was refused: {}",
-                    refusal.reason
-                );
+                tracing::info!("a link was refused: {}", refusal.reason);
                 let welcome = Welcome::Refused {
                     reason: refusal.reason.clone(),
                     again: refusal.again,
@@ -281,12 +238,7 @@ impl Hub {
         if let Err(lost) = send_open(&mut socket, &welcome).await {
             return lost;
         }
-        tracing::info!(
-            servant = self.servant,
-            node = name,
-            resumed,
-            "a robot's node is linked"
-        );
+        tracing::info!(resumed, "a robot's node is linked");
         let lost = {
             let mut running = pin!(link.session.run(&mut socket, &*link));
             let replaced = async { kicked.wait_for(|kicks| *kicks != turn).await.is_ok() };
@@ -378,7 +330,7 @@ impl Hub {
             self.nodes
                 .start(&hello.node, &hello.run)
                 .await
-                .map_err(LinkRefusal::permanent)?;
+                .map_err(|error| LinkRefusal::permanent(error.to_string()))?;
         }
         let link = NodeLink::start(self, hello, session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
@@ -487,12 +439,14 @@ impl Hub {
     fn expire_later(self: &Arc<Self>, link: &Arc<NodeLink>, turn: u64) {
         let (hub, link) = (Arc::clone(self), Arc::clone(link));
         let mut kicked = link.kick.subscribe();
-        tokio::spawn(async move {
+        let span = link.log_span.clone();
+        let expiring = async move {
             let back = kicked.wait_for(|kicks| *kicks != turn);
             if timeout(hub.options.grace, back).await.is_err() {
                 hub.end_link(&link, turn).await;
             }
-        });
+        };
+        tokio::spawn(expiring.instrument(span));
     }
 
     async fn stop_node(&self, node: &str) {

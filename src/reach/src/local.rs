@@ -9,6 +9,7 @@ use ros::JoinOptions;
 use ros::bus::RosVersion;
 use servant::engine::ServantHandle;
 use servant::local::{LocalEngine, LocalServant};
+use tracing::{Instrument, Span};
 
 use crate::components::{ComponentLoader, ComponentPlan};
 use crate::egress::{self, Relays};
@@ -75,7 +76,8 @@ impl Opener for LocalOpener {
             ..joining.clone()
         };
         let (ros, beside) = (options.ros, Arc::clone(&sockets));
-        let looked_at = Arc::clone(servant);
+        // Whoever looks inside first, this bus is not of that connection.
+        let (looked_at, span) = (Arc::clone(servant), Span::current());
         let joined = ros::connect(options.ros, sockets, joining);
         let (bus, recorded) = tokio::join!(joined, recorded);
         let bus = bus?;
@@ -99,7 +101,7 @@ impl Opener for LocalOpener {
                     let endings = Some(ExitNotifier::start(events, Arc::clone(&bus)));
                     Ok(JoinedBus { bus, endings })
                 };
-                joined.boxed()
+                joined.instrument(span.clone()).boxed()
             }),
             registry,
             lifecycles,

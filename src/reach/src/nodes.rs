@@ -19,7 +19,7 @@ use servant::engine::{LogStart, NodeExit, ServantHandle};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
-use crate::links::{NodeController, RequestUpdate};
+use crate::links::{NodeController, NodeError, RequestUpdate};
 use crate::{Observer, RecordedRevision, StubNode, Tenant, describe_exit};
 
 use planned::OwnNodes;
@@ -88,16 +88,14 @@ impl LinkedNodes {
 pub(crate) fn find_program<'a>(
     recorded: &'a RecordedRevision,
     node: &NodeLaunch,
-) -> Result<&'a String, String> {
+) -> Result<&'a String, NodeError> {
     let same = node.package == recorded.package;
     let programs = &recorded.inventory.programs;
     let known = programs.get(&node.executable).filter(|_| same);
-    known.ok_or_else(|| {
-        format!(
-            "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; \
-             push it with that node",
-            recorded.service, node.executable, node.package
-        )
+    known.ok_or_else(|| NodeError::NotPushed {
+        service: recorded.service.clone(),
+        executable: node.executable.clone(),
+        package: node.package.clone(),
     })
 }
 
@@ -150,8 +148,8 @@ impl NodeController for LinkedNodes {
         &self.recorded.service
     }
 
-    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), String> {
-        let tenant = self.told.tenant()?;
+    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError> {
+        let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
         self.told
             .observer()
             .check_stub(node.revision, &node.image)?;
@@ -185,7 +183,10 @@ impl NodeController for LinkedNodes {
             required: false,
         };
         let started = self.container.start_node(spec).await;
-        started.map_err(|error| format!("{} cannot be started: {error}", node.name))?;
+        started.map_err(|source| NodeError::Start {
+            node: node.name.clone(),
+            source,
+        })?;
         self.started.lock().insert(node.name.clone(), node.clone());
         Ok(())
     }
@@ -206,9 +207,9 @@ impl NodeController for LinkedNodes {
         running
     }
 
-    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), NodeError> {
         let sent = self.container.signal_node(node, signal).await;
-        sent.map_err(|error| error.to_string())
+        sent.map_err(NodeError::Signal)
     }
 
     async fn wait_exit(&self, node: &str) -> Exit {

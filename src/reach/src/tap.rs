@@ -13,8 +13,8 @@ use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd,
-    GoalEvents, GoalOutcome, Graph, Lending, NodeParameters, Publisher, PublisherReports,
-    QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    GoalError, GoalEvents, GoalOutcome, Graph, Lending, NodeParameters, Publisher,
+    PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::ros2::names;
 use ros::schema::ActionDef;
@@ -85,10 +85,10 @@ impl TapAnswer {
     }
 
     /// Creates the answer of a goal.
-    pub fn from_goal(end: &Result<GoalEnd, String>) -> TapAnswer {
+    pub fn from_goal(end: &Result<GoalEnd, GoalError>) -> TapAnswer {
         match end {
             Ok(end) => TapAnswer::Given(Some(end.outcome), end.result.clone()),
-            Err(reason) => TapAnswer::Refused(reason.clone()),
+            Err(error) => TapAnswer::Refused(error.to_string()),
         }
     }
 
@@ -455,7 +455,7 @@ impl GoalEvents for TappedEvents {
         self.events.on_feedback(feedback);
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let noted = self.under_way.lock().remove(&self.id);
         if let Some(noted) = noted {
             noted.answer(TapAnswer::from_goal(&end));

@@ -11,8 +11,8 @@ use link::control::{Exit, FromCloud, FromRobot, Hello, NodeLaunch, ServiceChanne
 use link::record::Record;
 use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
-use reach::links::{Hub, HubOptions, NodeController};
-use ros::bus::{Bus, BusError, ParamValue};
+use reach::links::{Hub, HubOptions, NodeController, NodeError};
+use ros::bus::{Bus, BusError, FailureReason, ParamValue};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -31,11 +31,11 @@ struct RunningNodes;
 
 #[async_trait]
 impl NodeController for RunningNodes {
-    async fn start(&self, _: &NodeLaunch, _: &str) -> Result<(), String> {
+    async fn start(&self, _: &NodeLaunch, _: &str) -> Result<(), NodeError> {
         Ok(())
     }
-    async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
-        Err("it does not run".to_owned())
+    async fn signal(&self, _: &str, _: i32) -> Result<(), NodeError> {
+        Err(NodeError::ServantEnded)
     }
     async fn wait_exit(&self, _: &str) -> Exit {
         std::future::pending().await
@@ -264,7 +264,7 @@ async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
     // Once found, it is not awaited again; failures carry the robot's message.
     let call = call_map(&servant, "three");
     let id = robot.expect_call(5, "three").await;
-    let reason = "not today".to_owned();
+    let reason = FailureReason::new("not today");
     robot.session.answer(id, now(), Err(reason));
     let error = call.await.unwrap().unwrap_err().to_string();
     assert!(error.contains("not today"), "{error}");

@@ -18,7 +18,7 @@ use reach::group::dispatch::Rules;
 use reach::group::{ServantGroup, open_seat};
 use reach::links::RequestUpdate;
 use reach::{Observer, Reach, ReachOptions, RecordedRevision, Tenant};
-use ros::bus::{Bus, ParamValue, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Bus, FailureReason, ParamValue, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -40,7 +40,7 @@ struct WorkService {
 
 #[async_trait]
 impl ServiceHandler for WorkService {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         self.asked.add_permits(1);
         if &request[..] == b"long" {
             std::future::pending::<()>().await;
@@ -86,7 +86,7 @@ fn work() -> ServiceType {
 struct NullObserver;
 
 impl Observer for NullObserver {
-    fn check_stub(&self, _: Option<u64>, _: &str) -> Result<(), String> {
+    fn check_stub(&self, _: Option<u64>, _: &str) -> Result<(), FailureReason> {
         Ok(())
     }
     fn record_event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
@@ -150,7 +150,7 @@ fn test_revision() -> RecordedRevision {
 #[derive(Debug)]
 enum StubEvent {
     Graph(Graph),
-    Answer(u32, Result<Bytes, String>),
+    Answer(u32, Result<Bytes, FailureReason>),
     Notice(String),
     Exited(Exit),
 }
@@ -272,12 +272,12 @@ impl Stub {
     }
 
     /// Calls a service; returns the response.
-    async fn call(&mut self, channel: u32, request: &str) -> Result<String, String> {
+    async fn call(&mut self, channel: u32, request: &str) -> Result<String, FailureReason> {
         let asked = self.session.call(channel, request.to_owned().into());
         self.answer(asked).await
     }
 
-    async fn answer(&mut self, asked: u32) -> Result<String, String> {
+    async fn answer(&mut self, asked: u32) -> Result<String, FailureReason> {
         loop {
             if let StubEvent::Answer(id, answer) = self.next_event().await {
                 assert_eq!(id, asked, "of another call");
@@ -354,7 +354,7 @@ async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
         permit = has(1) => { permit.unwrap().forget(); 1 }
     };
     group.leave(ids[lost], "its power went");
-    let reason = stub.answer(asked).await.unwrap_err();
+    let reason = stub.answer(asked).await.unwrap_err().to_string();
     let servant = members[lost].worker.servant;
     assert!(
         reason.contains(servant) && reason.contains("its power went"),

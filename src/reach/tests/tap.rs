@@ -8,7 +8,7 @@ use budget::Budget;
 use bytes::Bytes;
 use reach::tap::{Tap, TapAnswer, TapEvent, TapEventKind, TapReceiver};
 use ros::JoinOptions;
-use ros::bus::{Bus, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Bus, FailureReason, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -22,9 +22,9 @@ struct TapEchoService;
 
 #[async_trait]
 impl ServiceHandler for TapEchoService {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         match &request[..] {
-            b"" => Err("nothing to say".to_owned()),
+            b"" => Err(FailureReason::new("nothing to say")),
             b"wait" => std::future::pending().await,
             _ => Ok(request),
         }

@@ -17,6 +17,7 @@ use crate::schema::ActionDef;
 
 mod actions;
 mod error;
+mod failure_reason;
 mod graph;
 mod lending;
 mod matched;
@@ -25,9 +26,13 @@ mod parameters;
 mod qos;
 mod queue;
 mod types;
+mod version;
 
-pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, GoalOutcome};
+pub use actions::{
+    ActionClient, ActionHandler, ActionServer, GoalEnd, GoalError, GoalEvents, GoalOutcome,
+};
 pub use error::{BusError, CallFate};
+pub use failure_reason::FailureReason;
 pub use graph::{ActionNodes, Graph, NodeEntities, NodeNames, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, LentService, ServiceProvider};
 pub use matched::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
@@ -40,25 +45,7 @@ pub(crate) use parameters::{ParamChangeSender, param_change_channel};
 pub use qos::{QosDurability, QosLiveliness, QosProfile, QosReliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
 pub use types::{Digest, ServiceType, WireFormat, WireType};
-
-/// The generations of ROS.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum RosVersion {
-    /// ROS 1: Master, TCPROS, actionlib.
-    One,
-    /// ROS 2: DDS.
-    Two,
-}
-
-impl RosVersion {
-    /// Returns 1 or 2.
-    pub fn number(self) -> u8 {
-        match self {
-            Self::One => 1,
-            Self::Two => 2,
-        }
-    }
-}
+pub use version::RosVersion;
 
 /// One serialized message from one publisher.
 #[derive(Debug, Clone)]
@@ -108,7 +95,7 @@ pub trait Publisher: Send + Sync {
 #[async_trait]
 pub trait ServiceHandler: Send + Sync + 'static {
     /// Handles a serialized request; returns the serialized response or the reason for the failure.
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String>;
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason>;
 
     /// Returns the handler for a caller that expects the type with this digest, for handlers that serve several types
     /// (whose own digest is `*`). `None`, the default, means this handler.

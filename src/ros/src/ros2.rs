@@ -26,11 +26,13 @@ mod request_header;
 mod seen;
 mod services;
 mod show;
+mod state;
 mod subscriptions;
 #[cfg(test)]
 mod testing;
 #[cfg(test)]
 mod tests;
+mod topic_in;
 mod topic_type;
 mod type_hash;
 mod watcher;

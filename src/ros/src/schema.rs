@@ -12,23 +12,27 @@ mod derived;
 mod description;
 pub(crate) mod initial;
 mod interface_files;
+mod kind;
 mod limits;
 mod parse;
 pub(crate) mod plan;
+mod primitive;
 mod registry;
 mod resolve;
+mod syntax;
 mod text;
 mod types;
 
 #[cfg(test)]
 mod tests;
 
-pub use interface_files::InterfaceFile;
-pub use limits::{MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TEXT_BYTES};
+pub use interface_files::{IdlError, InterfaceFile};
+pub use limits::{ExceededLimit, MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TEXT_BYTES};
+pub use primitive::Primitive;
 pub use registry::Registry;
+pub use syntax::SyntaxError;
 pub use types::{
-    ActionDef, ActionServices, Arity, Base, Constant, Field, FieldBounds, MessageType, Primitive,
-    ServiceDef,
+    ActionDef, ActionServices, Arity, Base, Constant, Field, FieldBounds, MessageType, ServiceDef,
 };
 
 /// Errors of definitions.
@@ -64,7 +68,7 @@ pub enum SchemaError {
         /// Line number, from 1.
         line: usize,
         /// The problem.
-        reason: String,
+        reason: Box<SyntaxError>,
     },
     /// A service lacks its `---` line, or an action lacks one of its two.
     #[error("{name} has {found} --- lines instead of {expected}")]
@@ -82,6 +86,6 @@ pub enum SchemaError {
         /// Name of the definition.
         name: String,
         /// The limit exceeded.
-        reason: String,
+        reason: ExceededLimit,
     },
 }

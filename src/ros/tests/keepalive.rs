@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, ParamValue, QosProfile, ServiceHandler, ServiceType, WireType};
+use ros::bus::{Bus, FailureReason, ParamValue, QosProfile, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -22,7 +22,7 @@ struct Echo;
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         Ok(request)
     }
 }

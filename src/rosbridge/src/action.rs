@@ -4,7 +4,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::service::split_name;
 use crate::subscribe::fragment_size;
 use crate::{Compression, Id, Payload, Problem, Writer};

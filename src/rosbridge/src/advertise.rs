@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Id, Problem, QosRequest, Writer};
 
 /// Announces that the client will publish on a topic.

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Id, Problem, Writer};
 
 /// Credentials: a MAC over the other fields, with a secret shared with a third party.

@@ -55,14 +55,21 @@ pub enum Problem {
     #[error("a message has at most {0} fields")]
     TooManyFields(usize),
     /// The frame has no `op`.
-    #[error("field \"op\" is missing; it must be one of {known}{hint}", known = crate::op::KNOWN.join(", "))]
+    #[error("field \"op\" is missing; it must be one of {names}{hint}", names = .known.join(", "))]
     NoOp {
+        /// Names of all ops.
+        known: &'static [&'static str],
         /// Hint for clients of rosbridge 1.0.
         hint: &'static str,
     },
     /// The `op` is not part of the protocol.
-    #[error("unknown op {0:?}; known are {known}", known = crate::op::KNOWN.join(", "))]
-    UnknownOp(String),
+    #[error("unknown op {op:?}; known are {names}", names = .known.join(", "))]
+    UnknownOp {
+        /// The op, shortened.
+        op: String,
+        /// Names of all ops.
+        known: &'static [&'static str],
+    },
     /// A required field is absent.
     #[error("field {field:?} is missing, {expected} is expected")]
     Missing {

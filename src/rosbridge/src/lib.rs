@@ -24,6 +24,7 @@ mod fields;
 mod fragment;
 mod id;
 mod json;
+mod message;
 mod op;
 mod payload;
 mod png;

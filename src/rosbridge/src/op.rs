@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
+use crate::message::Message;
 use crate::{
     ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService,
     CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, QosRequest,
@@ -19,20 +20,6 @@ pub enum ProtocolFrame<'a> {
     Binary(&'a [u8]),
 }
 
-/// Common interface of all ops.
-pub(crate) trait Message<'a>: Sized {
-    /// Value of the field `op`.
-    const OP: &'static str;
-    /// All fields that the protocol defines for it, apart from `op` and `id`.
-    const FIELDS: &'static [&'static str];
-    /// Reads the fields.
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem>;
-    /// Returns the `id` field.
-    fn id(&self) -> Option<&Id<'a>>;
-    /// Writes the fields, apart from `op` and `id`.
-    fn write(&self, writer: &mut Writer<'_>);
-}
-
 macro_rules! ops {
     ($($(#[doc = $doc:literal])* $name:ident $(<$life:lifetime>)?,)*) => {
         /// One message of the protocol.
@@ -42,14 +29,17 @@ macro_rules! ops {
         }
 
         /// Names of all ops.
-        pub(crate) const KNOWN: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
+        const KNOWN: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
 
         impl<'a> Op<'a> {
             fn read(op: &str, id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
                 $(if op == $name::OP {
                     return $name::read(id, fields).map(Op::$name);
                 })*
-                Err(Problem::UnknownOp(op.chars().take(64).collect()))
+                Err(Problem::UnknownOp {
+                    op: op.chars().take(64).collect(),
+                    known: KNOWN,
+                })
             }
 
             /// Returns the value of the field `op`.
@@ -152,7 +142,7 @@ impl<'a> Op<'a> {
                 return Err(Error {
                     op: None,
                     id: known,
-                    problem: Problem::NoOp { hint },
+                    problem: Problem::NoOp { known: KNOWN, hint },
                 });
             }
             Err(problem) => {
@@ -165,7 +155,7 @@ impl<'a> Op<'a> {
         };
         let read = id.and_then(|id| Op::read(&op, id, &fields));
         read.map_err(|problem| {
-            let op = (!matches!(problem, Problem::UnknownOp(_))).then(|| op.into_owned());
+            let op = (!matches!(problem, Problem::UnknownOp { .. })).then(|| op.into_owned());
             Error {
                 op,
                 id: known,

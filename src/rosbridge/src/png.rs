@@ -6,7 +6,7 @@ use std::io::Cursor;
 use base64_simd::STANDARD;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Fragment, Id, Problem, Writer};
 
 /// A message encoded as a PNG image, or a part of one.

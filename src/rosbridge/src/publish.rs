@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Compression, Format, Id, Payload, Problem, QosRequest, Writer};
 
 /// A message on a topic.

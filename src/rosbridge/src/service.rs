@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::time::Duration;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::subscribe::fragment_size;
 use crate::{Compression, Id, Payload, Problem, Writer};
 

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Id, Problem, Writer};
 
 /// Severity of a status message; in `set_level` the least severe level to send.

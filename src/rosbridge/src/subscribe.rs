@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::time::Duration;
 
 use crate::fields::Fields;
-use crate::op::Message;
+use crate::message::Message;
 use crate::{Id, Problem, QosRequest, Writer};
 
 /// Encoding of payloads.

@@ -28,6 +28,7 @@ mod participant;
 mod qos;
 mod reader;
 mod sequence;
+mod shared;
 mod time;
 pub mod wire;
 mod writer;
@@ -35,12 +36,12 @@ mod writer;
 pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
 pub use network::{InterfaceAddress, InterfaceSelection, list_interfaces};
-pub use participant::{
-    Config, DataReader, DataWriter, DiscoveredGraph, DiscoveryServer, EndpointMatches, JoinError,
-    NetworkNamespace, Participant, ReceivedSample, Sink, TopicDescription,
-};
+pub use participant::{Config, DataReader, DataWriter, JoinError, NetworkNamespace, Participant};
 pub use qos::{
     DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind,
     Representations,
 };
 pub use sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};
+pub use shared::{
+    DiscoveredGraph, DiscoveryServer, EndpointMatches, ReceivedSample, Sink, TopicDescription,
+};

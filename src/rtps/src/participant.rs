@@ -1,6 +1,5 @@
 //! The public API: participants, readers and writers.
 
-use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
@@ -14,17 +13,18 @@ use socket2::SockRef;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
+use tracing::Instrument;
 
-use crate::discovery::{EndpointData, ParticipantData};
+use crate::discovery::ParticipantData;
 use crate::driver::{DriverState, PORTS, Sockets, drive};
 use crate::engine::{BUILTIN, Engine, Settings};
 use crate::flow::FlowControl;
 use crate::locator::{MULTICAST, Ports};
 use crate::network::{InterfaceAddress, InterfaceSelection, InterfaceSet};
-use crate::qos::{EndpointQos, Mismatch};
+use crate::qos::EndpointQos;
 use crate::reader::ReaderLimits;
 use crate::sequence::SequenceNumber;
-use crate::time::WireTime;
+use crate::shared::{DiscoveredGraph, DiscoveryServer, EndpointMatches, Sink, TopicDescription};
 use crate::{Guid, GuidPrefix, SampleIdentity, VendorId};
 
 /// Network namespace in which a participant has its sockets: a servant's, or the host's.
@@ -80,24 +80,6 @@ pub struct Config {
     pub predecessors: Vec<GuidPrefix>,
 }
 
-/// A Fast DDS discovery server, as clients are configured with it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct DiscoveryServer {
-    /// Position in the list of servers, with which the server itself is configured; it determines its GUID prefix.
-    pub place: u8,
-    /// Address at which it receives discovery data.
-    pub at: SocketAddr,
-}
-
-impl DiscoveryServer {
-    /// Returns its GUID prefix: `44.53.PLACE.5f.45.50.52.4f.53.49.4d.41`.
-    pub fn prefix(&self) -> GuidPrefix {
-        let mut prefix = *b"DS\0_EPROSIMA";
-        prefix[2] = self.place;
-        GuidPrefix(prefix)
-    }
-}
-
 impl Config {
     /// Creates the default configuration of a participant in a domain.
     pub fn new(domain: u16, name: impl Into<String>) -> Self {
@@ -134,64 +116,6 @@ pub enum JoinError {
     /// A socket could not be opened.
     #[error("opening a socket for DDS: {0}")]
     Socket(#[from] io::Error),
-}
-
-/// Other participants and their endpoints.
-#[derive(Debug, Clone, Default)]
-pub struct DiscoveredGraph {
-    /// Incremented with every change.
-    pub generation: u64,
-    /// The other participants.
-    pub participants: BTreeMap<GuidPrefix, Arc<ParticipantData>>,
-    /// Their writers.
-    pub writers: BTreeMap<Guid, Arc<EndpointData>>,
-    /// Their readers.
-    pub readers: BTreeMap<Guid, Arc<EndpointData>>,
-}
-
-/// The remote endpoints on the topic of a local one.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct EndpointMatches {
-    /// Matched endpoints, in the order in which they were discovered.
-    pub matched: Vec<Arc<EndpointData>>,
-    /// Matched endpoints that have shown that they know this endpoint: what is written from now on reaches them.
-    pub confirmed: Vec<Guid>,
-    /// Endpoints with incompatible QoS, with the mismatches.
-    pub refused: Vec<(Arc<EndpointData>, Vec<Mismatch>)>,
-}
-
-/// A received sample.
-#[derive(Debug, Clone)]
-pub struct ReceivedSample {
-    /// CDR with its header of four bytes.
-    pub payload: Bytes,
-    /// GUID of the writer.
-    pub writer: Guid,
-    /// Sequence number.
-    pub number: SequenceNumber,
-    /// The request that it replies to, or the identity with which a request wants to be answered (inline QoS).
-    pub related: Option<SampleIdentity>,
-    /// Source timestamp, on the writer's clock.
-    pub written: Option<WireTime>,
-    /// For an announcement: the endpoint or participant that it disposes of.
-    pub(crate) withdrawn: Option<Guid>,
-}
-
-/// Receives the samples of a reader, in the order of each writer. Must not block.
-pub trait Sink: Send + Sync + 'static {
-    /// Handles a sample.
-    fn on_sample(&self, sample: ReceivedSample);
-}
-
-/// Name and type of a topic.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct TopicDescription {
-    /// DDS name of the topic: `rt/chatter`.
-    pub name: String,
-    /// DDS name of the type: `std_msgs::msg::dds_::String_`.
-    pub type_name: String,
-    /// User data; ROS 2 uses `typehash=RIHS01_…;`.
-    pub user_data: Bytes,
 }
 
 /// A participant of a domain. Clones refer to the same participant. When the last one and all its endpoints are
@@ -309,10 +233,11 @@ impl Participant {
             multicast: multicast.map(UdpSocket::into_std).transpose()?,
         };
         let shared = DriverState::new(engine, flow, sockets, network)?;
-        let task = tokio::spawn(drive(Arc::clone(&shared), ports_each)).abort_handle();
+        let driving = drive(Arc::clone(&shared), ports_each);
+        let task = tokio::spawn(driving.in_current_span()).abort_handle();
         let looking = (!config.interfaces.is_loopback()).then(|| {
             let looking = watch_interfaces(Arc::clone(&shared), place, config.interfaces);
-            tokio::spawn(looking).abort_handle()
+            tokio::spawn(looking.in_current_span()).abort_handle()
         });
         Ok(Participant {
             running: Arc::new(ParticipantTask {

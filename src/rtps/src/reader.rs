@@ -18,9 +18,9 @@ use budget::Budget;
 
 use crate::discovery::EndpointData;
 use crate::fragments::{Assembly, Progress};
-use crate::participant::ReceivedSample;
 use crate::qos::{DurabilityKind, ReliabilityKind};
 use crate::sequence::{FragmentNumber, SPAN, SequenceNumber, SequenceSet};
+use crate::shared::ReceivedSample;
 use crate::time::WireTime;
 use crate::wire::{DataFrag, NackFrag};
 use crate::writer::CountFilter;

@@ -12,18 +12,13 @@ use oci_spec::runtime::{
 };
 
 use crate::container::{ContainerSpec, Profile};
+use crate::idmap::{MESSAGE_QUEUES, PENDING_SIGNALS};
 use crate::quotas::Quotas;
 use crate::rootfs::{COMPILE_USER, StagedRoot};
 use crate::seccomp;
 
 /// Limit of open files per process; a higher one only slows down programs that close all possible descriptors.
 const OPEN_FILES: u64 = 16_384;
-
-/// Limit of pending signals per user of a container; each of its timers counts as one, too.
-pub const PENDING_SIGNALS: u64 = 4096;
-
-/// Limit of bytes in POSIX message queues per user of a container: the kernel's default.
-pub const MESSAGE_QUEUES: u64 = 819_200;
 
 /// Limit of inotify instances per user of a container: the kernel's default.
 pub const INOTIFY_INSTANCES: u64 = 128;
@@ -202,7 +197,7 @@ fn mounts(
     volumes: &[PathBuf],
     quotas: &Quotas,
 ) -> Result<Vec<Mount>, OciSpecError> {
-    let scratch = quotas.scratch_bytes(spec.limits.memory);
+    let scratch = quotas.scratch_bytes(spec.limits.memory.map(|size| size.0));
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
         let mut options: Vec<String> = safe
@@ -296,7 +291,7 @@ fn mount(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spec::ResourceLimits;
+    use crate::spec::{Limits, Size};
 
     fn spec(profile: Profile) -> ContainerSpec {
         ContainerSpec {
@@ -304,9 +299,9 @@ mod tests {
             layers: vec![],
             writable: None,
             profile,
-            limits: ResourceLimits {
-                memory: Some(64 << 20),
-                ..ResourceLimits::default()
+            limits: Limits {
+                memory: Some(Size(64 << 20)),
+                ..Limits::default()
             },
             environment: Default::default(),
             nodes: vec![],

@@ -23,9 +23,8 @@ use serde::{Deserialize, Serialize};
 use crate::Error;
 use crate::container::ContainerSpec;
 use crate::engine::{EnforcedLimits, Usage};
-use crate::spec::ResourceLimits;
+use crate::spec::Limits;
 
-mod cores;
 mod disk;
 mod files;
 mod hosts;
@@ -152,7 +151,7 @@ impl Cgroup {
     }
 
     /// Sets the limits that are given. A limit that cannot be set is no error here: the limits in force are read back.
-    pub fn set_limits(&self, limits: &ResourceLimits) -> EnforcedLimits {
+    pub fn set_limits(&self, limits: &Limits) -> EnforcedLimits {
         if self.version == 2 {
             v2::set(self, limits)
         } else {
@@ -171,7 +170,7 @@ impl Cgroup {
         EnforcedLimits {
             cgroup_version: self.version,
             limits,
-            shim: ResourceLimits::default(),
+            shim: Limits::default(),
         }
     }
 

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::spec::{NodeSpec, ResourceLimits};
+use crate::spec::{Limits, NodeSpec};
 
 /// Everything that the shim needs to know about its container.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,7 +28,7 @@ pub struct ContainerSpec {
     pub profile: Profile,
     /// Hard limits.
     #[serde(default)]
-    pub limits: ResourceLimits,
+    pub limits: Limits,
     /// Environment of every process.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,

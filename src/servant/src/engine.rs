@@ -11,7 +11,7 @@ use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
 
-use crate::spec::{NodeSpec, ResourceLimits, Spec};
+use crate::spec::{Limits, NodeSpec, Spec};
 
 pub use unmet::missing_limits;
 
@@ -95,11 +95,11 @@ pub struct NodeExit {
 pub struct EnforcedLimits {
     /// Cgroup version, 1 or 2; 0 if no controller could be used.
     pub cgroup_version: u8,
-    /// Values in force; `None`: this host cannot limit it.
-    pub limits: ResourceLimits,
+    /// Values in force; absent where this host cannot limit it.
+    pub limits: Limits,
     /// Limits of the shim.
     #[serde(default)]
-    pub shim: ResourceLimits,
+    pub shim: Limits,
 }
 
 /// Resource usage as counted by the kernel.
@@ -161,7 +161,7 @@ pub trait ServantHandle: Send + Sync + 'static {
     /// Returns the limits read back from the kernel.
     fn enforced_limits(&self) -> EnforcedLimits;
     /// Changes the limits that are given, keeps the others, and returns those then in force.
-    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, crate::Error>;
+    async fn set_limits(&self, limits: Limits) -> Result<EnforcedLimits, crate::Error>;
     /// Returns the current usage.
     async fn usage(&self) -> Result<Usage, crate::Error>;
     /// Returns how long so far threads of its nodes, and of the processes that serve them, were runnable but waited for

@@ -127,7 +127,7 @@ pub enum Error {
     },
     /// Something that is not granted was asked for.
     #[error(transparent)]
-    Grant(#[from] crate::local::grants::GrantError),
+    Grant(#[from] crate::grant_error::GrantError),
     /// The layers of an image are not available.
     #[error("image {image} cannot be used: {source}")]
     Image {

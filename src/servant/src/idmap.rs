@@ -15,7 +15,13 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::wait::waitpid;
 use nix::unistd::{ForkResult, Uid, setresuid};
 
-use crate::{Error, bundle, sys};
+use crate::{Error, sys};
+
+/// Limit of pending signals per user of a container; each of its timers counts as one, too.
+pub const PENDING_SIGNALS: u64 = 4096;
+
+/// Limit of bytes in POSIX message queues per user of a container: the kernel's default.
+pub const MESSAGE_QUEUES: u64 = 819_200;
 
 /// Tests idmapped mounts on the file system that holds `directory`: a detached copy of the mount is created, idmapped,
 /// and dropped, invisibly to others.
@@ -83,8 +89,8 @@ pub(crate) fn create_user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error>
 /// Moves the calling process to a user namespace created by `user`.
 fn unshare_as(user: u32) -> nix::Result<()> {
     for (resource, most) in [
-        (Resource::RLIMIT_SIGPENDING, bundle::PENDING_SIGNALS),
-        (Resource::RLIMIT_MSGQUEUE, bundle::MESSAGE_QUEUES),
+        (Resource::RLIMIT_SIGPENDING, PENDING_SIGNALS),
+        (Resource::RLIMIT_MSGQUEUE, MESSAGE_QUEUES),
     ] {
         let most = getrlimit(resource)?.1.min(most);
         setrlimit(resource, most, most)?;

@@ -29,7 +29,7 @@ use crate::engine::ContainerState;
 use crate::process::ProcessIdentity;
 use crate::protocol::NodeStatus;
 use crate::quotas::Quotas;
-use crate::spec::ResourceLimits;
+use crate::spec::Limits;
 
 /// File of the [`LaunchRecord`].
 pub const SPEC: &str = "spec.json";
@@ -87,7 +87,7 @@ pub struct LaunchRecord {
     pub parent: CgroupParent,
     /// Limits of the shim itself; its processor time is also bounded by its servant's.
     #[serde(default)]
-    pub shim_limits: ResourceLimits,
+    pub shim_limits: Limits,
     /// Bounds on what a servant writes.
     #[serde(default)]
     pub quotas: Quotas,
@@ -109,11 +109,11 @@ impl LaunchRecord {
     }
 
     /// Returns the limits of the shim of a servant with these limits.
-    pub fn shim_limits_for(&self, servant: &ResourceLimits) -> ResourceLimits {
+    pub fn shim_limits_for(&self, servant: &Limits) -> Limits {
         // The Master must be able to answer at all.
         let most = servant.cpus.map(|cpus| cpus.max(SHIM_CPUS));
         let cpus = self.shim_limits.cpus.into_iter().chain(most);
-        ResourceLimits {
+        Limits {
             cpus: cpus.reduce(f64::min),
             ..self.shim_limits
         }

@@ -1,9 +1,7 @@
 //! The engine of this host: one shim process and one directory per servant.
 
 use std::collections::HashMap;
-use std::error::Error as StdError;
 use std::ffi::OsString;
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
@@ -12,6 +10,7 @@ use api::Grants;
 use async_trait::async_trait;
 use tokio::sync::{Semaphore, oneshot};
 use tokio::task::JoinSet;
+use tracing::Instrument;
 
 use crate::Error;
 use crate::cgroup::CgroupParent;
@@ -21,18 +20,21 @@ use crate::launch::{self, ExitRecord, RuntimeRecord};
 pub use crate::launch::{GracePeriods, Isolation};
 use crate::logs::DirectoryWatches;
 use crate::quotas::Quotas;
-use crate::spec::{ResourceLimits, Spec};
+use crate::spec::{Limits, Size, Spec};
 use crate::uids;
 
 mod connection;
 pub mod grants;
 mod handle;
 mod pool;
+mod resources;
 mod start;
 mod sweep;
 mod validate;
 
 pub use handle::LocalServant;
+use resources::NoResources;
+pub use resources::Resources;
 
 /// Number of ended servants whose remains are removed concurrently.
 const SWEEPS: usize = 16;
@@ -41,39 +43,6 @@ const SWEEPS: usize = 16;
 /// user ids lists as unused. Ranges for `/etc/subuid` grow from 100000, those of systemd-nspawn from 524288; a range
 /// chosen among either would collide sooner or later.
 pub const DEFAULT_UID_BASE: u32 = 0x7000_0000;
-
-/// Resources that the local engine needs from others.
-#[async_trait]
-pub trait Resources: Send + Sync + 'static {
-    /// Returns the extracted layers of an image, lowest first.
-    async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Box<dyn StdError + Send + Sync>>;
-    /// Resolves the hosts of `HOST:PORT`s to their names, each with the loopback address in the container that stands
-    /// for it; fails with the one that is not allowed.
-    fn hosts(
-        &self,
-        egress: &[String],
-    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>>;
-}
-
-/// Provides no image and no host: for engines that only start containers from layers.
-struct NoResources;
-
-#[async_trait]
-impl Resources for NoResources {
-    async fn layers(&self, _image: &str) -> Result<Vec<PathBuf>, Box<dyn StdError + Send + Sync>> {
-        Err("this engine was given no images".into())
-    }
-
-    fn hosts(
-        &self,
-        egress: &[String],
-    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>> {
-        match egress.first() {
-            Some(name) => Err(format!("this engine allows no connections to {name}").into()),
-            None => Ok(Vec::new()),
-        }
-    }
-}
 
 /// Configuration of the local engine.
 #[derive(Debug, Clone)]
@@ -85,9 +54,9 @@ pub struct LocalEngineConfig {
     /// Path of the static `cloudroid-init`.
     pub init: PathBuf,
     /// Limits used where a spec has none.
-    pub default_limits: ResourceLimits,
+    pub default_limits: Limits,
     /// Memory and CPU limits of each shim. Its processor time is also bounded by its servant's.
-    pub shim_limits: ResourceLimits,
+    pub shim_limits: Limits,
     /// Bounds on what each servant may write.
     pub quotas: Quotas,
     /// First uid of the first range; see [`DEFAULT_UID_BASE`].
@@ -110,15 +79,15 @@ impl LocalEngineConfig {
             home_servants_dir,
             shim_command,
             init,
-            default_limits: ResourceLimits {
-                memory: Some(1 << 30),
+            default_limits: Limits {
+                memory: Some(Size(1 << 30)),
                 pids: Some(512),
-                ..ResourceLimits::default()
+                ..Limits::default()
             },
-            shim_limits: ResourceLimits {
+            shim_limits: Limits {
                 cpus: Some(0.5),
-                memory: Some(256 << 20),
-                ..ResourceLimits::default()
+                memory: Some(Size(256 << 20)),
+                ..Limits::default()
             },
             quotas: Quotas::default(),
             uid_base: DEFAULT_UID_BASE,
@@ -247,14 +216,15 @@ impl LocalEngine {
         let id = spec.id.clone();
         // In a separate task: if the caller is cancelled half-way, the partial servant is still ended properly.
         let _began = privilege::run_sync(move || {
-            tokio::spawn(async move {
+            let starting = async move {
                 let outcome = start::start(&shared, spec).await;
                 if let Err(Ok(unwanted)) = sender.send(outcome) {
                     if let Err(error) = unwanted.stop().await {
                         tracing::warn!(%error, "an abandoned servant could not be stopped");
                     }
                 }
-            })
+            };
+            tokio::spawn(starting.in_current_span())
         });
         let gone = |_| Error::Start {
             id,

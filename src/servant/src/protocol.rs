@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::engine::{ContainerState, EnforcedLimits, NodeEvent, NodeExit};
 use crate::process::ProcessIdentity;
-use crate::spec::{NodeSpec, ResourceLimits};
+use crate::spec::{Limits, NodeSpec};
 
 /// Status of a node as known to the shim.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -130,7 +130,7 @@ pub enum Command {
         last: bool,
     },
     /// Change limits.
-    SetLimits(ResourceLimits),
+    SetLimits(Limits),
     /// End the servant. Answered when the stop has begun; the end of the connection tells the rest.
     Stop,
 }

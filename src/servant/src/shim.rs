@@ -26,6 +26,7 @@ use std::process::ExitCode;
 
 mod begin;
 mod clients;
+mod command_error;
 mod create;
 mod driver;
 mod input;

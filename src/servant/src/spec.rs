@@ -4,6 +4,8 @@
 use std::collections::BTreeMap;
 
 use api::Grants;
+pub use api::limits::UNLIMITED;
+pub use api::{Limits, Size};
 use serde::{Deserialize, Serialize};
 
 /// Everything the engine needs to know about a servant.
@@ -13,8 +15,8 @@ pub struct Spec {
     pub id: String,
     /// Digest of the image's manifest, `sha256:…`.
     pub image: String,
-    /// Hard limits.
-    pub limits: ResourceLimits,
+    /// Hard limits; absent ones are the engine's defaults.
+    pub limits: Limits,
     /// Environment of every process; variables of granted devices take precedence.
     pub environment: BTreeMap<String, String>,
     /// Processes to start, in order, once the container runs.
@@ -23,47 +25,6 @@ pub struct Spec {
     pub grants: Grants,
     /// Opaque configuration of the shim's resident (the ROS Master): initial parameters and the like.
     pub resident: serde_json::Value,
-}
-
-/// Value that removes a numeric limit in a change of [`ResourceLimits`] (memory, processes, bytes per second).
-pub const UNLIMITED: u64 = u64::MAX;
-
-/// Hard limits; `None` means the engine's default, and for a running servant no change.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct ResourceLimits {
-    /// Number of cores, such as 1.5.
-    pub cpus: Option<f64>,
-    /// Relative share when cores are scarce, 1..10000, default 100 (`cpu.weight`).
-    pub cpu_weight: Option<u64>,
-    /// Bytes of memory, without swap (`memory.max`; there is no swap). A servant that exceeds it is killed as a whole.
-    pub memory: Option<u64>,
-    /// Bytes of memory above which it is throttled and its memory reclaimed (`memory.high`; v2 only).
-    pub memory_high: Option<u64>,
-    /// Number of processes and threads.
-    pub pids: Option<u64>,
-    /// Bytes per second read from the disk that holds the layers (`io.max`).
-    pub io_read: Option<u64>,
-    /// Bytes per second written to that disk.
-    pub io_write: Option<u64>,
-    /// Cores on which it may run, bit n of word n / 64 for core n (`cpuset.cpus`).
-    pub cpuset: Option<[u64; 4]>,
-}
-
-impl ResourceLimits {
-    /// Returns these limits, with those of `default` where there are none.
-    pub fn or(self, default: &Self) -> Self {
-        Self {
-            cpus: self.cpus.or(default.cpus),
-            cpu_weight: self.cpu_weight.or(default.cpu_weight),
-            memory: self.memory.or(default.memory),
-            memory_high: self.memory_high.or(default.memory_high),
-            pids: self.pids.or(default.pids),
-            io_read: self.io_read.or(default.io_read),
-            io_write: self.io_write.or(default.io_write),
-            cpuset: self.cpuset.or(default.cpuset),
-        }
-    }
 }
 
 /// Environment variable of a node that names the run for which it was started, as chosen by the caller; so later

@@ -24,6 +24,7 @@ mod rollouts;
 mod rules;
 mod servants;
 mod services;
+mod throttle;
 mod tokens;
 
 use std::collections::HashMap;
@@ -51,6 +52,7 @@ pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
 pub use services::{Plan, RevisionRecord, RevisionSummary};
+pub use throttle::NoticeThrottle;
 pub use tokens::{NewToken, TokenRecord};
 
 /// Migrations from an empty database to the current schema; append-only.

@@ -39,7 +39,7 @@ pub async fn set_parameter(
     let changes = vec![(own.to_owned(), value)];
     let done = bus.node_parameters()?.set(node, changes).await?;
     match done.into_iter().next() {
-        Some(Err(reason)) => Err(bad(&reason)),
+        Some(Err(reason)) => Err(bad(reason.as_str())),
         _ => Ok(()),
     }
 }

@@ -14,7 +14,6 @@ use access::Operation;
 use bridge::ClientGrants;
 use budget::{Budget, Exceeded, JsonWeight};
 use bytes::Bytes;
-use foxglove::ws_protocol::JsonMessage;
 use foxglove::ws_protocol::client::{self, ClientMessage};
 use foxglove::ws_protocol::schema::Schema;
 use foxglove::ws_protocol::server::advertise::Channel;
@@ -24,6 +23,7 @@ use foxglove::ws_protocol::server::{
     Advertise, AdvertiseServices, ParameterValues, ServerInfo, Status, Unadvertise,
     UnadvertiseServices,
 };
+use foxglove::ws_protocol::{JsonMessage, ParseError};
 use ros::bus::{Bus, Graph, WireType};
 use ros::schema::{Registry, ServiceDef};
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -394,10 +394,10 @@ impl Session {
         }
         let message = if is_text {
             std::str::from_utf8(message)
-                .map_err(|error| error.to_string())
-                .and_then(|text| ClientMessage::parse_json(text).map_err(|error| error.to_string()))
+                .map_err(ParseError::from)
+                .and_then(ClientMessage::parse_json)
         } else {
-            ClientMessage::parse_binary(message).map_err(|error| error.to_string())
+            ClientMessage::parse_binary(message)
         };
         let message = match message {
             Ok(message) => message,
@@ -431,7 +431,7 @@ impl Session {
             ClientMessage::GetParameters(wanted) => {
                 // The same permission as for rosbridge clients.
                 if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/get_param") {
-                    return self.send_error(refused);
+                    return self.send_error(refused.to_string());
                 }
                 self.send_parameters(wanted.parameter_names, wanted.id)
                     .await;
@@ -470,7 +470,7 @@ impl Session {
 
     async fn set_parameters(&mut self, wanted: client::SetParameters) {
         if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/set_param") {
-            return self.send_error(refused);
+            return self.send_error(refused.to_string());
         }
         let mut names = Vec::new();
         for one in wanted.parameters {

@@ -8,7 +8,7 @@ use bridge::ClientGrants;
 use budget::Budget;
 use bytes::Bytes;
 use ros::bus::{
-    Bus, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType,
+    Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType,
     wait_for_connected,
 };
 use ros::schema::Registry;
@@ -99,7 +99,7 @@ struct Pictures;
 
 #[async_trait]
 impl ServiceHandler for Pictures {
-    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         let length = 1_u32 << 20;
         let head = [&[0, 1, 0, 0], &length.to_le_bytes()[..]].concat();
         Ok([head, vec![7; length as usize]].concat().into())

@@ -11,7 +11,8 @@ use anyhow::{Context, ensure};
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use ros::bus::{
-    ActionClient, Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, Graph, RosVersion, Subscription,
+    ActionClient, Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, RosVersion,
+    Subscription,
 };
 use ros::codec::{from_json, to_json};
 use ros::schema::{MessageType, Registry};
@@ -169,7 +170,7 @@ impl StubbedRobot {
     fn wait_for_end(&self, counting: &mut CountGoal) -> anyhow::Result<(GoalOutcome, Value)> {
         let ended = wait_for(counting.events.recv());
         let ended = self.site.runtime.block_on(ended).context("a result")?;
-        let end = ended.context("an end")?.map_err(anyhow::Error::msg)?;
+        let end = ended.context("an end")??;
         let of = self.registry.action(self.sharer.count)?;
         Ok((end.outcome, deserialize(&of.result, &end.result)?))
     }
@@ -178,16 +179,16 @@ impl StubbedRobot {
 /// A goal of the application.
 struct CountGoal {
     client: Box<dyn ActionClient>,
-    events: mpsc::UnboundedReceiver<Result<GoalEnd, String>>,
+    events: mpsc::UnboundedReceiver<Result<GoalEnd, GoalError>>,
 }
 
 /// Receives the end of a goal.
-struct GoalEndListener(mpsc::UnboundedSender<Result<GoalEnd, String>>);
+struct GoalEndListener(mpsc::UnboundedSender<Result<GoalEnd, GoalError>>);
 
 impl GoalEvents for GoalEndListener {
     fn on_feedback(&self, _feedback: Bytes) {}
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let _ = self.0.send(end);
     }
 }

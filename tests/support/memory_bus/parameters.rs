@@ -2,8 +2,8 @@
 
 use async_trait::async_trait;
 use ros::bus::{
-    BusError, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvent,
-    ParameterEvents, ParameterKind, ParameterNames,
+    BusError, FailureReason, NodeParameters, ParamChange, ParamValue, ParameterDescription,
+    ParameterEvent, ParameterEvents, ParameterKind, ParameterNames,
 };
 use tokio::sync::mpsc;
 
@@ -35,14 +35,14 @@ impl ParameterEvents for Events {
 }
 
 /// Converts a new value to the type of the present one.
-fn fitting(held: &ParamValue, given: ParamValue) -> Result<ParamValue, String> {
+fn fitting(held: &ParamValue, given: ParamValue) -> Result<ParamValue, FailureReason> {
     match (held, given) {
         // This conversion is lossless.
         (ParamValue::Double(_), ParamValue::Int(given)) => Ok(ParamValue::Double(given as f64)),
         (held, given) if std::mem::discriminant(held) == std::mem::discriminant(&given) => {
             Ok(given)
         }
-        _ => Err("it is of another kind".to_owned()),
+        _ => Err(FailureReason::new("it is of another kind")),
     }
 }
 
@@ -65,7 +65,7 @@ impl NodeParameters for MemoryBus {
         &self,
         node: &str,
         changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), String>>, BusError> {
+    ) -> Result<Vec<Result<(), FailureReason>>, BusError> {
         self.system.change(|state| {
             if !state.nodes.contains(node) {
                 return Err(self.absent(node));

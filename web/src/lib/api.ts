@@ -1,5 +1,5 @@
 // Requests to the daemon. Who asks is shown by a token, which is kept for this tab alone, or by the session's cookie.
-import type { Session } from './types';
+import type { Problem as Refusal, Session } from './types';
 
 const TOKEN = 'token';
 
@@ -30,8 +30,8 @@ export class Problem extends Error {
   }
 }
 
-/** A refusal as JSON. */
-export interface Told { status?: number; title?: string; detail?: string; next?: string; exists?: string[]; log?: string[] }
+/** A refusal as JSON, which may come from something before the daemon. */
+type Told = Partial<Refusal>;
 
 let csrf = '';
 

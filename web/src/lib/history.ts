@@ -1,7 +1,7 @@
 // What servants and the machine did since this page is open, for plots: of each the last quarter of an hour; and what the daemon has
 // recorded of the last hour and day.
 import { asked } from './api';
-import type { LocalPeriod, Machine, MachineHistory, Served, ServantHistory } from './types';
+import type { Link, LocalPeriod, Machine, MachineHistory, Served, ServantHistory } from './types';
 
 const KEPT = 900;
 
@@ -64,7 +64,7 @@ export function promise(served: Served): { desire?: number; max?: number; satisf
 
 /** Where the time of the slowest link's requests goes: medians. */
 function phases(served: Served): Partial<Record<(typeof PHASES)[number], number>> {
-  const total = (link: Served['links'][number]) => link.phases.find((part) => part.name === 'total')?.p50 ?? -1;
+  const total = (link: Link) => link.phases.find((part) => part.name === 'total')?.p50 ?? -1;
   const slowest = [...served.links].sort((one, other) => total(other) - total(one))[0];
   return Object.fromEntries((slowest?.phases ?? []).filter((part) => part.name !== 'total').map((part) => [part.name, part.p50]));
 }

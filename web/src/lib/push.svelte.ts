@@ -1,38 +1,10 @@
 // A push that is under way: it goes on while other pages are looked at, and ends with this tab.
-import { exchanged, Problem, type Told } from './api';
-import type { ServiceDetail } from './types';
+import { exchanged, Problem } from './api';
+import type { Caps, Limits, PushEvent, PushOptions, ServiceDetail } from './types';
 
-export interface Options {
-  name?: string;
-  apt?: string;
-  launch?: string;
-  nodes?: string[];
-  params?: Record<string, unknown>;
-  args?: Record<string, string>;
-  remaps?: Record<string, string>;
-  interface?: string;
-  requests?: string[];
-  map?: Record<string, string>;
-  with?: string[];
-  base?: string;
-  limits?: Record<string, string | number | undefined>;
-  caps?: { cpus?: number; memory?: string };
-  grants?: { devices: string[]; volumes: { source: string; target: string }[]; egress: string[] };
-  shared?: { min: number; max: number; idempotent: boolean; replicas: number; calls: number };
-  rollout?: { canary?: string; bound: number; samples: number; deadline?: number; promote_after?: number };
-  sla?: { rrt?: string; max_rrt?: string };
-  stateful?: boolean;
-  stateless?: boolean;
-  source?: string;
-}
-
-type PushEvent =
-  | { type: 'step'; title: string }
-  | { type: 'log'; line: string }
-  | { type: 'progress'; unit: string; done: number; total?: number }
-  | { type: 'warning'; message: string }
-  | { type: 'done'; service: ServiceDetail; took: number }
-  | { type: 'error'; problem: Told };
+/** Limits as they are written in a form: sizes may have a unit. */
+type Written<T> = { [name in keyof T]: string | number | undefined };
+export type Options = Omit<PushOptions, 'limits' | 'caps'> & { limits?: Written<Limits>; caps?: Written<Caps> };
 
 export interface Step { title: string; began: number; took?: number; end?: 'done' | 'failed' | 'cancelled' }
 

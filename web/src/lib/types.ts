@@ -1,271 +1,1103 @@
-// What the daemon says, as far as the page shows it: crate `api`, documented at /api/v1/openapi.json. Times are in milliseconds
-// since 1970, sizes in bytes.
+// Types of the API, written by `make types` from the schemas of /api/v1/openapi.json. Do not edit.
+// Members are described there. One that is not known is left out: null stands in lists only.
 
-export interface Session {
-  name?: string;
-  role?: string;
-  csrf?: string;
-  needed: boolean;
-  accounts: boolean;
-  /** An identity provider that knows people, too. */
-  provider?: { name: string; path: string };
+export interface Account {
+  created: Millis;
+  disabled?: Millis;
+  last_login?: Millis;
+  name: string;
+  role: string;
+  services: string[];
+  sessions: number;
 }
+
+export interface AccountChange {
+  disabled?: boolean;
+  password?: string;
+  role?: string;
+  services?: string[];
+}
+
+export interface Action {
+  name: string;
+  node: string;
+  type: string;
+}
+
+export interface Arm {
+  p50?: number;
+  p95?: number;
+  requests: number;
+  requests_failed: number;
+  servants: number;
+  servants_failed: number;
+}
+
+export interface Audited {
+  action: string;
+  did: string;
+  from: string;
+  id: number;
+  more?: number;
+  object: string;
+  status: number;
+  time: Millis;
+  who: string;
+}
+
+export interface BackOff {
+  again: Millis;
+  failures: number;
+  reason: string;
+  revision: number;
+  robot: string;
+  service: string;
+}
+
+export interface Calibration {
+  ended: string;
+  inputs: Fed[];
+  largest: Size;
+  memory_margin: number;
+  memory_peak: Size;
+  network?: TimeSpread;
+  pace?: number;
+  points: Point[];
+  revision: number;
+  rows: Row[];
+  service: string;
+  unused: string[];
+}
+
+export type CalibrationEvent =
+  | { title: string; type: 'step' }
+  | { point: Point; times?: number[]; type: 'measured' }
+  | { calibration: Calibration; servant: string; type: 'kept' }
+  | { calibration: Calibration; type: 'done' }
+  | { problem: Problem; type: 'error' };
+
+export interface CalibrationOptions {
+  aux?: Record<string, string>;
+  bytes?: Size;
+  cpus?: number[];
+  fast?: boolean;
+  input?: string;
+  keep?: number;
+  memory?: Size;
+  network?: number;
+  own?: boolean;
+  rate?: number;
+  requests?: number;
+  robot?: string;
+  seconds?: number;
+  source?: Source;
+  times?: boolean;
+}
+
+export interface Capacity {
+  cpus: number;
+  cpus_reserved: number;
+  memory: number;
+  memory_reserved: number;
+  waiting: number;
+}
+
+export interface Caps {
+  cpus?: number;
+  memory?: Size;
+}
+
+export interface Cause {
+  next: string;
+  weight: Weight;
+  what: string;
+}
+
+export interface Check {
+  fix?: string;
+  found: string;
+  name: string;
+  status: CheckStatus;
+}
+
+export type CheckStatus =
+  | 'ok'
+  | 'warning'
+  | 'missing';
+
+export interface Clock {
+  now: number;
+}
+
+export interface Compared {
+  candidate?: TimeSpread;
+  different: number;
+  equal: number;
+  fields: FieldDifference[];
+  kind: Kind;
+  missing: number;
+  name: string;
+  present?: TimeSpread;
+  surplus: number;
+}
+
+export interface Considered {
+  row: Row;
+  taken: boolean;
+  why: string;
+}
+
+export interface Cost {
+  accepts?: number;
+  cpus: number;
+  later?: number;
+  left: number;
+  robot: string;
+  rrt?: number;
+  servant: string;
+  service: string;
+}
+
+export type CpuSet = string;
+
+export interface Descriptor {
+  constraints: string;
+  description: string;
+  dynamic_typing: boolean;
+  range?: Range;
+  read_only: boolean;
+  type: string;
+}
+
+export interface Difference {
+  after?: string;
+  before?: string;
+  name: string;
+  part: RevisionPart;
+}
+
+export interface Differences {
+  differences: Difference[];
+  from: number;
+  service: string;
+  to: number;
+}
+
+export type Direction =
+  | 'input'
+  | 'output';
+
+export interface Doctor {
+  checks: Check[];
+}
+
+export type Durability =
+  | 'volatile'
+  | 'transient_local';
+
+export interface Event {
+  id: number;
+  kind: string;
+  level: Level;
+  message: string;
+  robot?: string;
+  servant?: string;
+  service?: string;
+  time: Millis;
+}
+
+export interface Expected {
+  from: string;
+  rrt: number;
+}
+
+export interface Explained {
+  class?: string;
+  goals: ExplainedGoal[];
+  limits?: Limits;
+  next: string[];
+  priority: number;
+  refused?: string;
+  service: string;
+  stated: Stated;
+  why: string[];
+}
+
+export interface ExplainedGoal {
+  bound: number;
+  desire: number;
+  measure: Measure;
+  rows: Considered[];
+}
+
+export interface Explanation {
+  causes: Cause[];
+  events: Event[];
+  robot: string;
+  servants: Served[];
+}
+
+export interface Fed {
+  from: string[];
+  sent: number;
+  topic: string;
+  type: string;
+}
+
+export interface FieldDifference {
+  answers: number;
+  candidate: string;
+  field: string;
+  present: string;
+}
+
+export interface Fit {
+  beyond_cpus: number;
+  beyond_memory: Size;
+  costs: Cost[];
+  cpus: number;
+  ends: string[];
+  expected?: Expected;
+  free_cpus: number;
+  free_memory: Size;
+  full: boolean;
+  lacking_cpus: number;
+  lacking_memory: Size;
+  memory: Size;
+  more?: number;
+  never?: string;
+  now: boolean;
+  shared?: number;
+  stalled?: string;
+  waiting: number;
+}
+
+export interface Goal {
+  action: string;
+  began: Millis;
+  by: string;
+  ended?: Millis;
+  id: string;
+  state: GoalState;
+  text?: string;
+}
+
+export type GoalState =
+  | 'underway'
+  | 'preempted'
+  | 'succeeded'
+  | 'aborted'
+  | 'rejected'
+  | 'recalled'
+  | 'lost';
+
+export interface Grants {
+  devices?: string[];
+  egress?: string[];
+  volumes?: Volume[];
+}
+
+export interface Group {
+  answered: number;
+  asked_again: number;
+  failed: number;
+  mean_ms?: number;
+  revision: number;
+  robots: number;
+  servants: GroupServant[];
+  waiting: number;
+  wasted: number;
+}
+
+export interface GroupServant {
+  id: string;
+  ready: boolean;
+  retiring: boolean;
+  under_way: number;
+}
+
+export interface Heard {
+  bytes: number;
+  last?: unknown;
+  received: number;
+  topic: string;
+  type: string;
+}
+
+export interface Interface {
+  actions: Action[];
+  lifecycle: string[];
+  needs: Need[];
+  parameters: Parameter[];
+  requests: Request[];
+  services: RosService[];
+  topics: Topic[];
+}
+
+export interface Isolation {
+  cgroup_version: number;
+  missing: string[];
+  mode: string;
+}
+
+export type Kind =
+  | 'topic'
+  | 'service'
+  | 'action';
+
+export interface Layer {
+  cached: boolean;
+  digest: string;
+  name: string;
+  size: number;
+}
+
+export type Level =
+  | 'info'
+  | 'warning'
+  | 'error';
 
 export interface Limits {
-  cpus?: number;
   cpu_weight?: number;
-  memory?: number;
-  memory_high?: number;
+  cpus?: number;
+  cpuset?: CpuSet;
+  io_read?: Size;
+  io_write?: Size;
+  memory?: Size;
+  memory_high?: Size;
   pids?: number;
-  io_read?: number;
-  io_write?: number;
-  cpuset?: string;
 }
 
-export interface Pressure { cpu: number; memory: number; io: number }
-
-export interface Usage {
-  cpu_usec: number;
-  memory: number;
-  pids: number;
-  oom_kills: number;
-  throttled_usec: number;
-  pressure?: Pressure;
+export interface Link {
+  age?: number;
+  clock?: number;
+  desire?: number;
+  desired_age?: number;
+  desired_frames_per_second?: number;
+  dropped: number;
+  drops: string[];
+  duplicates: string[];
+  fallback_after?: number;
+  frames_per_second?: number;
+  given: number;
+  late: number;
+  late_in?: Part;
+  left_out: number;
+  local: number;
+  max?: number;
+  node: string;
+  phases: Part[];
+  refused: string[];
+  requests: number;
+  round_trip?: number;
+  satisfaction?: number;
+  threshold?: number;
+  throughput?: number;
+  unfed: string[];
+  unsent: number;
+  unserved: string[];
+  up: boolean;
 }
 
-export interface Machine {
-  version: string;
-  home: string;
-  listen: string;
-  certificate?: string;
-  default_service?: string;
-  started: number;
-  isolation: { mode: string; cgroup_version: number; missing: string[] };
-  capacity: { cpus: number; memory: number; cpus_reserved: number; memory_reserved: number; waiting: number };
-  services: number;
-  servants: number;
-  warm_pool: number;
-  warm_nodes: number;
-  connections: number;
-  usage: Usage;
-  warnings: string[];
+export type Liveliness =
+  | 'automatic'
+  | 'manual_by_topic';
+
+export interface LocalPeriod {
+  began: Millis;
+  ended?: Millis;
+  node: string;
+  why: string;
+}
+
+export interface LogLine {
+  line: string;
+  node: string;
+  stream: Stream;
+  time: Millis;
+}
+
+export interface Machine extends Status {
   cores: number;
   host_cores: number;
   host_memory?: number;
   host_memory_available?: number;
 }
 
-export interface ServiceSummary {
-  name: string;
-  address: string;
-  package: string;
-  revision: number;
-  image: string;
-  published: number;
-  topics: number;
-  services: number;
-  actions: number;
-  parameters: number;
-  servants: number;
-  limits: Limits;
-}
-
-export interface Qos { reliability: string; durability: string; liveliness: string; deadline?: number; lifespan?: number; lease?: number }
-export interface Topic { name: string; type: string; direction: 'input' | 'output'; latched: boolean; lazy: boolean; qos?: Qos }
-export interface Descriptor { type: string; description: string; constraints: string; read_only: boolean; range?: { from?: number; to?: number; step?: number } }
-export interface Typed { name: string; type: string; node?: string }
-
-export interface ServiceDetail extends ServiceSummary {
-  revisions: Revision[];
-  nodes: { name: string; argv: string[] }[];
-  interface: {
-    topics: Topic[];
-    services: Typed[];
-    actions: Typed[];
-    parameters: { name: string; value?: unknown; descriptor?: Descriptor }[];
-    lifecycle: string[];
-    needs: { name: string; nodes: string[] }[];
-    requests: { node: string; input: string; outputs: string[]; by: string; reason: string }[];
-  };
-}
-
-export type Phase = 'requested' | 'admitted' | 'created' | 'starting' | 'ready' | 'draining' | 'stopped' | 'failed';
-
-export interface Servant {
-  id: string;
-  service: string;
-  revision: number;
-  robot: string;
-  phase: Phase;
-  reason?: string;
-  created: number;
-  connections: number;
-  idle_until?: number;
-  terms?: { stated: Record<string, { sla?: { rrt?: string; max_rrt?: string } }>; class?: string; priority: number; limits: Limits; why?: string[] };
-  limits: Limits;
-  enforced?: Limits;
-  cgroup_version: number;
-  usage?: Usage;
-  response?: { requests: number; p50_ms: number; p95_ms: number };
-  pids: number[];
-  dropped: number;
-  drops?: { topic: string; count: number }[];
-  down: { node: string; failures: number; again: number }[];
-  hung: string[];
-  lifecycle: { node: string; state: string; refused?: string }[];
-}
-
-export interface Part { name: string; p50: number; p90: number; max: number }
-
-export interface Link {
-  node: string;
-  up: boolean;
-  round_trip?: number;
-  dropped: number;
-  drops: string[];
-  desire?: number;
-  max?: number;
-  threshold?: number;
-  satisfaction?: number;
-  requests: number;
-  late: number;
-  local: number;
-  phases: Part[];
-}
-
-export interface Served { servant: Servant; throttled: number; cores: number; links: Link[] }
-
-export interface BackOff { service: string; revision: number; robot: string; failures: number; reason: string; again: number }
-
-export type Level = 'info' | 'warning' | 'error';
-
-export interface Event {
-  id: number;
-  time: number;
-  level: Level;
-  kind: string;
-  service?: string;
-  servant?: string;
-  robot?: string;
-  message: string;
-}
-
-export interface Update {
-  time: number;
-  machine?: Machine;
-  services?: ServiceSummary[];
-  services_gone?: string[];
-  servants?: Served[];
-  servants_gone?: string[];
-  back_offs?: BackOff[];
-  events?: Event[];
-}
-
-export interface LogLine { time: number; node: string; stream: 'stdout' | 'stderr'; line: string }
-
-export interface Cause { weight: 'blocks' | 'slows' | 'hint'; what: string; next: string }
-export interface Explanation { robot: string; causes: Cause[]; servants: Served[]; events: Event[] }
-
-export interface Fit {
-  cpus: number;
-  memory: number;
-  free_cpus: number;
-  free_memory: number;
-  waiting: number;
-  stalled?: string;
-  never?: string;
-  full: boolean;
-  now: boolean;
-  ends: string[];
-  lacking_cpus: number;
-  lacking_memory: number;
-  costs: { servant: string; service: string; robot: string; cpus: number; left: number; rrt?: number; later?: number; accepts?: number }[];
-  more?: number;
-  beyond_cpus?: number;
-  beyond_memory?: number;
-  expected?: { rrt: number; from: string };
-  shared?: number;
-}
-
-export interface Row {
-  id: number;
-  measure: 'rrt' | 'fps' | 'age';
-  value: number;
-  aux?: Record<string, string>;
-  limits: Limits;
-  spread?: { p50: number; p95: number; requests: number };
-  revision?: number;
-  written: number;
-}
-
-export interface Arm { servants: number; servants_failed: number; requests: number; requests_failed: number; p50?: number; p95?: number }
-
-export interface Rollout {
-  stable: number;
-  candidate: number;
-  state: string;
-  reason: string;
-  waits?: string;
-  started: number;
-  of_stable: Arm;
-  of_candidate: Arm;
-}
-
-export interface Revision { number: number; image: string; published: number; source: string; current: boolean }
-export interface Difference { part: string; name: string; before?: string; after?: string }
-export interface Differences { service: string; from: number; to: number; differences: Difference[] }
-
-export interface Token { name: string; role: string; services: string[]; robot?: string; classes: string[]; created: number; expires?: number; last_used?: number; revoked?: number }
-export interface Account { name: string; role: string; services: string[]; created: number; last_login?: number; disabled?: number; sessions: number }
-export interface Rule { id: number; who: string; services: string; allow: string[] }
-export interface Pairing { robot: string; services: string[]; state: 'waiting' | 'paired'; own_certificate: boolean; created: number; expires?: number; last_used?: number }
-export interface Audited { id: number; time: number; who: string; from: string; action: string; did: string; object: string; status: number; more?: number }
-
-export interface TimeSpread { p50: number; p95: number; max: number }
-export interface Point { cpus: number; requests: number; answered: number; compute?: TimeSpread; running: number; throttled: number; rate: number; memory: number }
-
-export interface Calibration {
-  service: string;
-  revision: number;
-  unused: string[];
-  points: Point[];
-  ended: string;
-  memory_peak: number;
-  memory_margin: number;
-  rows: Row[];
-}
-
-type Figures<K extends string> = { time: number[] } & Record<K, (number | null)[]>;
-
-/** A time in which a robot's node was served by its local original. */
-export interface LocalPeriod {
-  node: string;
-  began: number;
-  ended?: number;
-  why: string;
-}
-
-export interface ServantHistory {
-  servant: string;
-  service: string;
-  robot: string;
-  began: number;
-  seen: number;
-  step: number;
-  figures: Figures<'cores' | 'throttled' | 'memory' | 'p50' | 'p95' | 'desire' | 'max' | 'satisfaction' | 'dropped' | 'serialise' | 'up' | 'queue' | 'compute' | 'down'>;
-  local: LocalPeriod[];
+export interface MachineFigures {
+  cores: (number | null)[];
+  cores_most: (number | null)[];
+  cpu_waits: (number | null)[];
+  io_waits: (number | null)[];
+  memory: (number | null)[];
+  memory_waits: (number | null)[];
+  promised: (number | null)[];
+  servants: (number | null)[];
+  time: number[];
 }
 
 export interface MachineHistory {
+  figures: MachineFigures;
   step: number;
-  figures: Figures<'cores' | 'promised' | 'memory' | 'cpu_waits' | 'memory_waits' | 'io_waits'>;
 }
 
-/** A file of the last seconds of a servant. */
-export interface Recording { number: number; service: string; robot: string; servant: string; time: number; why: string; seconds: number; messages: number; bytes: number }
+export type Measure =
+  | 'rrt'
+  | 'fps'
+  | 'age';
 
-/** A goal of an action that a servant was sent. */
-export interface Goal { action: string; id: string; by: string; began: number; ended?: number; state: 'underway' | 'preempted' | 'succeeded' | 'aborted' | 'rejected' | 'recalled' | 'lost'; text?: string }
+export type Millis = number;
 
-/** What was published on a topic in a second; latency in seconds. */
-export interface TopicFigures { topic: string; type: string; rate: number; bandwidth: number; latency?: number }
+export interface Need {
+  name: string;
+  nodes: string[];
+}
+
+export interface NewAccount {
+  name: string;
+  password: string;
+  role: string;
+  services?: string[];
+}
+
+export interface NewPairing {
+  address?: string;
+  classes?: string[];
+  lifetime?: number;
+  own_certificate?: boolean;
+  robot: string;
+  services: string[];
+}
+
+export interface NewRows {
+  replace?: boolean;
+  rows: Row[];
+}
+
+export interface NewRule {
+  allow: string[];
+  services: string;
+  who: string;
+}
+
+export interface NewToken {
+  classes?: string[];
+  lifetime?: number;
+  name: string;
+  robot?: string;
+  role: string;
+  services?: string[];
+}
+
+export interface Node {
+  argv: string[];
+  name: string;
+}
+
+export interface NodeDown {
+  again: Millis;
+  failures: number;
+  node: string;
+}
+
+export interface NodeStage {
+  node: string;
+  refused?: string;
+  state: string;
+}
+
+export interface NotCompared {
+  count: number;
+  what: string;
+  why: string;
+}
+
+export interface Pair {
+  code: string;
+  request: string;
+  robot: string;
+}
+
+export interface Pairing {
+  classes: string[];
+  created: Millis;
+  expires?: Millis;
+  last_used?: Millis;
+  own_certificate: boolean;
+  robot: string;
+  services: string[];
+  state: PairingState;
+}
+
+export interface PairingMade {
+  expires?: Millis;
+  line?: string;
+  robot: string;
+}
+
+export type PairingState =
+  | 'waiting'
+  | 'paired';
+
+export interface Parameter {
+  descriptor?: Descriptor;
+  name: string;
+  node?: string;
+  value?: unknown;
+}
+
+export interface Part {
+  max: number;
+  name: string;
+  p50: number;
+  p90: number;
+}
+
+export type Phase =
+  | 'requested'
+  | 'admitted'
+  | 'created'
+  | 'starting'
+  | 'ready'
+  | 'draining'
+  | 'stopped'
+  | 'failed';
+
+export interface Point {
+  answered: number;
+  compute?: TimeSpread;
+  cpus: number;
+  memory: Size;
+  rate: number;
+  requests: number;
+  running: number;
+  throttled: number;
+}
+
+export interface Pressure {
+  cpu: number;
+  io: number;
+  memory: number;
+}
+
+export interface Problem {
+  detail: string;
+  exists?: string[];
+  log?: string[];
+  next?: string;
+  retry_after?: number;
+  status: number;
+  title: string;
+  type: string;
+}
+
+export interface ProviderLink {
+  name: string;
+  path: string;
+}
+
+export interface PublishedTopic {
+  bandwidth: number;
+  latency?: number;
+  rate: number;
+  topic: string;
+  type: string;
+}
+
+export interface PublishedTopics {
+  seconds: number;
+  topics: PublishedTopic[];
+}
+
+export type PushEvent =
+  | { title: string; type: 'step' }
+  | { line: string; type: 'log' }
+  | { done: number; total?: number; type: 'progress'; unit: string }
+  | { message: string; type: 'warning' }
+  | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done' }
+  | { problem: Problem; type: 'error' };
+
+export interface PushOptions {
+  apt?: string;
+  args?: Record<string, string>;
+  base?: string;
+  caps?: Caps;
+  grants?: Grants;
+  interface?: string;
+  launch?: string;
+  limits?: Limits;
+  map?: Record<string, string>;
+  name?: string;
+  nodes?: string[];
+  params?: Record<string, unknown>;
+  remaps?: Record<string, string>;
+  requests?: string[];
+  rollout?: RolloutTerms;
+  shared?: Shared;
+  sla?: Sla;
+  source?: string;
+  stateful?: boolean;
+  stateless?: boolean;
+  with?: string[];
+}
+
+export interface Qos {
+  deadline?: number;
+  durability: Durability;
+  lease?: number;
+  lifespan?: number;
+  liveliness: Liveliness;
+  reliability: Reliability;
+}
+
+export interface Range {
+  from?: number;
+  step?: number;
+  to?: number;
+}
+
+export interface Recording {
+  bytes: Size;
+  messages: number;
+  number: number;
+  robot: string;
+  seconds: number;
+  servant: string;
+  service: string;
+  time: Millis;
+  why: string;
+}
+
+export type Reliability =
+  | 'best_effort'
+  | 'reliable';
+
+export interface Renew {
+  request: string;
+}
+
+export interface Request {
+  by: string;
+  input: string;
+  node: string;
+  outputs: string[];
+  reason: string;
+}
+
+export interface ResponseTimes {
+  p50_ms: number;
+  p95_ms: number;
+  requests: number;
+}
+
+export interface Revision {
+  current: boolean;
+  image: string;
+  number: number;
+  published: Millis;
+  source: string;
+}
+
+export type RevisionPart =
+  | 'push'
+  | 'node'
+  | 'topic'
+  | 'service'
+  | 'action'
+  | 'need'
+  | 'definition'
+  | 'parameter'
+  | 'limit'
+  | 'cap'
+  | 'sla'
+  | 'grant'
+  | 'shared'
+  | 'environment'
+  | 'package';
+
+export interface RobotCertificate {
+  certificate: string;
+  expires: Millis;
+  issued: Millis;
+  robot: string;
+}
+
+export interface Rollback {
+  revision?: number;
+}
+
+export interface Rollout {
+  candidate: number;
+  changed: Millis;
+  of_candidate: Arm;
+  of_stable: Arm;
+  reason: string;
+  service: string;
+  stable: number;
+  started: Millis;
+  state: RolloutState;
+  terms: RolloutTerms;
+  waits?: string;
+}
+
+export type RolloutOrder =
+  | { order: 'start'; revision: number; terms?: RolloutTerms }
+  | { order: 'promote' }
+  | { order: 'abort' };
+
+export type RolloutState =
+  | 'canary'
+  | 'draining'
+  | 'promoted'
+  | 'rolled-back'
+  | 'aborted'
+  | 'replaced';
+
+export interface RolloutTerms {
+  bound?: number;
+  canary?: Share;
+  deadline?: number;
+  promote_after?: number;
+  samples?: number;
+}
+
+export interface RosService {
+  name: string;
+  node: string;
+  type: string;
+}
+
+export interface Row {
+  aux?: Record<string, string>;
+  id?: number;
+  limits: Limits;
+  measure: Measure;
+  revision?: number;
+  spread?: Spread;
+  value: number;
+  written?: Millis;
+}
+
+export interface Rule {
+  allow: string[];
+  id: number;
+  services: string;
+  who: string;
+}
+
+export interface Secret {
+  secret: string;
+  token: Token;
+}
+
+export interface Servant {
+  cgroup_version: number;
+  connections: number;
+  created: Millis;
+  down: NodeDown[];
+  dropped: number;
+  drops: TopicDrops[];
+  enforced?: Limits;
+  hung: string[];
+  id: string;
+  idle_until?: Millis;
+  lifecycle: NodeStage[];
+  limits: Limits;
+  phase: Phase;
+  pids: number[];
+  reason?: string;
+  response?: ResponseTimes;
+  revision: number;
+  robot: string;
+  service: string;
+  terms?: Terms;
+  usage?: Usage;
+}
+
+export interface ServantFigures {
+  compute: (number | null)[];
+  cores: (number | null)[];
+  cores_most: (number | null)[];
+  desire: (number | null)[];
+  down: (number | null)[];
+  dropped: (number | null)[];
+  max: (number | null)[];
+  memory: (number | null)[];
+  p50: (number | null)[];
+  p95: (number | null)[];
+  queue: (number | null)[];
+  satisfaction: (number | null)[];
+  serialise: (number | null)[];
+  throttled: (number | null)[];
+  time: number[];
+  up: (number | null)[];
+}
+
+export interface ServantHistory {
+  began: Millis;
+  figures: ServantFigures;
+  local: LocalPeriod[];
+  robot: string;
+  seen: Millis;
+  servant: string;
+  service: string;
+  step: number;
+}
+
+export interface Served {
+  cores: number;
+  links: Link[];
+  servant: Servant;
+  throttled: number;
+}
+
+export interface ServiceDetail extends ServiceSummary {
+  groups?: Group[];
+  interface: Interface;
+  nodes: Node[];
+  revisions: Revision[];
+  shared?: Shared;
+}
+
+export interface ServiceSummary {
+  actions: number;
+  address: string;
+  image: string;
+  limits: Limits;
+  name: string;
+  package: string;
+  parameters: number;
+  published: Millis;
+  revision: number;
+  servants: number;
+  services: number;
+  topics: number;
+}
+
+export interface Session {
+  accounts: boolean;
+  csrf?: string;
+  expires?: Millis;
+  name?: string;
+  needed: boolean;
+  provider?: ProviderLink;
+  role?: string;
+}
+
+export interface SessionLine {
+  created: Millis;
+  expires: Millis;
+  from: string;
+  id: number;
+  last_used: Millis;
+  name: string;
+  role: string;
+}
+
+export interface Shadow {
+  candidate: number;
+  compared: Compared[];
+  ended: string;
+  given: number;
+  not_compared: NotCompared[];
+  revision: number;
+  robot: string;
+  seconds: number;
+  service: string;
+  verdict: Verdict;
+  why: string;
+}
+
+export type ShadowEvent =
+  | { title: string; type: 'step' }
+  | { shadow: Shadow; type: 'done' }
+  | { problem: Problem; type: 'error' };
+
+export interface ShadowOptions {
+  acting?: boolean;
+  bound?: number;
+  ignore?: string[];
+  requests?: number;
+  revision?: number;
+  robot?: string;
+  seconds?: number;
+  tolerance?: number;
+}
+
+export type Share = string;
+
+export interface Shared {
+  calls?: number;
+  idempotent?: boolean;
+  max?: number;
+  min?: number;
+  replicas?: number;
+}
+
+export interface SignIn {
+  name: string;
+  password: string;
+}
+
+export type Size = number;
+
+export interface Sla {
+  age?: string;
+  fps?: number;
+  max_age?: string;
+  max_rrt?: string;
+  min_fps?: number;
+  rrt?: string;
+}
+
+export type Source =
+  | 'bag'
+  | 'frames'
+  | 'live';
+
+export interface Spread {
+  p50: number;
+  p95: number;
+  requests: number;
+}
+
+export interface Stated {
+  aux?: Record<string, string>;
+  class?: string;
+  cpus?: number;
+  memory?: Size;
+  sla?: Sla;
+}
+
+export interface Status {
+  capacity: Capacity;
+  certificate?: string;
+  connections: number;
+  default_service?: string;
+  home: string;
+  isolation: Isolation;
+  limits: Limits;
+  listen: string;
+  pid: number;
+  servants: number;
+  services: number;
+  started: Millis;
+  usage: Usage;
+  version: string;
+  warm_nodes: number;
+  warm_pool: number;
+  warnings: string[];
+}
+
+export interface Stopped {
+  stopped: string[];
+}
+
+export type Stream =
+  | 'stdout'
+  | 'stderr';
+
+export interface Terms {
+  class?: string;
+  limits: Limits;
+  measured?: Record<string, string>;
+  priority: number;
+  rows?: Row[];
+  stated: Record<string, Stated>;
+  why?: string[];
+}
+
+export interface TimeSpread {
+  max: number;
+  p50: number;
+  p95: number;
+}
+
+export interface Times {
+  acceptable: number;
+  desire: number;
+  max: number;
+  p50: number;
+  p90: number;
+}
+
+export interface Token {
+  classes: string[];
+  created: Millis;
+  expires?: Millis;
+  last_used?: Millis;
+  name: string;
+  revoked?: Millis;
+  robot?: string;
+  role: string;
+  services: string[];
+}
+
+export interface Topic {
+  direction: Direction;
+  latched: boolean;
+  lazy: boolean;
+  md5: string;
+  name: string;
+  qos?: Qos;
+  type: string;
+}
+
+export interface TopicDrops {
+  count: number;
+  topic: string;
+}
+
+export interface Trial {
+  answered: number;
+  inputs: Fed[];
+  outputs: Heard[];
+  requests: number;
+  rrt?: Times;
+  service: string;
+  unused: string[];
+}
+
+export interface Update {
+  back_offs?: BackOff[];
+  events?: Event[];
+  machine?: Machine;
+  servants?: Served[];
+  servants_gone?: string[];
+  services?: ServiceSummary[];
+  services_gone?: string[];
+  time: Millis;
+}
+
+export interface Usage {
+  cpu_usec: number;
+  memory: number;
+  oom_kills: number;
+  pids: number;
+  pressure?: Pressure;
+  throttled_usec: number;
+}
+
+export type Verdict =
+  | 'nothing'
+  | 'equal'
+  | 'slower'
+  | 'different'
+  | 'failed';
+
+export interface Volume {
+  source: string;
+  target: string;
+}
+
+export type Weight =
+  | 'blocks'
+  | 'slows'
+  | 'hint';
+
+export interface Whoami {
+  name: string;
+  robot?: string;
+  roles: string[];
+  services: string[];
+}

@@ -16,28 +16,16 @@ use crate::greeters;
 const TIME: Duration = Duration::from_secs(5);
 const THREADS: usize = 4;
 
-/// Robots that connect and leave, per second.
-#[derive(Debug)]
-pub(super) struct ConnectResult {
-    daemon: f64,
-    bare: f64,
-}
-
-pub(super) fn measure(daemon: &Daemon) -> Result<ConnectResult> {
+pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     let bare = accept_upgrades()?;
-    Ok(ConnectResult {
-        daemon: connections_per_second(&daemon.address, &greeters::robot_path("crowd"))?,
-        bare: connections_per_second(&bare.to_string(), "")?,
-    })
-}
-
-impl ConnectResult {
-    pub(super) fn add_figures(&self, report: &mut BenchReport) {
-        report
-            .figure("robots that connect and leave", "/s", self.daemon)
-            .relative_to("a WebSocket server with nothing behind it", self.bare)
-            .note(format!("{THREADS} at a time"));
-    }
+    let path = greeters::robot_path("crowd");
+    let ours = connections_per_second(&daemon.address, &path)?;
+    let bare = connections_per_second(&bare.to_string(), "")?;
+    report
+        .figure("robots that connect and leave", "/s", ours)
+        .relative_to("a WebSocket server with nothing behind it", bare)
+        .note(format!("{THREADS} at a time"));
+    Ok(())
 }
 
 /// Starts a server that accepts upgrades, and nothing else, until this program ends.

@@ -29,15 +29,6 @@ const PACE: Duration = Duration::from_millis(50);
 const CLIENT: f64 = 268.0;
 const OVERHEAD: f64 = 1.5;
 
-/// Results with a hundred clients that never read.
-#[derive(Debug)]
-pub(super) struct UnreadResult {
-    /// Resident memory of the daemon before they connected, in megabytes.
-    before: f64,
-    for_nobody: PublishingSample,
-    for_readers: PublishingSample,
-}
-
 /// Measurements made while messages were published.
 #[derive(Debug)]
 struct PublishingSample {
@@ -48,7 +39,7 @@ struct PublishingSample {
     most: f64,
 }
 
-pub(super) fn measure(daemon: &Daemon) -> Result<UnreadResult> {
+pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     let path = greeters::robot_path(UNREAD);
     let for_nobody = publish_and_call(daemon)?;
     let mut readers = Vec::new();
@@ -60,11 +51,32 @@ pub(super) fn measure(daemon: &Daemon) -> Result<UnreadResult> {
     }
     let before = Resources::read(daemon.pid())?.resident;
     let for_readers = publish_and_call(daemon)?;
-    Ok(UnreadResult {
-        before,
-        for_nobody,
-        for_readers,
-    })
+    let PublishingSample {
+        messages,
+        times,
+        most,
+    } = for_readers;
+    let title = format!("memory of the daemon with {READERS} clients that never read");
+    report
+        .figure(title, "MB", most)
+        .relative_to("before they were there", before)
+        .require(Target::AtMost((before + OVERHEAD * CLIENT).round()))
+        .note(format!(
+            "resident; {messages} messages of {MESSAGE} bytes were published"
+        ));
+    let title = format!("a call beside {READERS} clients that never read, p99");
+    report
+        .figure(title, "ms", quantile(&times, 0.99))
+        .relative_to(
+            "while the same is published for nobody",
+            quantile(&for_nobody.times, 0.99),
+        )
+        .note(format!(
+            "p50 {:.2} ms beside {:.2} ms",
+            quantile(&times, 0.5),
+            quantile(&for_nobody.times, 0.5)
+        ));
+    Ok(())
 }
 
 /// Publishes for a while and makes calls as another robot meanwhile.
@@ -105,40 +117,4 @@ fn publish_and_call(daemon: &Daemon) -> Result<PublishingSample> {
         times,
         most,
     })
-}
-
-impl UnreadResult {
-    pub(super) fn add_figures(&self, report: &mut BenchReport) {
-        let PublishingSample {
-            messages,
-            times,
-            most,
-        } = &self.for_readers;
-        report
-            .figure(
-                format!("memory of the daemon with {READERS} clients that never read"),
-                "MB",
-                *most,
-            )
-            .relative_to("before they were there", self.before)
-            .require(Target::AtMost((self.before + OVERHEAD * CLIENT).round()))
-            .note(format!(
-                "resident; {messages} messages of {MESSAGE} bytes were published"
-            ));
-        report
-            .figure(
-                format!("a call beside {READERS} clients that never read, p99"),
-                "ms",
-                quantile(times, 0.99),
-            )
-            .relative_to(
-                "while the same is published for nobody",
-                quantile(&self.for_nobody.times, 0.99),
-            )
-            .note(format!(
-                "p50 {:.2} ms beside {:.2} ms",
-                quantile(times, 0.5),
-                quantile(&self.for_nobody.times, 0.5)
-            ));
-    }
 }

@@ -14,8 +14,9 @@ use super::{CLASS, Kind};
 use crate::cells::{CachedResult, RunCache};
 use crate::deadline;
 use crate::examples::{EvalFixtures, ExecutionSite, InputRecording, LASER_SLAM};
-use crate::place::{NetworkProfile, RobotSandbox};
+use crate::place::NetworkProfile;
 use crate::recording::Recording;
+use crate::robot::RobotPlan;
 use crate::stream::{self, StreamHeader};
 use crate::trace::MapGrid;
 
@@ -101,15 +102,9 @@ impl StreamSources<'_> {
         let map = self
             .cells
             .measure("codecs source map", &(CLASS, SCANS), || {
-                self.workshop.publish(&LASER_SLAM)?;
-                let directory = self.workshop.directory()?;
-                let mut plan =
-                    self.workshop
-                        .plan(&LASER_SLAM, ExecutionSite::Outsourced, directory.path())?;
-                (plan.most, plan.every) = SCANS;
-                let place =
-                    RobotSandbox::new(&self.workshop.daemon.address, CLASS, NetworkProfile::Lan)?;
-                let (trace, _) = place.run(&plan, directory.path())?;
+                let (at, robot) = (ExecutionSite::Outsourced, (CLASS, NetworkProfile::Lan));
+                let adapt = |plan: &mut RobotPlan| (plan.most, plan.every) = SCANS;
+                let (trace, _) = self.workshop.run(&LASER_SLAM, at, robot, adapt)?;
                 trace.map.context("laser_slam published no map")
             })?;
         match map {

@@ -162,19 +162,9 @@ fn format_bytes(value: Option<f64>) -> String {
 fn savings_table(runs: &CodecRuns) -> Table {
     let mut table = Table::new(
         "Over the LAN, for each message",
-        [
-            "what is sent",
-            "codec",
-            "published row",
-            "published: saved",
-            "saved here",
-            "of the median message that is a tenth smaller",
-            "bytes to the servant",
-            "bytes back",
-            "messages at least a tenth smaller",
-            "PSNR, median, and least in brackets (dB)",
-            "pictures that changed",
-        ],
+        "what is sent | codec | published row | published: saved | saved here | \
+         of the median message that is a tenth smaller | bytes to the servant | bytes back | \
+         messages at least a tenth smaller | PSNR, median, and least in brackets (dB) | pictures that changed",
     );
     for (what, sent) in lan_streams(runs) {
         let (row, published) = what.kind.published_saving();
@@ -226,18 +216,8 @@ fn noise_cells(runs: &CodecRuns, what: &StreamSpec) -> (String, String) {
 fn times_table(runs: &CodecRuns) -> Table {
     let mut table = Table::new(
         "From publishing a message to its receipt, milliseconds (the publication has no such figure)",
-        [
-            "what is sent",
-            "codec",
-            "network",
-            "messages",
-            "lost",
-            "median",
-            "95 %",
-            "bytes to the servant",
-            "saved",
-            "messages at least a tenth smaller",
-        ],
+        "what is sent | codec | network | messages | lost | median | 95 % | bytes to the servant | saved | \
+         messages at least a tenth smaller",
     );
     for (what, sent) in measured_streams(runs) {
         table.push([
@@ -264,13 +244,7 @@ fn times_table(runs: &CodecRuns) -> Table {
 fn offline_table(runs: &CodecRuns) -> Table {
     let mut table = Table::new(
         "The same messages by one codec in one process, not on the cable",
-        [
-            "what",
-            "codec",
-            "published row",
-            "published: saved",
-            "saved here",
-        ],
+        "what | codec | published row | published: saved | saved here",
     );
     for (kind, alone) in &runs.alone {
         let (row, published) = kind.published_saving();
@@ -343,6 +317,7 @@ mod tests {
     use super::super::received::ReceivedPictures;
     use super::super::sources::{CodecOutput, OfflineResult};
     use super::*;
+    use crate::words::assert_tells;
 
     fn spec(setting: Setting) -> StreamSpec {
         StreamSpec {
@@ -404,26 +379,21 @@ mod tests {
         );
         assert_eq!(section.tables[2].rows[0][4], "25.00 %");
         let told = section.findings.join(" ");
-        assert!(
-            told.contains(
-                "saves 50.0 % of the bytes and loses nothing: 25.4 percentage points less than the \
-            publication's row \u{201c}video, libav\u{201d} (75.4 %)."
-            ),
-            "{told}"
+        assert_tells(
+            &told,
+            "saves 50.0 % of the bytes and loses nothing: 25.4 percentage points less than the \
+            publication's row \u{201c}video, libav\u{201d} (75.4 %).",
         );
-        assert!(
-            told.contains("saves 95.0 % of the bytes: at least as many as the publication's"),
-            "{told}"
+        assert_tells(
+            &told,
+            "saves 95.0 % of the bytes: at least as many as the publication's",
         );
-        assert!(
-            told.contains("takes longer with the codec (90.0 ms)"),
-            "{told}"
-        );
-        assert!(told.contains("1 of 2 messages took nine tenths"), "{told}");
-        assert!(
-            told.contains("of the same 200 bytes the codec image makes 160 and deflate 150 (1.1 times as many by ours: \
-                worse than hoped)."),
-            "{told}"
+        assert_tells(&told, "takes longer with the codec (90.0 ms)");
+        assert_tells(&told, "1 of 2 messages took nine tenths");
+        assert_tells(
+            &told,
+            "of the same 200 bytes the codec image makes 160 and deflate 150 (1.1 times as many by ours: \
+                worse than hoped).",
         );
         assert!(section.missing.is_empty(), "{:?}", section.missing);
     }

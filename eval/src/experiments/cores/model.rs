@@ -1,7 +1,7 @@
 //! A model of response times as sums of parts, each modelled separately: some parts of a response are work that cores
 //! share, the others are not.
 
-use crate::statistics::{Point, RrtModel, mean};
+use crate::statistics::{RrtModel, mean};
 use crate::trace::Trace;
 
 /// Names of [`ResponseParts`], in their order.
@@ -57,11 +57,8 @@ impl Model {
     /// three runs with at least two different numbers of cores.
     pub fn fit(runs: &[(f64, ResponseParts)], threads: usize) -> Option<Self> {
         let of = |index: usize| {
-            let points: Vec<Point> = runs
-                .iter()
-                .map(|(cores, parts)| point(*cores, parts[index]))
-                .collect();
-            RrtModel::fit(&points)
+            let points = runs.iter().map(|(cores, parts)| (*cores, parts[index]));
+            RrtModel::fit(&points.collect::<Vec<_>>())
         };
         let most = runs.iter().map(|run| run.0).fold(0.0, f64::max);
         Some(Self {
@@ -74,10 +71,7 @@ impl Model {
     /// Predicts the mean response time with `cores` cores, in seconds. More cores than were measured give no further
     /// improvement, because no measurement shows one.
     pub fn predict_cautious(&self, cores: f64) -> f64 {
-        self.parts
-            .iter()
-            .map(|part| part.predict(&point(cores, 0.0)))
-            .sum()
+        self.parts.iter().map(|part| part.predict(cores)).sum()
     }
 
     /// Lower bound of the prediction: assumes that the work of the computation can be divided among any number of cores
@@ -95,18 +89,6 @@ impl Model {
     /// Returns whether more cores stopped helping below the greatest measured number.
     pub fn has_end(&self) -> bool {
         self.parts[COMPUTATION].parallel < NEAR * self.most
-    }
-}
-
-fn point(cores: f64, rrt: f64) -> Point {
-    Point {
-        cores,
-        // The parts that were measured include the network.
-        round_trip: 0.0,
-        bytes_up: 0.0,
-        bytes_down: 0.0,
-        rate: f64::INFINITY,
-        rrt,
     }
 }
 

@@ -2,9 +2,8 @@
 
 use anyhow::Result;
 
-use crate::cells::CachedResult;
 use crate::plots;
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{AGAIN, MissingMeasurement, Section, Table};
 use crate::statistics::root_mean_square_error;
 use crate::words::{digits, milliseconds, or_dash, percent, ratio};
 
@@ -92,17 +91,13 @@ fn differences() -> Vec<String> {
 }
 
 fn measured_table(found: &[ProgramFit]) -> Table {
-    let head = [
-        "program",
-        "cores",
-        "used for",
-        "requests",
-        "bytes a request, both ways",
-    ];
-    let tail = ["response time", "model", "model's error"];
     let mut table = Table::new(
         "Means by the servant's limit, which was read back from the kernel (milliseconds); robot of the class Pi, LAN",
-        head.into_iter().chain(NAMES).chain(tail),
+        &format!(
+            "program | cores | used for | requests | bytes a request, both ways | {} | response time | model | \
+             model's error",
+            NAMES.join(" | ")
+        ),
     );
     for one in found {
         for (cores, measured) in &one.study.runs {
@@ -139,13 +134,7 @@ fn signed_percent(share: f64) -> String {
 fn models_table(found: &[ProgramFit]) -> Table {
     let mut table = Table::new(
         "The models: overhead + work / min(cores, parallel)",
-        [
-            "program",
-            "part",
-            "overhead (ms)",
-            "work (core ms)",
-            "parallel (cores)",
-        ],
+        "program | part | overhead (ms) | work (core ms) | parallel (cores)",
     );
     for one in found {
         for (name, part) in one
@@ -169,16 +158,8 @@ fn predictions_table(found: &[ProgramFit]) -> Table {
     let mut table = Table::new(
         "Predicted, not measured: mean response times with more cores (milliseconds), and how many times as fast as \
          natively on the class Pi, by means",
-        [
-            "program",
-            "cores",
-            "native on the Pi, measured",
-            "cautious",
-            "times as fast",
-            "bound",
-            "times as fast at most",
-            "published, up to",
-        ],
+        "program | cores | native on the Pi, measured | cautious | times as fast | bound | \
+         times as fast at most | published, up to",
     );
     for one in found {
         let Some(model) = &one.model else { continue };
@@ -343,48 +324,39 @@ fn limit_finding(one: &ProgramFit, model: &Model) -> String {
 }
 
 fn add_missing(section: &mut Section, one: &ProgramFit) {
-    let mut lacks = |what: String, why: &str| {
-        section
-            .missing
-            .push(MissingMeasurement::retryable(what, why));
-    };
     let native = format!("{}, native", one.name());
-    match &one.study.native {
-        CachedResult::Missing(why) => lacks(native, why),
-        CachedResult::Done(trace) => {
-            if let Some(why) = &trace.node_ended {
-                lacks(format!("{native}: to its end"), why);
-            }
-        }
+    if let Some(trace) = one.study.native.require(section, &native, AGAIN) {
+        section.note_early_end(format!("{native}: to its end"), trace);
     }
     for (cores, measured) in &one.study.runs {
         let what = format!("{}, {cores} cores", one.name());
-        match measured {
-            CachedResult::Missing(why) => lacks(what, why),
-            CachedResult::Done(run) if mean_parts(&run.trace).is_none() => {
-                lacks(what, "the package told no parts of its time");
-            }
-            CachedResult::Done(run) => {
-                if let Some(why) = &run.trace.node_ended {
-                    lacks(format!("{what}: to its end"), why);
-                }
-            }
+        let Some(run) = measured.require(section, &what, AGAIN) else {
+            continue;
+        };
+        if mean_parts(&run.trace).is_none() {
+            let why = "the package told no parts of its time";
+            let missing = MissingMeasurement::retryable(what, why);
+            section.missing.push(missing);
+        } else {
+            section.note_early_end(format!("{what}: to its end"), &run.trace);
         }
     }
     if one.model.is_none() {
-        lacks(
+        section.missing.push(MissingMeasurement::retryable(
             format!("{}: the model", one.name()),
             "fewer than three limits of those that it is fitted to were measured",
-        );
+        ));
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cells::CachedResult;
     use crate::experiments::cores::{CoreLimitRun, SUBJECTS, Subject};
     use crate::place::RunCost;
     use crate::trace::{ComputationPhases, RequestSample, Trace};
+    use crate::words::assert_tells;
 
     fn trace(computation: f64) -> Trace {
         Trace {
@@ -425,18 +397,14 @@ mod tests {
     fn the_report_has_errors_and_factors_beside_the_published_one() {
         let section = section(&[study(SUBJECTS[2], 8.0)]).expect("it is drawn");
         assert!(section.missing.is_empty(), "{:?}", section.missing);
-        assert!(
-            section.findings[0].contains(
-                "3 limits that were held back inside the fitted range the model's error is 0.0 %"
-            ),
-            "{:?}",
-            section.findings
+        assert_tells(
+            &section.findings[0],
+            "3 limits that were held back inside the fitted range the model's error is 0.0 %",
         );
         // 50 + 100 / 1.5 ms are predicted, 50 + 100 / 1.75 ms were measured.
-        assert!(
-            section.findings[1].contains("error is +8.9 %, that of the bound +0.0 %"),
-            "{:?}",
-            section.findings
+        assert_tells(
+            &section.findings[1],
+            "error is +8.9 %, that of the bound +0.0 %",
         );
         assert!(section.findings[2].contains("1.50 times as fast with 2 threads"));
         let four = &section.tables[2].rows[0];
@@ -451,9 +419,9 @@ mod tests {
     fn cores_that_gave_nothing_where_they_were_held_back_are_told() {
         let section = section(&[study(SUBJECTS[2], 1.5)]).expect("it is drawn");
         let told = &section.findings[2];
-        assert!(
-            told.contains("with 1.75 cores, which were held back, it computes only 1.00 times as fast as with 1.50"),
-            "{told}"
+        assert_tells(
+            told,
+            "with 1.75 cores, which were held back, it computes only 1.00 times as fast as with 1.50",
         );
     }
 
@@ -468,19 +436,18 @@ mod tests {
         }
         let section = section(&[study]).expect("it is drawn");
         let told = &section.findings[0];
-        assert!(
-            told.contains("computation is 175 core ms at 0.25 cores and 100 core ms at 1.00"),
-            "{told}"
+        assert_tells(
+            told,
+            "computation is 175 core ms at 0.25 cores and 100 core ms at 1.00",
         );
     }
 
     #[test]
     fn a_program_of_one_thread_gains_nothing() {
         let section = section(&[study(SUBJECTS[1], 1.0)]).expect("it is drawn");
-        assert!(
-            section.findings[2].contains("more than 1.00 cores are not expected"),
-            "{:?}",
-            section.findings
+        assert_tells(
+            &section.findings[2],
+            "more than 1.00 cores are not expected",
         );
         assert_eq!(section.tables[2].rows[0][4], section.tables[2].rows[3][6]);
     }

@@ -10,7 +10,7 @@ use super::AGAIN;
 use crate::cells::{CachedResult, RunCache};
 use crate::experiments::crowd::{self, Controller, CrowdDaemon, ENDLESS, SHORT, WorkerService};
 use crate::plots::{self, Series};
-use crate::section::{MissingMeasurement, Section, Table};
+use crate::section::{Section, Table};
 use crate::statistics::{mean, quantile};
 use crate::words::{digits, milliseconds, ratio};
 
@@ -159,19 +159,13 @@ pub(super) fn add_to_section(runs: &IsolationRuns, section: &mut Section) -> Res
     ));
     let mut table = Table::new(
         "A robot beside greedy neighbours",
-        [
-            "policy",
-            "neighbours",
-            "requests",
-            "RRT, median (ms)",
-            "RRT, 95 % (ms)",
-            "median, times that alone",
-            "cores that neighbours used",
-        ],
+        "policy | neighbours | requests | RRT, median (ms) | RRT, 95 % (ms) | median, times that alone | \
+         cores that neighbours used",
     );
     for (plan, measured) in &runs.0 {
-        match measured {
-            CachedResult::Done(beside) => table.push([
+        let what = format!("{} neighbours, {}", plan.neighbours, plan.policy.name());
+        if let Some(beside) = measured.require(section, what, AGAIN) {
+            table.push([
                 plan.policy.name().to_owned(),
                 plan.neighbours.to_string(),
                 beside.times.len().to_string(),
@@ -179,12 +173,7 @@ pub(super) fn add_to_section(runs: &IsolationRuns, section: &mut Section) -> Res
                 milliseconds(quantile(&beside.times, 0.95)),
                 ratio(runs.slowdown(plan.policy, plan.neighbours, 0.5)),
                 digits(beside.neighbours_cores),
-            ]),
-            CachedResult::Missing(why) => section.missing.push(MissingMeasurement::new(
-                format!("{} neighbours, {}", plan.neighbours, plan.policy.name()),
-                why,
-                AGAIN,
-            )),
+            ]);
         }
     }
     section.tables.push(table);
@@ -314,6 +303,7 @@ impl IsolationRuns {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::words::assert_tells;
 
     fn test_runs(limits: [f64; 2], weights: [f64; 2], none: [f64; 2]) -> IsolationRuns {
         let mut points = Vec::new();
@@ -366,11 +356,7 @@ mod tests {
         let mut section = Section::new(9, "a", "b");
         let measured = test_runs([0.01, 0.03], [0.01, 0.02], [0.01, 0.05]);
         add_to_section(&measured, &mut section).expect("it is told");
-        assert!(
-            section.findings[2].contains("worse than hoped"),
-            "{:?}",
-            section.findings
-        );
+        assert_tells(&section.findings[2], "worse than hoped");
     }
 
     #[test]
@@ -378,11 +364,7 @@ mod tests {
         let mut section = Section::new(9, "a", "b");
         let measured = test_runs([0.01, 0.03], [0.01, 0.02], [0.02, 0.05]);
         add_to_section(&measured, &mut section).expect("it is told");
-        assert!(
-            section.findings[2].contains("differ by 100 %"),
-            "{:?}",
-            section.findings
-        );
+        assert_tells(&section.findings[2], "differ by 100 %");
         assert_eq!(section.findings.len(), 3);
     }
 

@@ -23,17 +23,7 @@ pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
         most of each tenth of a second, which is jitter, too.".to_owned()];
     let mut table = Table::new(
         "Response times, milliseconds",
-        [
-            "package",
-            "robot",
-            "where",
-            "standard deviation",
-            "of the mean",
-            "5 %",
-            "median",
-            "95 %",
-            "99 %",
-        ],
+        "package | robot | where | standard deviation | of the mean | 5 % | median | 95 % | 99 %",
     );
     for run in runs {
         let Some((trace, _)) = run.measured.value() else {
@@ -118,6 +108,7 @@ fn steadiness_finding(
 mod tests {
     use super::*;
     use crate::experiments::outsourcing::tests::test_run;
+    use crate::words::assert_tells;
 
     #[test]
     fn jitter_is_compared_with_that_of_the_robot() {
@@ -130,10 +121,10 @@ mod tests {
         let [lan, wan] = &section.findings[..] else {
             panic!("{:?}", section.findings);
         };
-        assert!(lan.contains("LAN: response times differ less"), "{lan}");
-        assert!(
-            wan.contains("response times differ more outsourced (standard deviation 566 ms) than"),
-            "{wan}"
+        assert_tells(lan, "LAN: response times differ less");
+        assert_tells(
+            wan,
+            "response times differ more outsourced (standard deviation 566 ms) than",
         );
         assert!(wan.ends_with("(141 ms): worse than hoped."), "{wan}");
     }

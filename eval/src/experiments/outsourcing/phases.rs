@@ -23,15 +23,7 @@ pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
     ];
     let mut table = Table::new(
         "Mean of all frames, milliseconds",
-        [
-            "robot",
-            "where",
-            "acquisition",
-            "computation",
-            "rendering",
-            "transport and waiting",
-            "response time",
-        ],
+        "robot | where | acquisition | computation | rendering | transport and waiting | response time",
     );
     let mut bars = Vec::new();
     for run in runs

@@ -33,21 +33,9 @@ pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
         .extend(network.map(|network| format!("Packets are delayed by {network}.")));
     let mut table = Table::new(
         "Response times, from publishing a request to its answer (milliseconds), one request after the other",
-        [
-            "package",
-            "robot",
-            "where",
-            "requests",
-            "answered",
-            "median",
-            "95 %",
-            "accumulated (s)",
-            "times as fast, by medians",
-            "times as fast, by means",
-            "published",
-            "robot's CPU, whole run (s)",
-            "bytes a request, both ways",
-        ],
+        "package | robot | where | requests | answered | median | 95 % | accumulated (s) | \
+         times as fast, by medians | times as fast, by means | published | robot's CPU, whole run (s) | \
+         bytes a request, both ways",
     );
     for run in runs {
         let Some((trace, cost)) = run.measured.value() else {
@@ -203,6 +191,7 @@ fn accumulate(trace: &Trace) -> Vec<(f64, f64)> {
 mod tests {
     use super::*;
     use crate::experiments::outsourcing::tests::test_run;
+    use crate::words::assert_tells;
 
     #[test]
     fn how_much_faster_is_by_the_medians() {
@@ -226,16 +215,8 @@ mod tests {
         assert_eq!(faster, ["1.0", "4.0", "0.50"]);
         assert_eq!(section.tables[0].rows[1][9], "1.1");
         assert_eq!(section.tables[0].rows[1][10], "up to 25");
-        assert!(
-            section.findings[0].contains("4.0 times as fast"),
-            "{:?}",
-            section.findings
-        );
-        assert!(
-            section.findings[1].contains("more slowly"),
-            "{:?}",
-            section.findings
-        );
+        assert_tells(&section.findings[0], "4.0 times as fast");
+        assert_tells(&section.findings[1], "more slowly");
     }
 
     #[test]

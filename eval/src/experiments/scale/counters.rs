@@ -1,6 +1,7 @@
 //! The kernel's counters of the machine, the daemon, its servants and the robots' process.
 
 use anyhow::{Context, Result};
+use bench_report::Process;
 use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 
@@ -40,16 +41,14 @@ impl CoreUsage {
 
 impl TimeCounters {
     pub(super) fn read(daemon: &Daemon) -> Result<Self> {
-        let read = |path: String| std::fs::read_to_string(&path).context(path);
-        let of_process = |pid: String| -> Result<f64> {
-            let path = format!("/proc/{pid}/stat");
-            parse_process_time(&read(path.clone())?).context(path)
-        };
+        let machine = std::fs::read_to_string("/proc/stat").context("/proc/stat")?;
+        let of_process =
+            |process: Process| -> Result<f64> { Ok(process.total_processor_time()?.as_secs_f64()) };
         Ok(Self {
-            machine: parse_machine_time(&read("/proc/stat".to_owned())?).context("/proc/stat")?,
-            daemon: of_process(daemon.pid().to_string())?,
+            machine: parse_machine_time(&machine).context("/proc/stat")?,
+            daemon: of_process(Process::from_pid(daemon.pid()))?,
             servants: crowd::usage(daemon, SHORT)?.0,
-            robots: of_process("self".to_owned())?,
+            robots: of_process(Process::current())?,
         })
     }
 
@@ -76,16 +75,6 @@ fn parse_machine_time(text: &str) -> Option<f64> {
     (ticks.len() >= 4).then(|| used.iter().sum::<f64>() / TICKS)
 }
 
-/// Parses the seconds of a process with all its threads from `/proc/PID/stat`: utime and stime. The name in parentheses
-/// may contain spaces.
-fn parse_process_time(text: &str) -> Option<f64> {
-    let (_, rest) = text.rsplit_once(')')?;
-    let mut fields = rest.split_whitespace().skip(11);
-    let user: f64 = fields.next()?.parse().ok()?;
-    let system: f64 = fields.next()?.parse().ok()?;
-    Some((user + system) / TICKS)
-}
-
 /// Returns the memory available without swapping and the total memory, in bytes.
 pub(super) fn available_memory() -> Result<(f64, f64)> {
     let text = std::fs::read_to_string("/proc/meminfo").context("/proc/meminfo")?;
@@ -110,13 +99,6 @@ mod tests {
         let text = "cpu  100 10 40 9000 500 20 30 7 0 0\ncpu0 1 1 1 1\n";
         assert_eq!(parse_machine_time(text), Some(2.0));
         assert_eq!(parse_machine_time("intr 1"), None);
-    }
-
-    #[test]
-    fn a_processs_name_does_not_matter() {
-        let text = "12 (a ) b) S 1 2 3 4 5 6 7 8 9 10 250 50 0 0 20 0";
-        assert_eq!(parse_process_time(text), Some(3.0));
-        assert_eq!(parse_process_time("12 (a) S 1"), None);
     }
 
     #[test]

@@ -7,7 +7,6 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 
 use super::{ScalePlan, ScalePoint, ScaleRuns, THINK};
-use crate::cells::CachedResult;
 use crate::experiments::crowd::SHORT;
 use crate::plots::{self, Series};
 use crate::section::{MissingMeasurement, Section, Table};
@@ -83,17 +82,15 @@ pub fn section(runs: &ScaleRuns) -> Result<Section> {
     ];
     let mut told = Vec::new();
     for (index, (plan, measured)) in runs.0.iter().enumerate() {
-        match measured {
-            CachedResult::Done(point) => told.push(ReportedPoint {
+        let what = format!("{} robots", plan.robots);
+        let next = "make eval ONLY=10 tries it again";
+        if let Some(point) = measured.require(&mut section, what, next) {
+            let held_back = index % 2 == 1;
+            told.push(ReportedPoint {
                 plan,
                 point,
-                held_back: index % 2 == 1,
-            }),
-            CachedResult::Missing(why) => section.missing.push(MissingMeasurement::new(
-                format!("{} robots", plan.robots),
-                why,
-                "make eval ONLY=10 tries it again",
-            )),
+                held_back,
+            });
         }
     }
     if told.is_empty() {
@@ -133,7 +130,7 @@ fn add_starts(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
     let times: Vec<f64> = all.values().copied().collect();
     let mut table = Table::new(
         "Start of a servant, until it has answered a first call (s)",
-        ["figure", "published", "here", "servants started"],
+        "figure | published | here | servants started",
     );
     for (name, value) in [
         ("median", median(&times)),
@@ -180,17 +177,8 @@ fn add_starts(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
 fn add_points(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Section) {
     let mut table = Table::new(
         "Response times",
-        [
-            "robots",
-            "for the model",
-            "requests a second",
-            "RRT, median (ms)",
-            "RRT, 95 % (ms)",
-            "RRT, mean (ms)",
-            "the model's mean (ms)",
-            "its error (%)",
-            "machine busy (%)",
-        ],
+        "robots | for the model | requests a second | RRT, median (ms) | RRT, 95 % (ms) | RRT, mean (ms) | \
+         the model's mean (ms) | its error (%) | machine busy (%)",
     );
     for one in told {
         let predicted = node.map(|node| node.predict(one.plan.robots as u64).response);
@@ -215,14 +203,8 @@ fn add_points(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Se
 fn add_costs(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
     let mut table = Table::new(
         "What a robot costs",
-        [
-            "robots",
-            "memory of its servant (MB)",
-            "memory that the machine has less (MB)",
-            "processor per request: servant (ms)",
-            "daemon (ms)",
-            "robot (ms)",
-        ],
+        "robots | memory of its servant (MB) | memory that the machine has less (MB) | \
+         processor per request: servant (ms) | daemon (ms) | robot (ms)",
     );
     for one in told {
         let used = &one.point.used;

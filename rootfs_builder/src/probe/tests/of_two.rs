@@ -76,7 +76,7 @@ struct Zeros;
 
 #[async_trait::async_trait]
 impl ServiceHandler for Zeros {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(Bytes::from_static(&[
             0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
         ]))
@@ -241,7 +241,7 @@ struct Stage(Arc<Stages>, &'static str);
 
 #[async_trait::async_trait]
 impl ServiceHandler for Stage {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let Self(stages, name) = self;
         let of = stages.registry.service(name).expect("defined");
         let mut text = Vec::new();
@@ -353,7 +353,7 @@ async fn a_node_that_somebody_drives_is_left_to_it() {
 async fn actions_bring_the_definitions_that_their_parts_refer_to() {
     struct Nothing;
     impl ros::bus::ActionHandler for Nothing {
-        fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+        fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), FailureReason> {
             Ok(())
         }
         fn on_cancel(&self, _id: &str) {}

@@ -117,6 +117,24 @@ fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
 }
 
 #[test]
+fn every_key_is_read_and_documented() {
+    let document = include_str!("../../../../docs/robots.md");
+    for key in &KEYS {
+        assert!(
+            document.contains(&format!("`{}`", key.name)),
+            "{}",
+            key.name
+        );
+        let refused = read(&[(key.name, "")]).expect_err(key.name);
+        assert_eq!(refused.key, key.name);
+    }
+    for measure in Measure::ALL {
+        let pair = KEYS.iter().filter(|key| key.name.ends_with(measure.name()));
+        assert_eq!(pair.count(), 2, "{measure:?}");
+    }
+}
+
+#[test]
 fn a_goal_has_a_desire_and_a_bound() {
     let goals = |query: &[(&str, &str)]| read(query).expect("valid").sla.goals();
     let goal = |measure, desire, bound| Goal {

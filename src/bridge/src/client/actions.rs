@@ -5,39 +5,54 @@ mod goals;
 mod sending;
 mod server;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
-use ros::bus::RosVersion;
+use ros::bus::{BusError, RosVersion};
 use ros::schema::ActionDef;
 use rosbridge::Id;
-use tokio_util::sync::CancellationToken;
 
+use super::decoding::PayloadError;
+use super::under_way::BeginCallError;
 use super::{BridgeClient, remove_matching};
-use crate::lacking::explain_schema_error;
-use crate::names::lookup_name;
-use goals::ActionClient;
-use server::ActionServer;
+use crate::NotGrantedError;
+use crate::client_state::{ActionServer, Actions, ActiveGoal};
+use crate::lacking::DefinitionError;
+use crate::names::{ResolveNameError, lookup_name};
 
-/// The actions that a client uses and serves.
-#[derive(Default)]
-pub(super) struct Actions {
-    /// Actions it sends goals to, by name.
-    used: HashMap<String, Arc<ActionClient>>,
-    /// Goals in progress, by the server's id.
-    goals: HashMap<String, ActiveGoal>,
-    /// Actions it serves, by name.
-    served: HashMap<String, Arc<ActionServer>>,
-}
-
-/// A goal that can be cancelled.
-struct ActiveGoal {
-    /// Name of the action.
-    action: String,
-    /// Id used by the client, for cancelling.
-    id: Option<Id<'static>>,
-    /// Cancelled before it was sent.
-    recalled: CancellationToken,
+/// Reasons why an operation on an action or goal is refused.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ClientActionError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    #[error("action {action}: {source}")]
+    Definition {
+        action: String,
+        source: DefinitionError,
+    },
+    #[error(transparent)]
+    Begin(#[from] BeginCallError),
+    /// The goal, feedback or result is not a message of its type.
+    #[error(transparent)]
+    Payload(#[from] PayloadError),
+    /// The action cannot be used or served.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    #[error("this client uses {0} actions already")]
+    TooManyUsed(usize),
+    #[error("this client serves {0} actions already; unadvertise one")]
+    TooManyServed(usize),
+    #[error("a goal with id {0} is under way already")]
+    DuplicateGoal(Id<'static>),
+    #[error("no goal with id {0} is under way")]
+    NoSentGoal(Id<'static>),
+    #[error("action {0} is not advertised by this client; advertise_action it first")]
+    NotAdvertised(String),
+    #[error("field \"id\" is missing, the goal's id is expected")]
+    NoId,
+    #[error("action {action} has no goal with id {request:?} under way")]
+    NoServedGoal { action: String, request: String },
 }
 
 impl Actions {
@@ -66,7 +81,11 @@ impl Actions {
 }
 
 impl BridgeClient {
-    fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, String> {
+    fn action_def(
+        &self,
+        action: &str,
+        type_name: &str,
+    ) -> Result<Arc<ActionDef>, ClientActionError> {
         let name = lookup_name(self.version(), type_name);
         let registry = &self.shared.registry;
         let def = registry.action(&name);
@@ -75,11 +94,9 @@ impl BridgeClient {
             Some(short) if self.version() == RosVersion::One => registry.action(short),
             _ => Err(error),
         });
-        def.map_err(|error| {
-            format!(
-                "action {action}: {}",
-                explain_schema_error(self.version(), error)
-            )
+        def.map_err(|error| ClientActionError::Definition {
+            action: action.to_owned(),
+            source: DefinitionError::new(self.version(), error),
         })
     }
 }

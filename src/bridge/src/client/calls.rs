@@ -7,23 +7,71 @@ use std::task::{Context, Waker};
 use std::time::{Duration, Instant};
 
 use access::Operation;
-use budget::JsonWeight;
+use budget::{Exceeded, JsonWeight};
 use bytes::Bytes;
 use ros::bus::{BusError, CallFate, Digest, ServiceType};
-use ros::codec::{self, CborOptions, JsonOptions};
-use ros::schema::{MessageType, ServiceDef};
+use ros::codec::{self, CborOptions, CodecError, JsonOptions};
+use ros::schema::{MessageType, SchemaError, ServiceDef};
 use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
 
-use super::decoding::decode_args;
+use super::decoding::{PayloadError, decode_args, read_raw};
+use super::under_way::BeginCallError;
 use super::{BridgeClient, ReplyTarget, payload_format};
-use crate::lacking::explain_schema_error;
-use crate::names::{digest_word, is_same_type, ros_type_name, type_mismatch};
-use crate::own::{self, OwnService};
+use crate::NotGrantedError;
+use crate::lacking::DefinitionError;
+use crate::names::{DeclaredTypeError, ResolveNameError, digest_word, is_same_type, ros_type_name};
+use crate::own;
+use crate::own_service::{Caller, OwnService, OwnServiceError};
 use crate::sample::EncodedFrame;
 
 /// Maximum number of copies of the arguments of a call that the bridge answers itself, beside the parsed form: in its
 /// answer, and while that is sent.
 const COPIES: usize = 3;
+
+/// Reasons why a client's call fails.
+#[derive(Debug, thiserror::Error)]
+enum ServiceCallError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    Begin(#[from] BeginCallError),
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    /// The service does not answer, or answers that it failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    #[error(transparent)]
+    Definition(#[from] DefinitionError),
+    #[error(transparent)]
+    OtherDefinition(#[from] Box<ServiceDigestError>),
+    #[error(transparent)]
+    OtherType(#[from] DeclaredTypeError),
+    /// The arguments, or the values of an own service, are not those of the type.
+    #[error(transparent)]
+    Payload(#[from] PayloadError),
+    /// The response cannot be encoded.
+    #[error(transparent)]
+    Print(#[from] Box<CodecError>),
+    /// The definition of an own service is not available.
+    #[error(transparent)]
+    OwnDefinition(#[from] SchemaError),
+    #[error("field \"args\": {0}")]
+    NoRoom(#[from] Exceeded),
+    #[error(transparent)]
+    Own(#[from] OwnServiceError),
+}
+
+/// A service whose server has another definition of its type.
+#[derive(Debug, thiserror::Error)]
+#[error("service {service} has type {name} with {word} {theirs} there and {ours} here")]
+struct ServiceDigestError {
+    service: String,
+    name: String,
+    /// Term for the digests.
+    word: &'static str,
+    theirs: Digest,
+    ours: Digest,
+}
 
 /// A call, independent of its frame.
 struct ServiceCall {
@@ -56,11 +104,7 @@ impl ServiceCall {
 }
 
 impl BridgeClient {
-    pub(super) fn call_service(
-        self: &Arc<Self>,
-        op: CallService<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    pub(super) fn call_service(self: &Arc<Self>, op: CallService<'_>, reply: &ReplyTarget) {
         self.shared.metrics.calls.add(1);
         let compression = op.compression.unwrap_or(match reply.format {
             Format::Json => Compression::None,
@@ -84,13 +128,11 @@ impl BridgeClient {
         };
         let (service, guard) = match self
             .resolve(&op.service)
+            .map_err(ServiceCallError::from)
             .and_then(|service| Ok((service, self.begin_call(args)?)))
         {
             Ok(found) => found,
-            Err(reason) => {
-                self.answer_call_failed(&call, &reason);
-                return Ok(());
-            }
+            Err(error) => return self.answer_call_failed(&call, &error),
         };
         let call = ServiceCall {
             service: service.into_owned(),
@@ -105,7 +147,7 @@ impl BridgeClient {
             };
             match answered {
                 Ok(frame) => client.send_as(frame, call.compression, call.fragment_size),
-                Err(reason) => client.answer_call_failed(&call, &reason),
+                Err(error) => client.answer_call_failed(&call, &error),
             }
         });
         // The request is sent at once; the task that waits for the answer is spawned while the node handles it.
@@ -116,10 +158,9 @@ impl BridgeClient {
         {
             tokio::spawn(call);
         }
-        Ok(())
     }
 
-    async fn answer(&self, call: &ServiceCall) -> Result<EncodedFrame, String> {
+    async fn answer(&self, call: &ServiceCall) -> Result<EncodedFrame, ServiceCallError> {
         self.wait_own_service(&call.service).await;
         let bus = &self.shared.bus;
         let server = bus.graph().borrow().services.get(&call.service).cloned();
@@ -137,49 +178,37 @@ impl BridgeClient {
             .shared
             .service_types
             .find(self.shared.bus.as_ref(), &call.service)
-            .await
-            .map_err(|error| error.to_string())?;
-        let def = self
-            .shared
-            .registry
-            .service(&service_type.name)
-            .map_err(|error| explain_schema_error(self.version(), error));
-        let def = def.and_then(|def| match differing_digests(&service_type, &def) {
-            None => Ok(def),
-            Some((theirs, ours)) => Err(format!(
-                "service {} has type {} with {} {theirs} there and {ours} here",
-                call.service,
-                def.name,
-                digest_word(self.version()),
-            )),
-        });
+            .await?;
+        let def = self.find_definition(call, &service_type);
         if let Ok(def) = &def {
             self.warn_surplus_args(&call.reply(), "call_service", &def.request, call.args());
         }
-        let other = self.declared_type_mismatch(call, &service_type.name);
-        let request = match (&def, call.compression, call.args()) {
+        let other = match self.declared_type_mismatch(call, &service_type.name) {
             // Its bytes could be misinterpreted.
-            (_, Compression::CborRaw, _) if other.is_some() => {
-                return Err(other.unwrap_or_default());
-            }
-            (Ok(def), compression, args) => {
-                let request = decode_args(&def.request, args, compression);
-                let request = request.map_err(|problem| other.clone().unwrap_or(problem))?;
-                if let Some(other) = other {
-                    self.warn(&call.reply(), &format!("call_service: {other}"));
-                }
-                request
+            Some(other) if call.compression == Compression::CborRaw => return Err(other.into()),
+            other => other,
+        };
+        let (def, request) = match (def, call.args()) {
+            (Ok(def), args) => {
+                let request = decode_args(&def.request, args, call.compression);
+                let request = match (request, other) {
+                    (Ok(request), None) => request,
+                    (Ok(request), Some(other)) => {
+                        self.warn(&call.reply(), &format!("call_service: {other}"));
+                        request
+                    }
+                    (Err(_), Some(other)) => return Err(other.into()),
+                    (Err(error), None) => return Err(error.into()),
+                };
+                (Some(def), request)
             }
             // ROS bytes in both directions need no definition.
-            (Err(_), Compression::CborRaw, Some(args)) => Bytes::from(
-                args.raw()
-                    .map_err(|error| error.to_string())?
-                    .bytes
-                    .into_owned(),
-            ),
-            (Err(reason), ..) => return Err(reason.clone()),
+            (Err(_), Some(args)) if call.compression == Compression::CborRaw => {
+                (None, Bytes::from(read_raw(args)?.into_owned()))
+            }
+            (Err(error), _) => return Err(error),
         };
-        let of = def.as_ref().ok().map(|def| &*def.request);
+        let of = def.as_ref().map(|def| &*def.request);
         self.shared
             .inputs
             .for_input(&call.service, of)
@@ -195,7 +224,7 @@ impl BridgeClient {
             let took = response.is_ok().then(|| asked.elapsed());
             self.shared.options.called.record(took);
         }
-        let response = response.map_err(|error| {
+        let response = response.inspect_err(|error| {
             if matches!(
                 error,
                 BusError::CallFailed {
@@ -205,21 +234,44 @@ impl BridgeClient {
             ) {
                 self.shared.metrics.calls_denied.add(1);
             }
-            error.to_string()
         })?;
-        self.response_frame(call, def.as_deref().ok(), &response)
+        Ok(self.response_frame(call, def.as_deref(), &response)?)
+    }
+
+    /// Returns the definition of a service's type; fails if the server has another one.
+    fn find_definition(
+        &self,
+        call: &ServiceCall,
+        service_type: &ServiceType,
+    ) -> Result<Arc<ServiceDef>, ServiceCallError> {
+        let def = self.shared.registry.service(&service_type.name);
+        let def = def.map_err(|error| DefinitionError::new(self.version(), error))?;
+        match differing_digests(service_type, &def) {
+            None => Ok(def),
+            Some((theirs, ours)) => Err(Box::new(ServiceDigestError {
+                service: call.service.clone(),
+                name: def.name.clone(),
+                word: digest_word(self.version()),
+                theirs,
+                ours,
+            })
+            .into()),
+        }
     }
 
     /// Returns the mismatch if the client gives another type than the service has. As in rosbridge_suite, a call whose
     /// arguments fit is made anyway.
-    fn declared_type_mismatch(&self, call: &ServiceCall, theirs: &str) -> Option<String> {
+    fn declared_type_mismatch(
+        &self,
+        call: &ServiceCall,
+        theirs: &str,
+    ) -> Option<DeclaredTypeError> {
         let said = call
             .said
             .as_deref()
             .filter(|said| !is_same_type(said, theirs))?;
-        let service = format!("service {}", call.service);
-        Some(type_mismatch(
-            &service,
+        Some(DeclaredTypeError::new(
+            format!("service {}", call.service),
             theirs,
             &ros_type_name(self.version(), said, "srv"),
         ))
@@ -263,17 +315,16 @@ impl BridgeClient {
         &self,
         call: &ServiceCall,
         own: &dyn OwnService,
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, ServiceCallError> {
         if own.reads_graph() {
             self.wait_registered().await;
         }
         let def = own.definition(&self.shared)?;
         let args = self.own_service_args(call, &def)?;
         let mut held = self.budget.permit();
-        let counted = held.count(JsonWeight::estimate(&args).bytes + COPIES * args.len());
-        counted.map_err(|full| format!("field \"args\": {full}"))?;
+        held.count(JsonWeight::estimate(&args).bytes + COPIES * args.len())?;
         let grants = self.client_grants().grants();
-        let caller = own::Caller {
+        let caller = Caller {
             grants: &grants,
             budget: &self.budget,
         };
@@ -282,7 +333,11 @@ impl BridgeClient {
     }
 
     /// Returns the arguments of a call that the bridge answers, as a JSON object.
-    fn own_service_args(&self, call: &ServiceCall, def: &ServiceDef) -> Result<Bytes, String> {
+    fn own_service_args(
+        &self,
+        call: &ServiceCall,
+        def: &ServiceDef,
+    ) -> Result<Bytes, ServiceCallError> {
         match (call.args(), &call.args) {
             (None, _) => Ok(Bytes::from_static(b"{}")),
             (Some(args), Some((Format::Json, bytes)))
@@ -305,7 +360,7 @@ impl BridgeClient {
         call: &ServiceCall,
         def: &ServiceDef,
         values: &[u8],
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, ServiceCallError> {
         if matches!(call.compression, Compression::None | Compression::Png) {
             return answer_frame(call, Format::Json, |out| {
                 out.extend_from_slice(values);
@@ -317,7 +372,7 @@ impl BridgeClient {
             bytes: values,
         };
         let response = decode_args(&def.response, Some(values), Compression::None)?;
-        self.response_frame(call, Some(def), &response)
+        Ok(self.response_frame(call, Some(def), &response)?)
     }
 
     fn response_frame(
@@ -325,7 +380,7 @@ impl BridgeClient {
         call: &ServiceCall,
         def: Option<&ServiceDef>,
         response: &Bytes,
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(call.compression);
         let Some(def) = def.filter(|_| call.compression != Compression::CborRaw) else {
             let mut out = Vec::with_capacity(response.len() + 128);
@@ -349,7 +404,7 @@ impl BridgeClient {
         bytes: &[u8],
         format: Format,
         out: &mut Vec<u8>,
-    ) -> Result<(), String> {
+    ) -> Result<(), Box<CodecError>> {
         let json = JsonOptions {
             non_finite: self.shared.options.non_finite,
             max_bytes: self.shared.options.max_encoded,
@@ -363,17 +418,17 @@ impl BridgeClient {
             Format::Json => codec::to_json(message_type, bytes, out, &json),
             Format::Cbor => codec::to_cbor(message_type, bytes, out, &cbor),
         };
-        printed.map_err(|error| error.to_string())
+        printed.map_err(Box::new)
     }
 
-    fn answer_call_failed(&self, call: &ServiceCall, reason: &str) {
+    fn answer_call_failed(&self, call: &ServiceCall, error: &ServiceCallError) {
         self.shared.metrics.calls_failed.add(1);
-        tracing::debug!(client = %self.name, service = %call.written, "call failed: {reason}");
+        tracing::debug!(client = %self.name, service = %call.written, "call failed: {error}");
         let format = payload_format(call.compression);
         let mut out = Vec::with_capacity(256);
         let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
         writer.text("service", &call.written);
-        writer.text("values", reason);
+        writer.text("values", &error.to_string());
         writer.boolean("result", false);
         writer.end();
         self.send_frame(EncodedFrame::new(format, out), call.fragment_size, true);

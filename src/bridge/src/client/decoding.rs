@@ -1,12 +1,33 @@
 //! Conversion of clients' payloads to serialized messages.
 
+use std::borrow::Cow;
+
 use bytes::Bytes;
-use ros::codec::{self, FillOptions, Time};
+use ros::codec::{self, CodecError, FillOptions, Time};
 use ros::schema::MessageType;
 use rosbridge::{Compression, Format, Payload};
 
 /// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
 const SLICED: usize = 16 * 1024;
+
+/// Reasons why a payload is not a message of its type.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum PayloadError {
+    /// It does not have the form of a serialized message.
+    #[error(transparent)]
+    Raw(#[from] Box<rosbridge::Error>),
+    #[error(transparent)]
+    Message(#[from] Box<CodecError>),
+    #[error("field \"args\" is missing, the ROS serialization is expected")]
+    NoArgs,
+    #[error("field \"args\" is a list of too many values; name them in an object")]
+    TooManyArgs,
+}
+
+/// Returns the ROS serialization in a payload, without a check of its content.
+pub(super) fn read_raw(payload: Payload<'_>) -> Result<Cow<'_, [u8]>, PayloadError> {
+    Ok(payload.raw().map_err(Box::new)?.bytes)
+}
 
 /// Converts a payload to a serialized message.
 pub(super) fn decode(
@@ -14,15 +35,15 @@ pub(super) fn decode(
     payload: Payload<'_>,
     compression: Compression,
     source: Option<&Bytes>,
-) -> Result<Bytes, String> {
+) -> Result<Bytes, PayloadError> {
     if compression == Compression::CborRaw {
-        let raw = payload.raw().map_err(|error| error.to_string())?;
-        codec::validate(message_type, &raw.bytes).map_err(|error| error.to_string())?;
-        return Ok(match (&raw.bytes, source) {
-            (std::borrow::Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
+        let raw = read_raw(payload)?;
+        codec::validate(message_type, &raw).map_err(Box::new)?;
+        return Ok(match (&raw, source) {
+            (Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
                 source.slice_ref(slice)
             }
-            _ => Bytes::from(raw.bytes.into_owned()),
+            _ => Bytes::from(raw.into_owned()),
         });
     }
     let options = FillOptions {
@@ -35,7 +56,7 @@ pub(super) fn decode(
         Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
         Format::Cbor => codec::from_cbor(message_type, payload.bytes, &mut out, &options),
     };
-    decoded.map_err(|error| error.to_string())?;
+    decoded.map_err(Box::new)?;
     Ok(Bytes::from(out))
 }
 
@@ -45,17 +66,17 @@ pub(super) fn decode_args(
     message_type: &MessageType,
     args: Option<Payload<'_>>,
     compression: Compression,
-) -> Result<Bytes, String> {
+) -> Result<Bytes, PayloadError> {
     match args {
         None if compression == Compression::CborRaw && !message_type.fields().is_empty() => {
-            Err("field \"args\" is missing, the ROS serialization is expected".to_owned())
+            Err(PayloadError::NoArgs)
         }
         None => decode(message_type, Payload::json("{}"), Compression::None, None),
         Some(list) if list.is_list() && compression != Compression::CborRaw => {
             let fields = message_type.fields();
             let named = list
                 .to_named_object(fields.iter().map(|field| field.name.as_str()))
-                .ok_or("field \"args\" is a list of too many values; name them in an object")?;
+                .ok_or(PayloadError::TooManyArgs)?;
             decode(
                 message_type,
                 Payload {

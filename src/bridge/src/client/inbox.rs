@@ -4,13 +4,24 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use budget::{Budget, Exceeded, Permit};
-use rosbridge::{Fragment, Fragments, Png, ProtocolFrame as Incoming};
+use rosbridge::{Fragment, FragmentError, Fragments, Png, PngError, ProtocolFrame as Incoming};
 
 use super::BridgeClient;
 use crate::shared::BridgeShared;
 
 /// Maximum nesting of fragments and PNG images.
 const MAX_WRAPPING: usize = 4;
+
+/// Reasons why the message within others cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum WrappedMessageError {
+    #[error(transparent)]
+    Fragment(#[from] FragmentError),
+    #[error(transparent)]
+    Png(#[from] PngError),
+    #[error("messages within messages go {limit} deep at most", limit = MAX_WRAPPING)]
+    TooDeep,
+}
 
 /// Incomplete messages of one connection.
 pub(crate) struct Inbox {
@@ -42,11 +53,8 @@ impl BridgeClient {
         inbox: &mut Inbox,
         op: &Fragment<'_>,
         wrapping: usize,
-    ) -> Result<(), String> {
-        let whole = inbox
-            .fragments
-            .add(op, Instant::now())
-            .map_err(|error| error.to_string())?;
+    ) -> Result<(), WrappedMessageError> {
+        let whole = inbox.fragments.add(op, Instant::now())?;
         if let Some(text) = whole {
             self.handle_unwrapped(inbox, &text, wrapping)?;
         }
@@ -58,17 +66,13 @@ impl BridgeClient {
         inbox: &mut Inbox,
         op: &Png<'_>,
         wrapping: usize,
-    ) -> Result<(), String> {
+    ) -> Result<(), WrappedMessageError> {
         let whole = match op.fragment() {
             None => Some(op.data.to_string()),
-            Some(part) => inbox
-                .pictures
-                .add(&part, Instant::now())
-                .map_err(|error| error.to_string())?,
+            Some(part) => inbox.pictures.add(&part, Instant::now())?,
         };
         if let Some(data) = whole {
-            let text = rosbridge::decode_png(&data, self.shared.options.max_png)
-                .map_err(|error| error.to_string())?;
+            let text = rosbridge::decode_png(&data, self.shared.options.max_png)?;
             self.handle_unwrapped(inbox, &text, wrapping)?;
         }
         Ok(())
@@ -79,11 +83,9 @@ impl BridgeClient {
         inbox: &mut Inbox,
         text: &str,
         wrapping: usize,
-    ) -> Result<(), String> {
+    ) -> Result<(), WrappedMessageError> {
         if wrapping == MAX_WRAPPING {
-            return Err(format!(
-                "messages within messages go {MAX_WRAPPING} deep at most"
-            ));
+            return Err(WrappedMessageError::TooDeep);
         }
         self.handle_frame(inbox, Incoming::Text(text), None, wrapping + 1);
         Ok(())

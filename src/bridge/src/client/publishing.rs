@@ -1,17 +1,22 @@
 //! `advertise`, `unadvertise`, `publish`.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::sync::{Arc, Weak};
 
 use access::Operation;
 use bytes::Bytes;
+use ros::bus::{BusError, Digest};
 use ros::schema::MessageType;
-use rosbridge::{Advertise, Compression, Format, Id, Payload, Publish, StatusLevel, Unadvertise};
+use rosbridge::{Advertise, Compression, Payload, Publish, StatusLevel, Unadvertise};
 
-use super::decoding::decode;
+use super::decoding::{PayloadError, decode};
 use super::{BridgeClient, ReplyTarget, remove_matching};
-use crate::lacking::explain_schema_error;
-use crate::names::{digest_word, is_same_type, lookup_name, ros_type_name, type_mismatch};
+use crate::NotGrantedError;
+use crate::client_state::{AdvertisedTopic, TopicPublishers, Untyped};
+use crate::lacking::DefinitionError;
+use crate::names::{
+    DeclaredTypeError, ResolveNameError, digest_word, is_same_type, lookup_name, ros_type_name,
+};
 use crate::quality::{PublisherOffer, publication_offer};
 use crate::tf;
 use crate::topic_publisher::{PublisherEvents, TopicPublisher};
@@ -21,20 +26,53 @@ const MAX_UNTYPED: usize = 64;
 /// Maximum bytes of all such messages of one client; a single message may be larger.
 const MAX_UNTYPED_BYTES: usize = 16 << 20;
 
-/// Topics of a client, by absolute name.
-#[derive(Default)]
-pub(super) struct TopicPublishers {
-    open: HashMap<String, AdvertisedTopic>,
-    untyped: HashMap<String, Vec<Untyped>>,
-    /// Topics for which the client was told why nothing can be published.
-    told: HashSet<String>,
-}
-
-/// A topic that is published until it has been unadvertised as often as it was advertised.
-pub(super) struct AdvertisedTopic {
-    topic_publisher: Arc<TopicPublisher>,
-    /// Ids of its advertisements; empty if it was only published on.
-    ids: HashSet<Option<Id<'static>>>,
+/// Reasons why a client may not advertise a topic, or why its message is not published.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum PublishError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    #[error(transparent)]
+    OtherType(#[from] DeclaredTypeError),
+    #[error("topic {topic}: {source}")]
+    Definition {
+        topic: String,
+        source: DefinitionError,
+    },
+    /// The client gives the digest of another definition.
+    #[error(
+        "type {name} has {word} {ours} here and {theirs} there; use the definition that /rosapi/message_details shows"
+    )]
+    OtherDefinition {
+        name: String,
+        /// Term for the digests.
+        word: &'static str,
+        ours: Digest,
+        theirs: String,
+    },
+    #[error("this client advertises {topic} as {known}; unadvertise it first")]
+    TwoTypes { topic: String, known: String },
+    #[error("this client advertises {0} topics already; unadvertise one")]
+    TooMany(usize),
+    #[error("topic {0} does not exist; advertise it with its type first")]
+    NoTopic(String),
+    /// The type is still being looked up, and the messages that wait for it have this many bytes.
+    #[error(
+        "topic {topic} has no known type yet, and {waiting} bytes wait for one already; advertise it first"
+    )]
+    TooManyUntypedBytes { topic: String, waiting: usize },
+    /// The type is still being looked up, and too many messages wait for it.
+    #[error("topic {0} has no known type yet; advertise it first")]
+    TooManyUntyped(String),
+    /// The type cannot be looked up.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    #[error("topic {topic}: {source}")]
+    Payload { topic: String, source: PayloadError },
+    /// The payload of a message that has waited for its type.
+    #[error(transparent)]
+    UntypedPayload(PayloadError),
 }
 
 impl TopicPublishers {
@@ -81,21 +119,12 @@ impl PublisherEvents for AdvertiseNotifier {
     }
 }
 
-/// A message whose topic's type is being looked up.
-struct Untyped {
-    format: Format,
-    payload: Bytes,
-    compression: Compression,
-    offer: PublisherOffer,
-    reply: ReplyTarget,
-}
-
 impl BridgeClient {
     pub(super) fn advertise(
         self: &Arc<Self>,
         op: &Advertise<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), PublishError> {
         let topic = self.resolve(&op.topic)?;
         self.client_grants().check(Operation::Publish, &topic)?;
         let message_type = self
@@ -108,12 +137,12 @@ impl BridgeClient {
             .as_deref()
             .filter(|digest| *digest != "*" && *digest != message_type.digest())
         {
-            return Err(format!(
-                "type {} has {} {} here and {digest} there; use the definition that /rosapi/message_details shows",
-                message_type.name(),
-                digest_word(self.version()),
-                message_type.digest()
-            ));
+            return Err(PublishError::OtherDefinition {
+                name: message_type.name().to_owned(),
+                word: digest_word(self.version()),
+                ours: message_type.digest().into(),
+                theirs: digest.to_owned(),
+            });
         }
         let offer = publication_offer(self.version(), op.qos, op.latch, op.queue_size);
         self.open_publisher(&topic, message_type, offer, reply, true)?;
@@ -126,7 +155,7 @@ impl BridgeClient {
         &self,
         op: &Unadvertise<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ResolveNameError> {
         let topic = self.resolve(&op.topic)?;
         let mut topic_publishers = self.topic_publishers.lock();
         topic_publishers.told.remove(&*topic);
@@ -159,7 +188,11 @@ impl BridgeClient {
     }
 
     /// Returns the type of this name, if the topic may be published with it.
-    fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, String> {
+    fn publishable_type(
+        &self,
+        topic: &str,
+        type_name: &str,
+    ) -> Result<Arc<MessageType>, PublishError> {
         let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
         let theirs = graph
@@ -170,12 +203,16 @@ impl BridgeClient {
             |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
         if let Some(theirs) = theirs.filter(other) {
             let name = ros_type_name(version, type_name, "msg");
-            return Err(type_mismatch(&format!("topic {topic}"), theirs, &name));
+            let topic = format!("topic {topic}");
+            return Err(DeclaredTypeError::new(topic, theirs, &name).into());
         }
         self.shared
             .registry
             .message(&lookup_name(version, type_name))
-            .map_err(|error| format!("topic {topic}: {}", explain_schema_error(version, error)))
+            .map_err(|error| PublishError::Definition {
+                topic: topic.to_owned(),
+                source: DefinitionError::new(version, error),
+            })
     }
 
     /// Marks that the client is told why nothing can be published on a topic; returns whether it was told before.
@@ -190,7 +227,7 @@ impl BridgeClient {
 
     /// Returns the reason why a message cannot be published, but only for the first such message of its topic: hundreds
     /// of them may follow.
-    fn report_once(&self, topic: &str, reason: String) -> Result<(), String> {
+    fn report_once(&self, topic: &str, reason: PublishError) -> Result<(), PublishError> {
         if self.mark_reported(topic) {
             Ok(())
         } else {
@@ -205,7 +242,7 @@ impl BridgeClient {
         offer: PublisherOffer,
         reply: &ReplyTarget,
         advertised: bool,
-    ) -> Result<Arc<TopicPublisher>, String> {
+    ) -> Result<Arc<TopicPublisher>, PublishError> {
         let limit = self.shared.options.max_advertisements;
         let id = advertised.then(|| reply.id.clone());
         let mut topic_publishers = self.topic_publishers.lock();
@@ -216,18 +253,16 @@ impl BridgeClient {
         if let Some(known) = &known
             && known.topic_publisher.message_type.digest() != message_type.digest()
         {
-            let known = known.topic_publisher.message_type.name();
-            return Err(format!(
-                "this client advertises {topic} as {known}; unadvertise it first"
-            ));
+            return Err(PublishError::TwoTypes {
+                topic: topic.to_owned(),
+                known: known.topic_publisher.message_type.name().to_owned(),
+            });
         }
         let is_new = known
             .as_ref()
             .is_none_or(|known| id.as_ref().is_some_and(|id| !known.ids.contains(id)));
         if is_new && count >= limit {
-            return Err(format!(
-                "this client advertises {limit} topics already; unadvertise one"
-            ));
+            return Err(PublishError::TooMany(limit));
         }
         let mut ids = HashSet::new();
         if let Some(known) = known {
@@ -264,7 +299,7 @@ impl BridgeClient {
         op: Publish<'_>,
         reply: &ReplyTarget,
         source: Option<&Bytes>,
-    ) -> Result<(), String> {
+    ) -> Result<(), PublishError> {
         let topic = self.resolve(&op.topic)?;
         let known = self
             .topic_publishers
@@ -277,6 +312,7 @@ impl BridgeClient {
             None => match self
                 .client_grants()
                 .check(Operation::Publish, &topic)
+                .map_err(PublishError::from)
                 .and_then(|()| self.publish_type(&topic, &op))
             {
                 Ok(Some(message_type)) => {
@@ -293,7 +329,10 @@ impl BridgeClient {
             op.compression,
             source,
         )
-        .map_err(|reason| format!("topic {topic}: {reason}"))?;
+        .map_err(|source| PublishError::Payload {
+            topic: topic.to_string(),
+            source,
+        })?;
         topic_publisher.publish(bytes);
         if op.compression != Compression::CborRaw && self.wants_level(StatusLevel::Warning) {
             self.warn_defaulted_fields(&topic, &topic_publisher.message_type, op.msg, reply);
@@ -331,7 +370,7 @@ impl BridgeClient {
         &self,
         topic: &str,
         op: &Publish<'_>,
-    ) -> Result<Option<Arc<MessageType>>, String> {
+    ) -> Result<Option<Arc<MessageType>>, PublishError> {
         if let Some(name) = &op.type_name {
             return self.publishable_type(topic, name).map(Some);
         }
@@ -343,9 +382,7 @@ impl BridgeClient {
             }
             (_, Some(name)) => self.publishable_type(topic, &name).map(Some),
             (Some(_), None) => Ok(None),
-            (None, None) => Err(format!(
-                "topic {topic} does not exist; advertise it with its type first"
-            )),
+            (None, None) => Err(PublishError::NoTopic(topic.to_owned())),
         }
     }
 
@@ -355,7 +392,7 @@ impl BridgeClient {
         topic: &str,
         op: &Publish<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), PublishError> {
         let waiting = Untyped {
             format: op.msg.format,
             payload: Bytes::copy_from_slice(op.msg.bytes),
@@ -364,23 +401,21 @@ impl BridgeClient {
             reply: reply.clone(),
         };
         let mut topic_publishers = self.topic_publishers.lock();
-        let waiting_bytes: usize = topic_publishers
+        let held: usize = topic_publishers
             .untyped
             .values()
             .flatten()
             .map(|other| other.payload.len())
             .sum();
-        if waiting_bytes > 0 && waiting_bytes + waiting.payload.len() > MAX_UNTYPED_BYTES {
-            return Err(format!(
-                "topic {topic} has no known type yet, and {waiting_bytes} bytes wait for one already; advertise it \
-                 first"
-            ));
+        if held > 0 && held + waiting.payload.len() > MAX_UNTYPED_BYTES {
+            return Err(PublishError::TooManyUntypedBytes {
+                topic: topic.to_owned(),
+                waiting: held,
+            });
         }
         if let Some(others) = topic_publishers.untyped.get_mut(topic) {
             if others.len() >= MAX_UNTYPED {
-                return Err(format!(
-                    "topic {topic} has no known type yet; advertise it first"
-                ));
+                return Err(PublishError::TooManyUntyped(topic.to_owned()));
             }
             others.push(waiting);
             return Ok(());
@@ -401,36 +436,51 @@ impl BridgeClient {
                 .untyped
                 .remove(&topic)
                 .unwrap_or_default();
-            let found = asked.map_err(|error| error.to_string());
-            let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
-            for message in waiting {
-                let done = found.clone().and_then(|message_type| {
-                    let topic_publisher = client.open_publisher(
-                        &topic,
-                        message_type,
-                        message.offer,
-                        &message.reply,
-                        false,
-                    )?;
-                    let payload = Payload {
-                        format: message.format,
-                        bytes: &message.payload,
-                    };
-                    topic_publisher.publish(decode(
-                        &topic_publisher.message_type,
-                        payload,
-                        message.compression,
-                        None,
-                    )?);
-                    Ok(())
-                });
-                if let Err(reason) = done
-                    && !client.mark_reported(&topic)
-                {
-                    client.error(&message.reply, &format!("publish: topic {topic}: {reason}"));
+            let report = |message: &Untyped, error: &PublishError| {
+                if !client.mark_reported(&topic) {
+                    client.error(&message.reply, &format!("publish: topic {topic}: {error}"));
+                }
+            };
+            let found = asked.map_err(PublishError::from);
+            match found.and_then(|wire| client.publishable_type(&topic, &wire.name)) {
+                Ok(message_type) => {
+                    for message in &waiting {
+                        let done = client.publish_untyped(&topic, message_type.clone(), message);
+                        if let Err(error) = done {
+                            report(message, &error);
+                        }
+                    }
+                }
+                Err(error) => {
+                    for message in &waiting {
+                        report(message, &error);
+                    }
                 }
             }
         });
+        Ok(())
+    }
+
+    /// Publishes a message that has waited for this type.
+    fn publish_untyped(
+        self: &Arc<Self>,
+        topic: &str,
+        message_type: Arc<MessageType>,
+        message: &Untyped,
+    ) -> Result<(), PublishError> {
+        let topic_publisher =
+            self.open_publisher(topic, message_type, message.offer, &message.reply, false)?;
+        let payload = Payload {
+            format: message.format,
+            bytes: &message.payload,
+        };
+        let bytes = decode(
+            &topic_publisher.message_type,
+            payload,
+            message.compression,
+            None,
+        );
+        topic_publisher.publish(bytes.map_err(PublishError::UntypedPayload)?);
         Ok(())
     }
 }

@@ -1,28 +1,55 @@
 //! `advertise_service`, `unadvertise_service`, `service_response`: a client serves a service.
 
-use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
 use access::Operation;
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, ServiceHandler, ServiceType};
+use ros::codec::CodecError;
 use ros::schema::ServiceDef;
 use rosbridge::{AdvertiseService, Compression, Id, ServiceResponse, UnadvertiseService, Writer};
 use tokio::sync::{oneshot, watch};
-use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::sync::CancellationToken;
 
-use super::decoding::decode_args;
+use super::decoding::{PayloadError, decode_args};
 use super::{BridgeClient, ReplyTarget, payload_format, remove_matching};
-use crate::lacking::explain_schema_error;
-use crate::names::lookup_name;
+use crate::NotGrantedError;
+use crate::client_state::{ClientServices, PendingCall, ServedService};
+use crate::lacking::DefinitionError;
+use crate::names::{ResolveNameError, lookup_name};
 use crate::sample::EncodedFrame;
 
-/// Services of a client, and the calls it has not answered yet.
-#[derive(Default)]
-pub(super) struct ClientServices {
-    served: HashMap<String, ServedService>,
-    requests: HashMap<String, PendingCall>,
+/// Reasons why a client may not serve a service, or why its answer to a call is not used.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ServingError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    #[error("service {service}: {source}")]
+    Definition {
+        service: String,
+        source: DefinitionError,
+    },
+    #[error("this client serves {0} services already; unadvertise one")]
+    TooMany(usize),
+    #[error("field \"id\" is missing, the id of the call is expected")]
+    NoId,
+    #[error("service {0} is not advertised by this client; advertise_service it first")]
+    NotAdvertised(String),
+    #[error("no call of {service} with id {id:?} waits for an answer")]
+    NoCall { service: String, id: String },
+    /// The call with this id is one of another service.
+    #[error("the call with id {id:?} is one of {called}, not of {service}")]
+    OtherService {
+        id: String,
+        called: String,
+        service: String,
+    },
+    /// The values are not those of the type.
+    #[error(transparent)]
+    Payload(#[from] PayloadError),
 }
 
 impl ClientServices {
@@ -46,20 +73,6 @@ impl ClientServices {
     }
 }
 
-pub(super) struct ServedService {
-    number: u64,
-    /// Registration state; closed without having been true if the registration failed.
-    registered: watch::Receiver<bool>,
-    /// Ends the task that holds the registration.
-    _stop: DropGuard,
-}
-
-struct PendingCall {
-    service: String,
-    def: Arc<ServiceDef>,
-    answer: oneshot::Sender<Result<Bytes, String>>,
-}
-
 /// Forwards calls to the client.
 struct CallHandler {
     client: Weak<BridgeClient>,
@@ -72,8 +85,9 @@ struct CallHandler {
 
 #[async_trait]
 impl ServiceHandler for CallHandler {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let gone = || format!("the client that serves {} is gone", self.service);
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
+        let gone =
+            || FailureReason::new(format!("the client that serves {} is gone", self.service));
         let client = self.client.upgrade().ok_or_else(gone)?;
         client.shared.metrics.calls_served.add(1);
         let id = format!(
@@ -81,7 +95,8 @@ impl ServiceHandler for CallHandler {
             self.service,
             client.shared.next_number()
         );
-        let frame = self.frame(&client, &id, &request)?;
+        let frame = self.frame(&client, &id, &request);
+        let frame = frame.map_err(|error| FailureReason::new(error.to_string()))?;
         let (answer, answered) = oneshot::channel();
         let request = PendingCall {
             service: self.service.clone(),
@@ -99,10 +114,10 @@ impl ServiceHandler for CallHandler {
         match tokio::time::timeout(timeout, answered).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(gone()),
-            Err(_) => Err(format!(
+            Err(_) => Err(FailureReason::new(format!(
                 "the client that serves {} did not answer within {timeout:?}",
                 self.service
-            )),
+            ))),
         }
     }
 }
@@ -113,7 +128,7 @@ impl CallHandler {
         client: &BridgeClient,
         id: &str,
         request: &Bytes,
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + request.len());
         let mut writer = Writer::op(&mut out, format, "call_service", Some(&Id::from(id)));
@@ -151,27 +166,23 @@ impl BridgeClient {
         self: &Arc<Self>,
         op: &AdvertiseService<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ServingError> {
         let service = self.resolve(&op.service)?.into_owned();
         self.client_grants().check(Operation::Advertise, &service)?;
         let def = self
             .shared
             .registry
             .service(&lookup_name(self.version(), &op.type_name))
-            .map_err(|error| {
-                format!(
-                    "service {service}: {}",
-                    explain_schema_error(self.version(), error)
-                )
+            .map_err(|error| ServingError::Definition {
+                service: service.clone(),
+                source: DefinitionError::new(self.version(), error),
             })?;
         let limit = self.shared.options.max_advertisements;
         let number = self.shared.next_number();
         let stop = CancellationToken::new();
         let mut services = self.services.lock();
         if services.len() >= limit && !services.served.contains_key(&service) {
-            return Err(format!(
-                "this client serves {limit} services already; unadvertise one"
-            ));
+            return Err(ServingError::TooMany(limit));
         }
         let (now_registered, registered) = watch::channel(false);
         let served = ServedService {
@@ -269,7 +280,7 @@ impl BridgeClient {
         &self,
         op: &UnadvertiseService<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ResolveNameError> {
         let service = self.resolve(&op.service)?;
         let mut services = self.services.lock();
         let gone = services.served.remove(&*service);
@@ -285,10 +296,9 @@ impl BridgeClient {
             .collect();
         drop(services);
         for request in unanswered {
+            let reason = format!("{service} was unadvertised before it answered");
             // An error means that the caller has given up.
-            let _ = request.answer.send(Err(format!(
-                "{service} was unadvertised before it answered"
-            )));
+            let _ = request.answer.send(Err(FailureReason::new(reason)));
         }
         match gone {
             Some(_) => self.info(
@@ -307,35 +317,30 @@ impl BridgeClient {
     pub(super) fn fail_lost_response(&self, id: &str, reason: &str) {
         let request = self.services.lock().requests.remove(id);
         if let Some(PendingCall { answer, .. }) = request {
+            let reason = format!("the client's answer cannot be used: {reason}");
             // An error means that the caller has given up.
-            let _ = answer.send(Err(format!("the client's answer cannot be used: {reason}")));
+            let _ = answer.send(Err(FailureReason::new(reason)));
         }
     }
 
-    pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), String> {
+    pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), ServingError> {
         let service = self.resolve(&op.service)?;
-        let id = op
-            .id
-            .as_ref()
-            .ok_or("field \"id\" is missing, the id of the call is expected")?
-            .to_string();
+        let id = op.id.as_ref().ok_or(ServingError::NoId)?.to_string();
         let mut services = self.services.lock();
         match services.requests.get(&id) {
             None if !services.served.contains_key(&*service) => {
-                return Err(format!(
-                    "service {service} is not advertised by this client; advertise_service it first"
-                ));
+                return Err(ServingError::NotAdvertised(service.into_owned()));
             }
             None => {
-                return Err(format!(
-                    "no call of {service} with id {id:?} waits for an answer"
-                ));
+                let service = service.into_owned();
+                return Err(ServingError::NoCall { service, id });
             }
             Some(request) if *request.service != *service => {
-                return Err(format!(
-                    "the call with id {id:?} is one of {}, not of {service}",
-                    request.service
-                ));
+                return Err(ServingError::OtherService {
+                    id,
+                    called: request.service.clone(),
+                    service: service.into_owned(),
+                });
             }
             Some(_) => {}
         }
@@ -359,13 +364,19 @@ impl BridgeClient {
                 reason.into_owned()
             };
             // An error means that the caller has given up.
-            let _ = answer.send(Err(reason));
+            let _ = answer.send(Err(FailureReason::new(reason)));
             return Ok(());
         }
-        let response = decode_args(&def.response, op.values, op.compression);
-        let told = response.as_ref().err().cloned();
-        let _ = answer
-            .send(response.map_err(|reason| format!("the client's answer does not fit: {reason}")));
-        told.map_or(Ok(()), Err)
+        match decode_args(&def.response, op.values, op.compression) {
+            Ok(response) => {
+                let _ = answer.send(Ok(response));
+                Ok(())
+            }
+            Err(error) => {
+                let reason = format!("the client's answer does not fit: {error}");
+                let _ = answer.send(Err(FailureReason::new(reason)));
+                Err(error.into())
+            }
+        }
     }
 }

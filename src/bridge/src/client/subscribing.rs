@@ -1,35 +1,53 @@
 //! `subscribe` and `unsubscribe`.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 use std::time::Instant;
 
 use access::Operation;
-use ros::bus::{QosProfile, RosVersion};
+use ros::bus::RosVersion;
 use ros::schema::MessageType;
-use rosbridge::{Compression, Format, Id, StatusLevel, Subscribe, Unsubscribe};
+use rosbridge::{Compression, StatusLevel, Subscribe, Unsubscribe};
 
 use super::{BridgeClient, ReplyTarget};
-use crate::fanout::{Listener, ListenerGuard};
-use crate::lacking::explain_schema_error;
-use crate::names::{is_same_type, lookup_name, ros_type_name, type_mismatch};
-use crate::outbox::{Outbox, TopicKey};
+use crate::NotGrantedError;
+use crate::client_state::{TopicListener, TopicSubscription};
+use crate::fanout::Listener;
+use crate::lacking::DefinitionError;
+use crate::names::{DeclaredTypeError, ResolveNameError, is_same_type, lookup_name, ros_type_name};
+use crate::outbox::TopicKey;
 use crate::quality::{merge_qos, queue_length, subscription_qos};
 use crate::sample::TopicSample;
 use crate::topic_queue::{SubscriptionOptions, Subscriptions};
 
-/// Subscriptions of a client, by the topic name that it uses.
-pub(super) type ClientSubscriptions = HashMap<Arc<str>, TopicSubscription>;
-
-pub(super) struct TopicSubscription {
-    key: TopicKey,
-    subscriptions: Subscriptions,
-    /// Quality of service that each of them requests from publishers.
-    asked: HashMap<Option<Id<'static>>, QosProfile>,
-    /// Type of the topic, if it was known.
-    expected: Option<Arc<MessageType>>,
-    listening: ListenerGuard,
-    listener: Arc<TopicListener>,
+/// Reasons why a client may not subscribe to a topic.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum SubscribeError {
+    #[error(transparent)]
+    Name(#[from] ResolveNameError),
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    #[error(transparent)]
+    OtherType(#[from] DeclaredTypeError),
+    #[error("topic {topic}: {source}")]
+    Definition {
+        topic: String,
+        source: DefinitionError,
+    },
+    #[error(
+        "topic {0} does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing topics"
+    )]
+    NoTopic(String),
+    #[error("this client has {0} subscriptions already; unsubscribe from one")]
+    TooMany(usize),
+    #[error(
+        "this client subscribes to {topic} as {earlier}, not {wanted}; unsubscribe from it first"
+    )]
+    TwoTypes {
+        topic: String,
+        earlier: String,
+        wanted: String,
+    },
 }
 
 impl TopicSubscription {
@@ -37,19 +55,6 @@ impl TopicSubscription {
     pub(super) fn key(&self) -> TopicKey {
         self.key
     }
-}
-
-/// Puts messages of a topic into the client's queue.
-struct TopicListener {
-    outbox: Arc<Outbox>,
-    key: TopicKey,
-    hears_clients: bool,
-    client: Weak<BridgeClient>,
-    topic: Arc<str>,
-    /// Type that the client asked for, if any.
-    wanted: Option<String>,
-    id: Option<Id<'static>>,
-    format: Format,
 }
 
 impl TopicListener {
@@ -96,7 +101,7 @@ impl BridgeClient {
         self: &Arc<Self>,
         op: Subscribe<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), SubscribeError> {
         let name = self.resolve(&op.topic)?;
         self.client_grants().check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
@@ -122,17 +127,17 @@ impl BridgeClient {
             .get(&*op.topic)
             .is_none_or(|known| !known.subscriptions.contains_key(&reply.id));
         if is_new && all >= limit {
-            return Err(format!(
-                "this client has {limit} subscriptions already; unsubscribe from one"
-            ));
+            return Err(SubscribeError::TooMany(limit));
         }
         if let Some(known) = subscribed.get_mut(&*op.topic) {
             if let (Some(wanted), Some(earlier)) = (&wanted, &known.listener.wanted)
                 && !is_same_type(wanted, earlier)
             {
-                return Err(format!(
-                    "this client subscribes to {name} as {earlier}, not {wanted}; unsubscribe from it first"
-                ));
+                return Err(SubscribeError::TwoTypes {
+                    topic: name.into_owned(),
+                    earlier: earlier.clone(),
+                    wanted: wanted.clone(),
+                });
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
             known.asked.insert(reply.id.clone(), qos);
@@ -178,7 +183,7 @@ impl BridgeClient {
         &self,
         topic: &str,
         op: &Subscribe<'_>,
-    ) -> Result<Option<Arc<MessageType>>, String> {
+    ) -> Result<Option<Arc<MessageType>>, SubscribeError> {
         let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
         let nodes = graph.topics.get(topic);
@@ -190,14 +195,12 @@ impl BridgeClient {
         let wanted = op.type_name.as_deref().filter(|name| *name != "*");
         match (wanted, actual) {
             (None, None) if nodes.is_none() => {
-                return Err(format!(
-                    "topic {topic} does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing \
-                        topics"
-                ));
+                return Err(SubscribeError::NoTopic(topic.to_owned()));
             }
             (Some(wanted), Some(actual)) if !is_same_type(wanted, actual) => {
                 let wanted = ros_type_name(version, wanted, "msg");
-                return Err(type_mismatch(&format!("topic {topic}"), actual, &wanted));
+                let topic = format!("topic {topic}");
+                return Err(DeclaredTypeError::new(topic, actual, &wanted).into());
             }
             _ => {}
         }
@@ -211,10 +214,10 @@ impl BridgeClient {
             // Not needed for ROS bytes, and a publisher of ROS 1 sends its own.
             Err(_) if op.compression == Compression::CborRaw => Ok(None),
             Err(_) if version == RosVersion::One && is_published => Ok(None),
-            Err(error) => Err(format!(
-                "topic {topic}: {}",
-                explain_schema_error(version, error)
-            )),
+            Err(error) => Err(SubscribeError::Definition {
+                topic: topic.to_owned(),
+                source: DefinitionError::new(version, error),
+            }),
         }
     }
 
@@ -235,11 +238,7 @@ impl BridgeClient {
         true
     }
 
-    pub(super) fn unsubscribe(
-        &self,
-        op: &Unsubscribe<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    pub(super) fn unsubscribe(&self, op: &Unsubscribe<'_>, reply: &ReplyTarget) {
         let mut subscribed = self.subscriptions.lock();
         let Some(known) = subscribed.get_mut(&*op.topic) else {
             drop(subscribed);
@@ -250,7 +249,7 @@ impl BridgeClient {
                     op.topic
                 ),
             );
-            return Ok(());
+            return;
         };
         let gone = match &reply.id {
             None => true,
@@ -278,6 +277,5 @@ impl BridgeClient {
             reply,
             &format!("unsubscribe: unsubscribed from {}", op.topic),
         );
-        Ok(())
     }
 }

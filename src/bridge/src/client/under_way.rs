@@ -3,10 +3,24 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use budget::{Permit, UNCOUNTED};
+use budget::{Exceeded, Permit, UNCOUNTED};
 use rosbridge::Payload;
 
 use super::BridgeClient;
+
+/// Reasons why a client may not begin another call or goal.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum BeginCallError {
+    #[error(
+        "field \"args\" has {bytes} bytes, which together with the calls and goals under way is more than {limit}; \
+            wait for some to end"
+    )]
+    TooManyBytes { bytes: usize, limit: usize },
+    #[error("{0} calls and goals of this client are under way already; wait for some to end")]
+    TooManyCalls(usize),
+    #[error("field \"args\": {0}")]
+    NoRoom(#[from] Exceeded),
+}
 
 /// Guard of a call or goal in progress.
 pub(super) struct InFlightGuard {
@@ -31,7 +45,7 @@ impl BridgeClient {
     pub(super) fn begin_call(
         self: &Arc<Self>,
         args: Option<Payload<'_>>,
-    ) -> Result<InFlightGuard, String> {
+    ) -> Result<InFlightGuard, BeginCallError> {
         let options = &self.shared.options;
         let limit = options.max_calls;
         let bytes = args.map_or(0, |args| args.bytes.len());
@@ -43,21 +57,17 @@ impl BridgeClient {
             _permit: None,
         };
         if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
-            return Err(format!(
-                "field \"args\" has {bytes} bytes, which together with the calls and goals under way is more than {}; \
-                    wait for some to end",
-                options.max_call_bytes
-            ));
+            return Err(BeginCallError::TooManyBytes {
+                bytes,
+                limit: options.max_call_bytes,
+            });
         }
         if before >= limit {
-            return Err(format!(
-                "{limit} calls and goals of this client are under way already; wait for some to end"
-            ));
+            return Err(BeginCallError::TooManyCalls(limit));
         }
         if bytes_before.saturating_add(bytes) > UNCOUNTED {
             // They wait for a servant, possibly for long.
-            let permit = self.budget.take(bytes);
-            guard._permit = Some(permit.map_err(|full| format!("field \"args\": {full}"))?);
+            guard._permit = Some(self.budget.take(bytes)?);
         }
         Ok(guard)
     }

@@ -14,7 +14,7 @@ use ws::frame;
 use super::{BridgeConnection, MOVED, SOCKET_FULL, StopReason};
 use crate::cut::Fragmenter;
 use crate::outbox::{ControlMessage, Outgoing, TopicKey};
-use crate::sample::{EncodedFrame, TopicSample};
+use crate::sample::{EncodedFrame, SampleError, TopicSample};
 
 impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     /// Moves queued frames into the socket. Ready when none is left, pending when the socket accepts no more.
@@ -137,7 +137,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
             };
             match held {
                 Ok(permit) => Ok(frame.with_permit(permit)),
-                Err(full) => Err(Arc::from(format!("a message was dropped: {full}"))),
+                Err(full) => Err(Arc::new(SampleError::NoRoomAtClient(full))),
             }
         });
         match held {

@@ -6,11 +6,12 @@ use std::sync::Arc;
 use budget::Budget;
 use futures_util::StreamExt;
 use futures_util::stream;
-use ros::bus::{BusError, NodeParameters, ParamValue};
+use ros::bus::{BusError, ParamValue};
 use serde_json::{Value, json};
 
 use super::Args;
-use super::params::{GivenValue, bus_error_text, parse_default, to_json_text};
+use super::param_error::ParamRequestError;
+use super::params::{GivenValue, parse_default, to_json_text};
 use crate::names::resolve;
 use crate::shared::BridgeShared;
 
@@ -24,24 +25,18 @@ struct NodeParam {
 }
 
 /// Parses the name of the requested parameter.
-fn parse_name(shared: &BridgeShared, args: &Args) -> Result<NodeParam, String> {
-    const EXPECTED: &str = "a node and its parameter such as \"/camera:exposure\" is expected";
+fn parse_name(shared: &BridgeShared, args: &Args) -> Result<NodeParam, ParamRequestError> {
     match args.name.split_once(':') {
         Some((node, parameter)) if !parameter.is_empty() => Ok(NodeParam {
             node: resolve(shared.bus.version(), node)?.into_owned(),
             parameter: parameter.to_owned(),
         }),
-        _ if args.name.is_empty() => Err(format!("field \"name\" is missing, {EXPECTED}")),
+        _ if args.name.is_empty() => Err(ParamRequestError::NoNodeName),
         _ => {
-            let shown: String = args.name.chars().take(64).collect();
-            Err(format!("field \"name\" is {shown:?}, {EXPECTED}"))
+            let shown = args.name.chars().take(64).collect();
+            Err(ParamRequestError::NotOfNode(shown))
         }
     }
-}
-
-/// Returns the interface to the parameters of nodes.
-fn node_parameters(shared: &BridgeShared) -> Result<&dyn NodeParameters, String> {
-    shared.bus.node_parameters().map_err(bus_error_text)
 }
 
 /// Returns whether the queried node does not exist; then it has no such parameter either.
@@ -50,13 +45,13 @@ fn is_absence(error: &BusError) -> bool {
 }
 
 /// Reads a parameter; `None` if the node or the parameter does not exist.
-async fn read_value(shared: &BridgeShared, of: &NodeParam) -> Result<Option<ParamValue>, String> {
-    let parameters = node_parameters(shared)?;
+async fn read_value(shared: &BridgeShared, of: &NodeParam) -> Result<Option<ParamValue>, BusError> {
+    let parameters = shared.bus.node_parameters()?;
     let names = [of.parameter.clone()];
     match parameters.get(&of.node, &names).await {
         Ok(values) => Ok(values.into_iter().next().flatten()),
         Err(error) if is_absence(&error) => Ok(None),
-        Err(error) => Err(bus_error_text(error)),
+        Err(error) => Err(error),
     }
 }
 
@@ -70,7 +65,10 @@ fn absence_reason(shared: &BridgeShared, NodeParam { node, parameter }: &NodePar
     }
 }
 
-pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+pub(super) async fn get(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     let value = match read_value(shared, &of).await? {
         Some(value) => Some(to_json_text(&value)?),
@@ -90,18 +88,19 @@ async fn change(
     shared: &BridgeShared,
     of: NodeParam,
     value: Option<ParamValue>,
-) -> Result<Value, String> {
-    let parameters = node_parameters(shared)?;
+) -> Result<Value, ParamRequestError> {
+    let parameters = shared.bus.node_parameters()?;
     let NodeParam { node, parameter } = of;
     let changes = vec![(parameter.clone(), value)];
-    let done = parameters
-        .set(&node, changes)
-        .await
-        .map_err(bus_error_text)?;
+    let done = parameters.set(&node, changes).await?;
     match done.into_iter().next() {
         Some(Ok(())) => Ok(json!({ "successful": true, "reason": "" })),
-        Some(Err(reason)) => Err(format!("node {node} refuses {parameter}: {reason}")),
-        None => Err(format!("node {node} did not answer for {parameter}")),
+        Some(Err(reason)) => Err(ParamRequestError::Refused {
+            node,
+            parameter,
+            reason,
+        }),
+        None => Err(ParamRequestError::Unanswered { node, parameter }),
     }
 }
 
@@ -109,18 +108,24 @@ pub(super) async fn set(
     shared: &Arc<BridgeShared>,
     args: &Args,
     budget: &Budget,
-) -> Result<Value, String> {
+) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     let given = GivenValue::read(args, budget)?;
     change(shared, of, Some(given.value)).await
 }
 
-pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+pub(super) async fn has(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     Ok(json!({ "exists": read_value(shared, &of).await?.is_some() }))
 }
 
-pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+pub(super) async fn delete(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     match read_value(shared, &of).await? {
         Some(_) => change(shared, of, None).await,
@@ -130,8 +135,9 @@ pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Va
 }
 
 /// Returns the parameters of all nodes that offer them; nodes that do not answer are left out.
-pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, String> {
-    node_parameters(shared)?;
+pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, ParamRequestError> {
+    // Fails here where no node has parameters of its own.
+    shared.bus.node_parameters()?;
     let graph = shared.bus.graph().borrow().clone();
     let own = shared.bus.node();
     let nodes = graph.nodes.keys().filter(|node| *node != own);

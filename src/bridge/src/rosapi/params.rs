@@ -8,26 +8,20 @@ use serde::de::IgnoredAny;
 use serde_json::{Value, json};
 
 use super::Args;
+use super::param_error::{LONGEST_DEFAULT, ParamRequestError};
 use crate::names::resolve;
 use crate::shared::BridgeShared;
 
-fn param_name(args: &Args) -> Result<String, String> {
+fn param_name(args: &Args) -> Result<String, ParamRequestError> {
     match args.name.as_str() {
-        "" => Err("field \"name\" is missing, a parameter's name is expected".to_owned()),
+        "" => Err(ParamRequestError::NoName),
         "/" => Ok("/".to_owned()),
-        name => resolve(RosVersion::One, name).map(|name| name.into_owned()),
+        name => Ok(resolve(RosVersion::One, name)?.into_owned()),
     }
 }
 
-pub(super) fn bus_error_text(error: BusError) -> String {
-    error.to_string()
-}
-
-/// Maximum bytes of a default. A caller need not have a longer one sent back to itself.
-const LONGEST_DEFAULT: usize = 1 << 20;
-
 /// Returns the default given by the caller for a missing parameter, as JSON; `None` if there is none.
-pub(super) fn parse_default(args: &Args) -> Result<Option<String>, String> {
+pub(super) fn parse_default(args: &Args) -> Result<Option<String>, ParamRequestError> {
     let (field, default) = match args.default.as_str() {
         "" => ("default_value", args.default_value.as_str()),
         default => ("default", default),
@@ -36,10 +30,10 @@ pub(super) fn parse_default(args: &Args) -> Result<Option<String>, String> {
         return Ok(None);
     }
     if default.len() > LONGEST_DEFAULT {
-        return Err(format!(
-            "field {field:?} has {} bytes, at most {LONGEST_DEFAULT} are taken",
-            default.len()
-        ));
+        return Err(ParamRequestError::LongDefault {
+            field,
+            length: default.len(),
+        });
     }
     // Only validated: a parsed tree would take many times its bytes.
     let json = serde_json::from_str::<IgnoredAny>(default);
@@ -51,15 +45,18 @@ pub(super) fn parse_default(args: &Args) -> Result<Option<String>, String> {
 }
 
 /// Formats a value as JSON text.
-pub(super) fn to_json_text(value: &ParamValue) -> Result<String, String> {
-    serde_json::to_string(value).map_err(|error| error.to_string())
+pub(super) fn to_json_text(value: &ParamValue) -> Result<String, ParamRequestError> {
+    serde_json::to_string(value).map_err(ParamRequestError::Print)
 }
 
-pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+pub(super) async fn get(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
     let value = match shared.bus.parameter(&param_name(args)?).await {
         Ok(value) => to_json_text(&value)?,
         Err(BusError::NoParam(_)) => parse_default(args)?.unwrap_or_else(|| "null".to_owned()),
-        Err(error) => return Err(bus_error_text(error)),
+        Err(error) => return Err(error.into()),
     };
     Ok(json!({ "value": value }))
 }
@@ -78,32 +75,25 @@ impl GivenValue {
     ///
     /// # Errors
     /// Fails if it is not JSON, contains null, is larger or deeper than allowed, or has no room in `budget`.
-    pub(super) fn read(args: &Args, budget: &Budget) -> Result<Self, String> {
+    pub(super) fn read(args: &Args, budget: &Budget) -> Result<Self, ParamRequestError> {
         let mut held = budget.permit();
         let weight = JsonWeight::estimate(args.value.as_bytes());
-        let counted = held.count(TREES * weight.bytes);
-        counted.map_err(|full| format!("field \"value\": {full}"))?;
+        held.count(TREES * weight.bytes)?;
         let value = serde_json::from_str(&args.value);
-        let value = value.map_err(|error| value_error(&args.value, &error))?;
+        let value = value.map_err(|error| value_error(&args.value, error))?;
         Ok(Self { value, _held: held })
     }
 }
 
-/// Explains why a value is invalid.
-fn value_error(text: &str, error: &serde_json::Error) -> String {
-    let shown: String = text.chars().take(48).collect();
+/// Returns the reason why a value is invalid, given the error of parsing it as a parameter's.
+fn value_error(text: &str, source: serde_json::Error) -> ParamRequestError {
+    let shown = text.chars().take(48).collect();
     let given = serde_json::from_str::<Value>(text);
-    match given.as_ref().map(|given| find_null(given, String::new())) {
-        Ok(Some(place)) if place.is_empty() => {
-            "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one".to_owned()
-        }
-        Ok(Some(place)) => {
-            format!("field \"value\" holds null at {place}, which no ROS parameter can; leave it out")
-        }
-        Ok(None) => format!("field \"value\" is {shown:?}, which no ROS parameter can be: {error}"),
-        Err(_) => format!(
-            "field \"value\" is {shown:?}, JSON text (a boolean, number, string, list or object) is expected"
-        ),
+    match given.map(|given| find_null(&given, String::new())) {
+        Ok(Some(place)) if place.is_empty() => ParamRequestError::Null,
+        Ok(Some(place)) => ParamRequestError::NullInside(place),
+        Ok(None) => ParamRequestError::Unfit { shown, source },
+        Err(_) => ParamRequestError::NotJson(shown),
     }
 }
 
@@ -111,11 +101,10 @@ pub(super) async fn set(
     shared: &Arc<BridgeShared>,
     args: &Args,
     budget: &Budget,
-) -> Result<Value, String> {
+) -> Result<Value, ParamRequestError> {
     let (key, given) = (param_name(args)?, GivenValue::read(args, budget)?);
-    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
-    let set = parameters.set(&key, given.value);
-    set.await.map_err(bus_error_text)?;
+    let parameters = shared.bus.parameters()?;
+    parameters.set(&key, given.value).await?;
     Ok(json!({}))
 }
 
@@ -134,29 +123,37 @@ fn find_null(value: &Value, place: String) -> Option<String> {
     }
 }
 
-pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
-    Ok(json!({ "exists": parameters.has(&param_name(args)?).await.map_err(bus_error_text)? }))
+pub(super) async fn has(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
+    let parameters = shared.bus.parameters()?;
+    Ok(json!({ "exists": parameters.has(&param_name(args)?).await? }))
 }
 
-pub(super) async fn search(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
+pub(super) async fn search(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
+    let parameters = shared.bus.parameters()?;
     let found = parameters.search("/", args.name.trim_start_matches('/'));
-    let found = found.await.map_err(bus_error_text)?;
-    Ok(json!({ "global_name": found.unwrap_or_default() }))
+    Ok(json!({ "global_name": found.await?.unwrap_or_default() }))
 }
 
-pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
+pub(super) async fn delete(
+    shared: &Arc<BridgeShared>,
+    args: &Args,
+) -> Result<Value, ParamRequestError> {
+    let parameters = shared.bus.parameters()?;
     match parameters.delete(&param_name(args)?).await {
         Ok(()) | Err(BusError::NoParam(_)) => Ok(json!({})),
-        Err(error) => Err(bus_error_text(error)),
+        Err(error) => Err(error.into()),
     }
 }
 
-pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
-    Ok(json!({ "names": parameters.names().await.map_err(bus_error_text)? }))
+pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, ParamRequestError> {
+    let parameters = shared.bus.parameters()?;
+    Ok(json!({ "names": parameters.names().await? }))
 }
 
 #[cfg(test)]
@@ -181,7 +178,7 @@ mod tests {
         // Less than a megabyte.
         let maps = format!("[{}1]", r#"{"":1},"#.repeat(100_000));
         let full = GivenValue::read(&args_with_value(&maps), &budget).err();
-        let full = full.expect("it has no room");
+        let full = full.expect("it has no room").to_string();
         assert!(full.contains("the memory for client x"), "{full}");
         assert_eq!(budget.used_bytes(), 0);
     }
@@ -198,7 +195,7 @@ mod tests {
             (deep.as_str(), "more than 100 deep"),
         ] {
             let refused = GivenValue::read(&args_with_value(value), &budget).err();
-            let refused = refused.expect(value);
+            let refused = refused.expect(value).to_string();
             assert!(refused.contains(words), "{refused}");
         }
     }
@@ -211,12 +208,13 @@ mod tests {
                 ..Args::default()
             })
         };
-        assert_eq!(of(""), Ok(None));
-        assert_eq!(of(" [1, 2]\n"), Ok(Some("[1, 2]".to_owned())));
-        assert_eq!(of("a \"b"), Ok(Some(r#""a \"b""#.to_owned())));
+        assert_eq!(of("").unwrap(), None);
+        assert_eq!(of(" [1, 2]\n").unwrap(), Some("[1, 2]".to_owned()));
+        assert_eq!(of("a \"b").unwrap(), Some(r#""a \"b""#.to_owned()));
         let longest = "1".repeat(LONGEST_DEFAULT);
         assert!(of(&longest).is_ok());
         let refused = of(&format!("{longest}1")).expect_err("it is longer");
+        let refused = refused.to_string();
         assert!(refused.contains("at most 1048576"), "{refused}");
     }
 }

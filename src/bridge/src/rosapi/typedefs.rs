@@ -11,7 +11,7 @@ use ros::schema::{
 use serde_json::{Value, json};
 
 use super::find_with_own;
-use crate::lacking::explain_schema_error;
+use crate::lacking::DefinitionError;
 use crate::names::{lookup_name, short_type_name};
 
 /// Accessor of a part of an action.
@@ -26,7 +26,7 @@ pub(super) struct Definitions<'r> {
 
 impl Definitions<'_> {
     /// Describes a message.
-    pub(super) fn message(self, type_name: &str) -> Result<Value, String> {
+    pub(super) fn message(self, type_name: &str) -> Result<Value, DefinitionError> {
         if self.version == RosVersion::One
             && let Some(special) = time_typedef(&short_type_name(type_name))
         {
@@ -41,12 +41,12 @@ impl Definitions<'_> {
     }
 
     /// Describes the request of a service.
-    pub(super) fn request(self, type_name: &str) -> Result<Value, String> {
+    pub(super) fn request(self, type_name: &str) -> Result<Value, DefinitionError> {
         self.service_part(type_name, |service| &service.request)
     }
 
     /// Describes the response of a service.
-    pub(super) fn response(self, type_name: &str) -> Result<Value, String> {
+    pub(super) fn response(self, type_name: &str) -> Result<Value, DefinitionError> {
         self.service_part(type_name, |service| &service.response)
     }
 
@@ -54,14 +54,18 @@ impl Definitions<'_> {
         self,
         type_name: &str,
         part: fn(&ServiceDef) -> &Arc<MessageType>,
-    ) -> Result<Value, String> {
+    ) -> Result<Value, DefinitionError> {
         self.details(type_name, |registry, name| {
             registry.service(name).map(|service| part(&service).clone())
         })
     }
 
     /// Describes a part of an action.
-    pub(super) fn action_part(self, type_name: &str, part: ActionPart) -> Result<Value, String> {
+    pub(super) fn action_part(
+        self,
+        type_name: &str,
+        part: ActionPart,
+    ) -> Result<Value, DefinitionError> {
         self.details(type_name, |registry, name| {
             registry.action(name).map(|action| part(&action).clone())
         })
@@ -71,12 +75,12 @@ impl Definitions<'_> {
         self,
         type_name: &str,
         find: impl Fn(&Registry, &str) -> Result<Arc<MessageType>, SchemaError>,
-    ) -> Result<Value, String> {
+    ) -> Result<Value, DefinitionError> {
         let name = lookup_name(self.version, type_name);
         let found = find_with_own(self.version, self.registry, |registry| {
             find(registry, &name)
         });
-        let found = found.map_err(|error| explain_schema_error(self.version, error))?;
+        let found = found.map_err(|error| DefinitionError::new(self.version, error))?;
         Ok(typedefs(&found))
     }
 }

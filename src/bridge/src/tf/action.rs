@@ -15,7 +15,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::action_name;
 use super::republish::ACTION;
-use super::sending::{TransformRequest, check_limits, send_transforms};
+use super::sending::{TransformRequest, TransformRequestError, check_limits, send_transforms};
 use crate::names::is_same_type;
 use crate::shared::BridgeShared;
 
@@ -56,13 +56,18 @@ pub(crate) fn own_action_client(
 }
 
 impl TfGoals {
-    fn begin(&self, id: &str, goal: &[u8], events: Arc<dyn GoalEvents>) -> Result<(), String> {
-        let shared = self.shared.upgrade().ok_or("the bridge has ended")?;
+    fn begin(
+        &self,
+        id: &str,
+        goal: &[u8],
+        events: Arc<dyn GoalEvents>,
+    ) -> Result<(), TransformRequestError> {
+        let shared = self.shared.upgrade();
+        let shared = shared.ok_or(TransformRequestError::BridgeEnded)?;
         let mut json = Vec::new();
         codec::to_json(&self.of.goal, goal, &mut json, &JsonOptions::default())
-            .map_err(|error| error.to_string())?;
-        let wanted: TransformRequest =
-            serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+            .map_err(Box::new)?;
+        let wanted: TransformRequest = serde_json::from_slice(&json)?;
         let stop = CancellationToken::new();
         {
             let mut under_way = self.under_way.lock();
@@ -102,10 +107,10 @@ impl ActionClient for TfGoals {
     }
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        if let Err(text) = self.begin(id, &goal, events.clone()) {
+        if let Err(error) = self.begin(id, &goal, events.clone()) {
             events.on_ended(Ok(GoalEnd {
                 outcome: GoalOutcome::Rejected,
-                text,
+                text: error.to_string(),
                 result: Bytes::new(),
             }));
         }

@@ -3,12 +3,12 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use parking_lot::Mutex;
 use ros::codec::{Time, Value};
 use ros::schema::MessageType;
 
 use super::transform::Transform;
-use crate::fanout::{Listener, ListenerGuard};
+use crate::fanout::Listener;
+use crate::republisher::{FrameLink, Frames, TransformBuffer};
 use crate::sample::TopicSample;
 use crate::shared::BridgeShared;
 
@@ -16,26 +16,6 @@ use crate::shared::BridgeShared;
 const MAX_FRAMES: usize = 10_000;
 /// Maximum number of links between a frame and the root.
 const MAX_DEPTH: usize = 1000;
-
-/// The known transforms; subscribed for as long as it lives.
-pub(super) struct TransformBuffer {
-    frames: Arc<Frames>,
-    _listening: [ListenerGuard; 2],
-}
-
-#[derive(Default)]
-pub(super) struct Frames {
-    /// Links by child frame.
-    links: Mutex<HashMap<String, FrameLink>>,
-}
-
-/// Pose of a frame in its parent.
-struct FrameLink {
-    parent: String,
-    transform: Transform,
-    /// Time of the transform; `None` for static ones.
-    time: Option<Time>,
-}
 
 /// Pose of one frame relative to another.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,22 +1,23 @@
 //! Requests for transforms, by the service and by the topics of the action.
 
-use std::collections::HashMap;
-use std::sync::{Arc, OnceLock, Weak};
+use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use parking_lot::Mutex;
 use ros::bus::{PeerId, RosVersion, SerializedMessage, WireType};
 use ros::codec::{self, JsonOptions, Time};
 use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
-use ros::schema::{MessageType, ServiceDef};
+use ros::schema::{MessageType, SchemaError, ServiceDef};
 use tokio::time::Instant;
-use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::sync::CancellationToken;
 
-use super::sending::{TransformRequest, check_limits, newest_listener_on, send_transforms};
-use super::{SharedBuffer, TransformBuffer, array_name, package};
-use crate::fanout::{Listener, ListenerGuard};
-use crate::own::{Caller, OwnService};
+use super::sending::{
+    TransformRequest, TransformRequestError, check_limits, newest_listener_on, send_transforms,
+};
+use super::{array_name, package};
+use crate::fanout::Listener;
+use crate::own_service::{Caller, OwnService, OwnServiceError};
+use crate::republisher::{Republisher, TransformBuffer};
 use crate::sample::TopicSample;
 use crate::shared::BridgeShared;
 
@@ -54,25 +55,14 @@ const TOPIC_PREFIX: &str = "/tf_repub_";
 /// Name of the action, and of the node that appears to publish.
 pub(crate) const ACTION: &str = "/tf2_web_republisher";
 
-/// The republisher of a bridge.
-#[derive(Default)]
-pub(crate) struct Republisher {
-    buffer: SharedBuffer,
-    topics: Mutex<HashMap<String, DropGuard>>,
-    goals: Mutex<HashMap<String, DropGuard>>,
-    /// Set when a client first uses the action.
-    listening: OnceLock<[ListenerGuard; 2]>,
-}
-
 /// The service `/republish_tfs`.
 pub(crate) struct RepublishTfs;
 
 #[async_trait]
 impl OwnService for RepublishTfs {
-    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, String> {
+    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, SchemaError> {
         let name = format!("{}/RepublishTFs", package(shared.bus.version()));
-        let found = shared.registry.service(&name);
-        found.map_err(|error| error.to_string())
+        shared.registry.service(&name)
     }
 
     async fn answer(
@@ -80,7 +70,7 @@ impl OwnService for RepublishTfs {
         shared: &Arc<BridgeShared>,
         args: &[u8],
         _: &Caller<'_>,
-    ) -> Result<Vec<u8>, String> {
+    ) -> Result<Vec<u8>, OwnServiceError> {
         shared.republisher.call(shared, args)
     }
 }
@@ -93,9 +83,9 @@ impl Republisher {
     }
 
     /// Answers a call of the service; request and response are JSON.
-    fn call(&self, shared: &Arc<BridgeShared>, request: &[u8]) -> Result<Vec<u8>, String> {
+    fn call(&self, shared: &Arc<BridgeShared>, request: &[u8]) -> Result<Vec<u8>, OwnServiceError> {
         let wanted: TransformRequest =
-            serde_json::from_slice(request).map_err(|error| format!("args: {error}"))?;
+            serde_json::from_slice(request).map_err(OwnServiceError::Args)?;
         check_limits(&wanted, self.topics.lock().len())?;
         let topic = format!("{TOPIC_PREFIX}{}", shared.next_number());
         let stop = CancellationToken::new();
@@ -107,7 +97,7 @@ impl Republisher {
             topic.clone(),
             shared.registry.message(array_name(shared.bus.version())),
         );
-        let message_type = message_type.map_err(|error| error.to_string())?;
+        let message_type = message_type?;
         let mut heard = Instant::now();
         let of = message_type.clone();
         let deliver = move |shared: &Arc<BridgeShared>, transforms: Option<Vec<u8>>| {
@@ -184,16 +174,13 @@ impl Republisher {
         goal: GoalId,
         body: &[u8],
         publisher: PeerId,
-    ) -> Result<(), String> {
+    ) -> Result<(), TransformRequestError> {
         let action = shared
             .registry
-            .action("tf2_web_republisher/TFSubscription")
-            .map_err(|error| error.to_string())?;
+            .action("tf2_web_republisher/TFSubscription")?;
         let mut json = Vec::new();
-        codec::to_json(&action.goal, body, &mut json, &JsonOptions::default())
-            .map_err(|error| error.to_string())?;
-        let wanted: TransformRequest =
-            serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+        codec::to_json(&action.goal, body, &mut json, &JsonOptions::default()).map_err(Box::new)?;
+        let wanted: TransformRequest = serde_json::from_slice(&json)?;
         check_limits(&wanted, self.goals.lock().len())?;
         let stop = CancellationToken::new();
         self.goals

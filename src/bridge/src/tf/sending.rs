@@ -4,15 +4,16 @@ use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use ros::codec::Time;
-use ros::schema::MessageType;
+use ros::codec::{CodecError, Time};
+use ros::schema::{MessageType, SchemaError};
 use serde::Deserialize;
 use tokio_util::sync::CancellationToken;
 
 use super::buffer::FramePose;
 use super::transform::Transform;
-use super::{TransformBuffer, buffer, write_transforms};
+use super::{buffer, write_transforms};
 use crate::clock;
+use crate::republisher::TransformBuffer;
 use crate::shared::BridgeShared;
 
 /// Maximum number of requests served at once.
@@ -65,18 +66,37 @@ impl TransformRequest {
     }
 }
 
+/// Reasons why a request for transforms is refused.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TransformRequestError {
+    #[error("source_frames has {0} entries, at most {limit} are allowed", limit = MAX_SOURCES)]
+    TooManySources(usize),
+    #[error("{limit} requests for transforms are served already; cancel some", limit = MAX_REQUESTS)]
+    TooManyRequests,
+    #[error("the bridge has ended")]
+    BridgeEnded,
+    /// The action is not defined here.
+    #[error(transparent)]
+    Schema(#[from] SchemaError),
+    /// The goal is not a message of the action.
+    #[error(transparent)]
+    Goal(#[from] Box<CodecError>),
+    /// The fields of the goal are not those of a request.
+    #[error(transparent)]
+    Fields(#[from] serde_json::Error),
+}
+
 /// Refuses requests above the limits.
-pub(super) fn check_limits(wanted: &TransformRequest, requests: usize) -> Result<(), String> {
-    if wanted.source_frames.len() > MAX_SOURCES {
-        return Err(format!(
-            "source_frames has {} entries, at most {MAX_SOURCES} are allowed",
-            wanted.source_frames.len()
-        ));
+pub(super) fn check_limits(
+    wanted: &TransformRequest,
+    requests: usize,
+) -> Result<(), TransformRequestError> {
+    let sources = wanted.source_frames.len();
+    if sources > MAX_SOURCES {
+        return Err(TransformRequestError::TooManySources(sources));
     }
     if requests >= MAX_REQUESTS {
-        return Err(format!(
-            "{MAX_REQUESTS} requests for transforms are served already; cancel some"
-        ));
+        return Err(TransformRequestError::TooManyRequests);
     }
     Ok(())
 }

@@ -2,19 +2,19 @@
 
 /// A rotation (unit quaternion x, y, z, w) followed by a translation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Transform {
-    pub(super) translation: [f64; 3],
-    pub(super) rotation: [f64; 4],
+pub(crate) struct Transform {
+    pub(crate) translation: [f64; 3],
+    pub(crate) rotation: [f64; 4],
 }
 
 impl Transform {
-    pub(super) const IDENTITY: Transform = Transform {
+    pub(crate) const IDENTITY: Transform = Transform {
         translation: [0.0; 3],
         rotation: [0.0, 0.0, 0.0, 1.0],
     };
 
     /// Returns the composition: first `other`, then this transform.
-    pub(super) fn compose(&self, other: &Transform) -> Transform {
+    pub(crate) fn compose(&self, other: &Transform) -> Transform {
         let moved = rotate(self.rotation, other.translation);
         Transform {
             translation: std::array::from_fn(|at| moved[at] + self.translation[at]),
@@ -22,7 +22,7 @@ impl Transform {
         }
     }
 
-    pub(super) fn inverse(&self) -> Transform {
+    pub(crate) fn inverse(&self) -> Transform {
         let [x, y, z, w] = self.rotation;
         let rotation = [-x, -y, -z, w];
         Transform {
@@ -32,7 +32,7 @@ impl Transform {
     }
 
     /// Returns the distance between two transforms: metres, radians.
-    pub(super) fn distance(&self, other: &Transform) -> (f64, f64) {
+    pub(crate) fn distance(&self, other: &Transform) -> (f64, f64) {
         let squares = (0..3).map(|at| (self.translation[at] - other.translation[at]).powi(2));
         let dot: f64 = (0..4)
             .map(|at| self.rotation[at] * other.rotation[at])
@@ -41,7 +41,7 @@ impl Transform {
     }
 
     /// Returns the transform with a normalized rotation; `None` if that is impossible.
-    pub(super) fn normalize(mut self) -> Option<Transform> {
+    pub(crate) fn normalize(mut self) -> Option<Transform> {
         let length = self
             .rotation
             .iter()

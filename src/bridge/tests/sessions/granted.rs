@@ -6,7 +6,7 @@ use access::{ConnectionAccess, Grants};
 use async_trait::async_trait;
 use bridge::{ClientGrants, SessionEnd, SessionOptions};
 use bytes::Bytes;
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::watch;
 
@@ -28,7 +28,7 @@ struct Nothing;
 
 #[async_trait]
 impl ServiceHandler for Nothing {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(Bytes::new())
     }
 }

@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionOptions};
 use budget::Budget;
 use bytes::Bytes;
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, ServiceHandler, ServiceType};
 use serde_json::{Value, json};
 
 use super::support::{Client, World, patient, wait_connected, with_timeout};
@@ -196,7 +196,7 @@ struct Says(Bytes);
 
 #[async_trait]
 impl ServiceHandler for Says {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(self.0.clone())
     }
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bridge::{BridgeOptions, RequestObserver};
 use bytes::Bytes;
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::mpsc;
 
@@ -36,11 +36,11 @@ struct Refuses(usize);
 
 #[async_trait::async_trait]
 impl ServiceHandler for Refuses {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let (header, numbers) = request.split_at(self.0);
         match numbers[0] {
             0 => Ok([header, &numbers[8..]].concat().into()),
-            _ => Err("not today".to_owned()),
+            _ => Err(FailureReason::new("not today")),
         }
     }
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
-use ros::bus::{ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, ServiceHandler, ServiceType};
 use ros::codec;
 use serde_json::json;
 use tokio::sync::Notify;
@@ -25,7 +25,7 @@ struct Gated(Arc<Notify>, Bytes);
 
 #[async_trait]
 impl ServiceHandler for Gated {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         self.0.notified().await;
         Ok(self.1.clone())
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionOptions};
 use bytes::Bytes;
-use ros::bus::{Digest, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{Digest, FailureReason, RosVersion, ServiceHandler, ServiceType};
 use rosbridge::{CallService, Compression, Format, Op, Payload, ProtocolFrame};
 use serde_json::{Value, json};
 use tokio::sync::Notify;
@@ -28,7 +28,7 @@ impl Add {
 
 #[async_trait]
 impl ServiceHandler for Add {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         if let Some(gate) = &self.gate {
             gate.notified().await;
         }
@@ -36,7 +36,7 @@ impl ServiceHandler for Add {
         let number = |at: usize| i64::from_le_bytes(numbers[at..at + 8].try_into().unwrap());
         match number(0).checked_add(number(8)) {
             Some(sum) => Ok([header, &sum.to_le_bytes()].concat().into()),
-            None => Err("too much".to_owned()),
+            None => Err(FailureReason::new("too much")),
         }
     }
 }

@@ -19,7 +19,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use api::dictionary::Row;
-use api::sla::{Goal, check_aux};
+use api::limits::UnusableLimits;
+use api::sla::{AuxError, Goal, ParseValueError, check_aux};
 use api::{Limits, Measure};
 
 use super::Amount;
@@ -186,9 +187,10 @@ impl<'a> DictionaryView<'a> {
 
 /// Compares two values of a measure; the better one is less.
 fn compare_values(measure: Measure, one: f64, other: f64) -> std::cmp::Ordering {
-    match measure {
-        Measure::Rrt | Measure::Age => one.total_cmp(&other),
-        Measure::Fps => other.total_cmp(&one),
+    if measure.is_less_better() {
+        one.total_cmp(&other)
+    } else {
+        other.total_cmp(&one)
     }
 }
 
@@ -272,27 +274,66 @@ fn parse_number(text: &str) -> Option<f64> {
     text.parse().ok().filter(|number: &f64| number.is_finite())
 }
 
+/// Reason why a row is invalid, and what to write instead.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RowError {
+    /// Invalid value of the measure.
+    #[error("{} {error}", .measure.name())]
+    Value {
+        /// The measure.
+        measure: Measure,
+        /// Reason.
+        error: ParseValueError,
+    },
+    /// Invalid auxiliary parameter.
+    #[error("aux.{key} {error}")]
+    Aux {
+        /// Name of the parameter.
+        key: String,
+        /// Reason.
+        error: AuxError,
+    },
+    /// Invalid limits.
+    #[error(transparent)]
+    Limits(#[from] UnusableLimits),
+    /// Percentiles that are no times or rates.
+    #[error("spread: p50 {p50} and p95 {p95} are not valid times or rates")]
+    InvalidSpread {
+        /// Median.
+        p50: f64,
+        /// 95th percentile.
+        p95: f64,
+    },
+    /// Percentiles in the wrong order.
+    #[error("spread: p95, {p95}, is less than p50, {p50}; write p50 first")]
+    DisorderedSpread {
+        /// Median.
+        p50: f64,
+        /// 95th percentile.
+        p95: f64,
+    },
+}
+
 /// Checks a row; the error says what to write.
-pub fn check(row: &Row) -> Result<(), String> {
-    let name = row.measure.name();
-    row.measure
+pub fn check(row: &Row) -> Result<(), RowError> {
+    let measure = row.measure;
+    measure
         .parse_value(&row.value.to_string())
-        .map_err(|reason| format!("{name} {reason}"))?;
+        .map_err(|error| RowError::Value { measure, error })?;
     for (key, value) in &row.aux {
-        check_aux(key, value).map_err(|reason| format!("aux.{key} {reason}"))?;
+        check_aux(key, value).map_err(|error| RowError::Aux {
+            key: key.clone(),
+            error,
+        })?;
     }
-    crate::limits::check(&row.limits).map_err(|error| error.to_string())?;
+    row.limits.check()?;
     if let Some(spread) = &row.spread {
         let (p50, p95) = (spread.p50, spread.p95);
         if !(p50.is_finite() && p95.is_finite() && p50 >= 0.0 && p95 >= 0.0) {
-            return Err(format!(
-                "spread: p50 {p50} and p95 {p95} are not valid times or rates"
-            ));
+            return Err(RowError::InvalidSpread { p50, p95 });
         }
-        if row.measure != Measure::Fps && p95 < p50 {
-            return Err(format!(
-                "spread: p95, {p95}, is less than p50, {p50}; write p50 first"
-            ));
+        if measure.is_less_better() && p95 < p50 {
+            return Err(RowError::DisorderedSpread { p50, p95 });
         }
     }
     Ok(())

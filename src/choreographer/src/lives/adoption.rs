@@ -200,10 +200,7 @@ impl Choreographer {
         let permit = inner
             .admission
             .adopt(inner.promised_amount(&handle.requested_limits()));
-        tokio::spawn(driver::drive(
-            Arc::clone(inner),
-            handle,
-            ServantSource::Adopted(servant, Some(permit)),
-        ));
+        let beginning = ServantSource::Adopted(servant, Some(permit));
+        driver::start(inner, handle, beginning);
     }
 }

@@ -1,9 +1,9 @@
 //! Tracks which robots' servants fail, and when each may be started again.
 
-use std::collections::HashMap;
+mod failures;
+
 use std::time::Duration;
 
-use parking_lot::Mutex;
 use store::RevisionRecord;
 use tokio::time::Instant;
 
@@ -14,16 +14,12 @@ use crate::decide::back_off::{
 };
 use crate::lives::handle::{Failure, Handle};
 
+pub(crate) use failures::BackOffs;
+
 /// Common key of robots without a name: each has a name of its own, and would never see its pause.
 const NAMELESS: &str = "~";
 /// Number of entries from which on expired ones are removed.
 const MANY: usize = 256;
-
-/// Failures by service and robot.
-#[derive(Default)]
-pub(crate) struct BackOffs {
-    failing: Mutex<HashMap<(String, String), FailureStreak>>,
-}
 
 impl BackOffs {
     /// Returns the failures that forbid a servant of this revision for the robot now, with the remaining pause.

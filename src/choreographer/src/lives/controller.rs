@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use api::limits::DEFAULT_CPU_WEIGHT;
 use api::{Limits, Phase};
 use futures_util::future::join_all;
 use servant::engine::{ServantHandle, Usage};
@@ -14,13 +15,11 @@ use store::NewEvent;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::ChoreographerInner;
-use super::limits::PLAIN_WEIGHT;
 use super::visits::Visits;
 use crate::decide::controller::{
     ControlDecision, ControlFacts, ControlHistory, ResponseGoal, control,
 };
 use crate::decide::stall::{PressureReading, StallDetector};
-use crate::engine_limits;
 use crate::lives::handle::Handle;
 
 /// Interval between two rounds.
@@ -58,7 +57,7 @@ struct WorkingServant {
     limits: Limits,
     asked: Limits,
     /// The limits in force.
-    enforced: servant::spec::ResourceLimits,
+    enforced: Limits,
     used: Option<u64>,
     throttled: f64,
     waited: f64,
@@ -243,7 +242,7 @@ impl WorkingServant {
             id: &self.handle.id,
             promised,
             limit,
-            plain: self.limits.cpu_weight.unwrap_or(PLAIN_WEIGHT),
+            plain: self.limits.cpu_weight.unwrap_or(DEFAULT_CPU_WEIGHT),
             // A servant without a promise has what the operator allows.
             ceiling: match promised {
                 0 => limit,
@@ -251,7 +250,7 @@ impl WorkingServant {
             },
             weighed: self.asked.cpu_weight.is_some(),
             quota: self.enforced.cpus.map_or(limit, millicpus),
-            weight: self.enforced.cpu_weight.unwrap_or(PLAIN_WEIGHT),
+            weight: self.enforced.cpu_weight.unwrap_or(DEFAULT_CPU_WEIGHT),
             used: self.used,
             throttled: self.throttled,
             waited: self.waited,
@@ -276,7 +275,7 @@ impl WorkingServant {
             cpu_weight: outcome.weight,
             ..Limits::default()
         };
-        match timeout(PATIENCE, self.container.set_limits(engine_limits(&limits))).await {
+        match timeout(PATIENCE, self.container.set_limits(limits)).await {
             Ok(Ok(_)) => {
                 inner.moves.fetch_add(1, Ordering::Relaxed);
                 let message = format!(

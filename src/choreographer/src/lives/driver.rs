@@ -9,12 +9,14 @@ use futures_util::FutureExt;
 use reach::Reach;
 use servant::engine::{ContainerState, ServantHandle};
 use tokio::time::Instant;
+use tracing::Instrument;
 
+use super::group::run_place;
 use super::lifetime::{wait_for_interface, wait_unneeded};
 use super::nodes::NodeSupervisor;
 use super::waiting::Permit;
 use super::warm_pool::{self, WarmServant};
-use super::{ChoreographerInner, group, limits, starting};
+use super::{ChoreographerInner, limits, starting};
 use crate::decide::admission::AdmissionRequest;
 use crate::lives::handle::{Failure, Handle};
 use crate::with_last_log_line;
@@ -28,17 +30,23 @@ pub(crate) const GAVE_WAY: &str = "a robot needs this capacity";
 /// Origin of a servant.
 pub(crate) enum ServantSource {
     /// Requested by a robot; possibly from a warm container.
-    Asked(Option<WarmServant>),
+    Asked(Option<Box<WarmServant>>),
     /// Started by an earlier daemon.
     Adopted(Arc<dyn ServantHandle>, Option<Permit>),
 }
 
-/// Runs the servant's life to its end and cleans up.
-pub(crate) async fn drive(
-    inner: Arc<ChoreographerInner>,
+/// Starts the task that runs the servant's life.
+pub(crate) fn start(
+    inner: &Arc<ChoreographerInner>,
     handle: Arc<Handle>,
-    mut beginning: ServantSource,
+    beginning: ServantSource,
 ) {
+    let span = handle.span(None);
+    tokio::spawn(drive(Arc::clone(inner), handle, beginning).instrument(span));
+}
+
+/// Runs the servant's life to its end and cleans up.
+async fn drive(inner: Arc<ChoreographerInner>, handle: Arc<Handle>, mut beginning: ServantSource) {
     let mut permit = None;
     let outcome = run_life(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
@@ -71,7 +79,7 @@ pub(crate) async fn drive(
     // The request that is first in the queue now may need more than that.
     inner.make_room();
     if let ServantSource::Asked(Some(warm)) = beginning {
-        warm_pool::give_back(&inner, warm).await;
+        warm_pool::give_back(&inner, *warm).await;
     }
     inner.warm_pool.wake();
     handle.set_phase(if outcome.is_ok() {
@@ -127,7 +135,7 @@ async fn run_life(
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
     if let Some(rules) = handle.revision.plan.shared.filter(|_| handle.is_place()) {
-        return group::run_place(inner, handle, rules).await;
+        return run_place(inner, handle, rules).await;
     }
     let (container, reach, fresh) = match beginning {
         ServantSource::Asked(warm) => {
@@ -145,7 +153,7 @@ async fn run_life(
             }
             starting::record(inner, handle)?;
             starting::report_terms(inner, handle);
-            match starting::use_warm(inner, handle, warm.take()).await {
+            match starting::use_warm(inner, handle, warm.take().map(|warm| *warm)).await {
                 Some(warm) => (warm.container, Some(warm.reach), true),
                 None => (starting::start(inner, handle).await?, None, true),
             }

@@ -11,7 +11,6 @@
 mod members;
 mod places;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -29,7 +28,7 @@ use crate::Choreographer;
 use crate::decide::group::{GroupAction, GroupFacts, LoadSince, decide_group};
 use crate::lives::handle::{Failure, Handle};
 
-use members::SharedServant;
+use super::shared_group::{GroupStage, Groups, SharedGroup, SharedServant};
 use places::GroupPlace;
 
 pub(super) use places::run_place;
@@ -39,37 +38,6 @@ pub(crate) use places::{is_internal_robot, is_place};
 const LOOKS: Duration = Duration::from_millis(250);
 /// Reason for ending the servants of a group without robots.
 const UNUSED: &str = "no robot uses the service";
-
-/// All groups, by service and revision.
-#[derive(Default)]
-pub(crate) struct Groups {
-    all: Mutex<HashMap<(String, u64), Arc<SharedGroup>>>,
-}
-
-/// A group of servants, and the state its robots wait for.
-struct SharedGroup {
-    group: Arc<ServantGroup>,
-    revision: Arc<RevisionRecord>,
-    rules: Shared,
-    state: watch::Sender<GroupStage>,
-    seats: watch::Sender<usize>,
-    servants: Mutex<Vec<SharedServant>>,
-    /// The state of a servant has changed.
-    look: Notify,
-}
-
-/// Stage of a group.
-#[derive(Debug, Clone)]
-enum GroupStage {
-    /// None of its servants has capacity.
-    Queued,
-    /// A servant has capacity.
-    Admitted,
-    /// A servant answers.
-    Ready,
-    /// No servant answers, or ever will.
-    Over(Failure),
-}
 
 impl Groups {
     fn join(&self, inner: &Arc<ChoreographerInner>, handle: &Handle, rules: Shared) -> GroupPlace {

@@ -11,6 +11,8 @@ use reach::{Reach, Tenant};
 use tokio::sync::watch;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
+use tracing::Span;
+use tracing::span::Id;
 
 use crate::Error;
 use crate::decide::admission::AdmissionError;
@@ -232,6 +234,12 @@ impl Handle {
     /// Returns the sender of its position in the queue.
     pub(crate) fn standing_sender(&self) -> watch::Sender<Option<QueueStanding>> {
         self.stands.clone()
+    }
+
+    /// Creates a span of the log about this servant. Its parent is that of a connection to it; none for its own tasks.
+    pub fn span(&self, parent: Option<Id>) -> Span {
+        let (id, service, robot) = (&*self.id, self.service(), &*self.robot);
+        tracing::error_span!(parent: parent, "servant", id, service, robot)
     }
 
     /// Returns the context of its events.

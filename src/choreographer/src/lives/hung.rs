@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use api::{Phase, Sla, Stated, Terms};
 use tokio::time::Instant;
+use tracing::Instrument;
 
 use super::ChoreographerInner;
 use super::visits::Visits;
@@ -59,11 +60,14 @@ pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
                 let (before, mut words) = watched.remove(&key).unzip();
                 let (after, hung) = observe_flow(before, seen, patience, Instant::now().into_std());
                 if let Some(hung) = hung {
-                    let tidings = handle_hung(&inner, &handle, &key.1, hung);
+                    let span = handle.span(None);
+                    let tidings = span.in_scope(|| handle_hung(&inner, &handle, &key.1, hung));
                     if let Some(killed) = tidings.kills {
+                        let span = tracing::error_span!(parent: &span, "node", node = killed);
                         // Several nodes of a servant may hang at once.
                         let visit = format!("{} {}", handle.id, key.1);
-                        kills.begin(&visit, kill(Arc::clone(&handle), killed));
+                        let killing = kill(Arc::clone(&handle), killed).instrument(span);
+                        kills.begin(&visit, killing);
                     }
                     words = Some(tidings.words);
                 }
@@ -148,7 +152,6 @@ async fn kill(handle: Arc<Handle>, node: String) {
         return;
     };
     if let Err(error) = container.signal_node(&node, libc::SIGKILL).await {
-        let id = &handle.id;
-        tracing::warn!("{node} of {id} hangs and cannot be killed: {error}");
+        tracing::warn!("a node hangs and cannot be killed: {error}");
     }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use api::{Phase, Stated};
 use reach::Reach;
+use tracing::{Instrument, Span};
 
 use crate::Error;
 use crate::lives::ChoreographerInner;
@@ -53,9 +54,10 @@ impl Lease {
         self.wait_phase(Phase::Created).await?;
         let (inner, handle) = (Arc::clone(inner), Arc::clone(&self.handle));
         let (who, stated) = (self.who.clone(), stated.clone());
+        let span = handle.span(Span::current().id());
+        let agreed = async move { inner.agree_terms(&handle, &who, &stated).await };
         // The client may go away meanwhile; a change in progress is completed.
-        let agreed = tokio::spawn(async move { inner.agree_terms(&handle, &who, &stated).await });
-        agreed
+        tokio::spawn(agreed.instrument(span))
             .await
             .map_err(|_| Error::Internal("changing a servant's limits"))?
     }

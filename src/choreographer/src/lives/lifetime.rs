@@ -36,18 +36,13 @@ pub(super) async fn wait_for_interface(
         if let Some(refused) = lifecycles.as_mut().and_then(find_refused) {
             return Err(Failure::from_reason(format!("is unusable: {refused}")));
         }
-        let loading = match loads.as_mut().map(loading_containers) {
-            Some(Err(refused)) => {
-                return Err(Failure::from_reason(format!("is unusable: {refused}")));
-            }
-            loading => loading.and_then(Result::ok).unwrap_or_default(),
-        };
+        let loading = loads.as_mut().map(loading_containers).transpose()?;
         let mut missing = missing_endpoints(interface, &graph);
         let mut nodes_missing = missing_nodes(interface, &graph);
         if let Some(stages) = &lifecycles {
             missing.extend(inactive_nodes(&stages.borrow()));
         }
-        for container in loading {
+        for container in loading.unwrap_or_default() {
             missing.push(format!("the components of {container}"));
             nodes_missing.push(format!("the nodes of {container}"));
         }
@@ -100,11 +95,13 @@ fn inactive_nodes(stages: &Stages) -> impl Iterator<Item = String> {
 }
 
 /// Returns the component containers that have not loaded all of their nodes; an error if one refuses to.
-fn loading_containers(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>, String> {
+fn loading_containers(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>, Failure> {
     let loads = loads.borrow_and_update();
     let loading = loads.iter().filter_map(|(container, load)| match load {
         ContainerLoad::Loading => Some(Ok(container.clone())),
-        ContainerLoad::Refused(why) => Some(Err(why.clone())),
+        ContainerLoad::Refused(why) => {
+            Some(Err(Failure::from_reason(format!("is unusable: {why}"))))
+        }
         ContainerLoad::Loaded(_) => None,
     });
     loading.collect()

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
+use api::limits::DEFAULT_CPU_WEIGHT;
 use api::{Limits, Size, Stated, Terms};
 use servant::engine::ServantHandle;
-use servant::spec::UNLIMITED;
 
 use super::ChoreographerInner;
 use crate::decide::demand::{LimitSources, with_default_weight};
@@ -12,29 +12,29 @@ use crate::decide::measured::{MeasuredInput, aux_from_inputs, merge_max};
 use crate::decide::terms::{TermsError, aux_pairs, compute_terms, limits_in_words};
 use crate::decide::told::suppressed_note;
 use crate::error::{ResizeError, STATING};
-use crate::limits::to_api_limits;
 use crate::lives::handle::Handle;
-use crate::{Choreographer, Error, ServantRequest, engine_limits};
+use crate::{Choreographer, Error, ServantRequest};
 use store::NewEvent;
 use tokio::time::{Instant, timeout};
+use tracing::Instrument;
 
 /// Timeout for one servant to apply limits.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Default of `cpu.weight`.
-pub(super) const PLAIN_WEIGHT: u64 = 100;
 
 impl Choreographer {
     /// Changes the given limits of a running servant, and its promise with them.
     pub async fn set_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
-        let (whole, id) = (self.clone(), id.to_owned());
+        let (whole, handle) = (self.clone(), self.servant(id)?);
+        let span = handle.span(None);
+        let set = async move { whole.apply_limits(&handle, change).await };
         // The caller may go away meanwhile; a change in progress is completed.
-        let set = tokio::spawn(async move { whole.apply_limits(&id, change).await });
-        set.await
+        tokio::spawn(set.instrument(span))
+            .await
             .map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
-    async fn apply_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
-        let handle = self.servant(id)?;
+    async fn apply_limits(&self, handle: &Handle, change: Limits) -> Result<(), Error> {
+        let id = &handle.id;
         handle.check_container()?;
         // One change at a time: the promise, the limits in force and the stored limits must agree.
         let _turn = handle.lock_limits().await;
@@ -46,7 +46,7 @@ impl Choreographer {
         let inner = &self.inner;
         let set = after.set;
         let in_force = inner
-            .resize(&handle, with_default_weight(change), after)
+            .resize(handle, with_default_weight(change), after)
             .await?;
         inner.state.set_servant_limits(id, &set)?;
         let message = format!("servant {id}: limits changed to {in_force}");
@@ -253,7 +253,7 @@ impl ChoreographerInner {
             return Ok(None);
         }
         let (earlier, told) = (before.limits(), after.terms.clone());
-        let change = limit_changes(&earlier, &after.limits(), self.options.cores);
+        let change = earlier.changes_to(after.limits(), self.options.cores);
         if let (Some(wanted), Some(container)) = (change.memory, handle.container())
             && earlier.memory.is_none_or(|earlier| wanted < earlier)
             && let Ok(usage) = container.usage().await
@@ -300,18 +300,16 @@ impl ChoreographerInner {
         // An increase is promised before the kernel grants it, and a decrease is released only after the kernel has
         // applied it: otherwise more would be promised than there is if the kernel refuses.
         promise.change(has.max(wanted))?;
-        if let Err(error) = container.set_limits(engine_limits(&change)).await {
+        if let Err(error) = container.set_limits(change).await {
             // What the kernel applied before it refused the rest is reverted.
-            let back = limit_changes(&change, &before.limits(), self.options.cores);
-            let _ = container.set_limits(engine_limits(&back)).await;
+            let back = change.changes_to(before.limits(), self.options.cores);
+            let _ = container.set_limits(back).await;
             promise.change(has)?;
             return Err(error.into());
         }
         handle.set_limit_sources(after);
         promise.change(wanted)?;
-        Ok(limits_in_words(&to_api_limits(
-            &container.enforced_limits().limits,
-        )))
+        Ok(limits_in_words(&container.enforced_limits().limits))
     }
 }
 
@@ -330,9 +328,9 @@ pub(super) async fn fit_container(
     limits: &Limits,
     cores: f64,
 ) -> Result<(), servant::Error> {
-    let change = limit_changes(made, limits, cores);
+    let change = made.changes_to(*limits, cores);
     if change != Limits::default() {
-        container.set_limits(engine_limits(&change)).await?;
+        container.set_limits(change).await?;
     }
     Ok(())
 }
@@ -356,20 +354,19 @@ pub(super) async fn restore_cores(
         cpu_weight: has.cpu_weight,
         ..Limits::default()
     };
-    let change = limit_changes(
-        &before,
-        &Limits {
-            cpus: wanted.cpus,
-            cpu_weight: wanted.cpu_weight.or(has.cpu_weight.and(Some(PLAIN_WEIGHT))),
-            ..Limits::default()
-        },
-        inner.options.cores,
-    );
+    let after = Limits {
+        cpus: wanted.cpus,
+        cpu_weight: wanted
+            .cpu_weight
+            .or(has.cpu_weight.and(Some(DEFAULT_CPU_WEIGHT))),
+        ..Limits::default()
+    };
+    let change = before.changes_to(after, inner.options.cores);
     if change == Limits::default() {
         return;
     }
     let (id, about) = (&handle.id, handle.event_context());
-    match timeout(PATIENCE, container.set_limits(engine_limits(&change))).await {
+    match timeout(PATIENCE, container.set_limits(change)).await {
         Ok(Ok(_)) => {
             let message = format!(
                 "servant {id} of {} for {}: back from {} to {}: the controller is off",
@@ -389,63 +386,5 @@ pub(super) async fn restore_cores(
                 format!("servant {id} keeps cores set by the controller: it does not answer");
             inner.journal.warning("limits-unmet", &message, &about);
         }
-    }
-}
-
-/// Returns the limits to set to change `before` into `after`: equal ones are left out, since some limits, such as a
-/// cpuset on cgroup v1, cannot be set again. Limits that `after` omits are lifted: all of this machine's `cores`, and
-/// the kernel's default weight; a cpuset stays.
-fn limit_changes(before: &Limits, after: &Limits, cores: f64) -> Limits {
-    let unlimited = Limits {
-        cpus: Some(cores),
-        cpu_weight: Some(PLAIN_WEIGHT),
-        memory: Some(Size(UNLIMITED)),
-        memory_high: Some(Size(UNLIMITED)),
-        pids: Some(UNLIMITED),
-        io_read: Some(Size(UNLIMITED)),
-        io_write: Some(Size(UNLIMITED)),
-        cpuset: None,
-    };
-    after.or(before.and(unlimited)).without_equal(*before)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_later_terms_say_nothing_of_is_none_again() {
-        let size = |bytes| Some(Size(bytes));
-        let before = Limits {
-            cpus: Some(1.0),
-            cpu_weight: Some(1000),
-            memory: size(64),
-            memory_high: size(32),
-            pids: Some(9),
-            io_read: size(8),
-            io_write: size(9),
-            cpuset: "0-1".parse().ok(),
-        };
-        let after = Limits {
-            memory: size(64),
-            io_write: size(7),
-            ..Limits::default()
-        };
-        let none = size(UNLIMITED);
-        let change = Limits {
-            cpus: Some(4.0),
-            cpu_weight: Some(100),
-            memory: None,
-            memory_high: none,
-            pids: Some(UNLIMITED),
-            io_read: none,
-            io_write: size(7),
-            cpuset: None,
-        };
-        assert_eq!(limit_changes(&before, &after, 4.0), change);
-        let nothing = Limits::default();
-        assert_eq!(limit_changes(&before, &before, 4.0), nothing);
-        assert_eq!(limit_changes(&nothing, &nothing, 4.0), nothing);
-        assert_eq!(limit_changes(&nothing, &after, 4.0), after);
     }
 }

@@ -137,10 +137,11 @@ impl<'a> NodeSupervisor<'a> {
                 let how = self.ends.remove(&node);
                 let how = how.as_deref().unwrap_or("ended");
                 let message = format!("{node} {how} and is restarted after {delay} s");
-                return self.report(&NodeReport {
+                let event = NodeReport {
                     kind: "node-respawned",
                     message,
-                });
+                };
+                return self.report(&node, &event);
             }
             NodeEvent::Started { node } => return self.handle.note_start(&node),
         };
@@ -187,7 +188,7 @@ impl<'a> NodeSupervisor<'a> {
             NodeExitAction::Nothing => Ok(()),
             NodeExitAction::Without(event) => {
                 self.alive -= 1;
-                self.report(&event);
+                self.report(&node.name, &event);
                 Ok(())
             }
             NodeExitAction::Restart {
@@ -195,7 +196,7 @@ impl<'a> NodeSupervisor<'a> {
                 failures,
                 event,
             } => {
-                self.report(&event);
+                self.report(&node.name, &event);
                 self.handle.set_down(&node.name, Some((failures, after)));
                 self.failures.insert(node.name.clone(), failures);
                 self.pausing.push(Box::pin(async move {
@@ -205,7 +206,9 @@ impl<'a> NodeSupervisor<'a> {
                 Ok(())
             }
             NodeExitAction::Fail { event, reason } => {
-                event.iter().for_each(|event| self.report(event));
+                event
+                    .iter()
+                    .for_each(|event| self.report(&node.name, event));
                 Err(self.failure(&node, reason).await)
             }
         }
@@ -240,9 +243,10 @@ impl<'a> NodeSupervisor<'a> {
         }
     }
 
-    fn report(&self, event: &NodeReport) {
+    fn report(&self, node: &str, event: &NodeReport) {
         let message = format!("servant {}: {}", self.handle.id, event.message);
         let about = self.handle.event_context();
-        self.inner.journal.warning(event.kind, &message, &about);
+        let span = tracing::error_span!("node", node);
+        span.in_scope(|| self.inner.journal.warning(event.kind, &message, &about));
     }
 }

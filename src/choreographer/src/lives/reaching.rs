@@ -9,6 +9,7 @@ use catalogue::{Catalogue, RevisionContents};
 use link::control::RequestTiming;
 use reach::links::RequestUpdate;
 use reach::{Observer, Reach, ReachOptions, RecordedRevision, RequestTimes};
+use ros::bus::FailureReason;
 use servant::engine::ServantHandle;
 use store::{Journal, NewEvent, RevisionRecord};
 use tokio::time::Instant;
@@ -163,9 +164,10 @@ struct ServantObserver {
 }
 
 impl Observer for ServantObserver {
-    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
+    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), FailureReason> {
         self.catalogue
             .check_stub_compatibility(&self.revision, made_of, image)
+            .map_err(|error| FailureReason::new(error.to_string()))
     }
 
     fn record_event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {

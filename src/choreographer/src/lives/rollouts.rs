@@ -2,17 +2,16 @@
 //! out. State is reported and stored in the database, so that the next daemon continues it.
 
 mod orders;
+mod table;
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
 use api::rollout::RolloutState;
-use parking_lot::Mutex;
 use store::{NewEvent, RevisionRecord};
-use tokio::sync::Notify;
 
 pub use orders::check_terms;
+pub(crate) use table::Rollouts;
 
 use super::ChoreographerInner;
 use crate::decide::rollout::{
@@ -24,28 +23,6 @@ use crate::{Error, ServantRequest};
 
 /// Interval between evaluations.
 const LOOK: Duration = Duration::from_secs(1);
-
-/// The last rollout of each service.
-#[derive(Default)]
-pub(crate) struct Rollouts {
-    /// Held only briefly: each request is counted here.
-    kept: Mutex<RolloutTable>,
-    /// Held from reading the table until it is written, so that the last write is the newest.
-    writing: Mutex<()>,
-    /// Held while a rollout starts, takes a step or executes an order.
-    turn: tokio::sync::Mutex<()>,
-    /// Signals that a rollout has started.
-    begun: Notify,
-}
-
-#[derive(Default)]
-struct RolloutTable {
-    by_service: BTreeMap<String, Rollout>,
-    /// Services with unwritten counts or robots.
-    changed: BTreeSet<String>,
-    /// Blockers of canaries whose promotion time has come, by service.
-    waits: BTreeMap<String, PromotionBlocker>,
-}
 
 fn is_ongoing(of: &Rollout) -> bool {
     matches!(of.state, RolloutState::Canary | RolloutState::Draining)

@@ -213,11 +213,7 @@ impl Choreographer {
             servants.all.insert(handle.id.clone(), Arc::clone(&handle));
             Lease::new(Arc::clone(&handle), "")
         };
-        tokio::spawn(driver::drive(
-            Arc::clone(inner),
-            handle,
-            ServantSource::Asked(None),
-        ));
+        driver::start(inner, handle, ServantSource::Asked(None));
         Ok(MeasuredServant { lease })
     }
 }

@@ -12,9 +12,9 @@ use tokio::time::{Instant, timeout_at};
 
 use super::warm_pool::WarmServant;
 use super::{ChoreographerInner, limits, reaching};
+use crate::Error;
 use crate::decide::terms::limits_in_words;
 use crate::lives::handle::{Failure, Handle};
-use crate::{Error, engine_limits};
 
 /// Records the servant before it runs: a daemon that is killed now finds it again.
 pub(super) fn record(inner: &ChoreographerInner, handle: &Handle) -> Result<(), Failure> {
@@ -58,6 +58,7 @@ pub(super) async fn use_warm(
     warm: Option<WarmServant>,
 ) -> Option<WarmServant> {
     let warm = warm?;
+    warm.span.record("robot", &*handle.robot);
     let limits = handle.limits();
     if let Err(error) =
         limits::fit_container(&*warm.container, &warm.limits, &limits, inner.options.cores).await
@@ -128,7 +129,7 @@ pub(super) fn container_spec(
     Ok(Spec {
         id: id.to_owned(),
         image: revision.image.clone(),
-        limits: engine_limits(limits),
+        limits: *limits,
         environment: plan.environment.clone(),
         nodes,
         grants: plan.grants.clone(),
@@ -166,7 +167,7 @@ pub(super) fn report_unmet(
 ) {
     let unmet = container
         .enforced_limits()
-        .unmet_limits(&engine_limits(&handle.requested_limits()));
+        .unmet_limits(&handle.requested_limits());
     if !unmet.is_empty() {
         let message = format!(
             "servant {} runs without a requested limit: {}",

@@ -8,21 +8,16 @@
 //! time is lost.
 
 mod keeping;
+mod pool;
 
-use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::time::Duration;
 
 use futures_util::FutureExt;
-use parking_lot::Mutex;
-use reach::Reach;
-use servant::engine::{ContainerState, ServantHandle};
-use tokio::sync::Notify;
+use servant::engine::ContainerState;
 use tokio::time::Instant;
 
 use super::ChoreographerInner;
 use super::group::is_internal_robot;
-use super::waiting::Permit;
 use crate::decide;
 use crate::decide::Amount;
 use crate::decide::forecast::Arrivals;
@@ -31,72 +26,18 @@ use crate::decide::warm_pool::{WarmContainer as Facts, choose_container};
 use store::RevisionRecord;
 
 pub(crate) use keeping::{end_all, give_back, run, tidy};
+use pool::{LeadTime, WarmPoolState};
+pub(crate) use pool::{WarmPool, WarmServant};
 
 /// Robot name of the pool's containers in the database, from the start of their nodes until a robot takes them. No
 /// robot can give itself this name.
 pub(crate) const NOBODY: &str = "~warm";
 /// Robot name in the back-off for services whose containers cannot be made.
 const UNMADE: &str = "~warm-container";
-/// Default time from taking a container until the next one is ready.
-const LEAD: Duration = Duration::from_secs(1);
 /// Weight of the last lead time in their mean.
 const LAST: f64 = 0.3;
 /// Maximum number of taken containers of one service whose times are remembered until they are replaced.
 const TAKEN: usize = 64;
-
-/// A servant without a robot.
-pub(crate) struct WarmServant {
-    /// The container.
-    pub(crate) container: Arc<dyn ServantHandle>,
-    /// Access to its ROS and its bridge.
-    pub(crate) reach: Arc<dyn Reach>,
-    /// The limits that it was made with.
-    pub(crate) limits: api::Limits,
-    /// The revision's nodes were started in it.
-    pub(crate) nodes: bool,
-    /// The promise for its nodes, until a robot takes it over.
-    pub(crate) permit: Option<Permit>,
-    revision: Arc<RevisionRecord>,
-}
-
-/// The warm containers of all services.
-#[derive(Default)]
-pub(crate) struct WarmPool {
-    kept: Mutex<WarmPoolState>,
-    /// Signals that containers may be missing or superfluous.
-    look: Notify,
-    /// Held while warm containers are made or ended.
-    turn: tokio::sync::Mutex<()>,
-}
-
-#[derive(Default)]
-struct WarmPoolState {
-    /// Containers in the order in which they were made.
-    pool: Vec<WarmServant>,
-    /// Promises of containers that are being ended.
-    ending: HashMap<String, Amount>,
-    /// Services in the order of their last request, latest last.
-    asked_for: Vec<String>,
-    arrivals: HashMap<String, Arrivals>,
-    leads: HashMap<String, LeadTime>,
-    closed: bool,
-}
-
-/// Time until a taken container is replaced.
-struct LeadTime {
-    mean: Duration,
-    /// Times at which containers were taken that are not replaced yet.
-    taken: VecDeque<Instant>,
-}
-
-impl Default for LeadTime {
-    fn default() -> LeadTime {
-        LeadTime {
-            mean: LEAD,
-            taken: VecDeque::new(),
-        }
-    }
-}
 
 impl LeadTime {
     fn record_taken(&mut self, now: Instant) {
@@ -296,6 +237,8 @@ impl ChoreographerInner {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     #[test]

@@ -109,7 +109,7 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     assert_eq!(before[0], (Some(0.25), Some(250)));
     for (lease, cpus, cpu_weight) in [(&moved, 1.5, 1500), (&plain, 0.05, 1)] {
         let container = lease.handle().container().expect("it runs");
-        let moves = servant::spec::ResourceLimits {
+        let moves = api::Limits {
             cpus: Some(cpus),
             cpu_weight: Some(cpu_weight),
             ..Default::default()

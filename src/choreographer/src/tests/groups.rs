@@ -8,7 +8,8 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use in_memory::Process;
 use ros::bus::{
-    ActionClient, ActionHandler, Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, ServiceHandler,
+    ActionClient, ActionHandler, Bus, BusError, FailureReason, GoalEnd, GoalError, GoalEvents,
+    GoalOutcome, ServiceHandler,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::Semaphore;
@@ -28,7 +29,7 @@ struct Echo {
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         self.asked.fetch_add(1, Ordering::SeqCst);
         self.answers.acquire().await.expect("open").forget();
         let request = String::from_utf8_lossy(&request);
@@ -40,7 +41,7 @@ impl ServiceHandler for Echo {
 struct Deaf(Arc<AtomicUsize>);
 
 impl ActionHandler for Deaf {
-    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), FailureReason> {
         self.0.fetch_add(1, Ordering::SeqCst);
         Ok(())
     }
@@ -58,11 +59,11 @@ fn count() -> Arc<ActionDef> {
 
 /// Results of a client's goals.
 #[derive(Default)]
-struct Ends(Mutex<Vec<Result<GoalEnd, String>>>);
+struct Ends(Mutex<Vec<Result<GoalEnd, GoalError>>>);
 
 impl GoalEvents for Ends {
     fn on_feedback(&self, _feedback: Bytes) {}
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         self.0.lock().push(end);
     }
 }

@@ -9,6 +9,7 @@ use super::*;
 
 mod ahead;
 mod hung;
+mod log;
 mod rollouts;
 
 /// Returns a request of this robot for a servant of `greet`, with this statement.

@@ -200,7 +200,11 @@ async fn what_a_stub_stated_is_kept_while_it_is_in_use() {
             .limits
             .memory
     };
-    assert_eq!(memory(), Some(200 << 20), "it uses more than 50M");
+    assert_eq!(
+        memory(),
+        Some(api::Size(200 << 20)),
+        "it uses more than 50M"
+    );
     let told = world.event_messages("terms-refused");
     assert_eq!(told.len(), 1, "{told:?}");
     assert!(

@@ -36,9 +36,15 @@ pub enum Aux {
     Text(String),
 }
 
+/// Error of a text that is not a list of auxiliary parameters. Its own text continues a sentence that begins with the
+/// key `aux`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("is {0:?}; write KEY=VALUE, such as width=640")]
+pub struct ParseAuxError(String);
+
 impl Aux {
-    /// Returns names and values; the error describes the invalid part.
-    pub fn pairs(&self) -> Result<Vec<(String, String)>, String> {
+    /// Returns names and values; an error if a part of the text is not a pair.
+    pub fn pairs(&self) -> Result<Vec<(String, String)>, ParseAuxError> {
         match self {
             Self::Table(table) => Ok(table
                 .iter()
@@ -48,7 +54,7 @@ impl Aux {
                 .split_whitespace()
                 .map(|pair| match pair.split_once('=') {
                     Some((key, value)) => Ok((key.to_owned(), value.to_owned())),
-                    None => Err(format!("is {text:?}; write KEY=VALUE, such as width=640")),
+                    None => Err(ParseAuxError(text.clone())),
                 })
                 .collect(),
         }

@@ -1,6 +1,6 @@
 //! Checks of a configuration's values, alone and together, that types cannot express.
 
-use super::{CodecSetting, Config, MOST};
+use super::{CodecSetting, Config, MOST, OUTPUT_MEASURES};
 use crate::terms;
 
 /// A key with an invalid value.
@@ -16,18 +16,19 @@ impl Config {
     /// Checks the values of all keys.
     pub(super) fn check(&self) -> Result<(), InvalidSetting> {
         let wrong = |key, reason| Err(InvalidSetting { key, reason });
-        for (key, value) in [
+        let measured = OUTPUT_MEASURES.iter().flat_map(|measure| {
+            let [desired, bound] = measure.values(self);
+            [(measure.desired_key, desired), (measure.key, bound)]
+        });
+        let times = [
             ("desire", self.desire),
             ("max", self.max),
-            ("age", self.age),
-            ("desired_age", self.desired_age),
-            ("frames_per_second", self.frames_per_second),
-            ("desired_frames_per_second", self.desired_frames_per_second),
             ("threshold", self.threshold),
             ("initial", self.initial),
             ("fallback_after", Some(self.fallback_after)),
             ("call_limit", Some(self.call_limit)),
-        ] {
+        ];
+        for (key, value) in times.into_iter().chain(measured) {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
                 let reason = format!(
                     "is {value}; it should be a number greater than 0 and less than {MOST}"
@@ -49,29 +50,17 @@ impl Config {
             let reason = format!("is {cap}; it should be a number greater than threshold");
             return wrong("cap", reason);
         }
-        if let (Some(desired), Some(least)) =
-            (self.desired_frames_per_second, self.frames_per_second)
-        {
-            if desired < least {
-                let reason = format!(
-                    "({desired}) is less than frames_per_second ({least}), the minimum rate; raise it, or lower \
-                        frames_per_second"
-                );
-                return wrong("desired_frames_per_second", reason);
+        for measure in &OUTPUT_MEASURES {
+            if let Some(reason) = measure.find_contradiction(self) {
+                return wrong(measure.desired_key, reason);
             }
         }
-        for (key, desired, (other, most)) in [
-            ("desire", self.desire, ("max", self.max)),
-            ("desired_age", self.desired_age, ("age", self.age)),
-        ] {
-            if let (Some(desired), Some(most)) = (desired, most) {
-                if desired > most {
-                    let reason = format!(
-                        "({desired} s) is greater than {other} ({most} s); lower it, or raise {other}"
-                    );
-                    return wrong(key, reason);
-                }
-            }
+        if let (Some(desire), Some(max)) = (self.desire, self.max)
+            && desire > max
+        {
+            let reason =
+                format!("({desire} s) is greater than max ({max} s); lower it, or raise max");
+            return wrong("desire", reason);
         }
         Ok(())
     }
@@ -92,11 +81,10 @@ impl Config {
                 reason,
             });
         }
-        if self.desired_frames_per_second.is_some() && self.frames_per_second.is_none() {
-            return without("desired_frames_per_second", "frames_per_second");
-        }
-        if self.desired_age.is_some() && self.age.is_none() {
-            return without("desired_age", "age");
+        for measure in &OUTPUT_MEASURES {
+            if let [Some(_), None] = measure.values(self) {
+                return without(measure.desired_key, measure.key);
+            }
         }
         match (self.desire, self.max) {
             (Some(_), None) => without("desire", "max"),

@@ -7,8 +7,8 @@ use anyhow::bail;
 use ros::bus::ParamValue;
 use toml::{Table, Value};
 
-use super::Config;
 use super::sources::apply_overrides;
+use super::{Config, OUTPUT_MEASURES};
 
 /// Name of the group of parameters, after the namespace.
 const GROUP: &str = "cloudroid";
@@ -78,13 +78,14 @@ impl Config {
         }
         let config: Config = table.clone().try_into()?;
         if let Err(wrong) = config.check().and_then(|()| config.check_combined()) {
+            let mut measures = OUTPUT_MEASURES.iter();
             let other = match wrong.key {
                 "desire" => "max",
                 "max" => "desire",
-                "desired_age" => "age",
-                "desired_frames_per_second" => "frames_per_second",
                 "request" => "requests",
-                _ => "",
+                key => measures
+                    .find(|measure| measure.desired_key == key)
+                    .map_or("", |measure| measure.key),
             };
             let giver = givers.get(wrong.key).or_else(|| givers.get(other));
             match giver {

@@ -81,7 +81,7 @@ impl RequestsSetting {
                 RequestSetting::Timed(timed) => (timed.request, Some((timed.desire, timed.max))),
             };
             let name = if text.contains("->") {
-                let pair: TopicPair = text.parse().map_err(anyhow::Error::msg)?;
+                let pair: TopicPair = text.parse()?;
                 let name = pair.input.clone();
                 let known = meaning.answers.get_or_insert_with(Vec::new);
                 ensure!(

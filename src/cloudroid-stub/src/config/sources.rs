@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 use toml::{Table, Value};
 
-use super::{Config, FILE};
+use super::{Config, FILE, OUTPUT_MEASURES};
 use crate::address::Address;
 
 /// Reads `stub.toml` in `share`, with the overrides of the environment.
@@ -31,11 +31,14 @@ pub fn load(
 /// Returns the key that an environment variable sets.
 pub(super) fn key_for_variable(variable: &str) -> Option<String> {
     let key = variable.strip_prefix("CLOUDROID_")?.to_ascii_lowercase();
-    KEYS.contains(&key.as_str()).then_some(key)
+    let is_measure = OUTPUT_MEASURES
+        .iter()
+        .any(|measure| [measure.key, measure.desired_key].contains(&key.as_str()));
+    (is_measure || KEYS.contains(&key.as_str())).then_some(key)
 }
 
-/// All keys. Other variables with the prefix CLOUDROID_ are not the stub's.
-const KEYS: [&str; 33] = [
+/// All keys but those of [`OUTPUT_MEASURES`]. Other variables with the prefix CLOUDROID_ are not the stub's.
+const KEYS: [&str; 29] = [
     "server",
     "service",
     "token",
@@ -50,10 +53,6 @@ const KEYS: [&str; 33] = [
     "threshold",
     "initial",
     "cap",
-    "frames_per_second",
-    "desired_frames_per_second",
-    "age",
-    "desired_age",
     "output",
     "request",
     "requests",
@@ -84,7 +83,7 @@ pub(super) fn apply_overrides(
     while config.server.ends_with('/') {
         config.server.pop();
     }
-    Address::parse(&config.server).map_err(anyhow::Error::msg)?;
+    Address::parse(&config.server)?;
     config.check()?;
     Ok(config)
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use ros::bus::RosVersion;
 
-use super::Check;
+use super::check::Check;
 use crate::arguments::{NodeArgs, StubDoctorArgs};
 use crate::config::Config;
 use crate::network::Variable;

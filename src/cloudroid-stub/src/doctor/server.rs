@@ -5,7 +5,7 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use serde_json::Value;
 
-use super::Check;
+use super::check::Check;
 use super::overlay::ExaminedStub;
 use crate::config::Config;
 use crate::http;
@@ -60,7 +60,7 @@ impl PortalProbe {
         let bad = |found: String, fix: String| Box::new(Check::bad("server", found, fix));
         let address = match config.address() {
             Ok(address) => address,
-            Err(words) => return Err(bad(words, fix)),
+            Err(error) => return Err(bad(error.to_string(), fix)),
         };
         let token = config.token().map_err(|error| {
             let fix = format!("{installer} --token TOKEN");

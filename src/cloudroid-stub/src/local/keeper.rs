@@ -15,17 +15,18 @@ use std::sync::{Arc, Weak};
 use std::time::Instant;
 
 use bytes::Bytes;
-use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use qos::{
     DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, Phases,
     QosEvent, QosSla, RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
 };
-use ros::bus::{SerializedMessage, WireType};
+use ros::bus::{FailureReason, SerializedMessage, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
-use super::original::{ExpectedInterface, Original, OriginalEvent};
+use super::expected::ExpectedInterface;
+use super::original::{Original, OriginalEvent};
+use super::pending_answer::PendingAnswer;
 use super::remembered::RememberedSettings;
 use super::stamp::{StampReader, age};
 use context::LocalContext;
@@ -41,9 +42,6 @@ pub trait Cloud: Send + Sync + 'static {
     /// Makes a call that is not measured and returns its answer. Waits while the link is down.
     fn call_unmeasured(&self, service: &str, bytes: Bytes) -> PendingAnswer;
 }
-
-/// The pending answer of a call to one side.
-pub type PendingAnswer = BoxFuture<'static, Result<Bytes, Failure>>;
 
 /// The robot's nodes.
 pub trait Application: Send + Sync + 'static {
@@ -104,7 +102,7 @@ struct State {
     is_stateful: bool,
     /// Losses of the last hand-over.
     lost: Option<(Instant, String)>,
-    callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
+    callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, FailureReason>>>,
     goals: KeeperGoals,
 }
 
@@ -208,7 +206,7 @@ impl Keeper {
         self: &Arc<Self>,
         service: &Arc<str>,
         request: Bytes,
-    ) -> Result<Bytes, String> {
+    ) -> Result<Bytes, FailureReason> {
         let (sender, answer) = oneshot::channel();
         let id = self.update(|state, now| {
             state.ledger.record_input(now, service);
@@ -219,7 +217,7 @@ impl Keeper {
         let waiting = CallGuard { keeper: self, id };
         let answer = answer.await;
         drop(waiting);
-        answer.unwrap_or_else(|_| Err("the node is ending".to_owned()))
+        answer.unwrap_or_else(|_| Err(FailureReason::new("the node is ending")))
     }
 
     /// Handles an answer of the cloud to a call.
@@ -336,7 +334,7 @@ impl Keeper {
 }
 
 impl State {
-    fn reply(&mut self, id: RequestId, answer: Result<Bytes, String>) {
+    fn reply(&mut self, id: RequestId, answer: Result<Bytes, FailureReason>) {
         if let Some(caller) = self.callers.remove(&id) {
             let _ = caller.send(answer);
         }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, BusError, Digest, Lender, LentService, ServiceHandler};
+use ros::bus::{Bus, BusError, Digest, FailureReason, Lender, LentService, ServiceHandler};
 use tokio::sync::watch;
 
 /// Time limit for the result of a goal, longer than any goal takes.
@@ -64,15 +64,11 @@ struct ForwardedService {
 
 #[async_trait]
 impl ServiceHandler for ForwardedService {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let (service, digest) = (&self.service, &self.digest);
         let limit = call_limit_for(service, self.limit);
         let called = self.bus.call_typed(service, digest, request, limit);
-        called.await.map_err(|error| match error {
-            BusError::CallFailed { reason, .. } => reason,
-            error @ BusError::Timeout { .. } => report_timeout(&error),
-            other => other.to_string(),
-        })
+        called.await.map_err(describe_failure)
     }
 }
 
@@ -85,9 +81,16 @@ pub fn call_limit_for(service: &str, limit: Duration) -> Duration {
     }
 }
 
-/// Logs that a robot's service has not answered within its limit, and returns the message for the caller.
-pub fn report_timeout(error: &BusError) -> String {
-    let reason = format!("{error}; where it needs longer, raise call_limit in stub.toml");
-    tracing::warn!("{reason}");
-    reason
+/// Returns the reason for the failed call of a robot's service that its caller is given. Logs it if the service has not
+/// answered within its limit.
+pub fn describe_failure(error: BusError) -> FailureReason {
+    match error {
+        BusError::CallFailed { reason, .. } => FailureReason::new(reason),
+        BusError::Timeout { .. } => {
+            let reason = format!("{error}; where it needs longer, raise call_limit in stub.toml");
+            tracing::warn!("{reason}");
+            FailureReason::new(reason)
+        }
+        other => FailureReason::new(other.to_string()),
+    }
 }

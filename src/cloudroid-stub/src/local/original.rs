@@ -10,7 +10,7 @@
 
 mod runner;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -25,8 +25,9 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-use super::keeper::PendingAnswer;
+use super::expected::ExpectedInterface;
 use super::latched::LatchedRelay;
+use super::pending_answer::PendingAnswer;
 use super::private_system::{GraphChanges, PrivateSystem, RegisteredInterface};
 use super::process::OriginalProgram;
 use super::remembered::RememberedSettings;
@@ -52,38 +53,6 @@ pub struct OriginalSetup {
     /// Time allowed for it to subscribe to its requests after its node is registered. It may wait for something that
     /// never happens; after this time it is fed requests all the same.
     pub patience: Duration,
-}
-
-/// Known interface of the node. The original is ready when it subscribes to its requests and has registered the rest,
-/// or has had the time to. Inputs that it may wait for before it subscribes to requests are fed to it from its start
-/// ([`Keeper`](super::Keeper)).
-#[derive(Debug, Clone, Default)]
-pub struct ExpectedInterface {
-    /// Topics that it subscribes to.
-    pub inputs: BTreeMap<String, WireType>,
-    /// Quality of service that it requests for inputs, if known (ROS 2).
-    pub asked: BTreeMap<String, QosProfile>,
-    /// Inputs that are requests: the original is not ready before it subscribes to them.
-    pub awaited: BTreeSet<String>,
-    /// Topics that it publishes.
-    pub outputs: Vec<String>,
-    /// Services that it offers.
-    pub services: Vec<String>,
-    /// Names of the above that belong to further nodes of its process. These may differ in each run (a transform
-    /// listener has a random name), so only requests among them are waited for, and no longer than for the rest.
-    pub of_others: BTreeSet<String>,
-}
-
-impl ExpectedInterface {
-    /// Returns whether the original is expected to register this name, within the time for registrations.
-    pub(super) fn is_expected(&self, name: &str) -> bool {
-        self.awaited.contains(name) || !self.of_others.contains(name)
-    }
-
-    /// Returns whether the original is not ready before it subscribes to this topic, however long that takes.
-    fn is_required_input(&self, topic: &str) -> bool {
-        self.awaited.contains(topic) && !self.of_others.contains(topic)
-    }
 }
 
 /// An event of the local original.

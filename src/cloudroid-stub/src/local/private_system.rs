@@ -13,8 +13,8 @@ use ros::bus::{
 use tokio::sync::watch;
 use tokio::time::timeout;
 
+use super::expected::ExpectedInterface;
 use super::lender::RobotLender;
-use super::original::ExpectedInterface;
 use super::private_domain::PrivateDomain;
 use super::private_master::PrivateMaster;
 use crate::seen;

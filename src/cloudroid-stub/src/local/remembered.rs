@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 use tokio::sync::OwnedMutexGuard;
 use tokio::time::timeout;
 
-use super::keeper::PendingAnswer;
+use super::pending_answer::PendingAnswer;
 use super::reconfigured;
 use super::service_use::ServiceUse;
 

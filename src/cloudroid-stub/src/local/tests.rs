@@ -10,7 +10,8 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{HandOver, LocalState, QosEvent, QosSla, RequestId, RequestOutcome, SafeStop};
 use ros::bus::{
-    Bus, ParamValue, RosVersion, SerializedMessage, ServiceHandler, ServiceType, WireType,
+    Bus, FailureReason, ParamValue, RosVersion, SerializedMessage, ServiceHandler, ServiceType,
+    WireType,
 };
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -495,7 +496,7 @@ struct Hangs;
 
 #[async_trait::async_trait]
 impl ServiceHandler for Hangs {
-    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         std::future::pending().await
     }
 }
@@ -505,8 +506,8 @@ struct Says(Result<&'static str, &'static str>);
 
 #[async_trait::async_trait]
 impl ServiceHandler for Says {
-    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
-        Ok(self.0?.into())
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
+        self.0.map(Bytes::from).map_err(FailureReason::new)
     }
 }
 
@@ -749,7 +750,8 @@ async fn without_a_local_original_a_call_fails_with_the_reason() {
     let error = timeout(SOON, keeper.call(&"/add".into(), Bytes::new()))
         .await
         .unwrap()
-        .unwrap_err();
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("the link is down"), "{error}");
     assert!(error.contains("there is no local original"), "{error}");
     assert_eq!(hears.recv().await.unwrap(), "saidoncemissing");

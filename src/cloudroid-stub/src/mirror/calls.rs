@@ -1,38 +1,18 @@
 //! Services of the real node, served on the robot under this node's name.
 
-use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::clock::now;
 use link::control::ServiceChannel;
-use parking_lot::Mutex;
 use qos::{Failure, RequestId};
-use ros::bus::ServiceHandler;
+use ros::bus::{FailureReason, ServiceHandler};
 use tokio::sync::{oneshot, watch};
 
-use super::{Mirror, reports};
+use super::reports;
+use super::state::{Calls, Mirror, MirroredService};
 use crate::local::{Keeper, PendingAnswer, ServiceUse};
-
-/// Services by name, and pending calls.
-#[derive(Default)]
-pub struct Calls {
-    services: Mutex<HashMap<String, MirroredService>>,
-    waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, Failure>>>>,
-    /// Calls that the keeper has made: the link's id → the keeper's.
-    kept: Mutex<HashMap<u32, (RequestId, i64)>>,
-    /// Calls of the keeper that wait for their service's channel.
-    early: Mutex<Vec<(RequestId, String, Bytes)>>,
-}
-
-struct MirroredService {
-    /// The service as the cloud reported it.
-    told: ServiceChannel,
-    /// Channel number in this session; `None` until the cloud has reported it.
-    channel: Arc<watch::Sender<Option<u32>>>,
-    _serving: Box<dyn Send + Sync>,
-}
 
 impl Calls {
     /// Handles an answer of the cloud.
@@ -41,18 +21,19 @@ impl Calls {
         mirror: &Mirror,
         id: u32,
         (taken, given, arrived): (i64, i64, i64),
-        response: Result<Bytes, String>,
+        response: Result<Bytes, FailureReason>,
     ) {
+        let response = response.map_err(|reason| Failure::Refused(reason.into_string()));
         let kept = self.kept.lock().remove(&id);
         if let (Some(keeper), Some((request, asked))) = (mirror.keeper(), kept) {
             let clock = mirror.session().clock();
             let phases = clock
                 .map(|clock| reports::call_phases([asked, taken, given, arrived], clock.offset));
-            keeper.on_cloud_answer(request, response.map_err(Failure::Refused), phases);
+            keeper.on_cloud_answer(request, response, phases);
             return;
         }
         if let Some(caller) = self.waiting.lock().remove(&id) {
-            let _ = caller.send(response.map_err(Failure::Refused));
+            let _ = caller.send(response);
         }
     }
 
@@ -211,16 +192,16 @@ struct ForwardingHandler {
 
 #[async_trait]
 impl ServiceHandler for ForwardingHandler {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let keeper = {
             let mirror = self.mirror.upgrade();
-            let mirror = mirror.ok_or_else(|| "the node is ending".to_owned())?;
+            let mirror = mirror.ok_or_else(|| FailureReason::new("the node is ending"))?;
             mirror.keeper().cloned()
         };
         let Some(keeper) = keeper else {
             let channels = self.channel.subscribe();
             let answer = call_on_channel(self.mirror.clone(), channels, request).await;
-            return answer.map_err(|failure| failure.text().to_owned());
+            return answer.map_err(|failure| FailureReason::new(failure.text()));
         };
         match &self.what {
             ServiceUse::Request => keeper.call(&self.name, request).await,

@@ -7,7 +7,7 @@ use link::RobotSession;
 use link::control::FromRobot;
 use link::drops::{DropReporter, TopicDropCount};
 
-use super::Mirror;
+use super::state::Mirror;
 
 /// Interval between reports.
 const PERIOD: Duration = Duration::from_secs(2);

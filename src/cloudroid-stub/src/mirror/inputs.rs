@@ -1,8 +1,8 @@
 //! Topics that the real node subscribes to: subscribed to on the robot under this node's name, and sent to the cloud.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use link::DeliveryMode;
@@ -10,31 +10,15 @@ use link::clock::now;
 use link::control::{FromRobot, InputChannel, RequestedInput};
 use link::drops::Cause;
 use link::record::Data;
-use parking_lot::Mutex;
-use ros::bus::{Digest, MatchedPeers, PeerId, QosProfile, SerializedMessage, TopicPeer, WireType};
-use tokio::task::AbortHandle;
+use ros::bus::{MatchedPeers, PeerId, QosProfile, SerializedMessage, TopicPeer, WireType};
 
-use super::Mirror;
+use super::state::{InputTopic, Inputs, Mirror, OpenChannel, TopicChannels};
 
 /// Queue length on the bus while the link is busy, in messages.
 const QUEUE: usize = 256;
 
 /// Delay before a refused subscription is tried again.
 const REFUSED: Duration = Duration::from_secs(1);
-
-/// Inputs by topic.
-#[derive(Default)]
-pub struct Inputs {
-    topics: Mutex<HashMap<String, InputTopic>>,
-    channels: Mutex<HashMap<String, TopicChannels>>,
-    next: AtomicU32,
-}
-
-struct InputTopic {
-    wanted: RequestedInput,
-    feed: Arc<AtomicBool>,
-    reading: AbortHandle,
-}
 
 impl Drop for InputTopic {
     fn drop(&mut self) {
@@ -301,25 +285,6 @@ async fn read_input(
             (None, false) => {}
         }
     }
-}
-
-/// Channels of a topic: one shared by all publishers that do not latch, and one for each publisher that does, whose
-/// last message is retained.
-#[derive(Default)]
-struct TopicChannels {
-    by_publisher: HashMap<(Option<PeerId>, Digest), OpenChannel>,
-    /// Last latched message of each publisher.
-    latched: HashMap<PeerId, SerializedMessage>,
-    /// Latched messages that a new servant has not received yet.
-    to_send_again: HashMap<PeerId, SerializedMessage>,
-    /// Types of the connected publishers that do not latch.
-    offered: HashMap<PeerId, Arc<WireType>>,
-}
-
-struct OpenChannel {
-    number: u32,
-    /// Publishers that have sent on this channel.
-    publishers: BTreeSet<PeerId>,
 }
 
 impl TopicChannels {

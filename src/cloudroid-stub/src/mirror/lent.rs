@@ -1,32 +1,35 @@
 //! Services of the robot that nodes in the cloud call. They are looked up here when such a node looks for them, and
 //! watched from then on.
 
-use std::collections::HashMap;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 
 use budget::Permit;
 use link::RobotSession;
 use link::control::{FromRobot, ServiceChannel};
 use link::record::ReceivedCall;
-use parking_lot::Mutex;
-use ros::bus::{BusError, CallFate, Digest, Graph, ServiceProvider};
+use ros::bus::{BusError, CallFate, FailureReason, Graph, ServiceProvider};
 
-use super::Mirror;
+use super::state::{LentEntry, LentServices, Mirror};
 use crate::{local, seen};
 
-/// Services that were reported to the cloud.
-#[derive(Default)]
-pub struct LentServices {
-    services: Mutex<HashMap<String, LentEntry>>,
-    next: AtomicU32,
-}
-
-struct LentEntry {
-    channel: u32,
-    /// The node that serves it.
-    node: String,
-    digest: Digest,
+/// Reason why a service is not lent to the cloud.
+#[derive(Debug, thiserror::Error)]
+enum NotLendable {
+    /// The robot does not have it.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The servant itself serves it; contains the name of the service.
+    #[error("{0} is served by this servant itself")]
+    OwnServant(String),
+    /// Another servant serves it.
+    #[error("{service} is served by another stub, {stub}")]
+    OtherStub {
+        /// Name of the service.
+        service: String,
+        /// Name of the stub's node.
+        stub: String,
+    },
 }
 
 impl LentServices {
@@ -43,11 +46,12 @@ impl LentServices {
             let _held = held;
             let Some(mirror) = this.upgrade() else { return };
             let found = async { mirror.bus.lending()?.provider(&service).await }.await;
-            let found = found.map_err(|error| error.to_string());
+            let found = found.map_err(NotLendable::from);
             let found = found.and_then(|provider| mirror.check_lendable(&service, provider));
             let provider = match found {
                 Ok(provider) => Some(provider),
-                Err(reason) => {
+                Err(error) => {
+                    let reason = error.to_string();
                     tracing::debug!(service, reason, "not offered to the cloud");
                     None
                 }
@@ -107,7 +111,7 @@ impl LentServices {
                 .map(|(name, service)| (name.clone(), service.digest.clone()))
         };
         let Some((name, digest)) = known else {
-            let gone = "no node on the robot serves this any more".to_owned();
+            let gone = FailureReason::new("no node on the robot serves this any more");
             return session.answer(id, arrived, Err(gone));
         };
         let this = mirror.this.clone();
@@ -123,11 +127,7 @@ impl LentServices {
                     .lent
                     .withdraw(&mirror, |service| service.channel == channel);
             }
-            let called = called.map_err(|error| match error {
-                BusError::CallFailed { reason, .. } => reason,
-                error @ BusError::Timeout { .. } => local::report_timeout(&error),
-                other => other.to_string(),
-            });
+            let called = called.map_err(local::describe_failure);
             // Answered on the session that the call came from: in another one its id means another call.
             if let Some(session) = session.upgrade() {
                 session.answer(id, arrived, called);
@@ -172,17 +172,17 @@ impl Mirror {
         &self,
         service: &str,
         provider: ServiceProvider,
-    ) -> Result<ServiceProvider, String> {
+    ) -> Result<ServiceProvider, NotLendable> {
         let own = provider.node == self.bus.node();
         if own || provider.label.as_ref() == Some(&self.label) {
-            return Err(format!("{service} is served by this servant itself"));
+            return Err(NotLendable::OwnServant(service.to_owned()));
         }
         // Stubs of an earlier version send no label.
         if self.siblings.read().contains(&provider.node) {
-            return Err(format!(
-                "{service} is served by another stub, {}",
-                provider.node
-            ));
+            return Err(NotLendable::OtherStub {
+                service: service.to_owned(),
+                stub: provider.node,
+            });
         }
         Ok(provider)
     }
@@ -230,7 +230,7 @@ mod tests {
 
     #[async_trait]
     impl ServiceHandler for Echo {
-        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
             Ok(request)
         }
     }

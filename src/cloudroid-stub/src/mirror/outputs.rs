@@ -15,7 +15,8 @@ use qos::Responder;
 use ros::bus::{SerializedMessage, WireType};
 
 use self::topic::OutputTopic;
-use super::{Mirror, reports};
+use super::reports;
+use super::state::Mirror;
 
 /// Channel of outputs that the cloud has not reported.
 pub const NOWHERE: u32 = u32::MAX;

@@ -4,19 +4,12 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use link::Echoes;
 use link::control::FromRobot;
 use ros::bus::{ParamChange, ParamValue};
 
-use super::Mirror;
+use super::state::{Mirror, Parameters};
 use crate::parameters;
 use ros::ros1::own_parameters::is_set_by_master;
-
-/// Parameters set here on behalf of the cloud, which are not sent back.
-#[derive(Default)]
-pub struct Parameters {
-    set: Echoes,
-}
 
 impl Parameters {
     fn should_send(&self, key: &str, value: Option<&ParamValue>) -> bool {

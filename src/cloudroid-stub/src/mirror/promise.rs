@@ -14,13 +14,13 @@ use qos::{
 use ros::bus::{Bus, SerializedMessage};
 use serde_json::json;
 
-use super::Mirror;
 use super::diagnostics::Diagnostics;
 use super::known::KnownInterface;
 use super::reports::{self, Reports};
 use super::requests::RequestPattern;
 use super::safe_stop::{self, SafeStopPublisher};
-use crate::config::{self, Config};
+use super::state::Mirror;
+use crate::config::{self, Config, OUTPUT_MEASURES};
 use crate::local::{
     Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer,
 };
@@ -29,9 +29,10 @@ use crate::local::{
 /// if it excludes a local original as well, returns `None`.
 pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
     let mut sla = serde_json::Map::new();
-    let output = config.output.clone().unwrap_or_default();
-    match (config.frames_per_second, config.age) {
-        (None, None) => match (config.desire, config.max) {
+    let promised = OUTPUT_MEASURES.iter();
+    let promised: Vec<_> = promised.filter_map(|one| one.promise(config)).collect();
+    match promised.as_slice() {
+        [] => match (config.desire, config.max) {
             (Some(desire), Some(max)) => {
                 sla.insert("t_desire".into(), desire.into());
                 sla.insert("t_max".into(), max.into());
@@ -42,21 +43,15 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
                 sla.insert("measure".into(), measure);
             }
         },
-        (Some(_), Some(_)) => bail!("frames_per_second and age are both given; remove one"),
-        _ if config.desire.or(config.max).is_some() => {
-            bail!(
-                "desire and max are about response times; remove them, or frames_per_second and age"
-            )
+        [measure] if config.desire.or(config.max).is_none() => {
+            sla.insert("measure".into(), measure.clone());
         }
-        (Some(least), None) => {
-            let desire = config.desired_frames_per_second.unwrap_or(least);
-            let measure = json!({"output": output, "desire": desire, "min": least});
-            sla.insert("measure".into(), json!({"frames_per_second": measure}));
-        }
-        (None, Some(age)) => {
-            let desire = config.desired_age.unwrap_or(age);
-            let measure = json!({"output": output, "desire": desire, "max": age});
-            sla.insert("measure".into(), json!({"age": measure}));
+        [_] => bail!(
+            "desire and max are about response times; remove them, or what is set of an output"
+        ),
+        _ => {
+            let keys = OUTPUT_MEASURES.each_ref().map(|measure| measure.key);
+            bail!("{} are both given; remove one", keys.join(" and "))
         }
     }
     // JSON has no infinity.
@@ -349,7 +344,7 @@ impl Application for MirrorAdapter {
                 tracing::warn!("no answer in time: safe stop on {}", stop.topic);
                 mirror.outputs.publish(&stop.topic, bytes);
             }
-            Some(Err(reason)) => tracing::error!("no safe stop on {}: {reason}", stop.topic),
+            Some(Err(error)) => tracing::error!("no safe stop on {}: {error}", stop.topic),
             None => tracing::error!("no safe stop: {} is not an output of this node", stop.topic),
         }
     }

@@ -1,26 +1,17 @@
 //! Endpoints of the robot's topics with incompatible quality of service, which exchange no messages. The bus reports
 //! them in the robot's log; the cloud receives the current list, for `cloudroidctl explain`.
 
-use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use link::control::{FromRobot, IncompatibleEndpoint};
-use parking_lot::Mutex;
 use ros::bus::MatchedPeers;
 
-use super::Mirror;
+use super::state::{Mirror, Refusals};
 
 /// Interval between checks.
 const PERIOD: Duration = Duration::from_secs(1);
-
-/// Incompatible endpoints by the numbers of the local ones.
-#[derive(Default)]
-pub struct Refusals {
-    known: Mutex<BTreeMap<u64, Vec<IncompatibleEndpoint>>>,
-    next: AtomicU64,
-}
 
 /// A local endpoint; dropping it removes its incompatible peers.
 pub struct LocalEnd {

@@ -11,8 +11,8 @@ use parking_lot::Mutex;
 use qos::{DecisionReason, HandOver, Phases, QosEvent, RequestChannel, RequestOutcome, Responder};
 use tokio::time::{MissedTickBehavior, interval};
 
-use super::Mirror;
 use super::diagnostics::Diagnostics;
+use super::state::Mirror;
 
 /// Interval between reports, the usual rate of `/diagnostics`.
 const PERIOD: Duration = Duration::from_secs(1);

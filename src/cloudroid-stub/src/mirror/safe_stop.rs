@@ -57,14 +57,13 @@ impl SafeStopPublisher {
 }
 
 /// Returns a zero message; for ROS 2, with the defaults of the type's definition.
-pub fn zero_message(wire_type: &WireType) -> Result<Bytes, String> {
-    let of = wire_type.schema().map_err(|error| error.to_string())?;
+pub fn zero_message(wire_type: &WireType) -> anyhow::Result<Bytes> {
+    let of = wire_type.schema()?;
     if of.version() == RosVersion::One {
         return Ok(vec![0; of.min_size()].into());
     }
     let mut bytes = Vec::new();
-    ros::codec::from_json(&of, b"{}", &mut bytes, &Default::default())
-        .map_err(|error| error.to_string())?;
+    ros::codec::from_json(&of, b"{}", &mut bytes, &Default::default())?;
     Ok(bytes.into())
 }
 

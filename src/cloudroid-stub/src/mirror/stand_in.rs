@@ -7,7 +7,7 @@ use link::control::{self, Graph, OutputChannel, RequestedInput, ServiceChannel};
 use ros::bus::{QosProfile, ServiceType, WireType};
 
 use super::outputs::NOWHERE;
-use super::{KnownType, Mirror};
+use super::state::{KnownType, Mirror};
 use crate::local::{Keeper, Original, RegisteredInterface};
 
 /// Registers the interface of the local original on the robot until the cloud has sent the node's interface.

@@ -16,9 +16,10 @@ use link::session::{receive_open, send_open};
 use link::{DisconnectReason, SessionOptions};
 use link::{MAX_FRAME, MAX_RECORD};
 use qos::{QosSla, Responder};
-use reach::links::{Hub, HubOptions, NodeController};
+use reach::links::{Hub, HubOptions, NodeController, NodeError};
 use ros::bus::{
-    Graph as Seen, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
+    FailureReason, Graph as Seen, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType,
+    Subscription,
 };
 use ros::schema::Registry;
 use tokio::task::JoinHandle;
@@ -53,11 +54,11 @@ struct IdleNodes;
 
 #[async_trait]
 impl NodeController for IdleNodes {
-    async fn start(&self, _: &NodeLaunch, _: &str) -> Result<(), String> {
+    async fn start(&self, _: &NodeLaunch, _: &str) -> Result<(), NodeError> {
         Ok(())
     }
-    async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
-        Err("it does not run".to_owned())
+    async fn signal(&self, _: &str, _: i32) -> Result<(), NodeError> {
+        Err(NodeError::ServantEnded)
     }
     async fn wait_exit(&self, _: &str) -> Exit {
         std::future::pending().await
@@ -336,7 +337,7 @@ struct Says(Bytes);
 
 #[async_trait]
 impl ServiceHandler for Says {
-    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         Ok(self.0.clone())
     }
 }

@@ -6,12 +6,14 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use anyhow::anyhow;
+use ring::error::KeyRejected;
 use ring::rand::SystemRandom;
 use ring::signature::{ECDSA_P256_SHA256_ASN1_SIGNING, EcdsaKeyPair};
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
 
-use super::{file_error, request, write_atomically};
+use super::files::{file_error, write_atomically};
+use super::request;
 
 /// The private key of this robot.
 pub struct RobotKey {
@@ -49,24 +51,22 @@ impl RobotKey {
         let mut text = String::new();
         file.read_to_string(&mut text)
             .map_err(|error| file_error(path, error))?;
-        let read = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes());
-        let key = read
-            .map_err(|error| error.to_string())
-            .and_then(RobotKey::from_pkcs8);
-        key.map_err(|error| {
+        let invalid = |error: &dyn std::fmt::Display| {
             file_error(
                 path,
                 format!(
                     "not a valid key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"
                 ),
             )
-        })
+        };
+        let read = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes());
+        let written = read.map_err(|error| invalid(&error))?;
+        RobotKey::from_pkcs8(written).map_err(|error| invalid(&error))
     }
 
-    fn from_pkcs8(written: PrivatePkcs8KeyDer<'static>) -> Result<RobotKey, String> {
+    fn from_pkcs8(written: PrivatePkcs8KeyDer<'static>) -> Result<RobotKey, KeyRejected> {
         let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
-        let pair = EcdsaKeyPair::from_pkcs8(kind, written.secret_pkcs8_der(), &random)
-            .map_err(|error| error.to_string())?;
+        let pair = EcdsaKeyPair::from_pkcs8(kind, written.secret_pkcs8_der(), &random)?;
         Ok(RobotKey { pair, written })
     }
 

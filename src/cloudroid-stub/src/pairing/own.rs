@@ -10,8 +10,8 @@ use tls::KnownServers;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 
+use super::files::{file_error, write_atomically};
 use super::key::RobotKey;
-use super::{file_error, write_atomically};
 use crate::address::Address;
 
 /// The directory with the key and certificates of this robot.

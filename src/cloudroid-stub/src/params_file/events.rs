@@ -2,8 +2,9 @@
 
 use saphyr_parser::{Event, Parser, StrInput};
 
-/// A syntax or content error in a text.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// A syntax or content error in a text. It is displayed without its line, which only a text of several lines has.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{reason}")]
 pub struct Problem {
     /// Line number, starting at 1.
     pub line: usize,

@@ -15,8 +15,8 @@ const FALSE: [&str; 11] = [
 /// Parses the value of an argument `-p NAME:=VALUE`.
 ///
 /// # Errors
-/// The reason why it is not a value.
-pub fn parse_text(text: &str) -> Result<ParamValue, String> {
+/// The text is not a value, or is several.
+pub fn parse_text(text: &str) -> Result<ParamValue, Problem> {
     let mut found = None;
     let mut events = YamlEvents::new(text);
     let mut read = || {
@@ -30,8 +30,8 @@ pub fn parse_text(text: &str) -> Result<ParamValue, String> {
             }
         }
     };
-    read().map_err(|problem| problem.reason)?;
-    found.ok_or_else(|| NO_VALUE.to_owned())
+    read()?;
+    found.ok_or_else(|| Problem::new(1, NO_VALUE))
 }
 
 /// Reason that is reported if the value is missing.
@@ -232,7 +232,7 @@ mod tests {
             ("\"", "quote"),
             ("[1, 2", "expected ',' or ']'"),
         ] {
-            let reason = parse_text(text).expect_err(text);
+            let reason = parse_text(text).expect_err(text).to_string();
             assert!(reason.contains(said), "{text}: {reason}");
         }
     }

@@ -81,8 +81,8 @@ fn read_sections(parts: &[CommandLinePart]) -> anyhow::Result<Sections> {
                     None => ALL.to_owned(),
                 };
                 let value = value::parse_text(&given.value);
-                let value =
-                    value.map_err(|reason| arguments::invalid_value(&part.words, &reason))?;
+                let value = value
+                    .map_err(|problem| arguments::invalid_value(&part.words, &problem.reason))?;
                 sections.set(&nodes, given.name.clone(), value);
             }
             Kind::File(path) => sections.read(Path::new(path))?,

@@ -78,6 +78,21 @@ impl Axis {
     }
 }
 
+/// Begins a white document of this height.
+pub(crate) fn begin_svg(height: f64) -> String {
+    let width = LEFT + WIDTH + RIGHT;
+    let mut out = String::new();
+    push_line(
+        &mut out,
+        format_args!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+             font-family=\"sans-serif\" \
+             font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>"
+        ),
+    );
+    out
+}
+
 /// Draws the calibration as an SVG document.
 pub fn draw(calibration: &Calibration) -> String {
     let measured: Vec<(&Point, TimeSpread)> = calibration
@@ -92,16 +107,8 @@ pub fn draw(calibration: &Calibration) -> String {
     );
     let times = measured.iter().flat_map(|(_, time)| [time.p50, time.p95]);
     let y = Axis::from_values(times, TOP + HEIGHT, TOP);
-    let mut out = String::new();
-    let (width, height) = (LEFT + WIDTH + RIGHT, TOP + HEIGHT + BOTTOM);
-    push_line(
-        &mut out,
-        format_args!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
-             font-family=\"sans-serif\" \
-             font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>"
-        ),
-    );
+    let height = TOP + HEIGHT + BOTTOM;
+    let mut out = begin_svg(height);
     let title = format!(
         "{}, revision {}: response time by CPU cores",
         calibration.service, calibration.revision

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use anyhow::bail;
-use api::calibration::{OUT_OF_MEMORY, Point};
+use api::calibration::OUT_OF_MEMORY;
 use api::{Calibration, CalibrationEvent, CalibrationOptions, Problem, Servant, ServiceDetail};
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -14,7 +14,7 @@ use hyper::Method;
 use super::EvalArgs;
 use super::probe::{self, NetworkProbe, ProbeOutcome};
 use super::robot::RobotResources;
-use super::side::SideResult;
+use super::side::{SideResult, only_point};
 use super::verdict::Evaluation;
 use crate::calibrate::format_point;
 use crate::client::{self, DaemonClient, percent_encode};
@@ -218,11 +218,6 @@ fn rename_robot_flags(error: anyhow::Error) -> anyhow::Error {
         .into(),
         Err(error) => error,
     }
-}
-
-/// Returns the only measured point.
-pub(super) fn only_point(calibration: &Calibration) -> Point {
-    calibration.points.first().copied().unwrap_or_default()
 }
 
 fn has_answers(calibration: &Calibration) -> bool {

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use anyhow::{bail, ensure};
 use serde::Serialize;
 
 /// Delay and bandwidth of a network.
@@ -30,10 +31,10 @@ impl AddedNetwork {
 }
 
 impl FromStr for AddedNetwork {
-    type Err = String;
+    type Err = anyhow::Error;
 
     /// Parses `lan`, `wan` (the networks of docs/evaluation.md) or a number of milliseconds for both ways together.
-    fn from_str(text: &str) -> Result<AddedNetwork, String> {
+    fn from_str(text: &str) -> anyhow::Result<AddedNetwork> {
         let of = |each_way, mbits| AddedNetwork {
             each_way,
             mbits: Some(mbits),
@@ -43,12 +44,13 @@ impl FromStr for AddedNetwork {
             "wan" => return Ok(of(30.0, 20.0)),
             _ => {}
         }
-        let both: f64 = text
-            .parse()
-            .map_err(|_| "expected lan, wan, or milliseconds per request".to_owned())?;
-        if !(0.0..=3_600_000.0).contains(&both) {
-            return Err("expected 0 to 3600000 milliseconds".to_owned());
-        }
+        let Ok(both) = text.parse::<f64>() else {
+            bail!("expected lan, wan, or milliseconds per request");
+        };
+        ensure!(
+            (0.0..=3_600_000.0).contains(&both),
+            "expected 0 to 3600000 milliseconds"
+        );
         Ok(AddedNetwork {
             each_way: both / 2.0,
             mbits: None,

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use crate::calibrate::curve::{
-    Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, WIDTH, format_number, push_line, push_text,
+    Axis, BLUE, BOTTOM, HEIGHT, LEFT, WIDTH, begin_svg, format_number, push_line, push_text,
 };
 use crate::eval::side::SideResult;
 use crate::eval::verdict::Evaluation;
@@ -19,16 +19,8 @@ const LONGEST: usize = 60;
 pub fn draw(of: &Evaluation) -> String {
     let times = of.native.times.iter().chain(&of.outsourced.times);
     let x = Axis::from_values(times.copied(), LEFT, LEFT + WIDTH);
-    let (width, height) = (LEFT + WIDTH + RIGHT, TOP + HEIGHT + BOTTOM);
-    let mut out = String::new();
-    push_line(
-        &mut out,
-        format_args!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
-             font-family=\"sans-serif\" \
-             font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>"
-        ),
-    );
+    let height = TOP + HEIGHT + BOTTOM;
+    let mut out = begin_svg(height);
     let title = format!(
         "{}, revision {}: fraction of requests answered within a time",
         of.service, of.revision

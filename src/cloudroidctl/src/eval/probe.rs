@@ -204,7 +204,7 @@ impl NetworkProbe<'_> {
 
 /// Returns the time after which a request is repeated that may not have been received.
 fn retry_interval(calibration: &Calibration) -> Duration {
-    let longest = super::measure::only_point(calibration).compute;
+    let longest = super::side::only_point(calibration).compute;
     let longest = longest.map_or(0.0, |compute| compute.max);
     AGAIN + Duration::from_secs_f64(longest * 2.0 / 1000.0).min(ANSWER)
 }

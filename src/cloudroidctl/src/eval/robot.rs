@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use anyhow::{bail, ensure};
 use api::Size;
 use serde::Serialize;
 
@@ -16,32 +17,32 @@ pub enum RobotClass {
 }
 
 /// Parses a number of cores in the range in which the daemon measures.
-pub fn cores(text: &str) -> Result<f64, String> {
-    let cores: f64 = text
-        .parse()
-        .map_err(|_| "not a number of cores".to_owned())?;
-    if (0.01..=4096.0).contains(&cores) {
-        Ok(cores)
-    } else {
-        Err("expected 0.01 to 4096 cores".to_owned())
-    }
+pub fn cores(text: &str) -> anyhow::Result<f64> {
+    let Ok(cores) = text.parse::<f64>() else {
+        bail!("not a number of cores");
+    };
+    ensure!(
+        (0.01..=4096.0).contains(&cores),
+        "expected 0.01 to 4096 cores"
+    );
+    Ok(cores)
 }
 
 /// Parses an amount of memory that is large enough for a measurement.
-pub fn memory(text: &str) -> Result<Size, String> {
-    let memory: Size = text.parse().map_err(|wrong| format!("{wrong}"))?;
-    if memory >= Size(16 << 20) {
-        Ok(memory)
-    } else {
-        Err("expected at least 16M, such as 512M".to_owned())
-    }
+pub fn memory(text: &str) -> anyhow::Result<Size> {
+    let memory: Size = text.parse()?;
+    ensure!(
+        memory >= Size(16 << 20),
+        "expected at least 16M, such as 512M"
+    );
+    Ok(memory)
 }
 
 /// Parses a number of requests that is large enough to be significant.
-pub fn requests(text: &str) -> Result<usize, String> {
+pub fn requests(text: &str) -> anyhow::Result<usize> {
     match text.parse() {
         Ok(requests @ 10..=10_000) => Ok(requests),
-        _ => Err("expected 10 to 10000 requests".to_owned()),
+        _ => bail!("expected 10 to 10000 requests"),
     }
 }
 
@@ -92,16 +93,14 @@ mod tests {
             cores(wrong).expect_err(wrong);
             requests(wrong).expect_err(wrong);
         }
-        assert_eq!(cores("0.25"), Ok(0.25));
-        assert!(memory("1").expect_err("too little").contains("16M"));
+        assert_eq!(cores("0.25").expect("a number"), 0.25);
+        let refused = memory("1").expect_err("too little").to_string();
+        assert!(refused.contains("16M"), "{refused}");
         memory("much").expect_err("no size");
-        assert_eq!(memory("512M"), Ok(Size(512 << 20)));
-        assert!(
-            requests("9")
-                .expect_err("too few")
-                .contains("expected 10 to")
-        );
-        assert_eq!(requests("10"), Ok(10));
+        assert_eq!(memory("512M").expect("a size"), Size(512 << 20));
+        let refused = requests("9").expect_err("too few").to_string();
+        assert!(refused.contains("expected 10 to"), "{refused}");
+        assert_eq!(requests("10").expect("enough"), 10);
     }
 
     #[test]

@@ -1,10 +1,9 @@
 //! One side of an evaluation: its measurement, and the phases of its requests.
 
-use api::calibration::TimeSpread;
+use api::calibration::{Point, TimeSpread};
 use api::{Calibration, Size};
 use serde::Serialize;
 
-use super::measure::only_point;
 use super::network::AddedNetwork;
 use super::probe::ProbeOutcome;
 use super::robot::RobotResources;
@@ -13,6 +12,11 @@ use super::robot::RobotResources;
 const ENOUGH: f64 = 0.95;
 /// Smallest number of answers for a meaningful 95th percentile.
 const FEWEST: usize = 10;
+
+/// Returns the only measured point.
+pub(super) fn only_point(calibration: &Calibration) -> Point {
+    calibration.points.first().copied().unwrap_or_default()
+}
 
 /// Result of one side.
 #[derive(Debug, Clone, Default, Serialize)]

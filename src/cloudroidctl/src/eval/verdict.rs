@@ -1,5 +1,7 @@
 //! Result of an evaluation: both sides, the verdict and the suggested SLA.
 
+use std::fmt;
+
 use api::Calibration;
 use api::calibration::round_up_to_two_digits;
 use api::dictionary::{Row, Spread};
@@ -72,6 +74,29 @@ pub struct SuggestedSla {
     pub reason: String,
 }
 
+/// Reason why no SLA is suggested.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum NoSuggestion {
+    /// The measurement over the network was aborted.
+    Aborted,
+    /// Too few requests were answered, or not at the recording's rate.
+    TooFewAnswers,
+    /// The service is faster on the robot.
+    FasterOnRobot,
+}
+
+impl fmt::Display for NoSuggestion {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            NoSuggestion::Aborted => "the measurement over the network was aborted",
+            NoSuggestion::TooFewAnswers => {
+                "outsourced, too few requests were answered, or not at the recording's rate"
+            }
+            NoSuggestion::FasterOnRobot => "it is faster on the robot",
+        })
+    }
+}
+
 impl Evaluation {
     /// Creates the evaluation of both sides; `measured` is the daemon's measurement of the outsourced one.
     pub fn new(
@@ -99,7 +124,7 @@ impl Evaluation {
         evaluation.verdict = evaluation.verdict_in_words();
         match evaluation.suggest_sla(measured.rows.last()) {
             Ok(sla) => evaluation.sla = Some(sla),
-            Err(why) => evaluation.unsuggested = Some(why),
+            Err(why) => evaluation.unsuggested = Some(why.to_string()),
         }
         evaluation
     }
@@ -162,22 +187,20 @@ impl Evaluation {
 
     /// Suggests an SLA from the outsourced times: the row that the daemon proposes for the limits, with the response
     /// time seen from here.
-    fn suggest_sla(&self, proposed: Option<&Row>) -> Result<SuggestedSla, String> {
-        const LACKS: &str =
-            "outsourced, too few requests were answered, or not at the recording's rate";
+    fn suggest_sla(&self, proposed: Option<&Row>) -> Result<SuggestedSla, NoSuggestion> {
         if self.outsourced.broken.is_some() {
-            return Err("the measurement over the network was aborted".to_owned());
+            return Err(NoSuggestion::Aborted);
         }
         let measured = proposed.zip(self.outsourced.rrt);
-        let (row, rrt) = measured.ok_or_else(|| LACKS.to_owned())?;
+        let (row, rrt) = measured.ok_or(NoSuggestion::TooFewAnswers)?;
         if !self.outsourced.has_enough_answers() || !self.outsourced.keeps_pace(self.pace) {
-            return Err(LACKS.to_owned());
+            return Err(NoSuggestion::TooFewAnswers);
         }
         if self
             .times_as_fast
             .is_some_and(|factor| factor <= 1.0 / WORTH)
         {
-            return Err("it is faster on the robot".to_owned());
+            return Err(NoSuggestion::FasterOnRobot);
         }
         let phases = self.outsourced.phases.unwrap_or_default();
         let network_added = phases.up.unwrap_or(0.0) + phases.down.unwrap_or(0.0);

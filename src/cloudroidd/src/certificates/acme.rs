@@ -10,12 +10,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use portal::{App, TlsError};
+use portal::App;
 use store::{Journal, NewEvent, private};
 use tokio::net::TcpListener;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 
+use self::order::to_anyhow;
 use super::{ChainAndKey, DIRECTORY, read_chain_and_key};
 use crate::config;
 use crate::home::Home;
@@ -159,7 +160,7 @@ impl Renewal {
         let (chain, key) = privilege::run(async move {
             let first = CertificateDer::from_pem_slice(text.as_bytes())
                 .context("the authority's response is not a certificate")?;
-            authority::read_validity(&first).map_err(anyhow::Error::msg)?;
+            authority::read_validity(&first)?;
             private::write_atomically(&keep, text.as_bytes())
                 .with_context(|| format!("cannot write it to {}", keep.display()))?;
             Ok::<ChainAndKey, anyhow::Error>(read_chain_and_key(&keep, &keep)?)
@@ -172,11 +173,6 @@ impl Renewal {
         }
         tls.replace_certificate(chain, key).map_err(to_anyhow)
     }
-}
-
-/// Converts the error without its source, whose text it contains already.
-fn to_anyhow(error: TlsError) -> anyhow::Error {
-    anyhow::Error::msg(error.to_string())
 }
 
 /// Returns the time at which a certificate is to be renewed, in milliseconds since 1970.

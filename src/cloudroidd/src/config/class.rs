@@ -2,7 +2,6 @@
 
 use anyhow::{Context, bail};
 use api::{Limits, Size, Sla};
-use choreographer::limits::check as check_limits;
 use serde::Deserialize;
 
 /// A class of robots.
@@ -42,11 +41,11 @@ impl ClassConfig {
             memory: self.max_memory,
             ..Limits::default()
         };
-        if let Err(error) = check_limits(&caps) {
+        if let Err(error) = caps.check() {
             bail!("max_{error}");
         }
         self.sla.check().context("sla")?;
-        check_limits(&self.limits).context("limits")?;
+        self.limits.check().context("limits")?;
         let limits = &self.limits;
         if let (Some(has), Some(most)) = (limits.cpus, self.max_cpus)
             && has > most

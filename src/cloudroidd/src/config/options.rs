@@ -87,12 +87,12 @@ impl Config {
 
 impl PushConfig {
     /// Returns the limits of each container of a build.
-    pub fn limits(&self) -> servant::spec::ResourceLimits {
-        servant::spec::ResourceLimits {
+    pub fn limits(&self) -> api::Limits {
+        api::Limits {
             cpus: self.cpus,
-            memory: self.memory.map(|memory| memory.0),
+            memory: self.memory,
             pids: Some(self.pids),
-            ..servant::spec::ResourceLimits::default()
+            ..api::Limits::default()
         }
     }
 }

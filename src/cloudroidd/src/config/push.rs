@@ -1,8 +1,7 @@
 //! `[push]`: limits of pushes and their builds.
 
 use anyhow::bail;
-use api::{Limits, Size};
-use choreographer::limits::check as check_limits;
+use api::Size;
 use serde::Deserialize;
 
 use super::Time;
@@ -80,11 +79,6 @@ impl PushConfig {
         if sent.contains(&0) || self.probe.0.is_zero() {
             bail!("an archive, unpacked, entries or probe of 0 would refuse every push");
         }
-        Ok(check_limits(&Limits {
-            cpus: self.cpus,
-            memory: self.memory,
-            pids: Some(self.pids),
-            ..Limits::default()
-        })?)
+        Ok(self.limits().check()?)
     }
 }

@@ -3,8 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use super::lanes::{RecordLane, RecordLanes};
-use super::out::OutgoingRecord;
-use super::{InFlightRecord, SMALL};
+use super::out::{InFlightRecord, OutgoingRecord, SMALL};
 use crate::limits::LinkLimits;
 
 /// Streams reserved for control records and calls, which messages and long responses may not use.

@@ -4,9 +4,11 @@ use bytes::{BufMut, Bytes, BytesMut};
 use ros::ring::RingItem;
 use ros::ros1::actions;
 
-use super::SMALL;
 use super::lanes::RecordLane;
 use crate::record::Record;
+
+/// Records up to this size are sent in one piece and kept until they are acknowledged.
+pub(super) const SMALL: usize = 32 * 1024;
 
 /// Delivery guarantee of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -120,4 +122,15 @@ impl OutgoingRecord {
         piece.put_slice(&self.payload[..end.saturating_sub(head)]);
         piece.freeze()
     }
+}
+
+/// A record of which a part has been sent.
+#[derive(Debug)]
+pub(super) struct InFlightRecord {
+    pub(super) stream: u32,
+    pub(super) number: u64,
+    /// The record is sent again after a lost connection.
+    pub(super) again: bool,
+    pub(super) at: usize,
+    pub(super) out: OutgoingRecord,
 }

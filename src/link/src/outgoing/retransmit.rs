@@ -7,8 +7,8 @@ use ros::turns::RoundRobin;
 
 use super::data::topic_queue;
 use super::lanes::RecordLane;
-use super::out::OutgoingRecord;
-use super::{InFlightRecord, Outgoing, budget};
+use super::out::{InFlightRecord, OutgoingRecord};
+use super::{Outgoing, budget};
 use crate::drops::Cause;
 use crate::limits::KEPT;
 use crate::record::{ENCODED, FLAGS_AT};

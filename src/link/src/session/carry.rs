@@ -7,6 +7,7 @@ use std::task::Poll;
 use std::time::Duration;
 
 use bytes::Bytes;
+use ros::bus::FailureReason;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -304,7 +305,7 @@ impl<O: ControlMessage> Session<O> {
                         record.try_map_control(|_| Ok::<_, Error>(None))?
                     }
                     Err(full) => {
-                        self.answer(id, arrived, Err(full.to_string()));
+                        self.answer(id, arrived, Err(FailureReason::new(full.to_string())));
                         None
                     }
                 },

@@ -634,7 +634,7 @@ async fn calls_count_until_they_are_answered() {
         lost = asks.run(&mut at_asking, &to) => panic!("{lost}"),
         reason = answered => reason,
     };
-    assert!(reason.contains("the memory for calls"), "{reason}");
+    assert!(reason.as_str().contains("the memory for calls"), "{reason}");
     let kept = slow.0.into_inner();
     assert_eq!(kept.len(), 5);
     assert!(budget.used_bytes() >= 5 * (200 << 10));

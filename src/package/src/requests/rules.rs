@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 
 use qos::{Correlation, TopicPair};
 
-use super::{ObservedAnswer, Reason};
+use super::ObservedAnswer;
+use crate::request::Reason;
 
 /// Properties of a topic used by the rules.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -4,7 +4,7 @@ use catalogue::names::NameError;
 use choreographer::{AdmissionError, ResizeError, TermsError};
 
 use super::Error;
-use crate::principals::AuthenticationError;
+use crate::principals::refusals::AuthenticationError;
 
 const NEXT_OF_ENDING: &str = "try again when the daemon has restarted";
 const NEXT_OF_INTERNAL: &str =

@@ -5,11 +5,11 @@ use std::net::IpAddr;
 
 use axum::http::{HeaderMap, header};
 
-use super::header_text;
 use crate::errors::Error;
+use crate::headers::header_text;
 
 /// Refuses requests addressed to another host (DNS rebinding).
-pub(super) fn check_host(headers: &HeaderMap) -> Result<(), Error> {
+pub fn check_host(headers: &HeaderMap) -> Result<(), Error> {
     let host = header_text(headers, header::HOST).unwrap_or_default();
     if is_loopback_host(without_port(host)) {
         return Ok(());
@@ -24,7 +24,7 @@ pub(super) fn check_host(headers: &HeaderMap) -> Result<(), Error> {
 }
 
 /// Refuses pages of other machines, except from allowed origins.
-pub(super) fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<(), Error> {
+pub fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<(), Error> {
     let Some(origin) = header_text(headers, header::ORIGIN) else {
         return Ok(());
     };
@@ -76,7 +76,7 @@ const FORWARDED: [&str; 6] = [
 ];
 
 /// Refuses requests with a proxy's headers: their clients are on other machines, whatever `Host` says.
-pub(super) fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
+pub fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
         None => Ok(()),
         Some(name) => Err(Error::Foreign {

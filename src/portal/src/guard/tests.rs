@@ -52,6 +52,7 @@ fn tokens() -> Tokens {
 fn on_loopback_nobody_needs_a_token() {
     let none = Tokens::default();
     let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -90,6 +91,7 @@ fn pages_from_elsewhere_cannot_use_a_portal_on_loopback() {
     let none = Tokens::default();
     let origins = ["https://tool.example".to_owned()];
     let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -129,6 +131,7 @@ fn pages_from_elsewhere_cannot_use_a_portal_on_loopback() {
 fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
     let none = Tokens::default();
     let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -176,6 +179,7 @@ fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
 fn an_origin_that_a_sandboxed_page_has_is_named_with_what_to_write() {
     let none = Tokens::default();
     let closed = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -206,6 +210,7 @@ fn an_origin_that_a_sandboxed_page_has_is_named_with_what_to_write() {
 fn what_a_proxy_passes_on_needs_tokens() {
     let (none, some) = (Tokens::default(), tokens());
     let mut rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -242,6 +247,7 @@ fn what_a_proxy_passes_on_needs_tokens() {
 fn without_configured_tokens_any_token_owns_robots_names() {
     let none = Tokens::default();
     let open = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &none,
@@ -262,6 +268,7 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
     let some = tokens();
     for loopback in [true, false] {
         let rules = AdmissionRules {
+            find_access: crate::routes::find_access,
             loopback,
             known: Recogniser {
                 tokens: &some,
@@ -307,6 +314,7 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
 fn at_the_registry_a_token_is_the_password_of_any_name() {
     let some = tokens();
     let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: false,
         known: Recogniser {
             tokens: &some,
@@ -352,6 +360,7 @@ fn at_the_registry_a_token_is_the_password_of_any_name() {
 fn without_a_token_only_the_page_health_and_handshakes_are_open() {
     let some = tokens();
     let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
         loopback: true,
         known: Recogniser {
             tokens: &some,

@@ -3,9 +3,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::Value;
 
 use super::{ANY, BASE, MORE, REFUSED, document};
-use crate::routes::{Access, ROUTES};
+use crate::route_access::Access;
+use crate::routes::ROUTES;
 
 mod samples;
+mod typescript;
 
 fn document_json() -> Value {
     serde_json::to_value(document(ROUTES)).expect("plain data")
@@ -212,6 +214,9 @@ impl<'a> SchemaChecker<'a> {
             return Ok(());
         }
         for (key, member) in value.as_object().into_iter().flatten() {
+            if member.is_null() {
+                return Err(format!("{name}: {key} is null; it has to be left out"));
+            }
             let described = parts
                 .iter()
                 .find_map(|(part, schema)| Some((*part, schema["properties"].get(key)?)));
@@ -262,4 +267,18 @@ fn schemas_are_as_serde_writes() {
     }
     let never: Vec<&String> = described.difference(&judge.met).collect();
     assert!(never.is_empty(), "serde never writes {never:?}");
+}
+
+#[test]
+fn the_pages_types_are_those_of_the_document() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../web/src/lib/types.ts");
+    let types = typescript::write_types(&document_json());
+    if std::env::var_os("WRITE_TYPES").is_some() {
+        std::fs::write(path, &types).expect("web/src/lib is writable");
+    }
+    let found = std::fs::read_to_string(path).expect("web/src/lib/types.ts");
+    assert!(
+        found == types,
+        "web/src/lib/types.ts is of another document; run `make types`"
+    );
 }

@@ -3,8 +3,10 @@
 
 use axum::http::{HeaderMap, HeaderValue, Method, header};
 
+use crate::caller::PortalConnection;
 use crate::errors::Error;
-use crate::guard::{self, PortalConnection};
+use crate::guard::elsewhere;
+use crate::headers;
 use crate::tokens;
 
 /// Cookie name with TLS. Because of the prefix, browsers accept it only from this host, for all paths, and send it
@@ -187,9 +189,9 @@ pub fn check(
     secret: &str,
 ) -> Result<(), Error> {
     let reads = matches!(*method, Method::GET | Method::HEAD);
-    let upgrades = guard::is_upgrade(headers);
+    let upgrades = headers::is_upgrade(headers);
     if reads && !upgrades {
-        return guard::check_not_embedded(headers);
+        return elsewhere::check_not_embedded(headers);
     }
     check_origin(connection, headers, true)?;
     // A page cannot set headers of a WebSocket handshake; browsers always send its origin.
@@ -214,7 +216,7 @@ pub fn check(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::guard::ConnectionPeer;
+    use crate::caller::ConnectionPeer;
 
     fn connection(secure: bool) -> PortalConnection {
         let peer = ConnectionPeer::Tcp("127.0.0.1:5000".parse().expect("an address"));

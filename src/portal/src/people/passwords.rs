@@ -40,15 +40,33 @@ const OBVIOUS: [&str; 12] = [
     "robotrobotrobot",
 ];
 
-/// Refuses a password that is easy to guess, with a message.
-pub fn check_strength(name: &str, password: &str) -> Result<(), String> {
+/// Reason why a password may not be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PasswordError {
+    /// The password is too long.
+    #[error("a password has at most {LONGEST} bytes")]
+    TooLong,
+    /// The password is too short.
+    #[error("a password has at least {SHORTEST} characters; four unrelated words make a good one")]
+    TooShort,
+    /// The password is common, or made of its owner's name or of one character.
+    #[error("this password is too easy to guess; choose another")]
+    Obvious,
+}
+
+impl From<PasswordError> for Error {
+    fn from(error: PasswordError) -> Error {
+        Error::BadRequest(error.to_string())
+    }
+}
+
+/// Refuses a password that is easy to guess.
+pub fn check_strength(name: &str, password: &str) -> Result<(), PasswordError> {
     if password.len() > LONGEST {
-        return Err(format!("a password has at most {LONGEST} bytes"));
+        return Err(PasswordError::TooLong);
     }
     if password.chars().count() < SHORTEST {
-        return Err(format!(
-            "a password has at least {SHORTEST} characters; four unrelated words make a good one"
-        ));
+        return Err(PasswordError::TooShort);
     }
     let plain = password.to_lowercase();
     let mut characters = plain.chars();
@@ -56,7 +74,7 @@ pub fn check_strength(name: &str, password: &str) -> Result<(), String> {
     let is_of_one = characters.all(|other| Some(other) == first);
     let without_name = plain.replace(&name.to_lowercase(), "");
     if is_of_one || without_name.chars().count() < SHORTEST / 2 || OBVIOUS.contains(&&*plain) {
-        return Err("this password is too easy to guess; choose another".into());
+        return Err(PasswordError::Obvious);
     }
     Ok(())
 }

@@ -4,24 +4,22 @@
 use std::sync::Arc;
 
 use access::AccessAction;
-use api::people::ProviderLink;
 use axum::Extension;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
-use oidc::{Person, Roles};
+use oidc::Person;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
+use super::identity_provider::{IdentityProvider, LOGIN};
 use super::{check_confidential, cookies, finish_sign_in, no_store};
 use crate::app::App;
+use crate::caller::Caller;
 use crate::errors::Error;
-use crate::guard::{self, Caller};
 use crate::principals::StartedSession;
-use crate::query::Query;
+use crate::query::{Query, query_value};
 
-/// Path at which a sign-in starts.
-const LOGIN: &str = "/api/v1/oidc/login";
 /// Path to which the provider sends browsers back, below the portal's own origin.
 pub const CALLBACK: &str = "/api/v1/oidc/callback";
 /// Maximum number of groups listed in a refusal.
@@ -29,30 +27,6 @@ const NAMED: usize = 20;
 /// Content-Security-Policy of the pages: no scripts, styles or frames.
 const POLICY: &str =
     "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
-
-/// An identity provider and the roles of its groups.
-pub struct IdentityProvider {
-    /// Client of the provider.
-    pub provider: oidc::Provider,
-    /// Display name of the provider.
-    pub name: String,
-    /// Roles of its groups.
-    pub roles: Roles,
-    /// The portal's own origin as browsers write it (RFC 6454): `https://HOST[:PORT]`.
-    pub origin: String,
-    /// Claim that holds the groups, named in the message for people without any.
-    pub groups_claim: String,
-}
-
-impl IdentityProvider {
-    /// Returns what the page needs for a link to the sign-in.
-    pub fn link(&self) -> ProviderLink {
-        ProviderLink {
-            name: self.name.clone(),
-            path: LOGIN.to_owned(),
-        }
-    }
-}
 
 /// Query of a sign-in.
 #[derive(Debug, Deserialize, IntoParams)]
@@ -174,7 +148,7 @@ async fn complete_sign_in(
     cookies::check_visit(headers)?;
     let from = caller.peer.ip();
     app.principals.check_provider_sign_in(from, store::now())?;
-    let asked = |name: &str| guard::query_value(uri.query(), name);
+    let asked = |name: &str| query_value(uri.query(), name);
     let browser = cookies::signing_in_cookie(&connection, headers)?;
     let state = asked("state").unwrap_or_default();
     let mut started = known.provider.resume(&state, browser.as_deref())?;

@@ -118,7 +118,7 @@ impl Principals {
 
     /// Creates a token. Its secret is returned only here.
     pub fn create_token(&self, new: &api::access::NewToken) -> Result<api::access::Secret, Error> {
-        check_token(new).map_err(Error::BadRequest)?;
+        check_token(new)?;
         let robot = new.robot.as_deref();
         self.check_name_is_free(&new.name, NameHolder::Token { robot })?;
         let end = |seconds: u64| {
@@ -222,40 +222,44 @@ impl Principals {
 /// Limit on the rules of the policy, because each connection checks all of them.
 const MOST_RULES: usize = 1000;
 
-/// Checks a new token; the error is a message for the user.
-fn check_token(new: &api::access::NewToken) -> Result<(), String> {
-    access::principal::check_name(&new.name).map_err(|error| error.to_string())?;
+/// Checks a new token.
+fn check_token(new: &api::access::NewToken) -> Result<(), Error> {
+    let refused = |words: String| Err(Error::BadRequest(words));
+    access::principal::check_name(&new.name)
+        .map_err(|error| Error::BadRequest(error.to_string()))?;
     if RESERVED.contains(&new.name.as_str()) {
-        return Err(format!("{} is a reserved name; choose another", new.name));
+        return refused(format!("{} is a reserved name; choose another", new.name));
     }
     let (role, scoped) = (new.role, new.role.is_scoped());
     if scoped && new.services.is_empty() {
-        return Err(format!(
+        return refused(format!(
             "a {role} needs its services; give them with --service, or all with --service '*'"
         ));
     }
     let names_some = !new.services.is_empty() || !new.classes.is_empty();
     if !scoped && names_some {
-        return Err(format!(
+        return refused(format!(
             "an {role} is for all services and classes; omit --service and --class, or choose another role"
         ));
     }
     match (&new.robot, role) {
         (Some(robot), Role::Robot) => {
-            names::validate_robot(robot).map_err(|error| error.to_string())?
+            names::validate_robot(robot).map_err(|error| Error::BadRequest(error.to_string()))?
         }
         (None, Role::Robot) => {
-            return Err("a robot's token is for one robot; give it with --robot".into());
+            return refused("a robot's token is for one robot; give it with --robot".to_owned());
         }
         (Some(_), role) => {
-            return Err(format!(
+            return refused(format!(
                 "--robot is only for tokens of robots, but this one is for a {role}"
             ));
         }
         (None, _) => {}
     }
     match new.lifetime {
-        Some(0) => Err("a token that expires at once is useless; give it a longer lifetime".into()),
+        Some(0) => {
+            refused("a token that expires at once is useless; give it a longer lifetime".to_owned())
+        }
         _ => Ok(()),
     }
 }

@@ -16,10 +16,11 @@ use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
 use super::changing::{NameHolder, RESERVED};
-use super::stored::{StoredScope, record_error};
-use super::{
-    AuthenticationError, CallerIdentity, Credential, Principals, Recogniser, StoredPrincipals, USED,
-};
+use super::identity::{CallerIdentity, Credential};
+use super::recognising::Recogniser;
+use super::refusals::{AuthenticationError, CertificateRefusal, PairingCodeRefusal};
+use super::stored::{StoredPrincipals, StoredScope, record_error};
+use super::{Principals, USED};
 use crate::errors::Error;
 use crate::tokens;
 
@@ -29,46 +30,6 @@ const LONGEST_CODE: u64 = 7 * 86_400;
 
 /// Number of times per certificate lifetime that the end of a robot's newest certificate is written.
 const OFTEN: Millis = 10;
-
-/// Reason why a certificate is not accepted although a trusted authority has signed it.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum CertificateRefusal {
-    /// The certificate names no robot.
-    #[error("{0}")]
-    Nameless(String),
-    /// The robot was never paired.
-    #[error("robot {0} is not paired")]
-    NotPaired(String),
-    /// The robot was unpaired.
-    #[error("robot {0} was unpaired")]
-    Unpaired(String),
-    /// The robot was paired again, with another key or another authority.
-    #[error("robot {0} was paired again with another key than that of this certificate")]
-    Replaced(String),
-    /// The certificate has expired while the connection is open.
-    #[error("the certificate of robot {0} has expired")]
-    Expired(String),
-}
-
-/// Reason why a pairing code is not accepted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum PairingCodeRefusal {
-    /// The code is unknown.
-    #[error("this pairing code is not known")]
-    Unknown,
-    /// The code is for another robot.
-    #[error("this pairing code is for another robot")]
-    Another,
-    /// The code was used.
-    #[error("this pairing code was already used")]
-    Used,
-    /// The code was cancelled or replaced by a newer one.
-    #[error("this pairing code was cancelled or replaced by a newer one")]
-    Cancelled,
-    /// The code has expired.
-    #[error("this pairing code has expired")]
-    Expired,
-}
 
 /// A pairing of the database, in memory.
 pub(super) struct StoredPairing {
@@ -286,7 +247,7 @@ impl Principals {
 
     /// Creates a pairing code for a robot, replacing a pending one; returns the code and its expiry.
     pub fn begin_pairing(&self, new: &NewPairing) -> Result<(String, Millis), Error> {
-        check_pairing(new).map_err(Error::BadRequest)?;
+        check_pairing(new)?;
         self.check_name_is_free(&new.robot, NameHolder::Pairing)?;
         let seconds = new.lifetime.unwrap_or(CODE);
         let expires = store::now() + seconds * 1000;
@@ -299,7 +260,7 @@ impl Principals {
 
     /// Pairs a robot that has certificates of the operator's own authority.
     pub fn pair_own(&self, new: &NewPairing) -> Result<(), Error> {
-        check_pairing(new).map_err(Error::BadRequest)?;
+        check_pairing(new)?;
         self.check_name_is_free(&new.robot, NameHolder::Pairing)?;
         self.state
             .add_pairing(&new.robot, &self.encode_scope(new)?)?;
@@ -430,23 +391,26 @@ impl Principals {
     }
 }
 
-/// Checks a new pairing; the error is a message for the user.
-fn check_pairing(new: &NewPairing) -> Result<(), String> {
-    names::validate_robot(&new.robot).map_err(|error| error.to_string())?;
+/// Checks a new pairing.
+fn check_pairing(new: &NewPairing) -> Result<(), Error> {
+    let refused = |words: String| Err(Error::BadRequest(words));
+    names::validate_robot(&new.robot).map_err(|error| Error::BadRequest(error.to_string()))?;
     if RESERVED.contains(&new.robot.as_str()) {
-        return Err(format!("{} is a reserved name; choose another", new.robot));
+        return refused(format!("{} is a reserved name; choose another", new.robot));
     }
     if new.services.is_empty() {
-        return Err(
-            "a robot is paired for given services; give them with --services, or all with --services '*'".into(),
+        return refused(
+            "a robot is paired for given services; give them with --services, or all with --services '*'".to_owned(),
         );
     }
     match new.lifetime {
-        Some(0) => Err("a code that expires at once is useless; give a longer --ttl".into()),
-        Some(seconds) if seconds > LONGEST_CODE => Err(
+        Some(0) => {
+            refused("a code that expires at once is useless; give a longer --ttl".to_owned())
+        }
+        Some(seconds) if seconds > LONGEST_CODE => refused(
             "a pairing code is valid for at most 7d, since whoever finds it can act as the \
                 robot; give a shorter --ttl"
-                .into(),
+                .to_owned(),
         ),
         _ => Ok(()),
     }

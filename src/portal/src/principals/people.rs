@@ -1,114 +1,19 @@
 //! People: their accounts and sessions.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::sync::atomic::Ordering;
 
-use access::{Glob, Principal, Role};
+use access::{Glob, Role};
 use api::Millis;
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 use catalogue::names;
-use store::{AccountEdit, AccountRecord, NewSession, Owner, SessionRecord};
+use store::{AccountEdit, NewSession};
 
+use super::Principals;
 use super::changing::{NameHolder, RESERVED, SECRET};
-use super::stored::{StoredScope, read_principal, record_error};
-use super::{AuthenticationError, CallerIdentity, Credential, Principals};
+use super::identity::CallerIdentity;
+use super::stored::{KnownAccount, KnownSession, StoredScope, milliseconds, record_error};
 use crate::errors::Error;
 use crate::tokens;
-
-/// Lifetimes of sessions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SessionLifetimes {
-    /// Maximum lifetime.
-    pub most: Duration,
-    /// Maximum time without a request.
-    pub idle: Duration,
-}
-
-impl Default for SessionLifetimes {
-    fn default() -> Self {
-        SessionLifetimes {
-            most: Duration::from_secs(12 * 3600),
-            idle: Duration::from_secs(3600),
-        }
-    }
-}
-
-pub(super) fn milliseconds(time: Duration) -> Millis {
-    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
-}
-
-/// Returns the owner of robot names used by a person.
-fn person_owner(name: &str) -> Owner {
-    format!("person:{name}")
-}
-
-/// An account, in memory.
-pub struct KnownAccount {
-    pub(super) record: AccountRecord,
-    pub(super) principal: Arc<Principal>,
-}
-
-impl KnownAccount {
-    pub(super) fn read(record: AccountRecord) -> Result<KnownAccount, store::Error> {
-        let principal = read_principal(&record.name, &record.role, &record.scope, "account")?;
-        Ok(KnownAccount {
-            principal: Arc::new(principal),
-            record,
-        })
-    }
-
-    pub(super) fn is_live(&self) -> bool {
-        self.record.removed.is_none()
-    }
-
-    pub(super) fn owner(&self) -> Owner {
-        person_owner(&self.record.name)
-    }
-}
-
-/// A session, in memory.
-pub struct KnownSession {
-    pub(super) record: SessionRecord,
-    pub(super) principal: Arc<Principal>,
-    pub(super) last_used: AtomicU64,
-    /// Value of `last_used` when it was last written.
-    pub(super) written: AtomicU64,
-}
-
-impl KnownSession {
-    pub(super) fn read(record: SessionRecord) -> Result<KnownSession, store::Error> {
-        let principal = read_principal(&record.name, &record.role, &record.scope, "session")?;
-        Ok(KnownSession {
-            principal: Arc::new(principal),
-            last_used: AtomicU64::new(record.last_used),
-            written: AtomicU64::new(record.last_used),
-            record,
-        })
-    }
-
-    pub(super) fn owner(&self) -> Owner {
-        person_owner(&self.record.name)
-    }
-
-    pub(super) fn recognise(
-        &self,
-        now: Millis,
-        lasting: SessionLifetimes,
-    ) -> Result<CallerIdentity, AuthenticationError> {
-        let last = self.last_used.load(Ordering::Relaxed);
-        let idle = last.saturating_add(milliseconds(lasting.idle));
-        if self.record.expires.min(idle) <= now {
-            return Err(AuthenticationError::SessionOver);
-        }
-        Ok(CallerIdentity {
-            principal: Arc::clone(&self.principal),
-            shown: Credential::Session { id: self.record.id },
-            token: None,
-            owner: Some(self.owner()),
-        })
-    }
-}
 
 /// A session that was just started.
 pub struct StartedSession {
@@ -131,16 +36,20 @@ pub struct Candidate {
     scope: String,
 }
 
-fn check_role(role: Role, services: &[Glob]) -> Result<(), String> {
+fn check_role(role: Role, services: &[Glob]) -> Result<(), Error> {
+    let refused = |words: String| Err(Error::BadRequest(words));
     if role == Role::Robot {
-        return Err("an account cannot have the role robot; create a token for a robot: cloudroidctl token create NAME \
-            --role robot".into());
+        return refused(
+            "an account cannot have the role robot; create a token for a robot: cloudroidctl token create NAME --role \
+                robot"
+                .to_owned(),
+        );
     }
     match (role.is_scoped(), services.is_empty()) {
-        (true, true) => Err(format!(
+        (true, true) => refused(format!(
             "a {role} needs its services; give them with --service, or all with --service '*'"
         )),
-        (false, false) => Err(format!(
+        (false, false) => refused(format!(
             "an {role} is for all services; omit --service, or choose another role"
         )),
         _ => Ok(()),
@@ -179,12 +88,7 @@ impl Principals {
             let sessions = stored.sessions.values();
             Account {
                 name: record.name.clone(),
-                role: known
-                    .principal
-                    .roles
-                    .first()
-                    .copied()
-                    .unwrap_or(Role::Viewer),
+                role: known.principal.first_role(),
                 services: known.principal.scope.services.clone(),
                 created: record.created,
                 last_login: record.last_login,
@@ -271,12 +175,7 @@ impl Principals {
             .map(|known| SessionLine {
                 id: known.record.id,
                 name: known.record.name.clone(),
-                role: known
-                    .principal
-                    .roles
-                    .first()
-                    .copied()
-                    .unwrap_or(Role::Viewer),
+                role: known.principal.first_role(),
                 from: known.record.peer.clone(),
                 created: known.record.created,
                 last_used: known.last_used.load(Ordering::Relaxed),
@@ -321,7 +220,7 @@ impl Principals {
                 new.name
             )));
         }
-        check_role(new.role, &new.services).map_err(Error::BadRequest)?;
+        check_role(new.role, &new.services)?;
         self.check_name_is_free(&new.name, NameHolder::Account)
     }
 
@@ -374,7 +273,7 @@ impl Principals {
             ));
         }
         if let Some(role) = change.role {
-            check_role(role, &change.services).map_err(Error::BadRequest)?;
+            check_role(role, &change.services)?;
         }
         let scope = change
             .role

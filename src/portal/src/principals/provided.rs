@@ -7,7 +7,8 @@ use store::NewSession;
 
 use super::Principals;
 use super::changing::SECRET;
-use super::people::{KnownSession, StartedSession, encode_scope, milliseconds};
+use super::people::{StartedSession, encode_scope};
+use super::stored::{KnownSession, milliseconds};
 use crate::errors::Error;
 use crate::tokens;
 

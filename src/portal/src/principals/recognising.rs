@@ -8,8 +8,9 @@ use api::Millis;
 use parking_lot::Mutex;
 use store::TokenHash;
 
-use super::people::SessionLifetimes;
-use super::{AuthenticationError, CallerIdentity, Credential, StoredPrincipals};
+use super::identity::{CallerIdentity, Credential};
+use super::refusals::AuthenticationError;
+use super::stored::{SessionLifetimes, StoredPrincipals};
 use crate::tokens::{self, Tokens};
 
 /// Current credentials, by which tokens are recognised.

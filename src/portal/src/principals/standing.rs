@@ -8,8 +8,9 @@ use access::{AccessPolicy, ConnectionAccess, Grants};
 use api::Millis;
 use tokio::sync::watch;
 
-use super::{CallerIdentity, Credential, Principals};
-use crate::inside::InsideRole;
+use super::Principals;
+use super::identity::{CallerIdentity, Credential};
+use crate::inside::connections::InsideRole;
 
 /// Bounds on the interval at which expiry is checked.
 const SOONEST: Duration = Duration::from_millis(10);

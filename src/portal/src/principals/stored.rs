@@ -3,15 +3,16 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use access::{AccessPolicy, AccessRule, Glob, Principal, Role, Scope};
 use api::Millis;
 use serde::{Deserialize, Serialize};
-use store::{Owner, RuleRecord, State, TokenHash, TokenRecord};
+use store::{AccountRecord, Owner, RuleRecord, SessionRecord, State, TokenHash, TokenRecord};
 
+use super::identity::{CallerIdentity, Credential};
 use super::pairings::{self, StoredPairing};
-use super::people::{KnownAccount, KnownSession, SessionLifetimes};
-use super::{AuthenticationError, CallerIdentity, Credential};
+use super::refusals::AuthenticationError;
 
 /// Scope of a token as stored in the database, besides its role.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -54,11 +55,11 @@ impl KnownToken {
     }
 
     pub(super) fn to_api_token(&self) -> api::access::Token {
-        let Principal { name, roles, scope } = &*self.principal;
+        let Principal { name, scope, .. } = &*self.principal;
         let last = self.last_used.load(Ordering::Relaxed);
         api::access::Token {
             name: name.clone(),
-            role: roles.first().copied().unwrap_or(Role::Viewer),
+            role: self.principal.first_role(),
             services: scope.services.clone(),
             robot: scope.robot.clone(),
             classes: scope.classes.clone(),
@@ -67,6 +68,100 @@ impl KnownToken {
             last_used: (last > 0).then_some(last),
             revoked: self.revoked,
         }
+    }
+}
+
+/// Lifetimes of sessions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SessionLifetimes {
+    /// Maximum lifetime.
+    pub most: Duration,
+    /// Maximum time without a request.
+    pub idle: Duration,
+}
+
+impl Default for SessionLifetimes {
+    fn default() -> Self {
+        SessionLifetimes {
+            most: Duration::from_secs(12 * 3600),
+            idle: Duration::from_secs(3600),
+        }
+    }
+}
+
+pub(super) fn milliseconds(time: Duration) -> Millis {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
+/// Returns the owner of robot names used by a person.
+fn person_owner(name: &str) -> Owner {
+    format!("person:{name}")
+}
+
+/// An account, in memory.
+pub struct KnownAccount {
+    pub(super) record: AccountRecord,
+    pub(super) principal: Arc<Principal>,
+}
+
+impl KnownAccount {
+    pub(super) fn read(record: AccountRecord) -> Result<KnownAccount, store::Error> {
+        let principal = read_principal(&record.name, &record.role, &record.scope, "account")?;
+        Ok(KnownAccount {
+            principal: Arc::new(principal),
+            record,
+        })
+    }
+
+    pub(super) fn is_live(&self) -> bool {
+        self.record.removed.is_none()
+    }
+
+    pub(super) fn owner(&self) -> Owner {
+        person_owner(&self.record.name)
+    }
+}
+
+/// A session, in memory.
+pub struct KnownSession {
+    pub(super) record: SessionRecord,
+    pub(super) principal: Arc<Principal>,
+    pub(super) last_used: AtomicU64,
+    /// Value of `last_used` when it was last written.
+    pub(super) written: AtomicU64,
+}
+
+impl KnownSession {
+    pub(super) fn read(record: SessionRecord) -> Result<KnownSession, store::Error> {
+        let principal = read_principal(&record.name, &record.role, &record.scope, "session")?;
+        Ok(KnownSession {
+            principal: Arc::new(principal),
+            last_used: AtomicU64::new(record.last_used),
+            written: AtomicU64::new(record.last_used),
+            record,
+        })
+    }
+
+    pub(super) fn owner(&self) -> Owner {
+        person_owner(&self.record.name)
+    }
+
+    pub(super) fn recognise(
+        &self,
+        now: Millis,
+        lasting: SessionLifetimes,
+    ) -> Result<CallerIdentity, AuthenticationError> {
+        let last = self.last_used.load(Ordering::Relaxed);
+        let idle = last.saturating_add(milliseconds(lasting.idle));
+        if self.record.expires.min(idle) <= now {
+            return Err(AuthenticationError::SessionOver);
+        }
+        Ok(CallerIdentity {
+            principal: Arc::clone(&self.principal),
+            shown: Credential::Session { id: self.record.id },
+            token: None,
+            owner: Some(self.owner()),
+        })
     }
 }
 

@@ -9,11 +9,11 @@ use api::stream::Update;
 use axum::response::sse;
 use tokio::sync::watch;
 
-use super::StreamSlot;
-use super::sampler::{EVENTS, StateSample};
+use super::live::{StateSample, StreamSlot};
+use super::sampler::EVENTS;
 use crate::app::App;
+use crate::caller::Caller;
 use crate::events::is_visible;
-use crate::guard::Caller;
 
 /// A listener.
 pub struct Listener {

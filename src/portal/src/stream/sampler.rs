@@ -4,10 +4,9 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use api::explain::Served;
-use api::stream::Machine;
-use api::{BackOff, Event, ServiceSummary};
+use api::Event;
 
+use super::live::StateSample;
 use crate::app::App;
 use crate::errors::Error;
 use crate::looks::{self, ServantSampler};
@@ -19,17 +18,6 @@ const PERIOD: Duration = Duration::from_secs(1);
 const SOON: Duration = Duration::from_millis(100);
 /// Number of events kept for listeners.
 pub const EVENTS: usize = 500;
-
-/// State at one moment. What has not changed since the previous sample is the same allocation.
-#[derive(Default)]
-pub struct StateSample {
-    pub machine: Option<Arc<Machine>>,
-    pub services: Vec<Arc<ServiceSummary>>,
-    pub servants: Vec<Arc<Served>>,
-    pub back_offs: Arc<Vec<BackOff>>,
-    /// The newest events, oldest first.
-    pub events: Arc<Vec<Arc<Event>>>,
-}
 
 /// Takes samples until nobody listens or the daemon stops.
 pub async fn run(app: Arc<App>) {

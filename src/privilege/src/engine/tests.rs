@@ -33,6 +33,7 @@ fn work_is_done_with_the_rights_that_it_needs() {
         assert_ne!(run_sync(user), 0);
         assert_ne!(spawn_blocking(user).await.expect("no panic"), 0);
     }));
+    tracing::subscriber::set_global_default(tracing_subscriber::registry()).expect("the first");
     let engine = Engine::start(Account::default()).expect("threads");
     on_portal(Box::pin(async {
         assert_eq!(run(async { user() }).await, 0);
@@ -59,6 +60,20 @@ fn work_is_done_with_the_rights_that_it_needs() {
         assert_ne!(user(), 0);
         let blocked = tokio::task::spawn_blocking(user).await;
         assert_ne!(blocked.expect("no panic"), 0);
+        // Work keeps the span of the log in which it was handed over.
+        let span = tracing::error_span!("caller");
+        let caller = span.id().expect("a subscriber");
+        let current = || Span::current().id();
+        let handed_over = async move {
+            let blocking = spawn_blocking(current).await.expect("no panic");
+            let awaited = run(async move { current() }).await;
+            [awaited, run_sync(current), blocking]
+        };
+        let spans = handed_over.instrument(span).await;
+        assert!(
+            spans.iter().all(|span| span.as_ref() == Some(&caller)),
+            "{spans:?}"
+        );
         // Dropping the future ends the work that was handed over, and panics are propagated.
         let (dropped, heard) = (Arc::new(Notify::new()), Arc::new(Notify::new()));
         struct DropNotifier(Arc<Notify>);

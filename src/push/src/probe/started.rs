@@ -6,6 +6,7 @@ use choreographer::Permit;
 use servant::engine::ServantHandle;
 use tokio::sync::mpsc;
 use tokio_util::task::TaskTracker;
+use tracing::Instrument;
 
 use crate::Error;
 
@@ -65,11 +66,11 @@ impl<R: Send + Sync + 'static> ProbeServant<R> {
             return Ok(());
         };
         let alive = self.alive.clone();
-        let stopping = self.tasks.spawn(async move {
+        let stopping = async move {
             let _alive = alive;
             stop(&servant).await
-        });
-        let stopped = stopping.await;
+        };
+        let stopped = self.tasks.spawn(stopping.in_current_span()).await;
         Ok(stopped.map_err(|_| Error::Internal("stopping the started image"))??)
     }
 }
@@ -89,10 +90,11 @@ impl<R: Send + Sync + 'static> Drop for ProbeServant<R> {
             return;
         };
         let alive = self.alive.clone();
-        self.tasks.spawn(async move {
+        let stopping = async move {
             let _alive = alive;
             let _ = stop(&servant).await;
-        });
+        };
+        self.tasks.spawn(stopping.in_current_span());
     }
 }
 

@@ -13,6 +13,7 @@ use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
+use tracing::Instrument;
 
 use super::Route;
 
@@ -33,7 +34,8 @@ impl Relays {
             let inside = SocketAddr::from((route.inside, route.port));
             match network.listen(inside).await {
                 Ok(listener) => {
-                    listeners.spawn(relay_connections(listener, route.clone()));
+                    let relaying = relay_connections(listener, route.clone());
+                    listeners.spawn(relaying.in_current_span());
                 }
                 Err(error) => {
                     tracing::warn!("no route out to {}:{}: {error}", route.host, route.port)
@@ -69,7 +71,7 @@ async fn relay_connections(listener: TcpListener, route: Route) {
                     continue;
                 };
                 let far = Arc::clone(&far);
-                connections.spawn(async move {
+                let relaying = async move {
                     let _place = place;
                     let RelayTarget { route, .. } = &*far;
                     match far.dial().await {
@@ -80,7 +82,8 @@ async fn relay_connections(listener: TcpListener, route: Route) {
                             tracing::debug!("cannot connect to {}:{}: {error}", route.host, route.port);
                         }
                     }
-                });
+                };
+                connections.spawn(relaying.in_current_span());
             }
             Some(_) = connections.join_next() => {}
         }

@@ -9,6 +9,7 @@
 //! ```
 
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,9 +18,9 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, CallFate, Digest, GoalEnd, GoalEvents, GoalOutcome, MatchedPeers,
-    MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType, Subscription, TopicPeer,
-    WireType, message_queue,
+    ActionClient, BusError, CallFate, Digest, FailureReason, GoalEnd, GoalError, GoalEvents,
+    GoalOutcome, MatchedPeers, MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType,
+    Subscription, TopicPeer, WireType, message_queue,
 };
 use ros::ros2::actions::ActionInterfaces;
 use ros::ros2::actions::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
@@ -229,19 +230,19 @@ impl ActionParts {
     }
 
     async fn send_goal(self: &Arc<Self>, name: &str, request: &[u8]) -> Result<Bytes, BusError> {
-        let refused = |reason: String| {
+        let refused = |reason: &dyn Display| {
             self.notify_robot(&format!("a goal is refused: {reason}"));
             Ok(goal_server::rejected_response())
         };
         let (begun, goal) = match self.goals.begin(request) {
             Ok(begun) => begun,
-            Err(reason) => return refused(reason),
+            Err(refusal) => return refused(&refusal),
         };
         let permit = match self.budget.take(goal.len()) {
             Ok(permit) => permit,
             Err(full) => {
                 self.goals.reject(&begun);
-                return refused(full.to_string());
+                return refused(&full);
             }
         };
         let (answer, answered) = oneshot::channel();
@@ -260,7 +261,7 @@ impl ActionParts {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(reason)) => Err(BusError::CallFailed {
                 service: name.to_owned(),
-                reason,
+                reason: reason.into(),
                 fate: CallFate::Unknown,
             }),
             Err(_) => Err(BusError::Closed),
@@ -308,7 +309,7 @@ impl ActionParts {
 }
 
 /// Response to the sender of a goal, or the reason why there will be none.
-type GoalAnswer = Result<Bytes, String>;
+type GoalAnswer = Result<Bytes, FailureReason>;
 
 struct PartsGoalEvents {
     parts: Arc<ActionParts>,
@@ -342,7 +343,7 @@ impl GoalEvents for PartsGoalEvents {
         self.parts.goals.publish_feedback(&self.id, &feedback);
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let goals = &self.parts.goals;
         drop(self.permit.lock().take());
         let outcome = end.as_ref().ok().map(|end| end.outcome);
@@ -351,7 +352,7 @@ impl GoalEvents for PartsGoalEvents {
                 let why = end.text.clone();
                 (end, why)
             }
-            Err(reason) => (aborted_end(), reason),
+            Err(error) => (aborted_end(), error.to_string()),
         };
         // A goal whose sender was not answered before was not accepted.
         let rejected = matches!(outcome, None | Some(GoalOutcome::Rejected));
@@ -365,7 +366,7 @@ impl GoalEvents for PartsGoalEvents {
         }
         if refused {
             return self.answer_once(|| match outcome {
-                None => Err(why),
+                None => Err(FailureReason::new(why)),
                 Some(_) => Ok(goal_server::rejected_response()),
             });
         }

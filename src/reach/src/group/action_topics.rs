@@ -10,13 +10,13 @@ use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use budget::{Budget, Permit};
+use budget::{Budget, Exceeded, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, GoalEnd, GoalEvents, GoalOutcome, MatchedPeers, MessageSender, PeerId,
-    Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, TopicPeer, WireType,
-    message_queue,
+    ActionClient, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, MatchedPeers,
+    MessageSender, PeerId, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription,
+    TopicPeer, WireType, message_queue,
 };
 use ros::codec::Time;
 use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
@@ -62,6 +62,17 @@ struct TopicGoal {
     permit: Option<Permit>,
     /// Time at which it ended.
     ended: Option<Instant>,
+}
+
+/// Reason for rejecting a goal without asking a node.
+#[derive(Debug, thiserror::Error)]
+enum GoalRejection {
+    /// This number of goals has not ended.
+    #[error("{0} goals of this robot are under way already; wait for some to end")]
+    TooMany(usize),
+    /// The goal does not fit into the robot's budget.
+    #[error(transparent)]
+    NoMemory(Exceeded),
 }
 
 #[derive(Default)]
@@ -226,13 +237,12 @@ impl ActionTopics {
                 return;
             }
             let room = state.check_capacity().and_then(|()| {
-                self.budget
-                    .take(body.len())
-                    .map_err(|full| full.to_string())
+                let permit = self.budget.take(body.len());
+                permit.map_err(GoalRejection::NoMemory)
             });
             let (permit, refused) = match room {
                 Ok(permit) => (Some(permit), None),
-                Err(text) => (None, Some(text)),
+                Err(rejection) => (None, Some(rejection.to_string())),
             };
             let known = TopicGoal {
                 state: GoalState {
@@ -286,10 +296,10 @@ impl ActionTopics {
         ids.iter().for_each(|id| self.client.cancel_goal(id));
     }
 
-    fn finish_goal(&self, id: &str, end: Result<GoalEnd, String>) {
-        let end = end.unwrap_or_else(|text| GoalEnd {
+    fn finish_goal(&self, id: &str, end: Result<GoalEnd, GoalError>) {
+        let end = end.unwrap_or_else(|error| GoalEnd {
             outcome: GoalOutcome::Aborted,
-            text,
+            text: error.to_string(),
             result: self.empty_result(),
         });
         self.record_end(&mut self.state.lock(), id, end);
@@ -325,15 +335,13 @@ impl ActionTopics {
 
 impl State {
     /// Returns an error if there is no room for another goal.
-    fn check_capacity(&self) -> Result<(), String> {
+    fn check_capacity(&self) -> Result<(), GoalRejection> {
         let goals = self.goals.values();
         let count = goals.filter(|goal| goal.ended.is_none()).count();
         if count < GOALS {
             Ok(())
         } else {
-            Err(format!(
-                "{count} goals of this robot are under way already; wait for some to end"
-            ))
+            Err(GoalRejection::TooMany(count))
         }
     }
 
@@ -412,7 +420,7 @@ impl GoalEvents for TopicsGoalEvents {
             .publish_to_listeners(&mut state, ActionEndpoint::Feedback, bytes);
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         self.topics.finish_goal(&self.id, end);
     }
 }

@@ -11,7 +11,9 @@ use futures_util::StreamExt;
 use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
 use parking_lot::Mutex;
-use ros::bus::{ActionClient, BusError, GoalEnd, GoalEvents, GoalOutcome};
+use ros::bus::{
+    ActionClient, BusError, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome,
+};
 use ros::codec::default_message;
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
@@ -50,7 +52,7 @@ impl GoalEvents for PlainGoalEvents {
         self.0.on_feedback(feedback);
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         self.0.on_ended(end);
     }
 }
@@ -200,7 +202,7 @@ enum GoalUpdate {
     Accepted,
     CancelAnswered(bool),
     Feedback(Bytes),
-    Ended(Result<GoalEnd, String>),
+    Ended(Result<GoalEnd, GoalError>),
 }
 
 struct GoalUpdateSender {
@@ -227,7 +229,7 @@ impl GoalEvents for GoalUpdateSender {
         self.send_update(GoalUpdate::Feedback(feedback));
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         self.send_update(GoalUpdate::Ended(end));
     }
 }
@@ -243,7 +245,7 @@ impl GroupGoal {
         mut errand: PendingRequest,
         mut wished: watch::Receiver<u32>,
         events: &dyn GroupEvents,
-    ) -> Result<GoalEnd, String> {
+    ) -> Result<GoalEnd, GoalError> {
         let (group, began) = (Arc::clone(&errand.group), Instant::now());
         let (sender, mut said) = mpsc::unbounded_channel::<(Arc<MemberServant>, GoalUpdate)>();
         let mut sending: FuturesUnordered<SendAttempt> = FuturesUnordered::new();
@@ -278,8 +280,8 @@ impl GroupGoal {
                             group.counts.record_answer(began.elapsed());
                             return Ok(end);
                         }
-                        GoalUpdate::Ended(Err(reason)) => {
-                            tracing::debug!("servant {} lost a goal: {reason}", servant.id);
+                        GoalUpdate::Ended(Err(error)) => {
+                            tracing::debug!("servant {} lost a goal: {error}", servant.id);
                             at = None;
                             errand.finish_attempt(&servant, AttemptOutcome::Lost);
                             last = Some(servant);
@@ -335,7 +337,7 @@ impl GroupGoal {
                         "its robot is gone, and {at} did not end it within {GONE:?}; other robots' goals run there, too"
                     );
                     tracing::warn!("goal {} of {}: {words}", self.id, self.name);
-                    return Err(words);
+                    return Err(GoalError::GivenUp(FailureReason::new(words)));
                 }
                 () = end_wanted => {
                     told_to_end = true;
@@ -358,9 +360,9 @@ impl GroupGoal {
         group: &ServantGroup,
         last: Option<&MemberServant>,
         why: LossReason,
-    ) -> String {
+    ) -> GoalError {
         group.counts.failed.fetch_add(1, Ordering::Relaxed);
-        describe_loss(last, why)
+        GoalError::GivenUp(FailureReason::new(describe_loss(last, why)))
     }
 
     /// Returns the end of a goal that was cancelled before any servant had it.

@@ -16,7 +16,7 @@ use tokio::sync::{mpsc, watch};
 use super::bus::GroupBus;
 use super::names::NameResolver;
 use super::view::{GroupView, NodeAlias};
-use crate::links::{NodeController, RequestUpdate};
+use crate::links::{NodeController, NodeError, RequestUpdate};
 use crate::nodes::{RobotEvents, find_program, nodes_running};
 use crate::{Observer, RecordedRevision, Tenant};
 
@@ -64,7 +64,7 @@ impl SharedNodes {
         self.bus.set_view(all);
     }
 
-    fn node_view(&self, node: &NodeLaunch) -> Result<GroupView, String> {
+    fn node_view(&self, node: &NodeLaunch) -> Result<GroupView, NodeError> {
         let planned = find_group_node(&self.recorded, node)?;
         let ros = self.bus.ros();
         let alias = NodeAlias {
@@ -82,7 +82,7 @@ impl SharedNodes {
 fn find_group_node<'a>(
     recorded: &'a RecordedRevision,
     node: &NodeLaunch,
-) -> Result<&'a NodeSpec, String> {
+) -> Result<&'a NodeSpec, NodeError> {
     find_program(recorded, node)?;
     let all: Vec<&NodeSpec> = nodes_running(recorded, &node.executable).collect();
     let last = |name: &str| name.rsplit('/').next().unwrap_or_default().to_owned();
@@ -95,22 +95,16 @@ fn find_group_node<'a>(
         });
     match (same, &all[..]) {
         (Some(planned), _) | (None, [planned]) => Ok(planned),
-        (None, []) => Err(format!(
-            "robots share service {}, whose servants do not run {}: a stub uses what runs there; push the service with \
-             that node",
-            recorded.service, node.executable
-        )),
-        (None, several) => {
-            let names: Vec<&str> = several.iter().map(|planned| &*planned.name).collect();
-            Err(format!(
-                "robots share service {}, whose servants run {} as {}: which of them {} stands for is decided by its \
-                    name; give it one of these names",
-                recorded.service,
-                node.executable,
-                names.join(" and "),
-                node.name
-            ))
-        }
+        (None, []) => Err(NodeError::NotRun {
+            service: recorded.service.clone(),
+            executable: node.executable.clone(),
+        }),
+        (None, several) => Err(NodeError::Ambiguous {
+            service: recorded.service.clone(),
+            executable: node.executable.clone(),
+            candidates: several.iter().map(|planned| planned.name.clone()).collect(),
+            node: node.name.clone(),
+        }),
     }
 }
 
@@ -212,8 +206,8 @@ impl NodeController for SharedNodes {
         &self.recorded.service
     }
 
-    async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), String> {
-        let tenant = self.told.tenant()?;
+    async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), NodeError> {
+        let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
         self.told
             .observer()
             .check_stub(node.revision, &node.image)?;
@@ -229,7 +223,7 @@ impl NodeController for SharedNodes {
         Ok(())
     }
 
-    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), NodeError> {
         if !ENDS.contains(&signal) {
             return Ok(());
         }
@@ -362,11 +356,15 @@ mod tests {
             (&[COOK], "/r1/chef", "/bin/sh", Err("was not pushed with")),
         ] {
             let recorded = test_revision(nodes);
-            let found =
-                find_group_node(&recorded, &node(name, executable)).map(|it| it.name.as_str());
-            match expected {
-                Ok(expected) => assert_eq!(found, Ok(expected), "{name}"),
-                Err(words) => assert!(found.is_err_and(|it| it.contains(words)), "{name}"),
+            let node = node(name, executable);
+            let found = find_group_node(&recorded, &node).map(|it| it.name.as_str());
+            match (found, expected) {
+                (Ok(found), Ok(expected)) => assert_eq!(found, expected, "{name}"),
+                (Err(error), Err(words)) => {
+                    let error = error.to_string();
+                    assert!(error.contains(words), "{name}: {error}");
+                }
+                (found, _) => panic!("{name}: {found:?}"),
             }
         }
     }

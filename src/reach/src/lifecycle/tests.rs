@@ -1,7 +1,9 @@
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Publisher, QosProfile, ServiceHandler, ServiceType, WireFormat, WireType};
+use ros::bus::{
+    FailureReason, Publisher, QosProfile, ServiceHandler, ServiceType, WireFormat, WireType,
+};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
@@ -98,7 +100,7 @@ fn put_state(out: &mut Vec<u8>, number: u8) {
 
 #[async_trait]
 impl ServiceHandler for Part {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let Part(life) = self;
         let mut answer = HEADER.to_vec();
         let told = String::from_utf8_lossy(&request).into_owned();

@@ -4,21 +4,12 @@
 
 use std::sync::Arc;
 
-use super::Hub;
-use super::node_link::NodeLink;
+use super::state::{Hub, NodeLink, RobotMachine};
 use link::control::{FromCloud, Hello};
 
 /// Remedy, for messages.
 pub(super) const NEXT: &str =
     "give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)";
-
-/// The machine on which a stub runs.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct RobotMachine {
-    id: String,
-    host: String,
-    roscore: String,
-}
 
 impl RobotMachine {
     pub(super) fn from_hello(hello: &Hello) -> Self {

@@ -11,13 +11,23 @@
 
 use std::collections::VecDeque;
 
-use super::inputs::Mark;
 use link::record::InputTiming;
 
 /// Number of inputs remembered.
 const RECENT: usize = 256;
 /// Number of inputs for which it is remembered whether the node has answered them.
 const FATES: usize = 128;
+
+/// Stamp of a message whose type begins with a header. Other types have other data there, which identifies the input
+/// that an output answers no worse than nothing. In ROS 1 the stamp follows the header's sequence number, in ROS 2 the
+/// four bytes of the CDR header, so seconds and nanoseconds are at the same place.
+pub(super) type Mark = Option<[u8; 8]>;
+
+/// Returns the mark of a message as the node sees it.
+pub(super) fn stamp_mark(message: &[u8]) -> Mark {
+    let mark = message.get(4..12)?.try_into().ok()?;
+    (mark != [0; 8]).then_some(mark)
+}
 
 /// The last inputs of one node.
 #[derive(Default)]

@@ -4,33 +4,14 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use budget::Permit;
-use parking_lot::Mutex;
-
-use super::node_link::NodeLink;
-use link::control::FromRobot;
+use super::state::{HeldRecord, HoldGuard, HoldQueue, HoldState, NodeLink};
 use link::record::Record;
 use ros::ring::{self, Ring};
 
 /// Maximum number of records held back, and of bytes.
 const MOST: (usize, usize) = (256, 32 << 20);
 
-/// Records held back, and the holds for which they wait.
-#[derive(Default)]
-pub(super) struct HoldQueue {
-    state: Mutex<State>,
-}
-
-struct State {
-    /// Active holds by number.
-    holds: BTreeSet<u64>,
-    next: u64,
-    records: Ring<HeldRecord>,
-    /// A task is draining the queue, so other records queue up behind.
-    passing: bool,
-}
-
-impl Default for State {
+impl Default for HoldState {
     fn default() -> Self {
         Self {
             holds: BTreeSet::new(),
@@ -40,15 +21,6 @@ impl Default for State {
             passing: false,
         }
     }
-}
-
-/// A received record.
-pub(super) struct HeldRecord {
-    pub(super) record: Record<FromRobot>,
-    /// Memory permit charged to the robot until this is dropped, for a control message or call.
-    pub(super) held: Permit,
-    /// Time at which it was received (nanoseconds since the Unix epoch).
-    pub(super) at: i64,
 }
 
 impl ring::RingItem for HeldRecord {
@@ -61,7 +33,7 @@ impl ring::RingItem for HeldRecord {
     }
 }
 
-impl State {
+impl HoldState {
     fn is_due(&self) -> bool {
         self.holds.is_empty() || self.records.len() >= MOST.0 || self.records.bytes() >= MOST.1
     }
@@ -110,12 +82,6 @@ impl HoldQueue {
     fn remove_hold(&self, number: u64) {
         self.state.lock().holds.remove(&number);
     }
-}
-
-/// Holds back messages and calls of the link while it lives, but no longer than first messages of a topic wait.
-pub(super) struct HoldGuard {
-    link: Arc<NodeLink>,
-    number: u64,
 }
 
 impl HoldGuard {

@@ -12,8 +12,10 @@ use ros::schema::{MessageType, SchemaError};
 use ros::sizes::SizeCounters;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::given::{Mark, stamp_mark};
 use super::retry::Retry;
-use super::{Hub, types};
+use super::state::Hub;
+use super::types;
 use link::clock::now;
 use link::control::InputChannel;
 use link::drops::{Cause, DropCounters};
@@ -32,17 +34,6 @@ const WAITING: RingBounds = RingBounds {
     messages: 256,
     bytes: 32 << 20,
 };
-
-/// Stamp of a message whose type begins with a header. Other types have other data there, which identifies the input
-/// that an output answers no worse than nothing. In ROS 1 the stamp follows the header's sequence number, in ROS 2 the
-/// four bytes of the CDR header, so seconds and nanoseconds are at the same place.
-pub(super) type Mark = Option<[u8; 8]>;
-
-/// Returns the mark of a message as the node sees it.
-pub(super) fn stamp_mark(message: &[u8]) -> Mark {
-    let mark = message.get(4..12)?.try_into().ok()?;
-    (mark != [0; 8]).then_some(mark)
-}
 
 /// Channels by number.
 #[derive(Default)]

@@ -18,12 +18,14 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{BusError, Lender, LentService, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{
+    BusError, FailureReason, Lender, LentService, RosVersion, ServiceHandler, ServiceType,
+};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
-use super::node_link::NodeLink;
-use super::{Hub, types};
+use super::state::{Hub, NodeLink};
+use super::types;
 use link::control::{FromCloud, ServiceChannel};
 use link::skew::{Direction, Skew};
 use ros::codec::Stamps;
@@ -85,7 +87,7 @@ impl RobotService {
 
 #[derive(Default)]
 struct RobotCalls {
-    waiting: HashMap<u32, oneshot::Sender<Result<Bytes, String>>>,
+    waiting: HashMap<u32, oneshot::Sender<Result<Bytes, FailureReason>>>,
     /// The link has ended, so no call is answered any more.
     over: bool,
 }
@@ -101,7 +103,7 @@ impl RobotServices {
     }
 
     /// Completes a call with the robot's response.
-    pub(super) fn resolve_call(&self, id: u32, response: Result<Bytes, String>) {
+    pub(super) fn resolve_call(&self, id: u32, response: Result<Bytes, FailureReason>) {
         if let Some(caller) = self.calls.lock().waiting.remove(&id) {
             let _ = caller.send(response);
         }
@@ -135,9 +137,10 @@ impl RobotServices {
     }
 }
 
-fn link_lost_error() -> String {
-    "the link to the robot was lost during this call: the robot may or may not have executed it"
-        .to_owned()
+fn link_lost_error() -> FailureReason {
+    FailureReason::new(
+        "the link to the robot was lost during this call: the robot may or may not have executed it",
+    )
 }
 
 impl NodeLink {
@@ -268,7 +271,7 @@ impl NodeLink {
     }
 
     /// Calls a service of the robot. The call survives a lost connection and fails with the link.
-    async fn call_robot(&self, channel: u32, request: Bytes) -> Result<Bytes, String> {
+    async fn call_robot(&self, channel: u32, request: Bytes) -> Result<Bytes, FailureReason> {
         let (sender, answer) = oneshot::channel();
         let id = {
             let mut calls = self.lent.calls.lock();
@@ -343,7 +346,7 @@ pub(super) async fn start_lending(hub: &Arc<Hub>) {
     match begun.await {
         Ok(()) | Err(BusError::NotOffered(_)) => {}
         Err(error) => {
-            tracing::warn!(servant = hub.servant, %error, "its nodes cannot call services of the robot")
+            tracing::warn!(%error, "its nodes cannot call services of the robot")
         }
     }
 }
@@ -401,20 +404,24 @@ struct RobotServiceHandler {
 
 #[async_trait]
 impl ServiceHandler for RobotServiceHandler {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         let hub = self.hub.upgrade().ok_or_else(link_lost_error)?;
         let has = |link: &NodeLink| link.lent.find_known(&self.service);
         let link = hub.route_link(caller, |link| has(link).is_some());
         let found = link.and_then(|link| Some((has(&link)?, link)));
-        let (there, link) = found
-            .ok_or_else(|| format!("no node on the robot serves {} any more", self.service))?;
+        let (there, link) = found.ok_or_else(|| {
+            FailureReason::new(format!(
+                "no node on the robot serves {} any more",
+                self.service
+            ))
+        })?;
         if there.service_type != self.of {
-            return Err(format!(
+            return Err(FailureReason::new(format!(
                 "{} is served on the robot with {} now, not {} as when it was connected to",
                 self.service,
                 describe_type(&there.service_type),
                 describe_type(&self.of)
-            ));
+            )));
         }
         // Regardless of the link used, stamps are converted for the calling node.
         let calling = hub.link_of(caller);

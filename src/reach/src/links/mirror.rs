@@ -6,9 +6,9 @@ use std::sync::Arc;
 use ros::bus::{Digest, ServiceType, WireType};
 
 use super::inquiries::TypeInquiries;
-use super::node_link::{NodeLink, NodeService};
 use super::seen::{self, DeclaredType, NodeEndpointSet};
-use super::{Hub, types};
+use super::state::{Hub, NodeLink, NodeService};
+use super::types;
 use link::control::{FromCloud, Graph, OutputChannel, RequestedInput, ServiceChannel};
 use ros::codec::Stamps;
 

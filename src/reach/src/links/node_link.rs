@@ -1,34 +1,34 @@
 //! The link of one node: processes what the robot sends, in order.
 
-use std::collections::{BTreeSet, HashMap};
-use std::sync::{Arc, Weak};
+use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use budget::Permit;
 use parking_lot::Mutex;
 use tokio::sync::{Semaphore, mpsc, watch};
-use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
+use tracing::Instrument;
 
-use super::duplicates::RobotMachine;
-use super::held::{HeldRecord, HoldGuard, HoldQueue};
 use super::inputs::InputChannels;
 use super::lent::RobotServices;
-use super::node_time::{self, NodeTime};
+use super::node_time;
 use super::outputs::Outputs;
 use super::requests::RequestLog;
+use super::state::{
+    HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine,
+};
 use super::unsent::UnsentCounter;
-use super::{Hub, LinkStatus, mirror, seen};
+use super::{LinkStatus, mirror, seen};
 use crate::FlowCounts;
 use link::clock::ClockSample;
-use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint, SlaTargets};
+use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint};
 use link::drops::{DropCounters, DropReporter, TopicDropCount};
 use link::record::{ReceivedCall, Record};
 use link::session::{CloudSession, SessionHandler, SessionOptions};
 use link::skew::Direction;
-use ros::codec::Stamps;
+use ros::bus::{BusError, FailureReason};
 use ros::ros2::names;
-use ros::sizes::SizeCounters;
 
 /// Maximum number of topics opened concurrently, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
@@ -36,59 +36,6 @@ const OPENING: usize = 64;
 const GOAL: Duration = Duration::from_secs(24 * 3600);
 /// Interval at which drops are checked.
 const DROPS: Duration = Duration::from_secs(2);
-
-/// A robot's node as seen by the cloud.
-pub(super) struct NodeLink {
-    pub(super) node: String,
-    pub(super) run: String,
-    pub(super) machine: RobotMachine,
-    /// Session id.
-    pub(super) id: String,
-    pub(super) session: CloudSession,
-    /// Held by the connection that carries the session.
-    pub(super) lease: tokio::sync::Mutex<()>,
-    /// Incremented when another connection, or none, is to carry it.
-    pub(super) kick: watch::Sender<u64>,
-    pub(super) hub: Weak<Hub>,
-    pub(super) inputs: InputChannels,
-    pub(super) outputs: Outputs,
-    pub(super) lent: RobotServices,
-    pub(super) services: Mutex<HashMap<u32, Arc<NodeService>>>,
-    pub(super) listening: Mutex<BTreeSet<String>>,
-    pub(super) time: NodeTime,
-    sla: SlaTargets,
-    pub(super) requests: RequestLog,
-    unsent: UnsentCounter,
-    /// Drops on this side except those of the session.
-    pub(super) drops: DropCounters,
-    /// Drops on the robot's side as reported.
-    dropped: Mutex<Vec<TopicDropCount>>,
-    /// Incompatible endpoints on the robot as reported.
-    refused: Mutex<Vec<IncompatibleEndpoint>>,
-    /// Records that wait for an output to be subscribed to.
-    pub(super) held: HoldQueue,
-    orders: mpsc::UnboundedSender<QueuedOrder>,
-    /// Signals do not wait for control messages: a node that does not respond is the one to be ended.
-    signals: mpsc::UnboundedSender<i32>,
-    tasks: Mutex<Vec<AbortHandle>>,
-}
-
-/// A control message from the robot, until it is processed.
-struct QueuedOrder {
-    told: FromRobot,
-    /// Holds back other records until it is processed.
-    hold: Option<HoldGuard>,
-    /// Memory permit charged to the robot until then.
-    _held: Permit,
-}
-
-/// A service of the node.
-pub(super) struct NodeService {
-    pub(super) name: String,
-    pub(super) sizes: Arc<SizeCounters>,
-    pub(super) request: Stamps,
-    pub(super) response: Stamps,
-}
 
 impl NodeLink {
     pub(super) fn start(
@@ -100,6 +47,7 @@ impl NodeLink {
         let (orders, taken) = mpsc::unbounded_channel();
         let (signals, sent) = mpsc::unbounded_channel();
         let id = format!("{}-{:x}", hello.run, link::clock::now());
+        let log_span = tracing::error_span!(parent: &hub.log_span, "node", node = hello.node.name);
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
             run: hello.run.clone(),
@@ -125,35 +73,33 @@ impl NodeLink {
             orders,
             signals,
             tasks: Mutex::default(),
+            log_span,
         });
-        let mut tasks = vec![
-            tokio::spawn(process_orders(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
-            tokio::spawn(forward_signals(Arc::clone(&link), Arc::clone(hub), sent)).abort_handle(),
-            tokio::spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
-            tokio::spawn(node_time::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
-        ];
+        link.spawn(process_orders(Arc::clone(&link), Arc::clone(hub), taken));
+        link.spawn(forward_signals(Arc::clone(&link), Arc::clone(hub), sent));
+        link.spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub)));
+        link.spawn(node_time::follow(Arc::clone(&link), Arc::clone(hub)));
         let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
-        tasks.push(
-            tokio::spawn(async move {
-                let exit = nodes.wait_exit(&watching.node).await;
-                watching.session.send_control(&FromCloud::Exited(exit));
-            })
-            .abort_handle(),
-        );
+        link.spawn(async move {
+            let exit = nodes.wait_exit(&watching.node).await;
+            watching.session.send_control(&FromCloud::Exited(exit));
+        });
         let printing = Arc::clone(&link);
-        tasks.push(
-            tokio::spawn(async move {
-                while let Some((error, text)) = lines.recv().await {
-                    printing
-                        .session
-                        .send_control(&FromCloud::Line { error, text });
-                }
-            })
-            .abort_handle(),
-        );
-        tasks.push(tokio::spawn(report_drops(Arc::clone(&link))).abort_handle());
-        link.tasks.lock().extend(tasks);
+        link.spawn(async move {
+            while let Some((error, text)) = lines.recv().await {
+                printing
+                    .session
+                    .send_control(&FromCloud::Line { error, text });
+            }
+        });
+        link.spawn(report_drops(Arc::clone(&link)));
         link
+    }
+
+    /// Spawns a task that ends with the link.
+    fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) {
+        let task = tokio::spawn(task.instrument(self.log_span.clone()));
+        self.tasks.lock().push(task.abort_handle());
     }
 
     /// Stops everything done for the robot, without touching the node.
@@ -278,7 +224,9 @@ impl NodeLink {
         let known = self.services.lock().get(&service).cloned();
         let (Some(service), Some(hub)) = (known, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
-            return self.session.answer(id, taken, Err(gone));
+            return self
+                .session
+                .answer(id, taken, Err(FailureReason::new(gone)));
         };
         let link = Arc::clone(self);
         // Not aborted with the link: the node answers a call that it has accepted, even if nobody receives the
@@ -299,8 +247,8 @@ impl NodeLink {
                 id,
                 taken,
                 called.map_err(|error| match error {
-                    ros::bus::BusError::CallFailed { reason, .. } => reason,
-                    other => other.to_string(),
+                    BusError::CallFailed { reason, .. } => FailureReason::new(reason),
+                    other => FailureReason::new(other.to_string()),
                 }),
             );
         });
@@ -447,6 +395,7 @@ async fn process_orders(
                     let _held = _held;
                     link.inputs.open(&hub, &link.drops, input, turns).await;
                 };
+                let open = open.in_current_span();
                 opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
             }
             FromRobot::Close { channel } => {
@@ -482,7 +431,7 @@ async fn process_orders(
                 refused.truncate(IncompatibleEndpoint::MOST);
                 *link.refused.lock() = refused;
             }
-            other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
+            other => tracing::debug!(?other, "not for the cloud"),
         }
     }
 }
@@ -494,8 +443,9 @@ async fn forward_signals(
     mut signals: mpsc::UnboundedReceiver<i32>,
 ) {
     while let Some(signal) = signals.recv().await {
-        if let Err(reason) = hub.nodes.signal(&link.node, signal).await {
-            tracing::debug!(node = link.node, signal, reason, "a signal did not arrive");
+        if let Err(error) = hub.nodes.signal(&link.node, signal).await {
+            let reason = error.to_string();
+            tracing::debug!(signal, reason, "a signal did not arrive");
         }
     }
 }
@@ -506,7 +456,7 @@ async fn report_drops(link: Arc<NodeLink>) {
     loop {
         tokio::time::sleep(DROPS).await;
         for drop in reporter.take_new(&link.local_drops()) {
-            tracing::info!(node = link.node, "{drop}");
+            tracing::info!("{drop}");
             link.session.send_control(&FromCloud::Notice {
                 warning: !drop.cause.is_intended(),
                 text: format!("in the cloud {drop}"),

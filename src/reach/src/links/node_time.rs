@@ -10,8 +10,7 @@ use bytes::Bytes;
 use ros::bus::{BusError, Graph, NodeParameters, ParamValue};
 use ros::codec::Stamps;
 
-use super::Hub;
-use super::node_link::NodeLink;
+use super::state::{Hub, NodeLink, NodeTime};
 use link::control::Hello;
 use link::skew::{Direction, Skew};
 
@@ -19,13 +18,6 @@ use link::skew::{Direction, Skew};
 pub(super) const SIMULATED: &str = "use_sim_time";
 /// Pause before a node that did not answer is asked again.
 const AGAIN: Duration = Duration::from_secs(1);
-
-/// Time source of a node.
-pub(super) struct NodeTime {
-    /// The robot wants stamps unchanged.
-    kept: bool,
-    simulated: AtomicBool,
-}
 
 impl NodeTime {
     /// Returns the time source announced in the robot's hello. In ROS 2 this is the only parameter that it contains.
@@ -97,7 +89,7 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
         match followed {
             Ok(()) | Err(BusError::NotOffered(_)) => return,
             Err(error) => {
-                tracing::debug!(node = link.node, %error, "it did not say whether its time is simulated");
+                tracing::debug!(%error, "it did not say whether its time is simulated");
                 tokio::time::sleep(AGAIN).await;
             }
         }

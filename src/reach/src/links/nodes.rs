@@ -4,11 +4,87 @@ use std::sync::Weak;
 
 use async_trait::async_trait;
 use link::control::{Decision, Exit, Hello, NodeLaunch, RequestTiming};
-use ros::bus::ParamValue;
+use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
 use super::requests::RequestUpdate;
-use crate::{StubNode, Tenant};
+use crate::observer::Tenant;
+
+/// A node started by a stub.
+#[derive(Debug, Clone)]
+pub struct StubNode {
+    /// Description given by the stub.
+    pub node: NodeLaunch,
+    /// Parameters given by its push.
+    pub given: Vec<(String, ParamValue)>,
+}
+
+/// Error of starting or signalling a node of a servant.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeError {
+    /// The servant has no tenant any more.
+    #[error("the servant has ended")]
+    ServantEnded,
+    /// The daemon does not let this stub use the servant.
+    #[error(transparent)]
+    StubRefused(#[from] FailureReason),
+    /// The push did not record the program.
+    #[error(
+        "service {service} was not pushed with the executable {executable} of package {package}: a stub starts what \
+         its push recorded; push it with that node"
+    )]
+    NotPushed {
+        /// Name of the service.
+        service: String,
+        /// Name of the executable.
+        executable: String,
+        /// Package of the executable.
+        package: String,
+    },
+    /// No node of a shared service runs the program.
+    #[error(
+        "robots share service {service}, whose servants do not run {executable}: a stub uses what runs there; push \
+         the service with that node"
+    )]
+    NotRun {
+        /// Name of the service.
+        service: String,
+        /// Name of the executable.
+        executable: String,
+    },
+    /// Several nodes of a shared service run the program, and none of them has the name of the stub's node.
+    #[error(
+        "robots share service {service}, whose servants run {executable} as {}: which of them {node} stands for is \
+         decided by its name; give it one of these names", .candidates.join(" and ")
+    )]
+    Ambiguous {
+        /// Name of the service.
+        service: String,
+        /// Name of the executable.
+        executable: String,
+        /// Names of the service's nodes that run it.
+        candidates: Vec<String>,
+        /// Name of the stub's node.
+        node: String,
+    },
+    /// The servant is of a kind whose nodes are started only by stubs.
+    #[error("{0} is started only by stubs")]
+    OnlyByStubs(
+        /// Name of the node.
+        String,
+    ),
+    /// The engine does not start the program.
+    #[error("{node} cannot be started: {source}")]
+    Start {
+        /// Name of the node.
+        node: String,
+        /// Error of the engine.
+        source: servant::Error,
+    },
+    /// The engine does not send the signal.
+    #[error(transparent)]
+    Signal(servant::Error),
+}
 
 /// Starts, signals and observes the nodes of a servant on behalf of its links.
 #[async_trait]
@@ -17,15 +93,14 @@ pub trait NodeController: Send + Sync + 'static {
     fn service(&self) -> &str {
         ""
     }
-    /// Starts the node for this run of the robot's; returns once its program runs, or the reason why it cannot be
-    /// started.
-    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), String>;
+    /// Starts the node for this run of the robot's; returns once its program runs, or cannot be started.
+    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError>;
     /// Returns the run for which the node was last started, by any daemon, if that is recorded.
     fn last_run(&self, _node: &str) -> Option<String> {
         None
     }
     /// Sends a signal to the node.
-    async fn signal(&self, node: &str, signal: i32) -> Result<(), String>;
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), NodeError>;
     /// Waits for the node to exit; returns immediately if it is not running.
     async fn wait_exit(&self, node: &str) -> Exit;
     /// Returns whether the node is running.

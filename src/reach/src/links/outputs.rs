@@ -11,13 +11,11 @@ use ros::bus::{
 };
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
+use tracing::Instrument;
 
-use super::Hub;
-use super::given::GivenInputs;
-use super::held::HoldGuard;
-use super::inputs::{Mark, stamp_mark};
-use super::node_link::NodeLink;
+use super::given::{GivenInputs, Mark, stamp_mark};
 use super::retry::Retry;
+use super::state::{HoldGuard, Hub, NodeLink};
 use link::DeliveryMode;
 use link::clock::now;
 use link::drops::Cause;
@@ -133,7 +131,7 @@ impl Outputs {
         };
         let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
-        let reading = tokio::spawn(async move {
+        let reading = async move {
             let before = match bus.publisher_reports() {
                 Some(hearing) => hearing
                     .reported_connections(&topic)
@@ -181,7 +179,8 @@ impl Outputs {
                 }
             };
             tokio::join!(connected, read);
-        });
+        };
+        let reading = tokio::spawn(reading.in_current_span());
         if let Some(known) = self.channels.lock().get_mut(&channel) {
             known.reading = Some(reading.abort_handle());
         } else {

@@ -4,17 +4,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use budget::Permit;
-use parking_lot::Mutex;
 use ros::bus::{BusError, ParamValue};
 use ros::ros1::own_parameters::is_set_by_master;
-use tokio::sync::OnceCell;
-use tokio::task::AbortHandle;
+use tracing::Instrument;
 
-use super::Hub;
 use super::node_time::SIMULATED;
 use super::runs::RUNS;
-use link::Echoes;
+use super::state::{Hub, ParameterMirror, PendingChange};
 use link::control::{FromCloud, Hello, NodeLaunch};
 
 /// Memory overhead of a pending change in bytes.
@@ -23,21 +19,6 @@ const UNTOLD: usize = 256;
 /// Returns whether the parameter is set by the Master itself or stores the runs of nodes.
 fn is_internal(name: &str) -> bool {
     is_set_by_master(name) || name == RUNS.trim_start_matches('/')
-}
-
-/// Synchronization state of the parameters.
-#[derive(Default)]
-pub(super) struct ParameterMirror {
-    set: Echoes,
-    /// Changes by nodes before there was a link to report them.
-    untold: Mutex<BTreeMap<String, PendingChange>>,
-    watching: OnceCell<AbortHandle>,
-}
-
-/// A change that was not reported to any robot. Its memory is charged to the servant.
-struct PendingChange {
-    value: Option<ParamValue>,
-    _held: Permit,
 }
 
 impl Drop for ParameterMirror {
@@ -109,12 +90,13 @@ impl ParameterMirror {
         let begun = self.watching.get_or_try_init(|| async {
             let mut changes = hub.bus.parameters()?.watch().await?;
             let weak = Arc::downgrade(hub);
-            let task = tokio::spawn(async move {
+            let reporting = async move {
                 while let Some((key, value)) = changes.recv().await {
                     let Some(hub) = weak.upgrade() else { return };
                     hub.parameters.report_change(&hub, key, value);
                 }
-            });
+            };
+            let task = tokio::spawn(reporting.instrument(hub.log_span.clone()));
             Ok::<_, BusError>(task.abort_handle())
         });
         match begun.await {

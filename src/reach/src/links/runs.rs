@@ -4,7 +4,7 @@
 
 use ros::bus::ParamValue;
 
-use super::Hub;
+use super::state::Hub;
 
 /// Parameter below which runs are stored.
 pub(super) const RUNS: &str = "/cloudroid_runs";

@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use async_trait::async_trait;
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -32,14 +34,14 @@ impl QuietNodes {
 
 #[async_trait]
 impl NodeController for QuietNodes {
-    async fn start(&self, node: &NodeLaunch, _: &str) -> Result<(), String> {
+    async fn start(&self, node: &NodeLaunch, _: &str) -> Result<(), NodeError> {
         if self.is_stuck(&node.name) {
             std::future::pending::<()>().await;
         }
         self.running.lock().insert(node.name.clone());
         Ok(())
     }
-    async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+    async fn signal(&self, node: &str, signal: i32) -> Result<(), NodeError> {
         let sent = (node.to_owned(), signal);
         self.signals.send_modify(|signals| signals.push(sent));
         if self.is_stuck(node) {

@@ -52,11 +52,9 @@ impl RobotEvents {
         let _ = self.tenant.set(tenant);
     }
 
-    pub(crate) fn tenant(&self) -> Result<Arc<dyn Tenant>, String> {
-        self.tenant
-            .get()
-            .and_then(Weak::upgrade)
-            .ok_or_else(|| "the servant has ended".to_owned())
+    /// Returns the tenant; `None` if the servant has none yet, or has ended.
+    pub(crate) fn tenant(&self) -> Option<Arc<dyn Tenant>> {
+        self.tenant.get().and_then(Weak::upgrade)
     }
 
     pub(crate) fn observer(&self) -> &dyn Observer {
@@ -65,7 +63,9 @@ impl RobotEvents {
 
     /// Records a decision of the robot about the local original of a node.
     pub(crate) fn record_decision(&self, node: &str, decision: &Decision) {
-        let Ok(tenant) = self.tenant() else { return };
+        let Some(tenant) = self.tenant() else {
+            return;
+        };
         let count = {
             let mut decisions = self.decisions.lock();
             if decisions.0.elapsed() > DECISIONS.1 {
@@ -111,7 +111,7 @@ impl RobotEvents {
 
     /// Reports a problem of this robot to the operator.
     pub(crate) fn warn(&self, kind: &str, text: &str) {
-        let tenant = self.tenant().ok();
+        let tenant = self.tenant();
         let robot = tenant.as_ref().map(|tenant| tenant.robot());
         self.observer
             .record_event(Level::Warning, kind, text, robot);

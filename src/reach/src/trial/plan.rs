@@ -47,7 +47,7 @@ impl PlannedInput {
             qos: topic.qos.map_or(plain, |qos| QosProfile {
                 // No message may be lost.
                 reliability: plain.reliability,
-                ..qos.to_bus_qos(QUEUE)
+                ..package::interface::qos::to_bus(&qos, QUEUE)
             }),
         })
     }

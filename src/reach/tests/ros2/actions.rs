@@ -2,7 +2,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use ros::bus::{ActionClient, ActionHandler, Bus, GoalEnd, GoalEvents, GoalOutcome, RosVersion};
+use ros::bus::{
+    ActionClient, ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome,
+    RosVersion,
+};
 use ros::ros2::Ros2Bus;
 use ros::schema::{ActionDef, Registry};
 use serde_json::json;
@@ -73,8 +76,9 @@ impl GoalEvents for Events {
         let _ = self.told.send(ClientGoalEvent::Feedback(feedback));
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let end = end.map(|end| (end.outcome, json(&self.of.result, &end.result)));
+        let end = end.map_err(|error| error.to_string());
         let _ = self.told.send(ClientGoalEvent::Ended(end));
     }
 }
@@ -232,10 +236,10 @@ enum HandlerEvent {
 struct Handler(mpsc::UnboundedSender<HandlerEvent>);
 
 impl ActionHandler for Handler {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
         let goal = json(&fibonacci().goal, &goal);
         if goal == r#"{"order":-1}"# {
-            return Err("negative".to_owned());
+            return Err(FailureReason::new("negative"));
         }
         let _ = self.0.send(HandlerEvent::Goal(id.to_owned(), goal));
         Ok(())
@@ -254,7 +258,7 @@ impl ActionHandler for Handler {
 struct Echo(mpsc::UnboundedSender<(String, Bytes)>);
 
 impl ActionHandler for Echo {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
         let _ = self.0.send((id.to_owned(), goal));
         Ok(())
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use link::clock::now;
 use link::control::{Graph, Hello, InputChannel};
-use ros::bus::{Bus, Lending, QosProfile, RosVersion, ServiceType, WireType};
+use ros::bus::{Bus, FailureReason, Lending, QosProfile, RosVersion, ServiceType, WireType};
 use ros::ros2::Ros2Bus;
 use ros::schema::Registry;
 use serde_json::{Value, json as value};
@@ -352,7 +352,8 @@ async fn run_robot(robot: &mut LinkedRobot, own: &Arc<Ros2Bus>, graph: &Graph) {
                 let service = lent[channel as usize - 1].clone();
                 reading.spawn(async move {
                     let called = own.call(&service, request, LONG).await;
-                    session.answer(id, now(), called.map_err(|error| error.to_string()));
+                    let called = called.map_err(|error| FailureReason::new(error.to_string()));
+                    session.answer(id, now(), called);
                 });
             }
         }

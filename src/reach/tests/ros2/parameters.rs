@@ -1,7 +1,8 @@
 use std::sync::Arc;
 
 use ros::bus::{
-    Bus, BusError, DoubleRange, IntegerRange, ParamValue, ParameterEvent, ParameterKind,
+    Bus, BusError, DoubleRange, FailureReason, IntegerRange, ParamValue, ParameterEvent,
+    ParameterKind,
 };
 use ros::ros2::Ros2Bus;
 use tokio::time::timeout;
@@ -116,7 +117,7 @@ async fn parameters_of_a_node_are_set_if_it_agrees() {
     let done: Vec<bool> = set.iter().map(Result::is_ok).collect();
     let expected = [true, false, false, true, true, true, true, false, false];
     assert_eq!(done, expected, "{set:?}");
-    assert_eq!(set[1], Err("too fast".to_owned()));
+    assert_eq!(set[1], Err(FailureReason::new("too fast")));
     let asked = names(&["speed", "serial", "doubles", "blob", "texts", "count"]);
     let values = parameters.get(TUNED, &asked).await.unwrap();
     let expected = [

@@ -16,8 +16,8 @@ use link::record::{Data, Record};
 use link::session::{receive_open, send_open};
 use link::{DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use parking_lot::Mutex;
-use reach::links::{Hub, HubOptions, NodeController};
-use ros::bus::{Bus, ParamValue, RosVersion, ServiceType};
+use reach::links::{Hub, HubOptions, NodeController, NodeError};
+use ros::bus::{Bus, FailureReason, ParamValue, RosVersion, ServiceType};
 use ros::schema::Registry;
 use tokio::io::DuplexStream;
 use tokio::sync::{mpsc, watch};
@@ -45,7 +45,7 @@ impl NodeController for RunTracker {
     fn service(&self) -> &str {
         "vision"
     }
-    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), String> {
+    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError> {
         let mut started = self.started.lock();
         let known = started.entry(node.name.clone()).or_default();
         *known = (run.to_owned(), known.1 + 1);
@@ -54,8 +54,8 @@ impl NodeController for RunTracker {
     fn last_run(&self, node: &str) -> Option<String> {
         Some(self.started.lock().get(node)?.0.clone())
     }
-    async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
-        Err("it is not of this servant".to_owned())
+    async fn signal(&self, _: &str, _: i32) -> Result<(), NodeError> {
+        Err(NodeError::ServantEnded)
     }
     async fn wait_exit(&self, _: &str) -> Exit {
         std::future::pending().await
@@ -134,7 +134,7 @@ struct CloudRequestForwarder {
     graph: watch::Sender<Graph>,
     types: Mutex<HashMap<(String, String), String>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
-    answers: mpsc::UnboundedSender<(u32, Result<Bytes, String>)>,
+    answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
     asked: mpsc::UnboundedSender<CloudRequest>,
 }
 
@@ -168,7 +168,7 @@ pub struct LinkedRobot {
     pub asked: mpsc::UnboundedReceiver<CloudRequest>,
     ear: Arc<CloudRequestForwarder>,
     heard: mpsc::UnboundedReceiver<(u32, Bytes)>,
-    answers: mpsc::UnboundedReceiver<(u32, Result<Bytes, String>)>,
+    answers: mpsc::UnboundedReceiver<(u32, Result<Bytes, FailureReason>)>,
 }
 
 impl LinkedRobot {
@@ -262,7 +262,11 @@ impl LinkedRobot {
     }
 
     /// Calls a service on behalf of a node of the robot.
-    pub async fn call(&mut self, served: &ServiceChannel, request: Bytes) -> Result<Bytes, String> {
+    pub async fn call(
+        &mut self,
+        served: &ServiceChannel,
+        request: Bytes,
+    ) -> Result<Bytes, FailureReason> {
         let called = self.session.call(served.channel, request);
         loop {
             let answer = timeout(LONG, self.answers.recv()).await;

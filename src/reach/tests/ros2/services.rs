@@ -3,7 +3,7 @@ use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, BusError, CallFate, ServiceHandler};
+use ros::bus::{Bus, BusError, CallFate, FailureReason, ServiceHandler};
 use serde_json::json;
 
 use super::lab::{LONG, Lab, cdr, json, set_bool, set_bool_type, wait_graph};
@@ -19,7 +19,7 @@ pub struct CallerEchoService;
 
 #[async_trait]
 impl ServiceHandler for CallerEchoService {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         let asked = json(&set_bool().request, &request);
         let success = asked == r#"{"data":true}"#;
         let answer = format!(r#"{{"success":{success},"message":"{caller}"}}"#);

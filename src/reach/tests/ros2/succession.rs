@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus as _, ServiceHandler};
+use ros::bus::{Bus as _, FailureReason, ServiceHandler};
 use ros::ros2::Ros2Bus;
 use ros::{JoinOptions, ParticipantPrefix, Succession};
 use serde_json::{Value, json};
@@ -39,7 +39,7 @@ struct NamedService(&'static str);
 
 #[async_trait]
 impl ServiceHandler for NamedService {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let answer = format!(r#"{{"success":true,"message":"{}"}}"#, self.0);
         Ok(cdr(&set_bool().response, &answer))
     }

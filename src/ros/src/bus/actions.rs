@@ -6,7 +6,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::{BusError, Graph};
+use super::{BusError, FailureReason, Graph};
 
 /// Outcome of a goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,6 +34,50 @@ pub struct GoalEnd {
     pub result: Bytes,
 }
 
+/// The reason why the end of a goal will never be known.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum GoalError {
+    /// The bytes are no message of the action's goal type.
+    #[error("the goal is not a serialized {0}")]
+    NotAGoal(
+        /// Name of the goal type.
+        String,
+    ),
+    /// Another goal of this bus has the id and has not ended.
+    #[error("a goal with id {0} is under way already")]
+    AlreadyUnderWay(String),
+    /// The topics of the action are not open.
+    #[error("action {0} is not ready")]
+    NotReady(String),
+    /// No node serves the action.
+    #[error("action {0} has no server")]
+    NoServer(String),
+    /// The server went away while it had the goal.
+    #[error("action server {0} is gone")]
+    ServerGone(String),
+    /// The server does not list the goal any more.
+    #[error("the action server no longer knows the goal")]
+    Forgotten,
+    /// The server's answer to the goal does not have the action's type.
+    #[error("action {0} sent an answer that cannot be read")]
+    UnreadableAnswer(String),
+    /// The result does not have the action's type.
+    #[error("the result of action {0} cannot be read")]
+    UnreadableResult(String),
+    /// The bus failed, or was closed.
+    #[error(transparent)]
+    Bus(Arc<BusError>),
+    /// The goal was given up on its way to a server, or without one, for this reason.
+    #[error(transparent)]
+    GivenUp(FailureReason),
+}
+
+impl From<BusError> for GoalError {
+    fn from(error: BusError) -> Self {
+        Self::Bus(Arc::new(error))
+    }
+}
+
 /// Callbacks for one goal, called in order. Must not block.
 pub trait GoalEvents: Send + Sync + 'static {
     /// The server accepted the goal. Called only where servers answer goals (ROS 2), and not for a rejected goal.
@@ -43,8 +87,8 @@ pub trait GoalEvents: Send + Sync + 'static {
     fn on_cancel_response(&self, _ends: bool) {}
     /// Serialized feedback arrived.
     fn on_feedback(&self, feedback: Bytes);
-    /// The goal ended, or its outcome will never be known, for the given reason. This is the last event.
-    fn on_ended(&self, end: Result<GoalEnd, String>);
+    /// The goal ended, or its end will never be known. This is the last event.
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>);
 }
 
 /// A client of an action; dropping it cancels its active goals.
@@ -62,7 +106,7 @@ pub trait ActionClient: Send + Sync {
 /// Executes the goals of one action that this bus serves. Must not block.
 pub trait ActionHandler: Send + Sync + 'static {
     /// A goal arrived; an error rejects it.
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String>;
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason>;
     /// An accepted goal is to be cancelled.
     fn on_cancel(&self, id: &str);
     /// The action cannot be served.

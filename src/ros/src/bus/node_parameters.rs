@@ -2,7 +2,7 @@
 
 use async_trait::async_trait;
 
-use super::{BusError, ParamChange, ParamValue};
+use super::{BusError, FailureReason, ParamChange, ParamValue};
 
 /// Access to the parameters of each node (ROS 2). In ROS 1 all nodes share their parameters.
 #[async_trait]
@@ -16,7 +16,7 @@ pub trait NodeParameters: Send + Sync {
         &self,
         node: &str,
         changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), String>>, BusError>;
+    ) -> Result<Vec<Result<(), FailureReason>>, BusError>;
     /// Sets parameters like [`set`](Self::set), but all or none; the error carries the node's reason.
     async fn set_atomically(&self, node: &str, changes: Vec<ParamChange>) -> Result<(), BusError>;
     /// Lists the parameters of a node: those below the prefixes (all if there are none), with names of at most `depth`

@@ -12,6 +12,7 @@
 
 mod actions;
 mod calls;
+mod endpoint_owner;
 mod heard;
 mod lending;
 mod link;
@@ -22,11 +23,14 @@ mod registrar;
 mod server;
 mod services;
 mod slave;
+mod state;
 pub(super) mod subscriptions;
+mod topic_in;
+mod topic_out;
 mod topic_type;
 mod watcher;
 
-use std::collections::HashMap;
+use std::collections::BTreeSet;
 use std::fmt;
 use std::future::Future;
 use std::io;
@@ -40,75 +44,30 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
-use tokio::task::{AbortHandle, JoinSet};
+use tokio::task::AbortHandle;
+use tracing::{Instrument, Span};
 
-use self::calls::CallPool;
-use self::lending::Loans;
+pub(super) use self::endpoint_owner::EndpointOwner;
 use self::master_client::MasterClient;
-use self::publications::TopicOut;
 use self::registrar::Registrar;
-use self::services::ServiceEntry;
-use self::subscriptions::TopicIn;
+pub(super) use self::state::Ros1BusState;
+use self::state::{CallPool, FAREWELL, HANDSHAKE, Loans, PublisherClients};
 use super::names;
 use crate::JoinOptions;
 use crate::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    Lending, ParamChangeSender, ParamValue, Publisher, PublisherReports, QosProfile, RosVersion,
+    Lending, ParamValue, PeerId, Publisher, PublisherReports, QosProfile, RosVersion,
     ServiceHandler, ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
-use crate::ros1::tcpros::{FrameBounds, Header};
+use crate::ros1::tcpros::FrameBounds;
 use crate::ros1::xmlrpc::{self, ServerLimits, XmlRpcClient};
 use crate::schema::ActionDef;
-
-/// Time for a peer to accept a connection and answer its header.
-const HANDSHAKE: Duration = Duration::from_secs(10);
-/// Time for queued messages and unregistrations when the bus closes.
-const FAREWELL: Duration = Duration::from_secs(2);
 
 /// A ROS 1 system as a [`Bus`]. Dropping it closes all connections but leaves the registrations, as a crash would;
 /// [`Bus::close`] unregisters everything.
 pub struct Ros1Bus {
     inner: Arc<Ros1BusState>,
-}
-
-/// Owner of an endpoint of a topic. Messages published by this node are not delivered to its own subscriptions, except
-/// where one of the two endpoints belongs to an action: an action's topics may also be used directly, and its client
-/// may have its server behind the same bus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum EndpointOwner {
-    /// The owner of the bus.
-    User,
-    /// An action of this node.
-    Action,
-}
-
-/// State shared by all parts of a bus.
-pub(super) struct Ros1BusState {
-    sockets: Arc<dyn Sockets>,
-    pub(super) node: String,
-    /// Host in our addresses, and the port of our TCPROS server.
-    host: String,
-    port: u16,
-    frames: FrameBounds,
-    master: Arc<MasterClient>,
-    registrar: Registrar,
-    subscriptions: Mutex<HashMap<String, Arc<TopicIn>>>,
-    publications: Mutex<HashMap<String, Arc<TopicOut>>>,
-    /// Notified when something is advertised, and when somebody wants to know what type subscribers request.
-    publishing: Notify,
-    services: Mutex<HashMap<String, Arc<ServiceEntry>>>,
-    label: OnceLock<String>,
-    lending: Loans,
-    calls: CallPool,
-    publisher_clients: heard::PublisherClients,
-    pub(super) graph: watch::Sender<Arc<Graph>>,
-    shutdown: watch::Sender<Option<String>>,
-    param_watcher: Mutex<Option<ParamChangeSender>>,
-    closed: AtomicBool,
-    runtime: Handle,
-    tasks: Mutex<JoinSet<()>>,
-    next_id: AtomicI32,
 }
 
 impl Ros1Bus {
@@ -193,12 +152,13 @@ impl Ros1Bus {
             label: OnceLock::new(),
             lending: Loans::default(),
             calls: CallPool::default(),
-            publisher_clients: heard::PublisherClients::default(),
+            publisher_clients: PublisherClients::default(),
             graph: watch::Sender::new(Arc::default()),
             shutdown: watch::Sender::new(None),
             param_watcher: Mutex::default(),
             closed: AtomicBool::new(false),
             runtime: Handle::current(),
+            log_span: Span::current(),
             tasks: Mutex::default(),
             next_id: AtomicI32::new(1),
         });
@@ -247,6 +207,7 @@ impl Ros1BusState {
     pub(super) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
         let mut tasks = self.tasks.lock();
         while tasks.try_join_next().is_some() {}
+        let task = task.instrument(self.log_span.clone());
         let handle = tasks.spawn_on(task, &self.runtime);
         if self.closed.load(Ordering::Acquire) {
             handle.abort();
@@ -302,15 +263,6 @@ impl Ros1BusState {
         self.lending.clear();
         self.calls.clear();
     }
-}
-
-/// Returns the type declared in a TCPROS connection header.
-fn wire_type_from_header(header: &Header) -> WireType {
-    WireType::new(
-        header.get("type").unwrap_or("*"),
-        header.get("md5sum").unwrap_or("*"),
-        header.text("message_definition"),
-    )
 }
 
 #[async_trait]
@@ -447,6 +399,13 @@ impl Bus for Ros1Bus {
         };
         let _ = tokio::time::timeout(FAREWELL, farewell).await;
         self.inner.shut_down();
+    }
+}
+
+#[async_trait]
+impl PublisherReports for Ros1Bus {
+    async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
+        heard::connections(&self.inner, topic).await
     }
 }
 

@@ -96,11 +96,14 @@ impl Master {
     pub fn new(options: MasterOptions) -> Self {
         let mut params = Params::default();
         for (key, value) in options.parameters {
-            let set = Value::try_from(value).and_then(|value| {
-                let key = crate::ros1::names::canonical(&key);
-                params.set(&key, value).map_err(|error| error.to_string())
-            });
-            if let Err(reason) = set {
+            let reason = match Value::try_from(value) {
+                Ok(value) => {
+                    let set = params.set(&crate::ros1::names::canonical(&key), value);
+                    set.err().map(|error| error.to_string())
+                }
+                Err(error) => Some(error.to_string()),
+            };
+            if let Some(reason) = reason {
                 tracing::warn!(key, reason, "an initial parameter was left out");
             }
         }

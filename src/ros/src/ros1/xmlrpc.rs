@@ -18,7 +18,7 @@ pub use parse::{MAX_DEPTH, MAX_ELEMENTS, MethodCall, parse_call, parse_response,
 pub(crate) use print::fault_value;
 pub use print::{print_call, print_fault, print_response};
 pub use server::{MAX_HELD, ServerLimits, XmlRpcHandler, serve};
-pub use value::Value;
+pub use value::{UnsendableValue, Value};
 
 /// A fault returned by the other side instead of a value.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

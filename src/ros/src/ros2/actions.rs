@@ -25,7 +25,7 @@ use crate::schema::ActionDef;
 
 pub(super) use client::Ros2ActionClient;
 use goal_id::GoalId;
-pub(super) use server::{RetiredServices, Ros2ActionServer};
+pub(super) use server::Ros2ActionServer;
 
 /// Queue depth for feedback to a slow receiver.
 const QUEUE: u32 = 100;

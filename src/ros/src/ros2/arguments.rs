@@ -131,7 +131,7 @@ pub enum ArgumentError {
         /// The value given.
         given: String,
         /// The problem.
-        reason: String,
+        reason: ValueProblem,
         /// The right form.
         form: &'static str,
     },
@@ -142,12 +142,42 @@ pub enum ArgumentError {
     Unknown(String),
 }
 
+/// Problem with the value of an argument. The texts quote the part of it that is wrong.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ValueProblem {
+    /// Nothing separates the two sides.
+    #[error("it has no :=")]
+    NoSeparator,
+    /// The name of a node is malformed.
+    #[error("{0:?} is not a node name")]
+    NotANode(String),
+    /// The new name of a node is malformed.
+    #[error("{0:?} is not a node name (letters, digits and _; __ns:= sets the namespace)")]
+    NotANewNode(String),
+    /// The new namespace is malformed.
+    #[error("{0:?} is not a namespace, which begins with / and does not end with it")]
+    NotANamespace(String),
+    /// The name that a rule replaces is malformed.
+    #[error("{0:?} before := is not a name")]
+    NotANameBefore(String),
+    /// The name that a rule gives is malformed.
+    #[error("{0:?} behind := is not a name")]
+    NotANameBehind(String),
+    /// The name of a parameter is malformed.
+    #[error("{0:?} is not a parameter name")]
+    NotAParameter(String),
+    /// The value of a parameter cannot be read; the reason is that of its reader.
+    #[error("{0}")]
+    Unreadable(String),
+}
+
 /// Descriptions of the right form of a rule and of a parameter.
 const RULES: &str = "a rule is FROM:=TO";
 const PARAMETERS: &str = "a parameter is given as NAME:=VALUE";
 
 /// Returns the error for a parameter with an invalid value; `words` are the words by which it was given.
 pub fn invalid_value(words: &[String], reason: &str) -> ArgumentError {
+    let reason = ValueProblem::Unreadable(reason.to_owned());
     match words {
         [flag, given, ..] => refused_error(flag, given, reason, PARAMETERS),
         _ => refused_error("-p", "", reason, PARAMETERS),
@@ -184,13 +214,13 @@ pub fn parse(argv: &[String]) -> Result<Vec<CommandLinePart>, ArgumentError> {
             "-r" | "--remap" => {
                 let given = take_value(word, words.next(), "FROM:=TO")?;
                 let rule = parse_rule(given)
-                    .map_err(|reason| refused_error(word, given, &reason, RULES))?;
+                    .map_err(|reason| refused_error(word, given, reason, RULES))?;
                 part(vec![word, given], Kind::Rule(rule));
             }
             "-p" | "--param" => {
                 let given = take_value(word, words.next(), "NAME:=VALUE")?;
                 let parameter = parse_parameter(given)
-                    .map_err(|reason| refused_error(word, given, &reason, PARAMETERS))?;
+                    .map_err(|reason| refused_error(word, given, reason, PARAMETERS))?;
                 part(vec![word, given], Kind::Parameter(parameter));
             }
             "--params-file" => {
@@ -254,11 +284,16 @@ fn take_value<'a>(
     })
 }
 
-fn refused_error(flag: &str, given: &str, reason: &str, form: &'static str) -> ArgumentError {
+fn refused_error(
+    flag: &str,
+    given: &str,
+    reason: ValueProblem,
+    form: &'static str,
+) -> ArgumentError {
     ArgumentError::Refused {
         flag: flag.to_owned(),
         given: given.to_owned(),
-        reason: reason.to_owned(),
+        reason,
         form,
     }
 }
@@ -283,21 +318,20 @@ pub fn is_parameter_name(name: &str) -> bool {
     name.split(['.', '/']).all(is_token)
 }
 
-fn split_rule(text: &str) -> Result<(&str, &str), String> {
-    text.split_once(":=")
-        .ok_or_else(|| "it has no :=".to_owned())
+fn split_rule(text: &str) -> Result<(&str, &str), ValueProblem> {
+    text.split_once(":=").ok_or(ValueProblem::NoSeparator)
 }
 
 /// Splits off a `NODE:` prefix.
-fn split_node(text: &str) -> Result<(Option<String>, &str), String> {
+fn split_node(text: &str) -> Result<(Option<String>, &str), ValueProblem> {
     match text.split_once(':') {
         Some((node, rest)) if is_token(node) => Ok((Some(node.to_owned()), rest)),
-        Some((node, _)) => Err(format!("{node:?} is not a node name")),
+        Some((node, _)) => Err(ValueProblem::NotANode(node.to_owned())),
         None => Ok((None, text)),
     }
 }
 
-fn parse_rule(text: &str) -> Result<RemapRule, String> {
+fn parse_rule(text: &str) -> Result<RemapRule, ValueProblem> {
     let (from, to) = split_rule(text)?;
     // Rules for topics or services only.
     let kinds = [
@@ -324,21 +358,16 @@ fn parse_rule(text: &str) -> Result<RemapRule, String> {
     };
     match of {
         RemapTarget::Node if !is_token(to) => {
-            return Err(format!(
-                "{to:?} is not a node name (letters, digits and _; __ns:= sets the namespace)"
-            ));
+            return Err(ValueProblem::NotANewNode(to.to_owned()));
         }
         RemapTarget::Namespace if to != "/" && !names::is_global(to) => {
-            return Err(format!(
-                "{to:?} is not a namespace, which begins with / and does not end with it"
-            ));
+            return Err(ValueProblem::NotANamespace(to.to_owned()));
         }
-        of if of.is_name() => {
-            for (side, name) in [("before", from), ("behind", to)] {
-                if !is_pattern(name) {
-                    return Err(format!("{name:?} {side} := is not a name"));
-                }
-            }
+        of if of.is_name() && !is_pattern(from) => {
+            return Err(ValueProblem::NotANameBefore(from.to_owned()));
+        }
+        of if of.is_name() && !is_pattern(to) => {
+            return Err(ValueProblem::NotANameBehind(to.to_owned()));
         }
         _ => {}
     }
@@ -356,11 +385,11 @@ fn is_pattern(name: &str) -> bool {
     !name.is_empty() && name.bytes().all(allowed)
 }
 
-fn parse_parameter(text: &str) -> Result<Parameter, String> {
+fn parse_parameter(text: &str) -> Result<Parameter, ValueProblem> {
     let (name, text) = split_rule(text)?;
     let (node, name) = split_node(name)?;
     if !is_parameter_name(name) {
-        return Err(format!("{name:?} is not a parameter name"));
+        return Err(ValueProblem::NotAParameter(name.to_owned()));
     }
     Ok(Parameter {
         node,

@@ -17,9 +17,8 @@
 //! Actions use the same parts: `calls::client_for` and `services::serve` with names below `/_action/`, and `raw`, whose
 //! endpoints hear each other, because an action's client may have its server behind the same bus.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fmt;
-use std::future::Future;
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,23 +27,17 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Config, DiscoveredGraph, GuidPrefix, JoinError, Participant};
+use rtps::{Config, GuidPrefix, JoinError, Participant};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
-use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
+use tracing::Span;
 
-use super::actions::RetiredServices;
-use super::calls::Clients;
 use super::ends::LocalEndpointTable;
 use super::entities::{self, GidSize, ParticipantTable};
-use super::lending::Loans;
 use super::place::BusSockets;
-use super::publications::Adverts;
 use super::raw::Hub;
-use super::seen::DiscoverySnapshot;
-use super::services::ServedService;
-use super::subscriptions::TopicMap;
+use super::state::{Clients, Loans, RetiredServices, Ros2BusState, TopicMap};
 use super::watcher::Watcher;
 use super::{actions, calls, names, publications, services, subscriptions, topic_type};
 use crate::JoinOptions;
@@ -64,36 +57,6 @@ const FAREWELL: Duration = Duration::from_secs(2);
 /// A ROS 2 system as a [`Bus`]. Dropping it ends all activity, as [`Bus::close`] does, without waiting.
 pub struct Ros2Bus {
     pub(super) inner: Arc<Ros2BusState>,
-}
-
-/// State shared by all parts of a bus.
-pub(super) struct Ros2BusState {
-    pub(super) participant: Participant,
-    /// Absolute name of this node.
-    pub(super) node: String,
-    distribution: String,
-    /// Nodes announced by the other participants.
-    pub(super) told: Arc<ParticipantTable>,
-    /// Endpoints of this node.
-    pub(super) own: LocalEndpointTable,
-    pub(super) seen: watch::Sender<Arc<DiscoverySnapshot>>,
-    pub(super) graph: watch::Sender<Arc<Graph>>,
-    pub(super) hub: Hub,
-    pub(super) subscriptions: TopicMap,
-    pub(super) adverts: Mutex<Adverts>,
-    pub(super) clients: Clients,
-    pub(super) services: Mutex<HashMap<String, Arc<ServedService>>>,
-    /// Services of another system lent to the nodes of this one.
-    pub(super) loans: Loans,
-    /// Services of action servers that are gone.
-    pub(super) retired: RetiredServices,
-    /// Changes with the services that are served here.
-    pub(super) served: watch::Sender<u64>,
-    /// Reader of what the others announce.
-    listening: Mutex<Option<rtps::DataReader>>,
-    closed: AtomicBool,
-    runtime: Handle,
-    tasks: Mutex<JoinSet<()>>,
 }
 
 impl Ros2Bus {
@@ -151,6 +114,7 @@ impl Ros2Bus {
             listening: Mutex::new(Some(listening)),
             closed: AtomicBool::new(false),
             runtime: Handle::current(),
+            log_span: Span::current(),
             tasks: Mutex::default(),
         });
         let mut watcher = Watcher::new(Arc::clone(&inner), teller);
@@ -193,56 +157,6 @@ impl fmt::Debug for Ros2Bus {
             .field("node", &self.inner.node)
             .field("guid", &self.guid())
             .finish_non_exhaustive()
-    }
-}
-
-impl Ros2BusState {
-    /// Spawns a task that ends with the bus.
-    pub(super) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
-        let mut tasks = self.tasks.lock();
-        while tasks.try_join_next().is_some() {}
-        let handle = tasks.spawn_on(task, &self.runtime);
-        if self.closed.load(Ordering::Acquire) {
-            handle.abort();
-        }
-        handle
-    }
-
-    /// Returns the participant's current discovery state; the watcher may lag behind.
-    pub(super) fn discovery(&self) -> Arc<DiscoveredGraph> {
-        Arc::clone(&self.participant.watch_discovered().borrow())
-    }
-
-    /// Fails once the bus is closed.
-    pub(super) fn check_open(&self) -> Result<(), BusError> {
-        if self.closed.load(Ordering::Acquire) {
-            return Err(BusError::Closed);
-        }
-        Ok(())
-    }
-
-    /// Checks that the name is absolute and the bus open.
-    pub(super) fn check_name(&self, name: &str) -> Result<(), BusError> {
-        if !names::is_global(name) {
-            return Err(BusError::BadName(name.to_owned()));
-        }
-        self.check_open()
-    }
-
-    /// Ends all tasks and everything that uses this bus.
-    fn shut_down(&self) {
-        self.closed.store(true, Ordering::Release);
-        self.tasks.lock().abort_all();
-        let topics: Vec<_> = self.subscriptions.lock().drain().collect();
-        for (_, topic) in topics {
-            topic.close();
-        }
-        let clients = std::mem::take(&mut *self.clients.lock());
-        drop(clients);
-        let services = std::mem::take(&mut *self.services.lock());
-        drop(services);
-        let listening = self.listening.lock().take();
-        drop(listening);
     }
 }
 

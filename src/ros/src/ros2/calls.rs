@@ -5,12 +5,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use parking_lot::Mutex;
 use tokio::time::timeout;
 
-use super::bus::Ros2BusState;
 pub(super) use super::client::ServiceClient;
 use super::seen::DiscoverySnapshot;
+use super::state::Ros2BusState;
 use super::{names, node_ends, services};
 use crate::bus::{BusError, Digest, ServiceType};
 
@@ -72,9 +71,6 @@ fn served_type(seen: &DiscoverySnapshot, service: &str) -> Option<ServiceType> {
     let mut servers = request.iter();
     servers.find_map(|end| node_ends::service_type(seen, end, service, false))
 }
-
-/// Clients that are kept, by service and type.
-pub(super) type Clients = Mutex<HashMap<(String, String), Arc<ServiceClient>>>;
 
 /// Returns the client of a service; there is one per service and type.
 pub(super) fn client_for(

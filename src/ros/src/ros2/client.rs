@@ -14,16 +14,18 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-use super::bus::Ros2BusState;
 use super::ends::{ReaderEnd, WriterEnd};
 use super::replies::{MAX_IN_FLIGHT, PendingReply, Replies, ReplyAddress, ReplyKey};
 use super::request_header::RequestHeader;
 use super::seen::DiscoverySnapshot;
+use super::state::Ros2BusState;
 use super::{names, node_ends, services, type_hash};
 use crate::bus::{BusError, CallFate, ServiceType};
 
-/// Maximum wait for a server whose endpoints are known but which does not acknowledge ours.
-const UNSURE: Duration = Duration::from_millis(200);
+/// Maximum wait for a server whose endpoints are known but which does not acknowledge ours. One that is there does, within
+/// a few milliseconds, or on a busy machine within a second or two; called before, it would answer to nobody, as a server
+/// of Fast DDS drops the reply to a reader that it has not matched.
+const UNSURE: Duration = Duration::from_secs(5);
 
 /// The servers that a call would reach.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::time::timeout;
 
-use crate::bus::{Bus, BusError, Graph, ServiceType};
+use crate::bus::{Bus, BusError, FailureReason, Graph, ServiceType};
 use crate::codec::{CodecError, FillOptions, JsonOptions, from_json, to_json};
 use crate::schema::{MessageType, Registry, SchemaError, ServiceDef};
 
@@ -67,7 +67,7 @@ impl Component {
 }
 
 /// Error of a container that did not load a node.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 #[error("the component container {container} does not load {}: {reason}", shown(.name, .plugin, .package))]
 pub struct NotLoaded {
     /// Absolute name of the container.
@@ -79,7 +79,38 @@ pub struct NotLoaded {
     /// Package of the class.
     pub package: String,
     /// The container's reason, or the reason for its silence.
-    pub reason: String,
+    pub reason: Box<LoadFailure>,
+}
+
+/// The reason why a container did not load a node.
+#[derive(Debug, thiserror::Error)]
+pub enum LoadFailure {
+    /// The container does not serve the service that loads nodes.
+    #[error(
+        "it did not serve {service} within {waited:?}: it is not a component container, or is still waiting (see its \
+            log)"
+    )]
+    NotServed {
+        /// Name of the service.
+        service: String,
+        /// Time waited.
+        waited: Duration,
+    },
+    /// The container refused without a reason.
+    #[error("it does not say why (see its log)")]
+    Silent,
+    /// The container's own reason.
+    #[error(transparent)]
+    Refused(FailureReason),
+    /// The call failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The request or the answer does not fit the image's definition of the service.
+    #[error(transparent)]
+    Codec(#[from] CodecError),
+    /// The answer is not JSON.
+    #[error("its answer is not JSON: {0}")]
+    Json(#[from] serde_json::Error),
 }
 
 fn shown(name: &Option<String>, plugin: &str, package: &str) -> String {
@@ -144,7 +175,7 @@ impl ComponentContainer {
         format!("{}/_container/{part}", self.node)
     }
 
-    async fn wait_until_served(&self, patience: Duration) -> Result<(), String> {
+    async fn wait_until_served(&self, patience: Duration) -> Result<(), LoadFailure> {
         let service = self.service("load_node");
         // Items hidden from tools are found in the endpoints only.
         let there = |graph: &Arc<Graph>| {
@@ -154,36 +185,36 @@ impl ComponentContainer {
         let mut graph = self.bus.graph();
         match timeout(patience, graph.wait_for(there)).await {
             Ok(Ok(_)) => Ok(()),
-            Ok(Err(_)) => Err(BusError::Closed.to_string()),
-            Err(_) => Err(format!(
-                "it did not serve {service} within {patience:?}: it is not a component container, or is still waiting \
-                    (see its log)"
-            )),
+            Ok(Err(_)) => Err(BusError::Closed.into()),
+            Err(_) => Err(LoadFailure::NotServed {
+                service,
+                waited: patience,
+            }),
         }
     }
 
     /// Returns the names of the nodes that the container has loaded, in order.
-    async fn loaded_nodes(&self, patience: Duration) -> Result<Vec<String>, String> {
+    async fn loaded_nodes(&self, patience: Duration) -> Result<Vec<String>, LoadFailure> {
         let answer = match self.call("list_nodes", &self.list, b"{}", patience).await {
             Ok(answer) => answer,
             // A container that does not list nodes is of another make and has just started.
-            Err(CallFailure::Bus(BusError::NoService(_))) => return Ok(Vec::new()),
-            Err(other) => return Err(other.to_string()),
+            Err(LoadFailure::Bus(BusError::NoService(_))) => return Ok(Vec::new()),
+            Err(other) => return Err(other),
         };
         let names = answer["full_node_names"].as_array();
         let names = names.into_iter().flatten().filter_map(Value::as_str);
         Ok(names.map(str::to_owned).collect())
     }
 
-    async fn load(&self, component: &Component, patience: Duration) -> Result<String, String> {
+    async fn load(&self, component: &Component, patience: Duration) -> Result<String, LoadFailure> {
         let request = serde_json::to_vec(component).unwrap_or_default();
-        let asked = self.call("load_node", &self.load, &request, patience).await;
-        let answer = asked.map_err(|error| error.to_string())?;
+        let answer = self.call("load_node", &self.load, &request, patience);
+        let answer = answer.await?;
         let text = |field: &str| answer[field].as_str().unwrap_or_default().to_owned();
         match (answer["success"].as_bool(), text("error_message")) {
             (Some(true), _) => Ok(text("full_node_name")),
-            (_, words) if words.is_empty() => Err("it does not say why (see its log)".to_owned()),
-            (_, words) => Err(words),
+            (_, words) if words.is_empty() => Err(LoadFailure::Silent),
+            (_, words) => Err(LoadFailure::Refused(FailureReason::new(words))),
         }
     }
 
@@ -194,7 +225,7 @@ impl ComponentContainer {
         of: &ServiceDef,
         request: &[u8],
         patience: Duration,
-    ) -> Result<Value, CallFailure> {
+    ) -> Result<Value, LoadFailure> {
         let mut bytes = Vec::new();
         from_json(&of.request, request, &mut bytes, &FillOptions::default())?;
         let (service, digest) = (self.service(part), ServiceType::from_service(of).digest);
@@ -204,13 +235,13 @@ impl ComponentContainer {
         to_json_value(&of.response, &answer.await?)
     }
 
-    fn not_loaded(&self, component: &Component, reason: String) -> NotLoaded {
+    fn not_loaded(&self, component: &Component, reason: LoadFailure) -> NotLoaded {
         NotLoaded {
             container: self.node.clone(),
             name: component.full_name(),
             plugin: component.plugin.clone(),
             package: component.package.clone(),
-            reason,
+            reason: Box::new(reason),
         }
     }
 }
@@ -233,17 +264,7 @@ fn missing_components(components: &[Component], mut there: Vec<String>) -> Vec<&
     left
 }
 
-#[derive(Debug, thiserror::Error)]
-enum CallFailure {
-    #[error(transparent)]
-    Bus(#[from] BusError),
-    #[error(transparent)]
-    Codec(#[from] CodecError),
-    #[error("its answer is not JSON: {0}")]
-    Json(#[from] serde_json::Error),
-}
-
-fn to_json_value(of: &MessageType, answer: &Bytes) -> Result<Value, CallFailure> {
+fn to_json_value(of: &MessageType, answer: &Bytes) -> Result<Value, LoadFailure> {
     let mut json = Vec::new();
     to_json(of, answer, &mut json, &JsonOptions::default())?;
     Ok(serde_json::from_slice(&json)?)
@@ -329,7 +350,7 @@ mod tests {
                 name: name.map(str::to_owned),
                 plugin: "talkers::Talker".to_owned(),
                 package: "talkers".to_owned(),
-                reason: "no such class".to_owned(),
+                reason: Box::new(LoadFailure::Refused(FailureReason::new("no such class"))),
             };
             error.to_string()
         };

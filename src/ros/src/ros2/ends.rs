@@ -10,9 +10,9 @@ use rtps::{
 };
 use tokio::sync::watch;
 
-use super::bus::Ros2BusState;
 use super::entities::DiscoveredNode;
 use super::names::{self, RosTopicRole};
+use super::state::Ros2BusState;
 use crate::bus::NodeNames;
 
 /// One endpoint of this node.

@@ -14,19 +14,19 @@
 //! `typehash=RIHS01_…;cloudroid=LABEL;`. rmw picks out the keys that it knows.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use parking_lot::Mutex;
 use rtps::{EndpointData, TopicDescription};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::bus::{Ros2Bus, Ros2BusState};
+use super::bus::Ros2Bus;
 use super::calls::GRACE;
 use super::names::{self, RosTopicRole};
 use super::seen::DiscoverySnapshot;
+use super::state::{Loans, Ros2BusState};
 use super::{node_ends, services};
 use crate::bus::{BusError, Lender, Lending, LentService, ServiceProvider, ServiceType};
 
@@ -36,13 +36,6 @@ const AGAIN: Duration = Duration::from_secs(1);
 const MOST: usize = 1000;
 /// Key of the label in the user data.
 const LABEL: &str = "cloudroid";
-
-/// The lending task of a bus, and the label of its services.
-#[derive(Default)]
-pub(super) struct Loans {
-    following: Mutex<Option<AbortHandle>>,
-    label: OnceLock<String>,
-}
 
 impl Loans {
     /// Adds the label, if any, to the request topic of a service.

@@ -92,9 +92,6 @@ pub(super) fn service_type(
     })
 }
 
-/// Depth shown for an endpoint that keeps all samples.
-pub(super) const DEPTH: usize = 10;
-
 #[cfg(test)]
 mod tests {
     use std::collections::HashMap;

@@ -13,11 +13,11 @@ use async_trait::async_trait;
 use tokio::time::timeout;
 
 use self::reading::ParameterReader;
-use self::values::TypedValue;
+use self::values::{CoerceError, TypedValue};
 use crate::bus::{
-    Bus, BusError, CallFate, DoubleRange, IntegerRange, MatchedPeers, NodeParameters, ParamChange,
-    ParamValue, ParameterDescription, ParameterEvent, ParameterEvents, ParameterKind,
-    ParameterNames, QosProfile, Subscription, WireType,
+    Bus, BusError, CallFate, DoubleRange, FailureReason, IntegerRange, MatchedPeers,
+    NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvent, ParameterEvents,
+    ParameterKind, ParameterNames, QosProfile, Subscription, WireType,
 };
 use crate::codec::put::CdrWriter;
 use crate::ros2::{Ros2Bus, interfaces};
@@ -42,7 +42,7 @@ impl NodeParameters for Ros2Bus {
         &self,
         node: &str,
         changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), String>>, BusError> {
+    ) -> Result<Vec<Result<(), FailureReason>>, BusError> {
         let typed = self.coerce_changes(node, changes).await?;
         let sent = typed.iter().filter_map(|change| change.as_ref().ok());
         let sent: Vec<_> = sent.collect();
@@ -65,7 +65,7 @@ impl NodeParameters for Ros2Bus {
         let mut answers = answers.into_iter();
         let answer = |change: Result<(String, TypedValue), RefusedChange>| match change {
             Ok(_) => answers.next().unwrap_or(Ok(())),
-            Err(refused) => Err(refused.reason),
+            Err(refused) => Err(FailureReason::new(refused.reason.to_string())),
         };
         Ok(typed.into_iter().map(answer).collect())
     }
@@ -76,6 +76,7 @@ impl NodeParameters for Ros2Bus {
             match change {
                 Ok(change) => sent.push(change),
                 Err(RefusedChange { key, reason }) => {
+                    let reason = reason.to_string();
                     return Err(BusError::BadParam { key, reason });
                 }
             }
@@ -86,7 +87,7 @@ impl NodeParameters for Ros2Bus {
         let set = self.call_service(service, "SetParametersAtomically", put, read_set);
         set.await?.map_err(|reason| BusError::CallFailed {
             service: format!("{}/{}", service.0, service.1),
-            reason,
+            reason: reason.into_string(),
             fate: CallFate::Answered,
         })
     }
@@ -155,7 +156,7 @@ const DESCRIBE: ParameterQuery = ParameterQuery {
 /// A change that is not sent.
 struct RefusedChange {
     key: String,
-    reason: String,
+    reason: CoerceError,
 }
 
 impl Ros2Bus {
@@ -294,14 +295,14 @@ fn put_changes(changes: &[&(String, TypedValue)], put: &mut CdrWriter) {
 }
 
 /// Reads whether a parameter was set, or the reason why not.
-fn read_set(reading: &mut ParameterReader<'_>) -> Option<Result<(), String>> {
+fn read_set(reading: &mut ParameterReader<'_>) -> Option<Result<(), FailureReason>> {
     let (done, reason) = (reading.bool()?, reading.text()?);
     Some(if done {
         Ok(())
     } else if reason.is_empty() {
-        Err("the node does not say why".to_owned())
+        Err(FailureReason::new("the node does not say why"))
     } else {
-        Err(reason)
+        Err(FailureReason::new(reason))
     })
 }
 

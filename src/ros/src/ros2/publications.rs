@@ -8,17 +8,14 @@ use rtps::{EndpointData, EndpointMatches, EndpointQos};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use super::bus::Ros2BusState;
 use super::ends::WriterEnd;
 use super::quality;
 use super::seen::{self, DiscoverySnapshot};
+use super::state::Ros2BusState;
 use super::{names, show, topic_type};
 use crate::bus::{
     BusError, IncompatiblePeer, MatchedPeers, PeerId, Publisher, QosProfile, TopicPeer, WireType,
 };
-
-/// Advertised topics with their type and the number of advertisements.
-pub(super) type Adverts = HashMap<String, (Arc<WireType>, usize)>;
 
 /// Advertises a topic with a writer of its own.
 pub(super) async fn advertise(

@@ -5,8 +5,10 @@ use rtps::{
     ReliabilityKind,
 };
 
-use super::node_ends::DEPTH;
 use crate::bus::{self, QosProfile};
+
+/// Depth shown for an endpoint that keeps all samples.
+const DEPTH: usize = 10;
 
 /// The policies that determine which publishers a subscription matches; it requests nothing in any other policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -11,8 +11,8 @@ use rtps::{
 };
 use tokio::sync::watch;
 
-use super::bus::Ros2BusState;
 use super::ends::{ReaderEnd, WriterEnd};
+use super::state::Ros2BusState;
 
 /// Receives messages of a topic, in order per writer. Must not block.
 pub(super) trait RawListener: Send + Sync + 'static {

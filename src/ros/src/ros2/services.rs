@@ -10,9 +10,9 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use super::bus::Ros2BusState;
 use super::ends::{ReaderEnd, WriterEnd};
 use super::request_header::RequestHeader;
+use super::state::Ros2BusState;
 use super::{names, type_hash};
 use crate::bus::{BusError, ServiceHandler, ServiceType};
 
@@ -236,6 +236,7 @@ impl ServiceResponder {
             Ok(response) => response,
             Err(reason) => {
                 // ROS 2 has no reply for failures.
+                let reason = reason.as_str();
                 tracing::warn!(service, reason, "a request is not answered");
                 return;
             }

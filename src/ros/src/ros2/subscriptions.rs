@@ -13,22 +13,23 @@
 
 mod readers;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{DiscoveredGraph, DurabilityKind, EndpointData, Guid, ReceivedSample, Sink};
+use rtps::{DurabilityKind, EndpointData, Guid, ReceivedSample, Sink};
 use tokio::sync::{Notify, watch};
-use tokio::task::AbortHandle;
 
 use self::readers::Readers;
-use super::bus::Ros2BusState;
 use super::quality::{self, Quality};
 use super::seen::{self, DiscoverySnapshot};
+use super::state::Ros2BusState;
+use super::topic_in::{
+    HeldMessage, KnownWriter, ReaderSetKey, TopicIn, TopicSubscriber, TopicSubscribers,
+};
 use crate::bus::{
-    BusError, MatchedPeers, MessageSender, Offer, PeerId, QosProfile, SerializedMessage,
-    Subscription, WireType, message_queue,
+    BusError, MessageSender, Offer, QosProfile, SerializedMessage, Subscription, WireType,
+    message_queue,
 };
 
 /// Size below which a message to be kept is copied out of the receive buffer that it shares with others.
@@ -39,78 +40,12 @@ const BIG: usize = 64 * 1024;
 const MOST_HELD: usize = 64;
 const MOST_BYTES_HELD: usize = 16 << 20;
 
-/// Identifies subscriptions that share readers: topic, type name, quality.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct ReaderSetKey {
-    topic: String,
-    /// `*` for any type.
-    type_name: String,
-    wish: Quality,
-}
-
-/// Topics that are subscribed to.
-pub(super) type TopicMap = Mutex<HashMap<ReaderSetKey, Arc<TopicIn>>>;
-
-/// One topic with all its local subscriptions of one type and quality.
-pub(super) struct TopicIn {
-    key: ReaderSetKey,
-    depth: usize,
-    locals: Mutex<TopicSubscribers>,
-    /// Known properties of each writer that was discovered or heard.
-    sources: Mutex<HashMap<Guid, Arc<KnownWriter>>>,
-    matched: watch::Sender<MatchedPeers>,
-    /// Notified when local subscriptions change.
-    changed: Notify,
-    /// Task that maintains the readers.
-    following: Mutex<Option<AbortHandle>>,
-    discovered: watch::Receiver<Arc<DiscoveredGraph>>,
-    seen: watch::Receiver<Arc<DiscoverySnapshot>>,
-}
-
-#[derive(Default)]
-struct TopicSubscribers {
-    next: u64,
-    list: Vec<TopicSubscriber>,
-    /// Last message of each transient-local writer, for later local subscriptions.
-    latched: HashMap<Guid, SerializedMessage>,
-    /// Messages of writers whose node is not known yet, in order: it will be known in a moment, and a message names its
-    /// publisher.
-    held: Vec<HeldMessage>,
-}
-
-struct HeldMessage {
-    writer: Guid,
-    /// Properties known when the message arrived.
-    source: Arc<KnownWriter>,
-    quality: Quality,
-    bytes: Bytes,
-}
-
-struct TopicSubscriber {
-    id: u64,
-    sender: MessageSender,
-    wanted: WireType,
-}
-
 impl TopicSubscriber {
     fn send(&self, message: SerializedMessage) {
         if self.wanted.is_compatible_with(&message.wire_type) {
             self.sender.send(message);
         }
     }
-}
-
-/// A writer of the topic.
-#[derive(Debug)]
-struct KnownWriter {
-    peer: PeerId,
-    offer: Offer,
-    /// Quality of the reader that is meant for the writer.
-    quality: Quality,
-    /// Type name in DDS.
-    type_name: String,
-    /// True once the writer's node is known, as far as it will be.
-    named: bool,
 }
 
 impl KnownWriter {

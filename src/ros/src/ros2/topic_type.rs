@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 
-use super::bus::Ros2BusState;
 use super::names;
 use super::seen::{self, DiscoverySnapshot};
+use super::state::Ros2BusState;
 use crate::bus::{BusError, WireType};
 
 /// Time for new endpoints to be discovered.

@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 use rtps::Guid;
 use tokio::time::sleep_until;
 
-use super::bus::Ros2BusState;
 use super::entities::{self, DiscoveredNode, GidSize};
 use super::other_types::TypeMismatchLog;
 use super::seen::DiscoverySnapshot;
+use super::state::Ros2BusState;
 use super::{calls, graph};
 
 /// Time for a ROS participant to announce the node of an endpoint. Until then its messages are held, and it is not

@@ -9,7 +9,8 @@ use std::fmt::Write;
 
 use sha2::{Digest, Sha256};
 
-use crate::schema::types::{Arity, Base, Field, MessageType, Primitive};
+use crate::schema::primitive::Primitive;
+use crate::schema::types::{Arity, Base, Field, MessageType};
 
 /// Field that rosidl adds to a type without fields, because C has no empty structures.
 pub(crate) const PLACEHOLDER: &str = "structure_needs_at_least_one_member";

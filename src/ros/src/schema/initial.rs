@@ -1,6 +1,7 @@
 //! Values in ROS 2 definitions: default values of fields (`int32 x 5`) and constants.
 
-use crate::schema::types::Primitive;
+use crate::schema::SyntaxError;
+use crate::schema::primitive::Primitive;
 
 /// Default value of a field: one value, or those of an array.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,14 +21,14 @@ impl Initial {
         primitive: Primitive,
         is_array: bool,
         written: &str,
-    ) -> Result<Initial, String> {
+    ) -> Result<Initial, SyntaxError> {
         if !is_array {
             return Ok(Initial([parse_item(primitive, written)?].into()));
         }
         let inside = written
             .strip_prefix('[')
             .and_then(|rest| rest.strip_suffix(']'))
-            .ok_or_else(|| format!("{written} is not a list, write [VALUE, VALUE]"))?;
+            .ok_or_else(|| SyntaxError::NotAList(written.to_owned()))?;
         let items = elements(inside)?
             .into_iter()
             .map(|element| parse_item(primitive, element));
@@ -36,14 +37,14 @@ impl Initial {
 }
 
 /// Splits at commas outside quotes.
-fn elements(inside: &str) -> Result<Vec<&str>, String> {
+fn elements(inside: &str) -> Result<Vec<&str>, SyntaxError> {
     let mut found = Vec::new();
     let mut rest = inside.trim();
     while !rest.is_empty() {
         let end = match quoted_end(rest) {
             Some(end) => end,
             None if rest.starts_with(['"', '\'']) => {
-                return Err(format!("{rest} has no closing quote"));
+                return Err(SyntaxError::UnclosedQuote(rest.to_owned()));
             }
             None => rest.find(',').unwrap_or(rest.len()),
         };
@@ -53,7 +54,7 @@ fn elements(inside: &str) -> Result<Vec<&str>, String> {
         rest = match after.strip_prefix(',') {
             Some(more) => more.trim_start(),
             None if after.is_empty() => after,
-            None => return Err(format!("{after:?} follows a value, write a comma")),
+            None => return Err(SyntaxError::MissingComma(after.to_owned())),
         };
     }
     Ok(found)
@@ -86,7 +87,7 @@ pub(crate) fn unquote(written: &str) -> String {
 }
 
 /// Parses a value of this type.
-pub(crate) fn parse_item(primitive: Primitive, written: &str) -> Result<InitialItem, String> {
+pub(crate) fn parse_item(primitive: Primitive, written: &str) -> Result<InitialItem, SyntaxError> {
     let signed = |bits: u32| integer(written).filter(|it| fits_signed(*it, bits));
     let unsigned = |bits: u32| integer(written).filter(|it| (0..1 << bits).contains(it));
     let bits = match primitive {
@@ -106,7 +107,10 @@ pub(crate) fn parse_item(primitive: Primitive, written: &str) -> Result<InitialI
         Primitive::Float64 => float::<f64>(written).map(f64::to_bits),
         Primitive::Time | Primitive::Duration => None,
     };
-    let bits = bits.ok_or_else(|| format!("{written:?} is no {}", primitive.name()))?;
+    let bits = bits.ok_or_else(|| SyntaxError::BadValue {
+        value: written.to_owned(),
+        type_name: primitive.name().to_owned(),
+    })?;
     Ok(InitialItem::Scalar(bits.to_le_bytes()))
 }
 
@@ -196,21 +200,19 @@ mod tests {
                 InitialItem::Text(text) => text.to_string(),
                 InitialItem::Scalar(_) => unreachable!(),
             };
-            Ok::<Vec<_>, String>(items.iter().map(text).collect())
+            Ok::<Vec<_>, SyntaxError>(items.iter().map(text).collect())
         };
         assert_eq!(texts("[]").unwrap(), [""; 0]);
         assert_eq!(
             texts(r#"["a, b" , 'it\'s', plain word,"" ]"#).unwrap(),
             ["a, b", "it's", "plain word", ""]
         );
-        assert_eq!(texts("[\"a]").unwrap_err(), "\"a has no closing quote");
-        assert_eq!(
-            texts("[\"a\" b]").unwrap_err(),
-            "\"b\" follows a value, write a comma"
-        );
-        assert_eq!(
-            texts("a").unwrap_err(),
-            "a is not a list, write [VALUE, VALUE]"
-        );
+        for (written, reason) in [
+            ("[\"a]", "\"a has no closing quote"),
+            ("[\"a\" b]", "\"b\" follows a value, write a comma"),
+            ("a", "a is not a list, write [VALUE, VALUE]"),
+        ] {
+            assert_eq!(texts(written).unwrap_err().to_string(), reason);
+        }
     }
 }

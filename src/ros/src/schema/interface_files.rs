@@ -10,7 +10,9 @@ mod idl;
 use std::collections::BTreeMap;
 
 use crate::bus::RosVersion;
-use crate::schema::{Registry, SchemaError};
+use crate::schema::{Registry, SchemaError, SyntaxError};
+
+pub use self::idl::IdlError;
 
 /// Contents of one interface file: definitions by key (see [`Registry::insert`]).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -53,13 +55,13 @@ struct FieldLine {
 impl FieldLine {
     /// Appends the line. Names are checked where the text is read and cannot contain line breaks; values are checked
     /// here.
-    fn append_to(&self, text: &mut String) -> Result<(), String> {
+    fn append_to(&self, text: &mut String) -> Result<(), SyntaxError> {
         if self.value.contains(['\n', '\r']) {
-            return Err(format!("the value of {} goes over a line", self.name));
+            return Err(SyntaxError::ValueOverLine(self.name.clone()));
         }
         for word in [&self.one, &self.brackets, &self.name] {
             if word.contains(char::is_whitespace) {
-                return Err(format!("{word:?} is not a legal name"));
+                return Err(SyntaxError::BadIdentifier(word.clone()));
             }
         }
         text.push_str(&self.one);

@@ -21,3 +21,35 @@ pub(crate) const MAX_NAME_BYTES: usize = 255;
 
 /// Maximum number of definitions in one full text.
 pub(crate) const MAX_DEFINITIONS: usize = 512;
+
+/// Maximum nesting of modules in IDL: package, kind, and the module of a structure's constants.
+pub(crate) const MOST_MODULES: usize = 3;
+
+/// A limit that a definition exceeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum ExceededLimit {
+    /// The definition, or the full text with it, has more than [`MAX_TEXT_BYTES`].
+    #[error("more than {MAX_TEXT_BYTES} bytes of text")]
+    TextBytes,
+    /// The description of the type has more than [`MAX_TEXT_BYTES`].
+    #[error("more than {MAX_TEXT_BYTES} bytes of description")]
+    DescriptionBytes,
+    /// The IDL has more than [`MAX_TEXT_BYTES`].
+    #[error("more than {MAX_TEXT_BYTES} bytes of IDL")]
+    IdlBytes,
+    /// The full text has more definitions than are read from one.
+    #[error("its text holds more than {MAX_DEFINITIONS} definitions")]
+    Definitions,
+    /// The message has more than [`MAX_FIELDS`], constants included.
+    #[error("more than {MAX_FIELDS} fields and constants")]
+    Fields,
+    /// Messages nest deeper than [`MAX_DEPTH`].
+    #[error("messages nest deeper than {MAX_DEPTH}")]
+    Depth,
+    /// The message takes more than [`MAX_MESSAGE_BYTES`] even when it is empty.
+    #[error("its fixed arrays take more than {MAX_MESSAGE_BYTES} bytes")]
+    FixedArrays,
+    /// The message has more values even when it is empty than are decoded.
+    #[error("it always holds more than {MAX_VALUES} values")]
+    Values,
+}

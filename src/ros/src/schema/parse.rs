@@ -6,8 +6,9 @@ mod ros2;
 use crate::bus::RosVersion;
 use crate::schema::initial::Initial;
 use crate::schema::limits::{MAX_FIELDS, MAX_NAME_BYTES};
-use crate::schema::types::{Arity, Constant, FieldBounds, Primitive};
-use crate::schema::{MAX_MESSAGE_BYTES, SchemaError};
+use crate::schema::primitive::Primitive;
+use crate::schema::types::{Arity, Constant, FieldBounds};
+use crate::schema::{ExceededLimit, MAX_MESSAGE_BYTES, SchemaError, SyntaxError};
 
 /// A parsed definition, line by line.
 #[derive(Debug, Default)]
@@ -28,9 +29,9 @@ pub(crate) struct ParsedField {
 }
 
 impl Parsed {
-    fn add_field(&mut self, field: ParsedField) -> Result<(), String> {
+    fn add_field(&mut self, field: ParsedField) -> Result<(), SyntaxError> {
         if self.fields.iter().any(|other| other.name == field.name) {
-            return Err(format!("field {} is there twice", field.name));
+            return Err(SyntaxError::RepeatedField(field.name));
         }
         self.fields.push(field);
         Ok(())
@@ -49,19 +50,19 @@ pub(crate) fn parse(version: RosVersion, name: &str, text: &str) -> Result<Parse
         parse_line(package, line, &mut parsed).map_err(|reason| SchemaError::Syntax {
             name: name.to_owned(),
             line: index + 1,
-            reason,
+            reason: Box::new(reason),
         })?;
         if parsed.fields.len() + parsed.constants.len() > MAX_FIELDS {
             return Err(SchemaError::TooLarge {
                 name: name.to_owned(),
-                reason: format!("more than {MAX_FIELDS} fields and constants"),
+                reason: ExceededLimit::Fields,
             });
         }
     }
     Ok(parsed)
 }
 
-fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), String> {
+fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), SyntaxError> {
     let code = line.split('#').next().unwrap_or_default().trim();
     if code.is_empty() {
         return Ok(());
@@ -74,7 +75,7 @@ fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), Stri
 }
 
 /// Parses `TYPE NAME=VALUE`; the value of a string extends to the end of the line and may include `#`.
-fn parse_constant(line: &str, code: &str) -> Result<Constant, String> {
+fn parse_constant(line: &str, code: &str) -> Result<Constant, SyntaxError> {
     let (type_name, _) = code.split_once([' ', '\t', '=']).unwrap_or((code, ""));
     let source = if type_name == "string" {
         line.trim()
@@ -93,7 +94,7 @@ fn parse_constant(line: &str, code: &str) -> Result<Constant, String> {
     })
 }
 
-fn check_constant(type_name: &str, value: &str) -> Result<(), String> {
+fn check_constant(type_name: &str, value: &str) -> Result<(), SyntaxError> {
     let fits = |low: i128, high: i128| {
         value
             .parse::<i128>()
@@ -114,20 +115,23 @@ fn check_constant(type_name: &str, value: &str) -> Result<(), String> {
         Some(Primitive::Float32 | Primitive::Float64) => value.parse::<f64>().is_ok(),
         Some(Primitive::String) => true,
         Some(Primitive::Time | Primitive::Duration | Primitive::Wstring) | None => {
-            return Err(format!("a constant cannot be of type {type_name}"));
+            return Err(SyntaxError::BadConstantType(type_name.to_owned()));
         }
     };
     if valid {
         Ok(())
     } else {
-        Err(format!("{value:?} is no {type_name}"))
+        Err(SyntaxError::BadValue {
+            value: value.to_owned(),
+            type_name: type_name.to_owned(),
+        })
     }
 }
 
-fn parse_field(package: &str, code: &str) -> Result<ParsedField, String> {
+fn parse_field(package: &str, code: &str) -> Result<ParsedField, SyntaxError> {
     let mut words = code.split_ascii_whitespace();
     let (Some(written), Some(name), None) = (words.next(), words.next(), words.next()) else {
-        return Err(format!("{code:?} is not a field, write TYPE NAME"));
+        return Err(SyntaxError::NotAField(code.to_owned()));
     };
     check_identifier(name)?;
     let (bare, brackets) = written.split_at(written.find('[').unwrap_or(written.len()));
@@ -140,27 +144,25 @@ fn parse_field(package: &str, code: &str) -> Result<ParsedField, String> {
     })
 }
 
-fn parse_brackets(brackets: &str) -> Result<Arity, String> {
+fn parse_brackets(brackets: &str) -> Result<Arity, SyntaxError> {
     let Some(inside) = brackets.strip_prefix('[') else {
         return Ok(Arity::One);
     };
     let inside = inside
         .strip_suffix(']')
-        .ok_or_else(|| format!("{brackets} is not an array suffix"))?;
+        .ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
     if inside.is_empty() {
         return Ok(Arity::Variable);
     }
     let digits = inside.bytes().all(|byte| byte.is_ascii_digit());
     match inside.parse::<u32>() {
         Ok(count) if digits && count as usize <= MAX_MESSAGE_BYTES => Ok(Arity::Fixed(count)),
-        _ => Err(format!(
-            "array length {inside} is not a number up to {MAX_MESSAGE_BYTES}"
-        )),
+        _ => Err(SyntaxError::BadArrayLength(inside.to_owned())),
     }
 }
 
 /// Resolves a type name. A bare `Header` means std_msgs' in every package; other bare names are the package's own.
-fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, String> {
+fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, SyntaxError> {
     if Primitive::from_name(bare).is_some() {
         return Ok(bare.to_owned());
     }
@@ -181,17 +183,17 @@ fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, Str
 }
 
 /// Checks that `name` is a letter followed by letters, digits and underscores.
-pub(crate) fn check_identifier(name: &str) -> Result<(), String> {
+pub(crate) fn check_identifier(name: &str) -> Result<(), SyntaxError> {
     let mut bytes = name.bytes();
     let legal = bytes
         .next()
         .is_some_and(|first| first.is_ascii_alphabetic())
         && bytes.all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
     if !legal {
-        return Err(format!("{name:?} is not a legal name"));
+        return Err(SyntaxError::BadIdentifier(name.to_owned()));
     }
     if name.len() > MAX_NAME_BYTES {
-        return Err(format!("a name is longer than {MAX_NAME_BYTES} bytes"));
+        return Err(SyntaxError::LongName);
     }
     Ok(())
 }

@@ -4,8 +4,6 @@
 //! prepared in JSON and in CBOR. For input ([`CodecPlan::members`]), fields stay grouped by message, because they may
 //! come in any order.
 
-mod kind;
-
 use std::ops::Range;
 
 use crate::bus::RosVersion;
@@ -13,7 +11,7 @@ use crate::cbor_head::{MAP, TEXT, write_head};
 use crate::schema::initial::Initial;
 use crate::schema::{Arity, Base, Field};
 
-pub(crate) use kind::{Count, Kind, Scalar, Text};
+pub(crate) use crate::schema::kind::{Count, Kind, Scalar, Text};
 
 /// Maximum number of steps of a nested message to be flattened; larger ones are called, as are all once the plan has
 /// grown to `MAX_FLATTENED_JSON` bytes of literals. Otherwise a plan could grow exponentially with the depth of its

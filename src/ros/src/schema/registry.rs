@@ -13,7 +13,7 @@ use crate::schema::parse::check_identifier;
 use crate::schema::resolve::{build_action, build_message, build_service};
 use crate::schema::text::split_full_text;
 use crate::schema::types::{ActionDef, MessageType, ServiceDef};
-use crate::schema::{MAX_TEXT_BYTES, SchemaError};
+use crate::schema::{ExceededLimit, MAX_TEXT_BYTES, SchemaError};
 
 /// Definitions of one ROS version and the types they resolve to. Share it by `Arc`; all methods take `&self`.
 #[derive(Debug)]
@@ -102,7 +102,7 @@ impl Registry {
         }
         let (own, others) = split_full_text(text);
         if others.len() > MAX_DEFINITIONS {
-            let reason = format!("its text holds more than {MAX_DEFINITIONS} definitions");
+            let reason = ExceededLimit::Definitions;
             return Err(SchemaError::TooLarge { name, reason });
         }
         let others = others
@@ -368,6 +368,6 @@ fn plain_name(name: &str, kind: &str) -> Result<String, SchemaError> {
 fn too_long(name: &str) -> SchemaError {
     SchemaError::TooLarge {
         name: name.to_owned(),
-        reason: format!("more than {MAX_TEXT_BYTES} bytes of text"),
+        reason: ExceededLimit::TextBytes,
     }
 }

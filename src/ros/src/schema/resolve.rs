@@ -8,11 +8,10 @@ use crate::bus::RosVersion;
 use crate::schema::limits::{MAX_DEPTH, MAX_MESSAGE_BYTES, MAX_VALUES};
 use crate::schema::parse::{Parsed, ParsedField, parse};
 use crate::schema::plan::CodecPlan;
+use crate::schema::primitive::Primitive;
 use crate::schema::registry::State;
-use crate::schema::types::{
-    ActionDef, ActionServices, Base, Field, MessageType, Primitive, ServiceDef,
-};
-use crate::schema::{Arity, SchemaError};
+use crate::schema::types::{ActionDef, ActionServices, Base, Field, MessageType, ServiceDef};
+use crate::schema::{Arity, ExceededLimit, SchemaError};
 
 /// Resolves message `name` (`package/Type`) and its dependencies.
 pub(crate) fn build_message(
@@ -136,10 +135,7 @@ impl Resolver<'_> {
             return Err(SchemaError::Cycle(way.join(" > ")));
         }
         if self.stack.len() >= MAX_DEPTH {
-            return Err(too_large(
-                &self.stack[0],
-                format!("messages nest deeper than {MAX_DEPTH}"),
-            ));
+            return Err(too_large(&self.stack[0], ExceededLimit::Depth));
         }
         let Some(text) = self.state.message_text(name)? else {
             return Err(match self.stack.last() {
@@ -186,10 +182,7 @@ impl Resolver<'_> {
         }
         // The depth of the dependencies was checked when they were first resolved, perhaps from elsewhere.
         if message.plan.depth > MAX_DEPTH {
-            return Err(too_large(
-                name,
-                format!("messages nest deeper than {MAX_DEPTH}"),
-            ));
+            return Err(too_large(name, ExceededLimit::Depth));
         }
         Ok(Arc::new(message))
     }
@@ -241,22 +234,16 @@ fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
         .iter()
         .fold(0usize, |sum, field| sum.saturating_add(field.min_size()));
     if size > MAX_MESSAGE_BYTES {
-        return Err(too_large(
-            name,
-            format!("its fixed arrays take more than {MAX_MESSAGE_BYTES} bytes"),
-        ));
+        return Err(too_large(name, ExceededLimit::FixedArrays));
     }
     let values = CodecPlan::count_values(fields);
     if values > MAX_VALUES {
-        return Err(too_large(
-            name,
-            format!("it always holds more than {MAX_VALUES} values"),
-        ));
+        return Err(too_large(name, ExceededLimit::Values));
     }
     Ok(())
 }
 
-fn too_large(name: &str, reason: String) -> SchemaError {
+fn too_large(name: &str, reason: ExceededLimit) -> SchemaError {
     SchemaError::TooLarge {
         name: name.to_owned(),
         reason,

@@ -8,9 +8,9 @@ use tokio::sync::watch;
 
 use super::{Engine, LocalReader, LocalWriter};
 use crate::discovery::EndpointData;
-use crate::participant::{EndpointMatches, Sink, TopicDescription};
 use crate::qos::EndpointQos;
 use crate::reader::ReaderState;
+use crate::shared::{EndpointMatches, Sink, TopicDescription};
 use crate::writer::{CacheChange, SendRequests, WriterState};
 use crate::{EntityId, Guid, SampleIdentity, SequenceNumber};
 

@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::{Engine, LocalReader};
 use crate::discovery;
-use crate::participant::ReceivedSample;
+use crate::shared::ReceivedSample;
 use crate::wire::{self, ReceivedSubmessage, Submessage};
 use crate::writer::SendRequests;
 use crate::{EntityId, Guid, GuidPrefix};

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use super::Engine;
 use crate::discovery::EndpointData;
-use crate::participant::EndpointMatches;
 use crate::qos::Mismatch;
+use crate::shared::EndpointMatches;
 use crate::writer::SendRequests;
 use crate::{EntityId, Guid};
 

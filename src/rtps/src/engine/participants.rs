@@ -16,7 +16,7 @@ use super::servers::DiscoverySource;
 use super::{Engine, RemoteParticipant};
 use crate::discovery::{EndpointData, ParticipantData};
 use crate::locator::Locator;
-use crate::participant::DiscoveredGraph;
+use crate::shared::DiscoveredGraph;
 use crate::writer::SendRequests;
 use crate::{EntityId, Guid, GuidPrefix};
 

@@ -4,11 +4,11 @@ use std::fs;
 use std::io;
 use std::path::Path;
 
+use super::Cgroup;
 use super::files::{read_field, read_number};
-use super::{Cgroup, cores};
 use crate::engine::Usage;
 use crate::host::cgroup_pressure;
-use crate::spec::{ResourceLimits, UNLIMITED};
+use crate::spec::{Limits, Size, UNLIMITED};
 
 /// Scheduling period in microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
@@ -36,7 +36,7 @@ pub fn counts_sockets(hierarchy: &Path) -> bool {
     hierarchy.join(SOCKETS).exists()
 }
 
-pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
+pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     // The caller reads back whether a write took effect.
     let write = |controller, name, value: String| {
         cgroup
@@ -55,11 +55,11 @@ pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
         write("cpu", "cpu.shares", weight_to_shares(weight).to_string());
     }
     if let Some(memory) = limits.memory {
-        let buffers = format_limit(socket_buffer_limit(memory), "-1");
+        let buffers = format_limit(socket_buffer_limit(memory.0), "-1");
         // The limit with swap must never be below the one without, whichever way both change: so both are written
         // twice.
         for _ in 0..2 {
-            let memory = format_limit(memory, "-1");
+            let memory = format_limit(memory.0, "-1");
             write("memory", "memory.limit_in_bytes", memory.clone());
             write("memory", "memory.memsw.limit_in_bytes", memory);
         }
@@ -75,13 +75,13 @@ pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
                 write(
                     "blkio",
                     name,
-                    format!("{disk} {}", format_limit(limit, "0")),
+                    format!("{disk} {}", format_limit(limit.0, "0")),
                 );
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
-        write("cpuset", "cpuset.cpus", cores::format_cpuset(cpuset));
+        write("cpuset", "cpuset.cpus", cpuset.to_string());
     }
 }
 
@@ -93,7 +93,7 @@ fn format_limit(limit: u64, none: &str) -> String {
     }
 }
 
-pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
+pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     let number = |controller, name| read_number(&cgroup.control_file(controller, name)?);
     let period = number("cpu", "cpu.cfs_period_us");
     // -1 means no limit; it does not parse as u64, so it becomes `None`.
@@ -103,16 +103,19 @@ pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
             &cgroup.control_file("blkio", name)?,
             cgroup.disk.as_deref()?,
         )
+        .map(Size)
     };
     let cpuset = cgroup
         .control_file("cpuset", "cpuset.cpus")
-        .and_then(|file| cores::parse_cpuset(&fs::read_to_string(file).ok()?));
-    ResourceLimits {
+        .and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
+    Limits {
         cpus: quota
             .zip(period)
             .map(|(quota, period)| quota as f64 / period as f64),
         cpu_weight: number("cpu", "cpu.shares").map(shares_to_weight),
-        memory: number("memory", "memory.limit_in_bytes").filter(|bytes| *bytes < NO_LIMIT),
+        memory: number("memory", "memory.limit_in_bytes")
+            .filter(|bytes| *bytes < NO_LIMIT)
+            .map(Size),
         // The nearest equivalent, soft_limit_in_bytes, throttles nobody.
         memory_high: None,
         pids: number("pids", "pids.max"),

@@ -2,16 +2,16 @@
 
 use std::fs;
 
+use super::Cgroup;
 use super::files::{read_device_field, read_field, read_number};
-use super::{Cgroup, cores};
 use crate::engine::Usage;
 use crate::host::cgroup_pressure;
-use crate::spec::{ResourceLimits, UNLIMITED};
+use crate::spec::{Limits, Size, UNLIMITED};
 
 /// Scheduling period in microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
 
-pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
+pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     // The caller reads back whether a write took effect.
     let write = |controller, name, value: String| {
         cgroup
@@ -29,13 +29,13 @@ pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
         write("cpu", "cpu.weight", weight.to_string());
     }
     if let Some(memory) = limits.memory {
-        write("memory", "memory.max", format_limit(memory));
+        write("memory", "memory.max", format_limit(memory.0));
         write("memory", "memory.swap.max", "0".into());
         // A servant is killed as a whole: nodes that were spared would wait for the one that was not.
         write("memory", "memory.oom.group", "1".into());
     }
     if let Some(high) = limits.memory_high {
-        write("memory", "memory.high", format_limit(high));
+        write("memory", "memory.high", format_limit(high.0));
     }
     if let Some(pids) = limits.pids {
         write("pids", "pids.max", format_limit(pids));
@@ -43,13 +43,13 @@ pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
     if let Some(disk) = &cgroup.disk {
         for (key, limit) in [("rbps", limits.io_read), ("wbps", limits.io_write)] {
             if let Some(limit) = limit {
-                let limit = format_limit(limit);
+                let limit = format_limit(limit.0);
                 write("io", "io.max", format!("{disk} {key}={limit}"));
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
-        write("cpuset", "cpuset.cpus", cores::format_cpuset(cpuset));
+        write("cpuset", "cpuset.cpus", cpuset.to_string());
     }
 }
 
@@ -61,7 +61,7 @@ fn format_limit(limit: u64) -> String {
     }
 }
 
-pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
+pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     let number = |controller, name| read_number(&cgroup.control_file(controller, name)?);
     let cpus = cgroup.control_file("cpu", "cpu.max").and_then(|file| {
         let text = fs::read_to_string(file).ok()?;
@@ -70,16 +70,16 @@ pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
     });
     let io = |key| {
         let disk = cgroup.disk.as_deref()?;
-        read_device_field(&cgroup.control_file("io", "io.max")?, disk, key)
+        read_device_field(&cgroup.control_file("io", "io.max")?, disk, key).map(Size)
     };
     let cpuset = cgroup
         .control_file("cpuset", "cpuset.cpus")
-        .and_then(|file| cores::parse_cpuset(&fs::read_to_string(file).ok()?));
-    ResourceLimits {
+        .and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
+    Limits {
         cpus,
         cpu_weight: number("cpu", "cpu.weight"),
-        memory: number("memory", "memory.max"),
-        memory_high: number("memory", "memory.high"),
+        memory: number("memory", "memory.max").map(Size),
+        memory_high: number("memory", "memory.high").map(Size),
         pids: number("pids", "pids.max"),
         io_read: io("rbps"),
         io_write: io("wbps"),

@@ -14,8 +14,9 @@ use std::path::PathBuf;
 use api::Grants;
 use serde::Deserialize;
 
-use super::Resources;
+use super::resources::Resources;
 use crate::container::Mount;
+pub use crate::grant_error::{CdiError, GrantError};
 
 /// Resources of this host that a service may be granted; nothing by default.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
@@ -27,50 +28,6 @@ pub struct Allow {
     pub volumes: Vec<PathBuf>,
     /// `HOST:PORT`, `*:PORT` (any on the internet), `ADDRESS:PORT` or `ADDRESS/PREFIX:PORT`.
     pub egress: Vec<String>,
-}
-
-/// Reason why something is not granted.
-#[derive(Debug, thiserror::Error)]
-pub enum GrantError {
-    /// The configuration does not allow it.
-    #[error(
-        "{kind} {name} is not allowed here; the operator can add it to {kind}s in [allow] of the configuration"
-    )]
-    NotAllowed {
-        /// `device` or `volume`.
-        kind: &'static str,
-        /// Name of the device or volume.
-        name: String,
-    },
-    /// Egress was refused.
-    #[error(transparent)]
-    Egress(Box<dyn std::error::Error + Send + Sync>),
-    /// A volume does not exist or cannot be opened.
-    #[error("volume {path} cannot be used: {source}")]
-    Volume {
-        /// Path on the host.
-        path: String,
-        /// Error of the system.
-        source: std::io::Error,
-    },
-    /// No CDI specification names the device.
-    #[error("no CDI specification in {directories} names the device {name}; there are: {known}")]
-    UnknownDevice {
-        /// Name that was asked for.
-        name: String,
-        /// Directories that were searched.
-        directories: String,
-        /// Known names, for people.
-        known: String,
-    },
-    /// A CDI specification cannot be used.
-    #[error("the CDI specification {path}: {reason}")]
-    Specification {
-        /// File of the specification.
-        path: PathBuf,
-        /// Description of the fault.
-        reason: String,
-    },
 }
 
 /// The granted resources in terms of this host.

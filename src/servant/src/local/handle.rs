@@ -14,6 +14,7 @@ use tokio::io::unix::AsyncFd;
 use tokio::net::UnixStream;
 use tokio::sync::{broadcast, mpsc, watch};
 use tokio::task::JoinHandle;
+use tracing::Instrument;
 
 use super::connection::{RequestSender, ServantView, ShimRequestError};
 use super::sweep;
@@ -28,7 +29,7 @@ use crate::logs::{self, DirectoryWatches};
 use crate::netns::NetNs;
 use crate::process::{self, ProcessIdentity};
 use crate::protocol::Command;
-use crate::spec::{NodeSpec, ResourceLimits};
+use crate::spec::{Limits, NodeSpec};
 use crate::sys;
 
 /// Time beyond the grace period for a shim to finish its cleanup.
@@ -171,12 +172,8 @@ fn connect(
     let ServantLocation { id, directory, .. } = place;
     let known = Arc::new(ServantView::default());
     let shim = Arc::new(pidfd);
-    let listener = tokio::spawn(watch_shim(
-        known.clone(),
-        read,
-        directory.to_owned(),
-        shim.clone(),
-    ));
+    let watching = watch_shim(known.clone(), read, directory.to_owned(), shim.clone());
+    let listener = tokio::spawn(watching.in_current_span());
     Ok(Arc::new(LocalServant {
         id: id.to_owned(),
         directory: directory.to_owned(),
@@ -228,7 +225,7 @@ fn shim_loss_reason(directory: &Path) -> String {
         Some(cgroup) => {
             let limit = cgroup.enforced_limits().limits.memory.unwrap_or_default();
             format!(
-                "its shim was killed: it needed more than its {limit} bytes of memory, for parameters, registrations \
+                "its shim was killed: it needed more than its {limit} of memory, for parameters, registrations \
                  or what nodes do not read"
             )
         }
@@ -420,7 +417,7 @@ impl ServantHandle for LocalServant {
         self.known.enforced.borrow().clone()
     }
 
-    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, Error> {
+    async fn set_limits(&self, limits: Limits) -> Result<EnforcedLimits, Error> {
         self.request_briefly(Command::SetLimits(limits)).await?;
         Ok(self.enforced_limits())
     }

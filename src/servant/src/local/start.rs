@@ -23,7 +23,7 @@ pub(super) async fn start(
     shared: &EngineShared,
     mut spec: ContainerSpec,
 ) -> Result<Arc<LocalServant>, Error> {
-    spec.limits = spec.limits.or(&shared.config.default_limits);
+    spec.limits = spec.limits.or(shared.config.default_limits);
     validate::validate(&spec)?;
     let id = spec.id.clone();
     let directory = shared.config.home_servants_dir.join(&id);

@@ -88,27 +88,8 @@ fn find_problem(spec: &ContainerSpec) -> Option<String> {
     if let Some((_, name)) = spec.hosts.iter().find(|(_, name)| unprintable(name)) {
         return Some(format!("{name:?} is not a host name"));
     }
-    let limits = &spec.limits;
-    if limits
-        .cpus
-        .is_some_and(|cpus| !(cpus >= 0.01 && cpus.is_finite()))
-    {
-        return Some("a limit of cores must be at least 0.01".into());
-    }
-    if limits
-        .cpu_weight
-        .is_some_and(|weight| !(1..=10_000).contains(&weight))
-    {
-        return Some("a CPU weight lies between 1 and 10000".into());
-    }
-    if limits.pids == Some(0) || limits.memory.is_some_and(|bytes| bytes < 4 << 20) {
-        return Some("a servant needs at least 4 MiB of memory and one process".into());
-    }
-    if [limits.io_read, limits.io_write, limits.memory_high].contains(&Some(0)) {
-        return Some("a limit of 0 would stop the servant: leave it out for none".into());
-    }
-    if limits.cpuset == Some([0; 4]) {
-        return Some("a set of cores needs at least one".into());
+    if let Err(unusable) = spec.limits.check() {
+        return Some(unusable.to_string());
     }
     let mut names = BTreeSet::new();
     for node in &spec.nodes {
@@ -153,7 +134,7 @@ fn is_plain_path(path: &Path) -> bool {
 mod tests {
     use super::*;
     use crate::container::Mount;
-    use crate::spec::{NodeSpec, ResourceLimits};
+    use crate::spec::{Limits, NodeSpec, Size};
 
     fn good() -> ContainerSpec {
         ContainerSpec {
@@ -161,7 +142,7 @@ mod tests {
             layers: vec!["/usr".into()],
             writable: None,
             profile: Profile::Servant,
-            limits: ResourceLimits::default(),
+            limits: Limits::default(),
             environment: Default::default(),
             nodes: vec![],
             owned_directories: vec![],
@@ -237,23 +218,23 @@ mod tests {
             ),
             (
                 ContainerSpec {
-                    limits: ResourceLimits {
+                    limits: Limits {
                         cpus: Some(f64::NAN),
-                        ..ResourceLimits::default()
+                        ..Limits::default()
                     },
                     ..good()
                 },
-                "cores",
+                "cpus = NaN",
             ),
             (
                 ContainerSpec {
-                    limits: ResourceLimits {
-                        memory: Some(1),
-                        ..ResourceLimits::default()
+                    limits: Limits {
+                        memory: Some(Size(1)),
+                        ..Limits::default()
                     },
                     ..good()
                 },
-                "4 MiB",
+                "4M",
             ),
             (
                 ContainerSpec {

@@ -7,6 +7,7 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
+use super::command_error::CommandError;
 use super::input::ShimEvent;
 use crate::protocol::{self, ShimMessage, ShimRequest};
 
@@ -82,11 +83,11 @@ impl DaemonConnections {
     }
 
     /// Sends a reply to one connection.
-    pub(super) fn answer(&self, client: u64, request: u64, outcome: Result<(), String>) {
+    pub(super) fn answer(&self, client: u64, request: u64, outcome: Result<(), CommandError>) {
         if let Some((queue, _)) = self.connected.get(&client) {
             let _ = queue.send(protocol::to_line(&ShimMessage::Reply {
                 id: request,
-                error: outcome.err(),
+                error: outcome.err().map(|error| error.to_string()),
             }));
         }
     }

@@ -16,13 +16,14 @@
 use std::collections::HashMap;
 use std::ffi::CString;
 use std::fs::File;
-use std::io::Write;
+use std::io::{self, Write};
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use libcontainer::container::builder::ContainerBuilder;
+use libcontainer::error::LibcontainerError;
 use libcontainer::syscall::syscall::SyscallType;
 use libcontainer::workload::{
     Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError,
@@ -30,6 +31,7 @@ use libcontainer::workload::{
 use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, send, socketpair};
 use nix::sys::stat::{Mode, umask};
 use nix::unistd::ForkResult;
+use oci_spec::OciSpecError;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
@@ -116,7 +118,7 @@ pub(super) fn fork(
                 .and_then(|staged| create(directory, launch, staged, socket, wait))
             {
                 Ok(init) => CreatorReport::Created { init },
-                Err(reason) => CreatorReport::Failed(reason),
+                Err(error) => CreatorReport::Failed(chain(&error)),
             };
             report_line(&write, &outcome);
             // SAFETY: ends the child without running the exit handlers registered by the parent.
@@ -136,13 +138,38 @@ struct StagedContainer {
     _user_namespace: OwnedFd,
 }
 
+/// Reason why the creator does not create the container.
+#[derive(Debug, thiserror::Error)]
+enum CreatorError {
+    #[error(transparent)]
+    Files(#[from] Error),
+    /// The container cannot be described.
+    #[error(transparent)]
+    Config(#[from] OciSpecError),
+    #[error(transparent)]
+    Json(#[from] serde_json::Error),
+    #[error("the shim did not move its creator into the cgroup")]
+    NotMoved,
+    /// `/dev/null` cannot be opened.
+    #[error(transparent)]
+    Null(io::Error),
+    #[error(transparent)]
+    Libcontainer(Box<LibcontainerError>),
+    #[error("libcontainer does not know init's pid")]
+    NoPid,
+}
+
+impl From<LibcontainerError> for CreatorError {
+    fn from(error: LibcontainerError) -> Self {
+        Self::Libcontainer(Box::new(error))
+    }
+}
+
 /// Prepares everything that libcontainer needs: root, volumes, configuration.
-fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, String> {
-    let text = |error: &dyn std::error::Error| chain(error);
+fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, CreatorError> {
     // Roots of containers must be readable for their own users, whatever the shim's umask.
     umask(Mode::from_bits_truncate(0o022));
-    let init = File::open(&launch.init)
-        .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
+    let init = File::open(&launch.init).map_err(Error::file("open", &launch.init))?;
     let skeleton = directory.join("skeleton");
     make_skeleton(
         &skeleton,
@@ -150,30 +177,24 @@ fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, Str
         &launch.spec.layers,
         &launch.spec.mounts,
         &launch.spec.hosts,
-    )
-    .map_err(|error| text(&error))?;
+    )?;
     let rootfs = Rootfs {
         layers: &launch.spec.layers,
         skeleton: &skeleton,
         upper: launch.spec.writable.as_deref(),
         uid_range: launch.uid_range,
     };
-    let staged = rootfs
-        .mount(&launch.spec.mounts)
-        .map_err(|error| text(&error))?;
-    rootfs
-        .make_owned_directories(&staged.root, &launch.spec.owned_directories)
-        .map_err(|error| text(&error))?;
-    let config =
-        bundle::config(&launch.spec, &staged, &launch.quotas()).map_err(|error| text(&error))?;
+    let staged = rootfs.mount(&launch.spec.mounts)?;
+    rootfs.make_owned_directories(&staged.root, &launch.spec.owned_directories)?;
+    let config = bundle::config(&launch.spec, &staged, &launch.quotas())?;
     let file = directory.join("config.json");
-    let json = serde_json::to_vec(&config).map_err(|error| text(&error))?;
+    let json = serde_json::to_vec(&config)?;
     let mut options = File::options();
     options.write(true).create(true).truncate(true).mode(0o600);
     options
         .open(&file)
         .and_then(|mut file| file.write_all(&json))
-        .map_err(|error| format!("could not write {}: {error}", file.display()))?;
+        .map_err(Error::file("write", &file))?;
     Ok(StagedContainer {
         init,
         records: staged.root.with_file_name("records"),
@@ -188,40 +209,34 @@ fn create(
     staged: StagedContainer,
     socket: OwnedFd,
     wait: OwnedFd,
-) -> Result<i32, String> {
-    let text = |error: &dyn std::error::Error| chain(error);
+) -> Result<i32, CreatorError> {
     if nix::unistd::read(&wait, &mut [0]) != Ok(1) {
-        return Err("the shim did not move its creator into the cgroup".into());
+        return Err(CreatorError::NotMoved);
     }
     let null = || {
         File::options()
             .read(true)
             .write(true)
             .open("/dev/null")
-            .map_err(|error| text(&error))
+            .map_err(CreatorError::Null)
     };
     let mut container = ContainerBuilder::new(launch.spec.id.clone(), SyscallType::default())
-        .with_root_path(&staged.records)
-        .map_err(|error| text(&error))?
+        .with_root_path(&staged.records)?
         .with_executor(RunInit {
             init: Arc::new(staged.init),
         })
         .with_stdin(socket)
         .with_stdout(null()?)
         .with_stderr(null()?)
-        .validate_id()
-        .map_err(|error| text(&error))?
+        .validate_id()?
         .as_init(directory)
         .with_systemd(false)
         .with_detach(true)
         .as_sibling(true)
-        .build()
-        .map_err(|error| text(&error))?;
-    container.start().map_err(|error| text(&error))?;
-    container
-        .pid()
-        .map(|pid| pid.as_raw())
-        .ok_or_else(|| "libcontainer does not know init's pid".into())
+        .build()?;
+    container.start()?;
+    let pid = container.pid().ok_or(CreatorError::NoPid)?;
+    Ok(pid.as_raw())
 }
 
 /// Formats an error with all its causes.
@@ -314,6 +329,19 @@ impl tracing::Subscriber for ErrorReporter {
     fn exit(&self, _span: &tracing::Id) {}
 }
 
+/// Reason why a container was not created, in the words of its creator.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum CreationError {
+    #[error(
+        "the creating process ended without a word: see the kernel's log for an out-of-memory kill"
+    )]
+    Silent,
+    #[error("{0}")]
+    Reported(String),
+    #[error("{outermost} ({cause})")]
+    ReportedWithCause { outermost: String, cause: String },
+}
+
 impl Creator {
     /// Returns whether the report, as far as it was read, says that init runs.
     pub(super) fn has_succeeded(text: &[u8]) -> bool {
@@ -329,7 +357,7 @@ impl Creator {
     }
 
     /// Evaluates the whole report: host pid of init, or the errors.
-    pub(super) fn outcome(text: &str) -> Result<i32, String> {
+    pub(super) fn outcome(text: &str) -> Result<i32, CreationError> {
         let mut complaints: Vec<String> = Vec::new();
         for line in text.lines() {
             match serde_json::from_str(line) {
@@ -342,12 +370,14 @@ impl Creator {
             }
         }
         // The outermost error comes last and says least; the first is the cause.
-        match complaints.as_slice() {
-            [] => Err("the creating process ended without a word: see the kernel's log for an out-of-memory \
-                       kill".into()),
-            [only] => Err(only.clone()),
-            [first, .., last] => Err(format!("{last} ({first})")),
-        }
+        Err(match complaints.as_slice() {
+            [] => CreationError::Silent,
+            [only] => CreationError::Reported(only.clone()),
+            [first, .., last] => CreationError::ReportedWithCause {
+                outermost: last.clone(),
+                cause: first.clone(),
+            },
+        })
     }
 }
 
@@ -361,13 +391,15 @@ mod tests {
             |report: &CreatorReport| String::from_utf8(crate::protocol::to_line(report)).unwrap();
         let failed = |text: &str| line(&CreatorReport::Failed(text.into()));
         assert_eq!(
-            Creator::outcome(&(failed("warning") + &line(&CreatorReport::Created { init: 7 }))),
-            Ok(7)
+            Creator::outcome(&(failed("warning") + &line(&CreatorReport::Created { init: 7 })))
+                .expect("it was created"),
+            7
         );
+        let refusal = |text: &str| Creator::outcome(text).unwrap_err().to_string();
         assert_eq!(
-            Creator::outcome(&(failed("no such mount") + &failed("create failed"))).unwrap_err(),
+            refusal(&(failed("no such mount") + &failed("create failed"))),
             "create failed (no such mount)"
         );
-        assert!(Creator::outcome("").unwrap_err().contains("without a word"));
+        assert!(refusal("").contains("without a word"));
     }
 }

@@ -17,13 +17,14 @@ use tokio::task::LocalSet;
 use super::Resident;
 use super::begin::PreparedShim;
 use super::clients::DaemonConnections;
+use super::command_error::CommandError;
 use super::input::{ShimEvent, StopStage};
 use super::link::InitLink;
 use super::nodes::NodeTable;
 use super::streams::Streams;
 use crate::engine::{ContainerState, EnforcedLimits, NodeEvent};
 use crate::protocol::{Command, ShimMessage, Snapshot};
-use crate::spec::ResourceLimits;
+use crate::spec::Limits;
 use crate::{Error, logs};
 
 struct Driver {
@@ -107,7 +108,8 @@ impl Driver {
     }
 
     async fn run(&mut self) {
-        if let Err(reason) = self.bring_up().await {
+        if let Err(error) = self.bring_up().await {
+            let reason = error.to_string();
             self.verdict = Some(ContainerState::Failed { reason });
             self.kill();
             if self.init.is_none() {
@@ -152,17 +154,17 @@ impl Driver {
         client: u64,
         request: u64,
         command: Command,
-    ) -> Option<Result<(), String>> {
+    ) -> Option<Result<(), CommandError>> {
         match command {
             Command::Stop => {
                 self.stop("stopped").await;
                 Some(Ok(()))
             }
-            _ if self.stopping.is_some() || self.init.is_none() => Some(Err("it is ending".into())),
+            _ if self.stopping.is_some() || self.init.is_none() => Some(Err(CommandError::Ending)),
             Command::StartNode(node) => {
                 let name = node.name.clone();
-                if let Err(reason) = self.nodes.add(node) {
-                    return Some(Err(reason));
+                if let Err(error) = self.nodes.add(node) {
+                    return Some(Err(error.into()));
                 }
                 let (number, spec) = self.nodes.start(&name)?;
                 self.waiting.insert(number, (client, request));
@@ -185,16 +187,18 @@ impl Driver {
                 self.clients.report(&ShimMessage::Enforced {
                     enforced: enforced.clone(),
                 });
-                Some(match enforced.unmet_limits(&limits).as_slice() {
-                    [] => Ok(()),
-                    unmet => Err(format!("cannot be set: {}", unmet.join(", "))),
+                let unmet = enforced.unmet_limits(&limits);
+                Some(if unmet.is_empty() {
+                    Ok(())
+                } else {
+                    Err(CommandError::Limits(unmet))
                 })
             }
         }
     }
 
     /// Sets the servant's limits, and those of the shim that depend on them.
-    fn set_limits(&self, limits: &ResourceLimits) -> EnforcedLimits {
+    fn set_limits(&self, limits: &Limits) -> EnforcedLimits {
         let enforced = self.begun.cgroup.set_limits(limits);
         let of_shim = self.begun.launch.shim_limits_for(&enforced.limits);
         EnforcedLimits {

@@ -24,6 +24,20 @@ pub(super) struct NodeTable {
     next: u32,
 }
 
+/// Reason why a node cannot be added or signalled.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum NodeTableError {
+    /// The spec has no name or no program.
+    #[error("node {0:?} needs a name and the absolute path of its program")]
+    Incomplete(String),
+    #[error("node {0} runs already: stop it first or choose another name")]
+    RunsAlready(String),
+    #[error("there is no node {0}")]
+    Unknown(String),
+    #[error("node {0} does not run")]
+    NotRunning(String),
+}
+
 /// Consequence of the end of a node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Consequence {
@@ -37,17 +51,14 @@ pub(super) enum Consequence {
 
 impl NodeTable {
     /// Adds a node, or replaces one of the same name that has ended.
-    pub(super) fn add(&mut self, spec: NodeSpec) -> Result<(), String> {
+    pub(super) fn add(&mut self, spec: NodeSpec) -> Result<(), NodeTableError> {
         if spec.name.is_empty()
             || spec
                 .argv
                 .first()
                 .is_none_or(|program| !program.starts_with('/'))
         {
-            return Err(format!(
-                "node {:?} needs a name and the absolute path of its program",
-                spec.name
-            ));
+            return Err(NodeTableError::Incomplete(spec.name));
         }
         let starting = self.is_starting(&spec.name);
         let running = self
@@ -55,10 +66,7 @@ impl NodeTable {
             .get(&spec.name)
             .is_some_and(|node| node.inside.is_some());
         if starting || running {
-            return Err(format!(
-                "node {} runs already: stop it first or choose another name",
-                spec.name
-            ));
+            return Err(NodeTableError::RunsAlready(spec.name));
         }
         let starts = self
             .known
@@ -191,13 +199,13 @@ impl NodeTable {
     }
 
     /// Returns the pid of a node in the container.
-    pub(super) fn pid_inside(&self, name: &str) -> Result<i32, String> {
+    pub(super) fn pid_inside(&self, name: &str) -> Result<i32, NodeTableError> {
         let node = self
             .known
             .get(name)
-            .ok_or_else(|| format!("there is no node {name}"))?;
+            .ok_or_else(|| NodeTableError::Unknown(name.to_owned()))?;
         node.inside
-            .ok_or_else(|| format!("node {name} does not run"))
+            .ok_or_else(|| NodeTableError::NotRunning(name.to_owned()))
     }
 
     /// Returns the status of a node.
@@ -301,6 +309,7 @@ mod tests {
             nodes
                 .add(node("/a", false, false))
                 .unwrap_err()
+                .to_string()
                 .contains("runs already")
         );
         nodes.on_exited(2, parse_wait_status(256, false)).unwrap();

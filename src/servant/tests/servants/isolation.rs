@@ -1,8 +1,8 @@
 //! Restrictions of nodes and shims.
 
-use servant::bundle;
 use servant::container::{Mount, OpenedSource, Profile};
 use servant::engine::{LogStart, ServantHandle};
+use servant::{bundle, idmap};
 
 use crate::support::*;
 
@@ -42,13 +42,13 @@ async fn a_shim_that_was_taken_over_reaches_nothing_of_roots() {
     let shim = world.runtime(servant.id()).shim.pid;
     assert_eq!(status_field(shim, "Seccomp"), "2");
     // It can still change limits and end its servant.
-    let change = servant::spec::ResourceLimits {
-        memory: Some(64 << 20),
+    let change = servant::spec::Limits {
+        memory: Some(servant::spec::Size(64 << 20)),
         ..Default::default()
     };
     if world.has_controller("memory") {
         let enforced = servant.set_limits(change).await.unwrap();
-        assert_eq!(enforced.limits.memory, Some(64 << 20));
+        assert_eq!(enforced.limits.memory, change.memory);
     }
     world.stop(servant).await;
 }
@@ -152,7 +152,7 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
     let others = told[1][1];
     assert!(signals.abs_diff(others) < 8, "{told:?}");
     assert_eq!([queues, others, instances, terminals], told[1][..]);
-    assert!(signals <= bundle::PENDING_SIGNALS, "{told:?}");
+    assert!(signals <= idmap::PENDING_SIGNALS, "{told:?}");
     assert!(instances <= bundle::INOTIFY_INSTANCES, "{told:?}");
     assert!(terminals <= bundle::TERMINALS, "{told:?}");
     // This process, which is root's, still has its own limits.

@@ -37,7 +37,7 @@ async fn shared_memory_counts_as_the_servants_and_ends_at_its_bound() {
     world.require_controllers(&["memory"]);
     let mut spec = spec(vec![node("/fills", &["fill", "/dev/shm/piece", "24"])]);
     // Half of it is the limit of shared memory.
-    spec.limits.memory = Some(64 << 20);
+    spec.limits.memory = Some(servant::spec::Size(64 << 20));
     let servant = world.start(spec).await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "filled").await;

@@ -17,7 +17,7 @@ use servant::engine::{ContainerState, Engine, LogLine, ServantHandle};
 use servant::launch::{self, RuntimeRecord};
 use servant::local::{GracePeriods, Isolation, LocalEngine, LocalEngineConfig, LocalServant};
 use servant::shim::{Resident, ResidentContext, ResidentError};
-use servant::spec::{NodeSpec, ResourceLimits};
+use servant::spec::{Limits, NodeSpec};
 
 /// Runs before `main`: a shim must have one thread, and the test harness creates more.
 #[used]
@@ -311,7 +311,7 @@ pub fn spec(nodes: Vec<NodeSpec>) -> ContainerSpec {
         layers: vec![layer()],
         writable: None,
         profile: Profile::Servant,
-        limits: ResourceLimits::default(),
+        limits: Limits::default(),
         environment: [("SHARED".to_owned(), "yes".to_owned())].into(),
         nodes,
         owned_directories: vec![],

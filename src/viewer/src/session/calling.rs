@@ -4,10 +4,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use access::Operation;
+use bridge::NotGrantedError;
+use budget::Exceeded;
 use bytes::Bytes;
 use foxglove::ws_protocol::server::{ServiceCallFailure, ServiceCallResponse};
 use foxglove::ws_protocol::{BinaryMessage, JsonMessage, client};
-use ros::codec;
+use ros::bus::BusError;
+use ros::codec::{self, CodecError};
 use ros::schema::ServiceDef;
 
 use super::{FinishedTask, Session};
@@ -21,6 +24,59 @@ const ANSWER: Duration = Duration::from_secs(60);
 /// Upper bound on the bytes of a response before its payload: ids and the encoding's name.
 const HEAD: usize = 64;
 
+/// Reason why a viewer's call is not made.
+#[derive(Debug, thiserror::Error)]
+enum CallRefusal {
+    /// No service has this id.
+    #[error("there is no service {0}")]
+    NoService(u32),
+    /// The request is encoded in another way than the servant's messages.
+    #[error("{service}: requests must be encoded as {expected}, not {given}")]
+    Encoding {
+        /// Name of the service.
+        service: String,
+        /// Encoding of the servant's messages.
+        expected: &'static str,
+        /// Encoding of the request.
+        given: String,
+    },
+    /// As many calls of the viewer as allowed are in progress; contains the name of the service.
+    #[error("{0}: a viewer may have {CALLS} calls in progress")]
+    TooMany(String),
+    /// The viewer may not call the service.
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    /// The request does not have the type of the service.
+    #[error("{service}: not a request of {type_name}: {source}")]
+    Malformed {
+        /// Name of the service.
+        service: String,
+        /// Name of its type.
+        type_name: String,
+        /// Error of the request.
+        source: Box<CodecError>,
+    },
+    /// The request does not fit into the viewer's budget.
+    #[error("{service}: {source}")]
+    NoMemory {
+        /// Name of the service.
+        service: String,
+        /// The request for memory.
+        source: Exceeded,
+    },
+}
+
+/// Reason why a call has no response, or one that is not sent.
+#[derive(Debug, thiserror::Error)]
+enum CallFailure {
+    /// The call failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The response does not fit into the viewer's budget.
+    #[error("the answer: {0}")]
+    NoMemory(#[from] Exceeded),
+}
+
 /// A service call that passed all checks.
 struct CheckedCall {
     service: String,
@@ -33,13 +89,14 @@ impl Session {
     pub(super) async fn call(&mut self, call: client::ServiceCallRequest<'_>) {
         let (service_id, call_id) = (call.service_id, call.call_id);
         let found = self.check_call(&call).and_then(|(service, of)| {
-            let request = self.charge(call.payload.to_vec());
-            let request = request.map_err(|full| format!("{service}: {full}"))?;
-            Ok(CheckedCall {
-                service,
-                of,
-                request,
-            })
+            match self.charge(call.payload.to_vec()) {
+                Ok(request) => Ok(CheckedCall {
+                    service,
+                    of,
+                    request,
+                }),
+                Err(source) => Err(CallRefusal::NoMemory { service, source }),
+            }
         });
         let CheckedCall {
             service,
@@ -47,8 +104,8 @@ impl Session {
             request,
         } = match found {
             Ok(found) => found,
-            Err(words) => {
-                let failure = ServiceCallFailure::new(service_id, call_id, words);
+            Err(refusal) => {
+                let failure = ServiceCallFailure::new(service_id, call_id, refusal.to_string());
                 return self.send_json(&failure);
             }
         };
@@ -58,11 +115,9 @@ impl Session {
         self.tasks.spawn(async move {
             let digest = of.md5.as_str().into();
             let answered = bus.call_typed(&service, &digest, request, ANSWER).await;
-            let answered = answered.map_err(|error| error.to_string());
-            let response = answered.and_then(|answer| {
+            let response = answered.map_err(CallFailure::from).and_then(|answer| {
                 // Charged before it is copied.
-                let permit = budget.take(HEAD + answer.len());
-                let permit = permit.map_err(|full| format!("the answer: {full}"))?;
+                let permit = budget.take(HEAD + answer.len())?;
                 let response = ServiceCallResponse {
                     service_id,
                     call_id,
@@ -73,8 +128,8 @@ impl Session {
             });
             let message = match response {
                 Ok(response) => ViewerFrame::Binary(response),
-                Err(words) => {
-                    let words = format!("{service}: {words}");
+                Err(error) => {
+                    let words = format!("{service}: {error}");
                     let failure = ServiceCallFailure::new(service_id, call_id, words);
                     ViewerFrame::Text(failure.to_string().into())
                 }
@@ -87,25 +142,26 @@ impl Session {
     fn check_call(
         &self,
         call: &client::ServiceCallRequest<'_>,
-    ) -> Result<(String, Arc<ServiceDef>), String> {
+    ) -> Result<(String, Arc<ServiceDef>), CallRefusal> {
         let found = self.catalogue.service(call.service_id);
-        let (service, of) =
-            found.ok_or_else(|| format!("there is no service {}", call.service_id))?;
+        let (service, of) = found.ok_or(CallRefusal::NoService(call.service_id))?;
         let encoding = self.format.encoding;
         if call.encoding != encoding {
-            return Err(format!(
-                "{service}: requests must be encoded as {encoding}, not {}",
-                call.encoding
-            ));
+            return Err(CallRefusal::Encoding {
+                service: service.clone(),
+                expected: encoding,
+                given: call.encoding.clone().into_owned(),
+            });
         }
         if self.calls >= CALLS {
-            return Err(format!(
-                "{service}: a viewer may have {CALLS} calls in progress"
-            ));
+            return Err(CallRefusal::TooMany(service.clone()));
         }
         self.granted.check(Operation::Call, service)?;
-        codec::validate(&of.request, &call.payload)
-            .map_err(|error| format!("{service}: not a request of {}: {error}", of.name))?;
+        codec::validate(&of.request, &call.payload).map_err(|error| CallRefusal::Malformed {
+            service: service.clone(),
+            type_name: of.name.clone(),
+            source: Box::new(error),
+        })?;
         Ok((service.clone(), Arc::clone(of)))
     }
 }

@@ -3,11 +3,12 @@
 use std::sync::Arc;
 
 use access::Operation;
+use bridge::NotGrantedError;
 use bytes::Bytes;
 use foxglove::ws_protocol::client;
-use ros::bus::{Publisher, QosProfile, WireType, wait_for_connected};
+use ros::bus::{BusError, Publisher, QosProfile, WireType, wait_for_connected};
 use ros::codec;
-use ros::schema::MessageType;
+use ros::schema::{MessageType, SchemaError};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
@@ -17,6 +18,40 @@ use super::{CONNECTS, FinishedTask, OUTGOING, Session};
 const ADVERTISEMENTS: usize = 512;
 /// Minimum queue size of a viewer's topic towards a slow node.
 const PUBLISHED: usize = 10;
+
+/// Reason why a topic of a viewer is not advertised.
+#[derive(Debug, thiserror::Error)]
+enum AdvertiseError {
+    /// The messages are encoded in another way than the servant's.
+    #[error("{topic}: messages must be encoded as {expected}, not {given}")]
+    Encoding {
+        /// Name of the topic.
+        topic: String,
+        /// Encoding of the servant's messages.
+        expected: &'static str,
+        /// Encoding of the viewer's messages.
+        given: String,
+    },
+    /// The viewer may not publish on the topic.
+    #[error(transparent)]
+    NotGranted(#[from] NotGrantedError),
+    /// The type of the messages has no definition.
+    #[error("{topic}: {source}")]
+    UnknownType {
+        /// Name of the topic.
+        topic: String,
+        /// Error of the definitions.
+        source: SchemaError,
+    },
+    /// The servant's bus does not advertise the topic.
+    #[error("{topic} cannot be advertised: {source}")]
+    Bus {
+        /// Name of the topic.
+        topic: String,
+        /// Error of the bus.
+        source: BusError,
+    },
+}
 
 /// A topic advertised by the viewer.
 pub(super) struct ViewerPublication {
@@ -68,8 +103,8 @@ impl Session {
                 of,
                 messages: self.spawn_publisher(&topic, publisher),
             }),
-            Err(words) => {
-                self.send_error(words);
+            Err(error) => {
+                self.send_error(error.to_string());
                 None
             }
         };
@@ -81,24 +116,30 @@ impl Session {
         &self,
         topic: &str,
         channel: &client::advertise::Channel<'_>,
-    ) -> Result<(Arc<MessageType>, Box<dyn Publisher>), String> {
+    ) -> Result<(Arc<MessageType>, Box<dyn Publisher>), AdvertiseError> {
         let encoding = self.format.encoding;
         if channel.encoding != encoding {
-            return Err(format!(
-                "{topic}: messages must be encoded as {encoding}, not {}",
-                channel.encoding
-            ));
+            return Err(AdvertiseError::Encoding {
+                topic: topic.to_owned(),
+                expected: encoding,
+                given: channel.encoding.clone().into_owned(),
+            });
         }
         self.granted.check(Operation::Publish, topic)?;
         let message = self.registry.message(&channel.schema_name);
-        let message = message.map_err(|error| format!("{topic}: {error}"))?;
+        let message = message.map_err(|source| AdvertiseError::UnknownType {
+            topic: topic.to_owned(),
+            source,
+        })?;
         let qos = QosProfile::keep_last(self.depth.max(PUBLISHED));
         let publisher = self
             .bus
             .advertise(topic, WireType::from_message(&message), qos)
             .await;
-        let publisher =
-            publisher.map_err(|error| format!("{topic} cannot be advertised: {error}"))?;
+        let publisher = publisher.map_err(|source| AdvertiseError::Bus {
+            topic: topic.to_owned(),
+            source,
+        })?;
         Ok((message, publisher))
     }
 

@@ -45,7 +45,7 @@ impl Session {
             return self.send_error(words);
         }
         if let Err(refused) = self.granted.check(Operation::Subscribe, &topic) {
-            return self.send_error(refused);
+            return self.send_error(refused.to_string());
         }
         let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
         let (listened, budget) = (topic.clone(), self.budget.clone());

@@ -12,7 +12,7 @@ use servant::Error;
 use servant::engine::{
     ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage,
 };
-use servant::spec::{NodeSpec, ResourceLimits, Spec, UNLIMITED};
+use servant::spec::{Limits, NodeSpec, Size, Spec};
 use tokio::sync::{broadcast, mpsc, watch};
 
 use crate::engine::EngineState;
@@ -28,7 +28,7 @@ pub struct MemoryServant {
     world: Weak<EngineState>,
     state: watch::Sender<ContainerState>,
     events: broadcast::Sender<NodeEvent>,
-    limits: watch::Sender<ResourceLimits>,
+    limits: watch::Sender<Limits>,
     nodes: watch::Sender<BTreeMap<String, MemoryNodeState>>,
     log: watch::Sender<Vec<LogLine>>,
     oom_kills: Mutex<u64>,
@@ -172,7 +172,7 @@ impl MemoryServant {
 
     /// Allocates memory; kills the node and returns false if the servant has too little left.
     pub(crate) fn allocate(&self, name: &str, bytes: u64) -> bool {
-        let limit = self.limits.borrow().memory.unwrap_or(u64::MAX);
+        let limit = self.limits.borrow().memory.map_or(u64::MAX, |size| size.0);
         let mut fits = true;
         self.nodes.send_modify(|nodes| {
             let held: u64 = nodes.values().map(|node| node.held).sum();
@@ -322,25 +322,23 @@ impl ServantHandle for MemoryServant {
         }
     }
 
-    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, Error> {
+    async fn set_limits(&self, limits: Limits) -> Result<EnforcedLimits, Error> {
         self.wait_until_responsive().await;
         self.check_runs()?;
         let held: u64 = self.nodes.borrow().values().map(|node| node.held).sum();
-        if limits.memory.is_some_and(|memory| memory < held) {
+        if limits.memory.is_some_and(|memory| memory < Size(held)) {
             return Err(Error::Refused {
                 id: self.id.clone(),
                 reason: format!("{held} bytes of memory are in use"),
             });
         }
-        self.limits.send_modify(|known| {
-            let lifted = |limit: &mut Option<u64>| *limit = limit.filter(|it| *it != UNLIMITED);
-            *known = limits.or(known);
-            lifted(&mut known.memory);
-            lifted(&mut known.memory_high);
-            lifted(&mut known.pids);
-            lifted(&mut known.io_read);
-            lifted(&mut known.io_write);
-        });
+        let lifted = Limits {
+            cpus: None,
+            cpu_weight: None,
+            ..Limits::unlimited(0.0)
+        };
+        self.limits
+            .send_modify(|known| *known = limits.or(*known).without_equal(lifted));
         Ok(self.enforced_limits())
     }
 

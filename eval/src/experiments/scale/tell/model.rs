@@ -106,13 +106,7 @@ fn add_node_counts(told: &[ReportedPoint], node: &NodeModel, section: &mut Secti
     );
     let mut table = Table::new(
         caption,
-        [
-            "robots",
-            "robots per node by the model",
-            "by memory",
-            "by what the daemon reserves",
-            "nodes needed",
-        ],
+        "robots | robots per node by the model | by memory | by what the daemon reserves | nodes needed",
     );
     for robots in MANY {
         let served = alone.robots_served(robots, T_MAX);

@@ -1,5 +1,7 @@
 use super::*;
+use crate::cells::CachedResult;
 use crate::experiments::scale::counters::CoreUsage;
+use crate::words::assert_tells;
 
 /// A known node: 2 cores, 10 ms of a core per request, of which the robot uses 1 ms, and 2 ms of delay.
 const NODE: NodeModel = NodeModel {
@@ -60,14 +62,8 @@ fn finding<'a>(section: &'a Section, word: &str) -> &'a str {
 fn the_model_is_checked_where_it_was_not_fitted() {
     let section = section_for(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let model = finding(&section, "closed queue");
-    assert!(
-        model.contains("of 2 cores, with 10.00 ms of a core and 2.00"),
-        "{model}"
-    );
-    assert!(
-        model.contains("within 0.0 % on average, 0.0 % at most"),
-        "{model}"
-    );
+    assert_tells(model, "of 2 cores, with 10.00 ms of a core and 2.00");
+    assert_tells(model, "within 0.0 % on average, 0.0 % at most");
     assert_eq!(section.tables[1].rows[1][1], "held back");
     assert_eq!(section.tables[1].rows[2][1], "fitted");
     assert!(section.missing.is_empty());
@@ -97,12 +93,9 @@ fn the_bend_and_its_reason_are_told() {
         "{bend}"
     );
     // The same number as in the table of nodes.
-    assert!(bend.contains("would be enough for 720 robots"), "{bend}");
+    assert_tells(bend, "would be enough for 720 robots");
     let first = finding(&section, "first call");
-    assert!(
-        first.contains("after 300 ms on an empty node (the first one) and"),
-        "{first}"
-    );
+    assert_tells(first, "after 300 ms on an empty node (the first one) and");
     let few = section_for(&[1, 2, 4]);
     let bend = finding(&few, "does not bend");
     assert!(bend.starts_with("Up to 4 robots"), "{bend}");

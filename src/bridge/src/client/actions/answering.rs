@@ -6,24 +6,24 @@ use access::Operation;
 use ros::bus::GoalOutcome;
 use rosbridge::{ActionFeedback, ActionResult, AdvertiseAction, GoalStatus, UnadvertiseAction};
 
-use super::server::ActionServer;
+use super::ClientActionError;
 use crate::client::decoding::{decode, decode_args};
 use crate::client::{BridgeClient, ReplyTarget};
+use crate::client_state::ActionServer;
+use crate::names::ResolveNameError;
 
 impl BridgeClient {
     pub(in crate::client) fn advertise_action(
         self: &Arc<Self>,
         op: &AdvertiseAction<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ClientActionError> {
         let name = self.resolve(&op.action)?.into_owned();
         self.client_grants().check(Operation::Advertise, &name)?;
         let def = self.action_def(&name, &op.type_name)?;
         let limit = self.shared.options.max_advertisements;
         if self.actions.lock().served.len() >= limit {
-            return Err(format!(
-                "this client serves {limit} actions already; unadvertise one"
-            ));
+            return Err(ClientActionError::TooManyServed(limit));
         }
         // The earlier one is dropped first, which aborts its goals.
         let earlier = self.actions.lock().served.remove(&name);
@@ -48,7 +48,7 @@ impl BridgeClient {
         &self,
         op: &UnadvertiseAction<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ResolveNameError> {
         let name = self.resolve(&op.action)?;
         let gone = self.actions.lock().served.remove(&*name);
         match gone {
@@ -82,28 +82,28 @@ impl BridgeClient {
         }
     }
 
-    fn action_server(&self, action: &str) -> Result<Arc<ActionServer>, String> {
+    fn action_server(&self, action: &str) -> Result<Arc<ActionServer>, ClientActionError> {
         let name = self.resolve(action)?;
         let server = self.actions.lock().served.get(&*name).cloned();
-        server.ok_or_else(|| {
-            format!("action {name} is not advertised by this client; advertise_action it first")
-        })
+        server.ok_or_else(|| ClientActionError::NotAdvertised(name.into_owned()))
     }
 
-    pub(in crate::client) fn action_feedback(&self, op: &ActionFeedback<'_>) -> Result<(), String> {
+    pub(in crate::client) fn action_feedback(
+        &self,
+        op: &ActionFeedback<'_>,
+    ) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
         let request = op.id.to_string();
         let body = decode(&server.def.feedback, op.values, op.compression, None)?;
         server.publish_feedback(&request, body)
     }
 
-    pub(in crate::client) fn action_result(&self, op: &ActionResult<'_>) -> Result<(), String> {
+    pub(in crate::client) fn action_result(
+        &self,
+        op: &ActionResult<'_>,
+    ) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
-        let request = op
-            .id
-            .as_ref()
-            .ok_or("field \"id\" is missing, the goal's id is expected")?
-            .to_string();
+        let request = op.id.as_ref().ok_or(ClientActionError::NoId)?.to_string();
         let text = match op.values {
             _ if op.result => None,
             None => Some("".into()),
@@ -121,15 +121,15 @@ impl BridgeClient {
         }
         match decode_args(&server.def.result, op.values, op.compression) {
             Ok(body) => server.end_goal(&request, outcome, "", body),
-            Err(reason) => {
-                let text = format!("the result does not fit: {reason}");
+            Err(error) => {
+                let text = format!("the result does not fit: {error}");
                 server.end_goal(
                     &request,
                     GoalOutcome::Aborted,
                     &text,
                     server.default_result(),
                 )?;
-                Err(reason)
+                Err(error.into())
             }
         }
     }

@@ -4,8 +4,8 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use ros::bus::{GoalEnd, GoalEvents, GoalOutcome};
-use ros::codec;
+use ros::bus::{GoalEnd, GoalError, GoalEvents, GoalOutcome};
+use ros::codec::{self, CodecError};
 use ros::schema::{ActionDef, MessageType};
 use rosbridge::{Compression, GoalStatus, Id, Writer};
 
@@ -14,12 +14,6 @@ use crate::sample::EncodedFrame;
 
 /// Number of queued answers above which feedback is dropped.
 const FEEDBACK_WAITS: usize = 256;
-
-/// An action that a client sends goals to.
-pub(super) struct ActionClient {
-    pub(super) def: Arc<ActionDef>,
-    pub(super) bus: Box<dyn ros::bus::ActionClient>,
-}
 
 /// A goal of a client.
 pub(super) struct SentGoal {
@@ -53,14 +47,14 @@ impl GoalEvents for SentGoal {
         }
         match self.frame(&client, "action_feedback", &def.feedback, &body, |_| {}) {
             Ok(frame) => client.send_as(frame, self.compression, self.fragment_size),
-            Err(reason) => client.error(&self.reply(), &format!("action_feedback: {reason}")),
+            Err(error) => client.error(&self.reply(), &format!("action_feedback: {error}")),
         }
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         self.record_duration(&end);
         let (status, end) = match end {
-            Err(reason) => return self.fail(&reason),
+            Err(error) => return self.fail(&error.to_string()),
             Ok(end) => match end.outcome {
                 GoalOutcome::Succeeded => (GoalStatus::Succeeded, end),
                 GoalOutcome::Canceled => (GoalStatus::Canceled, end),
@@ -78,7 +72,7 @@ impl GoalEvents for SentGoal {
 
 impl SentGoal {
     /// Records the duration; nothing if the client has cancelled the goal, which says nothing about the server.
-    fn record_duration(&self, end: &Result<GoalEnd, String>) {
+    fn record_duration(&self, end: &Result<GoalEnd, GoalError>) {
         let outcome = end.as_ref().ok().map(|end| end.outcome);
         let (Some(client), Some(sent)) = (self.client.upgrade(), self.sent.get()) else {
             return;
@@ -105,7 +99,7 @@ impl SentGoal {
         message_type: &MessageType,
         body: &[u8],
         rest: impl FnOnce(&mut Writer<'_>),
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
         let mut writer = Writer::op(&mut out, format, op, self.id.as_ref());
@@ -137,7 +131,7 @@ impl SentGoal {
         });
         match frame {
             Ok(frame) => self.answer(&client, frame),
-            Err(reason) => self.fail(&format!("the result cannot be read: {reason}")),
+            Err(error) => self.fail(&format!("the result cannot be read: {error}")),
         }
     }
 

@@ -11,11 +11,12 @@ use ros::schema::ActionDef;
 use rosbridge::{CancelActionGoal, Compression, Format, SendActionGoal};
 use tokio_util::sync::CancellationToken;
 
-use super::ActiveGoal;
-use super::goals::{ActionClient, SentGoal};
+use super::goals::SentGoal;
+use super::{ActiveGoal, ClientActionError};
 use crate::client::decoding::decode_args;
 use crate::client::{BridgeClient, ReplyTarget};
-use crate::names::type_mismatch;
+use crate::client_state::ActionClient;
+use crate::names::DeclaredTypeError;
 use crate::tf;
 
 /// A goal that is ready to be sent.
@@ -32,7 +33,7 @@ impl BridgeClient {
         self: &Arc<Self>,
         op: SendActionGoal<'_>,
         reply: &ReplyTarget,
-    ) -> Result<(), String> {
+    ) -> Result<(), ClientActionError> {
         self.shared.metrics.goals.add(1);
         let compression = op.compression.unwrap_or(match reply.format {
             Format::Json => Compression::None,
@@ -41,7 +42,7 @@ impl BridgeClient {
         if let Some(id) = &reply.id
             && self.actions.lock().find_goal_id(id).is_some()
         {
-            return Err(format!("a goal with id {id} is under way already"));
+            return Err(ClientActionError::DuplicateGoal(id.clone()));
         }
         let goal = SentGoal {
             client: Arc::downgrade(self),
@@ -54,7 +55,8 @@ impl BridgeClient {
             begun: None,
             sent: OnceLock::new(),
         };
-        let prepared = self.begin_call(op.args).and_then(|guard| {
+        let begun = self.begin_call(op.args).map_err(ClientActionError::from);
+        let prepared = begun.and_then(|guard| {
             let prepared = self.prepare_goal(&op, reply, compression)?;
             Ok((prepared, guard))
         });
@@ -75,7 +77,7 @@ impl BridgeClient {
                 drop(actions);
                 tokio::spawn(run_goal(prepared, Arc::new(goal)));
             }
-            Err(reason) => goal.fail(&reason),
+            Err(error) => goal.fail(&error.to_string()),
         }
         Ok(())
     }
@@ -85,7 +87,7 @@ impl BridgeClient {
         op: &SendActionGoal<'_>,
         reply: &ReplyTarget,
         compression: Compression,
-    ) -> Result<PreparedGoal, String> {
+    ) -> Result<PreparedGoal, ClientActionError> {
         let name = self.resolve(&op.action)?.into_owned();
         self.client_grants().check(Operation::Call, &name)?;
         let def = self.action_def(&name, &op.action_type)?;
@@ -114,7 +116,7 @@ impl BridgeClient {
         self: &Arc<Self>,
         name: &str,
         def: Arc<ActionDef>,
-    ) -> Result<Arc<ActionClient>, String> {
+    ) -> Result<Arc<ActionClient>, ClientActionError> {
         let limit = self.shared.options.max_advertisements;
         let mut actions = self.actions.lock();
         if let Some(known) = actions.used.get(name) {
@@ -122,14 +124,11 @@ impl BridgeClient {
                 return Ok(known.clone());
             }
         } else if actions.used.len() >= limit {
-            return Err(format!("this client uses {limit} actions already"));
+            return Err(ClientActionError::TooManyUsed(limit));
         }
         let bus = match tf::own_action_client(&self.shared, name, &def) {
             Some(own) => own,
-            None => {
-                let opened = self.shared.bus.action_client(name, &def);
-                opened.map_err(|error| error.to_string())?
-            }
+            None => self.shared.bus.action_client(name, &def)?,
         };
         let action = Arc::new(ActionClient { def, bus });
         let replaced = actions.used.insert(name.to_owned(), action.clone());
@@ -141,12 +140,12 @@ impl BridgeClient {
     pub(in crate::client) fn cancel_action_goal(
         &self,
         op: &CancelActionGoal<'_>,
-    ) -> Result<(), String> {
+    ) -> Result<(), ClientActionError> {
         let goal_id = self.actions.lock().find_goal_id(&op.id);
         if goal_id.is_some_and(|goal_id| self.cancel_goal(&goal_id)) {
             Ok(())
         } else {
-            Err(format!("no goal with id {} is under way", op.id))
+            Err(ClientActionError::NoSentGoal(op.id.clone().into_owned()))
         }
     }
 
@@ -195,8 +194,8 @@ async fn run_goal(prepared: PreparedGoal, goal: Arc<SentGoal>) {
             return goal.fail(&text);
         }
         Err(BusError::TypeMismatch { theirs, ours, .. }) => {
-            let action = format!("action {name}");
-            return goal.fail(&type_mismatch(&action, &theirs, &ours));
+            let error = DeclaredTypeError::new(format!("action {name}"), &theirs, &ours);
+            return goal.fail(&error.to_string());
         }
         Err(error) => return goal.fail(&error.to_string()),
     }

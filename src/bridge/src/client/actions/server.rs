@@ -1,42 +1,32 @@
 //! A client as an action server.
 
-use std::collections::HashMap;
 use std::sync::{Arc, OnceLock, Weak};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{ActionHandler, GoalEnd, GoalOutcome};
-use ros::codec;
+use ros::bus::{ActionHandler, BusError, FailureReason, GoalEnd, GoalOutcome};
+use ros::codec::{self, CodecError};
 use ros::schema::ActionDef;
 use rosbridge::{AdvertiseAction, CancelActionGoal, Compression, Id, StatusLevel, Writer};
 
+use super::ClientActionError;
 use crate::client::{BridgeClient, payload_format};
+use crate::client_state::ActionServer;
 use crate::sample::EncodedFrame;
 
 /// Reason for aborting goals.
 const GONE: &str = "the client that serves this action is gone";
 
-/// An action that a client serves.
-pub(in crate::client) struct ActionServer {
-    name: String,
-    /// Name as the client wrote it.
-    written: String,
-    pub(super) def: Arc<ActionDef>,
-    compression: Compression,
-    /// Goals in progress: from the client's ids to the bus's.
-    goals: Mutex<HashMap<String, String>>,
-    /// Set once, right after construction: goals are sent to the server itself.
-    bus: OnceLock<Box<dyn ros::bus::ActionServer>>,
-    client: Weak<BridgeClient>,
-}
-
 /// Forwards goals to the client.
 struct GoalHandler(Weak<ActionServer>);
 
 impl ActionHandler for GoalHandler {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
-        let server = self.0.upgrade().ok_or(GONE)?;
-        server.send_goal(id, &goal)
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
+        let gone = || FailureReason::new(GONE);
+        let server = self.0.upgrade().ok_or_else(gone)?;
+        let client = server.client.upgrade().ok_or_else(gone)?;
+        let sent = server.send_goal(&client, id, &goal);
+        sent.map_err(|error| FailureReason::new(error.to_string()))
     }
 
     fn on_cancel(&self, id: &str) {
@@ -66,7 +56,7 @@ impl ActionServer {
         name: &str,
         op: &AdvertiseAction<'_>,
         def: Arc<ActionDef>,
-    ) -> Result<Arc<Self>, String> {
+    ) -> Result<Arc<Self>, BusError> {
         let server = Arc::new(Self {
             name: name.to_owned(),
             written: op.action.clone().into_owned(),
@@ -79,15 +69,19 @@ impl ActionServer {
         let handler = Arc::new(GoalHandler(Arc::downgrade(&server)));
         let served = client.shared.bus.serve_action(name, &server.def, handler);
         // Only set here.
-        let _ = server.bus.set(served.map_err(|error| error.to_string())?);
+        let _ = server.bus.set(served?);
         Ok(server)
     }
 
-    fn send_goal(&self, id: &str, body: &Bytes) -> Result<(), String> {
-        let client = self.client.upgrade().ok_or(GONE)?;
+    fn send_goal(
+        &self,
+        client: &BridgeClient,
+        id: &str,
+        body: &Bytes,
+    ) -> Result<(), Box<CodecError>> {
         let number = client.shared.next_number();
         let request = format!("action_goal:{}:{number}", self.name);
-        let frame = self.frame(&client, &request, body)?;
+        let frame = self.frame(client, &request, body)?;
         self.goals.lock().insert(request, id.to_owned());
         client.send_as(frame, self.compression, None);
         Ok(())
@@ -98,7 +92,7 @@ impl ActionServer {
         client: &BridgeClient,
         request: &str,
         body: &Bytes,
-    ) -> Result<EncodedFrame, String> {
+    ) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
         let mut writer = Writer::op(
@@ -137,13 +131,19 @@ impl ActionServer {
         }
     }
 
-    fn no_such_goal(&self, request: &str) -> String {
-        let action = &self.name;
-        format!("action {action} has no goal with id {request:?} under way")
+    fn no_such_goal(&self, request: &str) -> ClientActionError {
+        ClientActionError::NoServedGoal {
+            action: self.name.clone(),
+            request: request.to_owned(),
+        }
     }
 
     /// Publishes feedback on the goal that the client knows as `request`.
-    pub(super) fn publish_feedback(&self, request: &str, body: Bytes) -> Result<(), String> {
+    pub(super) fn publish_feedback(
+        &self,
+        request: &str,
+        body: Bytes,
+    ) -> Result<(), ClientActionError> {
         let id = self.goals.lock().get(request).cloned();
         let told = match (id, self.bus.get()) {
             (Some(id), Some(bus)) => bus.publish_feedback(&id, body),
@@ -159,7 +159,7 @@ impl ActionServer {
         outcome: GoalOutcome,
         text: &str,
         result: Bytes,
-    ) -> Result<(), String> {
+    ) -> Result<(), ClientActionError> {
         let id = self.goals.lock().remove(request);
         let end = GoalEnd {
             outcome,

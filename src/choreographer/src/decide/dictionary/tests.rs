@@ -226,7 +226,7 @@ fn rows_that_cannot_be_are_refused_with_what_to_write() {
     let with = |change: fn(&mut Row)| {
         let mut row = good.clone();
         change(&mut row);
-        check(&row).expect_err("refused")
+        check(&row).expect_err("refused").to_string()
     };
     for (refused, words) in [
         (with(|row| row.value = 0.0), "rrt \"0\" is not a time"),

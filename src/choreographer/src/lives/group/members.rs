@@ -5,26 +5,17 @@ use std::sync::Arc;
 
 use api::Phase;
 use catalogue::names;
-use reach::group::dispatch::Member;
 use store::RevisionRecord;
 
-use super::{GroupStage, SharedGroup};
 use crate::Lease;
 use crate::decide::placement::Placement;
 use crate::lives::driver::{self, ServantSource};
 use crate::lives::handle::{Failure, Handle};
+use crate::lives::shared_group::{GroupStage, SharedGroup, SharedServant};
 use crate::lives::{ChoreographerInner, Servants};
 
 /// Prefix of a group's name, in place of a robot's name.
 const NAMED: &str = "~group-";
-
-/// A servant of a group.
-pub(super) struct SharedServant {
-    pub(super) number: usize,
-    pub(super) lease: Lease,
-    pub(super) member: Option<Member>,
-    pub(super) retiring: bool,
-}
 
 /// Updates the state of the servants; returns the failure of one that never answered.
 pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Option<Failure> {
@@ -222,8 +213,8 @@ fn find_or_start(
     servants.add(key, &handle);
     let lease = Lease::new(Arc::clone(&handle), "");
     drop(servants);
-    let beginning = ServantSource::Asked(warm);
-    tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
+    let beginning = ServantSource::Asked(warm.map(Box::new));
+    driver::start(inner, handle, beginning);
     Some(lease)
 }
 

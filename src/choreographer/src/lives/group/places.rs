@@ -7,10 +7,10 @@ use api::{Phase, Shared};
 use reach::group::open_seat;
 use store::RevisionRecord;
 
-use super::{GroupStage, SharedGroup};
 use crate::decide::group::expired_places;
 use crate::lives::handle::{Failure, Handle};
 use crate::lives::lifetime::wait_unneeded;
+use crate::lives::shared_group::{GroupStage, SharedGroup};
 use crate::lives::{ChoreographerInner, Servants, reaching};
 
 /// A robot's place; given up on drop.

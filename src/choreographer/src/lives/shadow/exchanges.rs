@@ -8,7 +8,7 @@ use api::shadow::Kind;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use reach::tap::{TapAnswer, TapEventKind};
-use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, GoalOutcome};
+use ros::bus::{ActionClient, Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 use ros::schema::{ActionDef, MessageType, Registry, ServiceDef};
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
@@ -137,7 +137,7 @@ impl Exchanges {
             TapEventKind::Goal { action, of, goal } => {
                 let client = match self.action_client(&action, &of) {
                     Ok(client) => client,
-                    Err(why) => return notes.add(&action, &why),
+                    Err(error) => return notes.add(&action, &error.to_string()),
                 };
                 let id = format!("cloudroid-shadow-{number}");
                 let sent = (Arc::clone(&client), id.clone());
@@ -273,12 +273,11 @@ impl Exchanges {
         &mut self,
         action: &str,
         of: &Arc<ActionDef>,
-    ) -> Result<Arc<dyn ActionClient>, String> {
+    ) -> Result<Arc<dyn ActionClient>, BusError> {
         if let Some(known) = self.clients.get(action) {
             return Ok(Arc::clone(known));
         }
-        let client = self.to.action_client(action, of);
-        let client: Arc<dyn ActionClient> = client.map_err(|error| error.to_string())?.into();
+        let client: Arc<dyn ActionClient> = self.to.action_client(action, of)?.into();
         self.clients.insert(action.to_owned(), Arc::clone(&client));
         Ok(client)
     }
@@ -306,19 +305,20 @@ async fn run_goal(client: &dyn ActionClient, id: &str, goal: Bytes) -> (TapAnswe
     let (sender, ended) = oneshot::channel();
     let asked = Instant::now();
     client.send_goal(id, goal, Arc::new(GoalEndSender(Mutex::new(Some(sender)))));
-    let end = ended
-        .await
-        .unwrap_or_else(|_| Err("its outcome is unknown".to_owned()));
-    (TapAnswer::from_goal(&end), millis(asked.elapsed()))
+    let answer = match ended.await {
+        Ok(end) => TapAnswer::from_goal(&end),
+        Err(_) => TapAnswer::Refused("its outcome is unknown".to_owned()),
+    };
+    (answer, millis(asked.elapsed()))
 }
 
 /// Reports how a goal of the candidate ends.
-struct GoalEndSender(Mutex<Option<oneshot::Sender<Result<GoalEnd, String>>>>);
+struct GoalEndSender(Mutex<Option<oneshot::Sender<Result<GoalEnd, GoalError>>>>);
 
 impl GoalEvents for GoalEndSender {
     fn on_feedback(&self, _feedback: Bytes) {}
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         if let Some(sender) = self.0.lock().take() {
             let _ = sender.send(end);
         }

@@ -9,7 +9,7 @@ use api::shadow::Kind;
 use budget::Budget;
 use reach::ObservedBus;
 use ros::bus::{
-    Bus, Graph, PeerId, Publisher, QosProfile, SerializedMessage, Subscription, WireType,
+    Bus, BusError, Graph, PeerId, Publisher, QosProfile, SerializedMessage, Subscription, WireType,
     wait_for_connected,
 };
 use ros::codec::{Time, header_stamp};
@@ -56,6 +56,15 @@ pub(super) struct MirroredTopics {
     pub(super) given: u64,
     /// Stubs send goals by the topics of actions.
     linked: bool,
+}
+
+/// Reason why a topic is not compared as a whole.
+#[derive(Debug, thiserror::Error)]
+enum ListenError {
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    #[error("no node of the candidate subscribed to it within {PATIENCE:?}")]
+    NoSubscriber,
 }
 
 /// A received message.
@@ -202,8 +211,8 @@ impl MirroredTopics {
         }
         for (name, type_name, input, output) in wanted {
             let outcome = self.listen(&from, &name, &type_name, (input, output)).await;
-            if let Err(why) = outcome {
-                notes.add(&name, &why);
+            if let Err(error) = outcome {
+                notes.add(&name, &error.to_string());
             }
         }
     }
@@ -214,7 +223,7 @@ impl MirroredTopics {
         name: &str,
         type_name: &str,
         (input, output): (bool, bool),
-    ) -> Result<(), String> {
+    ) -> Result<(), ListenError> {
         let of = self.registry.message(type_name).ok();
         let known = self.listened.get(name);
         let heard_there = known.is_some_and(|known| known.candidate.is_some());
@@ -229,15 +238,14 @@ impl MirroredTopics {
         if let Some(of) = of.as_ref().filter(|_| input)
             && !self.publishers.contains_key(&key)
         {
-            let advertised = self
+            let publisher = self
                 .to
                 .advertise(
                     name,
                     WireType::from_message(of),
                     QosProfile::keep_last(QUEUE),
                 )
-                .await;
-            let publisher = advertised.map_err(|error| error.to_string())?;
+                .await?;
             let listens = tokio::time::timeout(
                 PATIENCE,
                 wait_for_connected(publisher.matched_subscribers(), 1),
@@ -246,9 +254,7 @@ impl MirroredTopics {
             self.publishers.insert(key, publisher);
             if listens.is_err() {
                 // Later messages are sent to it nevertheless.
-                return Err(format!(
-                    "no node of the candidate subscribed to it within {PATIENCE:?}"
-                ));
+                return Err(ListenError::NoSubscriber);
             }
         }
         match self.listened.get_mut(name) {
@@ -283,9 +289,9 @@ impl MirroredTopics {
         bus: &Arc<dyn Bus>,
         name: &str,
         published: bool,
-    ) -> Result<AbortOnDropHandle<()>, String> {
+    ) -> Result<AbortOnDropHandle<()>, BusError> {
         let subscribed = bus.subscribe(name, WireType::any(), QosProfile::keep_last(QUEUE));
-        let subscription = subscribed.await.map_err(|error| error.to_string())?;
+        let subscription = subscribed.await?;
         let connected = wait_for_connected(subscription.matched.clone(), usize::from(published));
         // A later publisher is received later.
         let _ = tokio::time::timeout(PATIENCE, connected).await;

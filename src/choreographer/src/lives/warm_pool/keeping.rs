@@ -6,8 +6,10 @@ use catalogue::names;
 use futures_util::FutureExt;
 use futures_util::future::join_all;
 use tokio::time::Instant;
+use tracing::Instrument;
 
-use super::{LEAD, NOBODY, UNMADE, WarmServant};
+use super::pool::{LEAD, WarmServant};
+use super::{NOBODY, UNMADE};
 use crate::Error;
 use crate::decide::forecast::INTERVAL;
 use crate::decide::warm_pool::{
@@ -242,10 +244,13 @@ async fn make(
 ) -> Result<WarmServant, Error> {
     let id = names::servant_id(&revision.service);
     let limits = inner.push_limits(&revision).limits();
+    let robot = tracing::field::Empty;
+    let span = tracing::error_span!(parent: None, "servant", id, service = revision.service, robot);
     let spec = starting::container_spec(inner, &id, &revision, &limits, Vec::new())?;
-    let container = inner.engine.start(spec).await?;
+    let container = inner.engine.start(spec).instrument(span.clone()).await?;
     let limit = inner.options.start;
-    let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
+    let opening = reaching::open(inner, &revision, &container).instrument(span.clone());
+    let reached = tokio::time::timeout(limit, opening).await;
     match reached {
         Ok(Ok(reach)) => Ok(WarmServant {
             container,
@@ -253,6 +258,7 @@ async fn make(
             limits,
             nodes: false,
             permit: None,
+            span,
             revision,
         }),
         failed => {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use ros::InterfaceSelection;
 
-use super::super::Check;
+use super::super::check::Check;
 use super::{ExaminedStub, found_check, is_same_directory, shadowed_check};
 use crate::network::{self, Variable};
 
@@ -140,7 +140,7 @@ fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::CheckVerdict;
+    use super::super::super::check::CheckVerdict;
     use super::*;
 
     struct Robot(tempfile::TempDir);

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use super::super::Check;
+use super::super::check::Check;
 use super::{ExaminedStub, found_check, is_same_directory, shadowed_check};
 use crate::network::Variable;
 
@@ -30,7 +30,7 @@ pub fn shadowing(stub: &ExaminedStub, variable: Variable<'_>) -> Check {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::CheckVerdict;
+    use super::super::super::check::CheckVerdict;
     use super::*;
 
     struct Robot(tempfile::TempDir);

@@ -8,6 +8,7 @@ use bytes::Bytes;
 use qos::{
     DecisionReason, Effect, Failure, HandOver, QosEvent, RequestChannel, RequestId, Responder,
 };
+use ros::bus::FailureReason;
 
 use super::{Keeper, Payload, PendingAnswer, State};
 
@@ -24,7 +25,7 @@ impl Keeper {
                     request, reason, ..
                 } = effect
                 {
-                    state.reply(*request, Err(reason.clone()));
+                    state.reply(*request, Err(FailureReason::new(reason.as_str())));
                     state.goals.fail(*request);
                 }
             }

@@ -22,7 +22,7 @@ use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use link::clock;
 use qos::{CorrelationKey, Failure, RequestId, Responder};
-use ros::bus::{SerializedMessage, WireFormat};
+use ros::bus::{FailureReason, SerializedMessage, WireFormat};
 use tokio::sync::oneshot;
 
 use super::goal_messages::{self as messages, ALL, GoalId};
@@ -146,9 +146,13 @@ fn goal_key(id: &GoalId) -> CorrelationKey {
 
 impl Keeper {
     /// Handles a goal of the application. An action server cannot give a reason for a refusal.
-    pub async fn send_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
+    pub async fn send_goal(
+        &self,
+        action: &Arc<str>,
+        request: Bytes,
+    ) -> Result<Bytes, FailureReason> {
         let Some(id) = messages::goal_id(&request) else {
-            return Err(format!("a goal of {action} has no id"));
+            return Err(FailureReason::new(format!("a goal of {action} has no id")));
         };
         let (sender, answer) = oneshot::channel();
         let sent = GoalRequest {
@@ -182,7 +186,11 @@ impl Keeper {
     }
 
     /// Handles a request of the application for a goal's result.
-    pub async fn get_result(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
+    pub async fn get_result(
+        &self,
+        action: &Arc<str>,
+        request: Bytes,
+    ) -> Result<Bytes, FailureReason> {
         let (sender, answer) = oneshot::channel();
         let known = self.update(|state, _| {
             let goal = state.goals.0.get_mut(&messages::goal_id(&request)?)?;
@@ -195,7 +203,7 @@ impl Keeper {
         match known {
             Some(()) => answer
                 .await
-                .map_err(|_| "the result of this goal is no longer available".to_owned()),
+                .map_err(|_| FailureReason::new("the result of this goal is no longer available")),
             // The goal was sent before this stub started.
             None => {
                 self.forward(&action_service(action, "get_result"), request)
@@ -205,7 +213,11 @@ impl Keeper {
     }
 
     /// Handles a request of the application to cancel a goal, or all.
-    pub async fn cancel_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
+    pub async fn cancel_goal(
+        &self,
+        action: &Arc<str>,
+        request: Bytes,
+    ) -> Result<Bytes, FailureReason> {
         let wanted = messages::goal_id(&request).unwrap_or(ALL);
         let (ids, sides) = self.update(|state, _| {
             let (mut ids, mut sides) = (Vec::new(), [false; 2]);
@@ -234,12 +246,14 @@ impl Keeper {
         let mut answers: FuturesUnordered<_> = given
             .map(|side| tokio::spawn(self.call_side(side, &service, request.clone())))
             .collect();
-        let mut last = Err("the goals are no longer known".to_owned());
+        let mut last = Err(FailureReason::new("the goals are no longer known"));
         while let Some(answer) = answers.next().await {
             match answer {
                 Ok(Ok(answer)) if messages::has_canceled_goals(&answer) => return Ok(answer),
                 Ok(Ok(answer)) => last = Ok(answer),
-                Ok(Err(failure)) if last.is_err() => last = Err(failure.text().to_owned()),
+                Ok(Err(failure)) if last.is_err() => {
+                    last = Err(FailureReason::new(failure.text()));
+                }
                 _ => {}
             }
         }

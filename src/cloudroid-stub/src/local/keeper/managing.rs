@@ -5,6 +5,7 @@ use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use qos::{Failure, Responder};
+use ros::bus::FailureReason;
 use tokio::time::timeout;
 
 use super::Keeper;
@@ -13,7 +14,7 @@ use crate::local::service_use::ServiceUse;
 
 impl Keeper {
     /// Calls the cloud if the link is up, otherwise the local original.
-    pub async fn forward(&self, service: &str, request: Bytes) -> Result<Bytes, String> {
+    pub async fn forward(&self, service: &str, request: Bytes) -> Result<Bytes, FailureReason> {
         let passed = self.call_active_side(service, request).await;
         passed.map(|(_, answer)| answer)
     }
@@ -22,7 +23,7 @@ impl Keeper {
         &self,
         service: &str,
         request: Bytes,
-    ) -> Result<(Responder, Bytes), String> {
+    ) -> Result<(Responder, Bytes), FailureReason> {
         let is_up = self.state.lock().governor.sides().cloud;
         let cloud = if is_up {
             self.call_side(Responder::Cloud, service, request.clone())
@@ -32,12 +33,14 @@ impl Keeper {
         };
         let reason = match cloud {
             Ok(answer) => return Ok((Responder::Cloud, answer)),
-            Err(Failure::Refused(reason)) => return Err(reason),
+            Err(Failure::Refused(reason)) => return Err(FailureReason::new(reason)),
             Err(Failure::Unreachable(reason)) => reason,
         };
         let local = self.call_side(Responder::Local, service, request).await;
         let local = local.map(|answer| (Responder::Local, answer));
-        local.map_err(|failure| format!("cloud: {reason}; local: {}", failure.text()))
+        local.map_err(|failure| {
+            FailureReason::new(format!("cloud: {reason}; local: {}", failure.text()))
+        })
     }
 
     /// Changes a setting of the node: on the side that answers, and on the other side, now or when it starts.
@@ -46,7 +49,7 @@ impl Keeper {
         service: &str,
         what: &ServiceUse,
         request: Bytes,
-    ) -> Result<Bytes, String> {
+    ) -> Result<Bytes, FailureReason> {
         // Serializes changes by the same service: a replay to a new node sees this one or an earlier one.
         let turn = self.remembered.acquire_turn(service).await;
         let (side, answer) = self.call_active_side(service, request.clone()).await?;

@@ -1,7 +1,7 @@
 //! Tests of features that only ROS 2 nodes have: quality of service of each endpoint, and actions that consist of
 //! service calls.
 
-use ros::bus::{ActionHandler, GoalEnd, GoalEvents, GoalOutcome, QosReliability};
+use ros::bus::{ActionHandler, GoalEnd, GoalError, GoalEvents, GoalOutcome, QosReliability};
 use tokio::sync::mpsc;
 
 use super::*;
@@ -96,9 +96,9 @@ async fn the_cloud_is_told_with_whom_no_messages_pass() {
 struct ForwardedGoals(mpsc::UnboundedSender<(String, Bytes)>);
 
 impl ActionHandler for ForwardedGoals {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
         let sent = self.0.send((id.to_owned(), goal));
-        sent.map_err(|error| error.to_string())
+        sent.map_err(|error| FailureReason::new(error.to_string()))
     }
     fn on_cancel(&self, id: &str) {
         let _ = self.0.send((id.to_owned(), Bytes::new()));
@@ -115,7 +115,7 @@ impl GoalEvents for OutcomeLog {
     fn on_feedback(&self, feedback: Bytes) {
         let _ = self.0.send(format!("at {}", feedback[4]));
     }
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
         let end = end.unwrap();
         let number = end.result.get(4).copied().unwrap_or_default();
         let _ = self.0.send(format!("{:?} {number}", end.outcome));

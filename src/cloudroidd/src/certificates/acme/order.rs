@@ -8,7 +8,7 @@ use instant_acme::{
     Account, AuthorizationStatus, ChallengeType, Identifier, NewOrder, Order, OrderStatus,
     RetryPolicy,
 };
-use portal::{Challenge, Tls};
+use portal::{Challenge, Tls, TlsError};
 use rcgen::{CertificateParams, CustomExtension, DistinguishedName, KeyPair};
 use tokio_rustls::rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
 
@@ -89,7 +89,7 @@ async fn prove_names(order: &mut Order, tls: &Tls) -> anyhow::Result<()> {
         let digest = challenge.key_authorization().digest();
         shown.push(challenge_certificate(of, digest.as_ref())?);
     }
-    tls.set_challenges(shown).map_err(super::to_anyhow)?;
+    tls.set_challenges(shown).map_err(to_anyhow)?;
     let mut names = order.authorizations();
     while let Some(name) = names.next().await {
         let mut name = name.context("cannot fetch the order")?;
@@ -135,4 +135,9 @@ async fn failure_reasons(order: &mut Order) -> Vec<String> {
         reasons.extend(failed.map(|problem| format!("{of}: {problem}")));
     }
     reasons
+}
+
+/// Converts the error without its source, whose text it contains already.
+pub(super) fn to_anyhow(error: TlsError) -> anyhow::Error {
+    anyhow::Error::msg(error.to_string())
 }

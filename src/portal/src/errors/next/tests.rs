@@ -9,7 +9,7 @@ use servant::Error as E;
 
 use super::super::Error;
 use super::*;
-use crate::principals::{CertificateRefusal, PairingCodeRefusal};
+use crate::principals::refusals::{CertificateRefusal, PairingCodeRefusal};
 
 fn x() -> String {
     "x".to_owned()
@@ -124,7 +124,7 @@ fn push_errors() -> Vec<Error> {
             newcomer: x(),
         },
         P::NotAllowed(x()),
-        P::Options(x()),
+        P::Options(push::OptionsError::Exported),
         P::Failed {
             message: x(),
             next: None,
@@ -213,7 +213,9 @@ fn servant_errors() -> Vec<Error> {
         C::Calibration(x()),
         C::Shadow(x()),
         C::Reach(reach::Error::Elsewhere(x())),
-        C::Reach(reach::Error::Linked(x())),
+        C::Reach(reach::Error::Linked(Box::new(
+            reach::links::NodeError::ServantEnded,
+        ))),
         C::Reach(reach::Error::Trial(x())),
         C::Internal("x"),
         C::Engine(E::Call {

@@ -76,7 +76,9 @@ fn passwords_that_are_guessed_first_are_refused() {
         ("administrator1", "Administrator1", "too easy to guess"),
         ("alice", "alicealice123", "too easy to guess"),
     ] {
-        let refused = check_strength(name, password).expect_err(password);
+        let refused = check_strength(name, password)
+            .expect_err(password)
+            .to_string();
         assert!(refused.contains(words), "{password}: {refused}");
     }
 }

@@ -1,9 +1,13 @@
+use std::sync::Arc;
+
 use access::ConnectionAccess;
 use api::access::NewToken;
 use store::State;
 use tokio::sync::watch;
 
 use super::*;
+use crate::principals::SessionLifetimes;
+use crate::principals::refusals::AuthenticationError;
 use crate::tokens::Tokens;
 
 struct World {

@@ -85,12 +85,12 @@ struct Handler {
 }
 
 impl ActionHandler for Handler {
-    fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), FailureReason> {
         let _ = self.told.send((id.to_owned(), true));
         if self.takes {
             Ok(())
         } else {
-            Err(String::new())
+            Err(FailureReason::new(""))
         }
     }
 

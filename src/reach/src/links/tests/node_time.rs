@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use link::clock::ClockSample;
-use ros::bus::{NodeParameters, ServiceHandler, ServiceType};
+use ros::bus::{FailureReason, NodeParameters, ServiceHandler, ServiceType};
 
 use super::*;
 use crate::memory_bus::{MemoryBus, MemorySystem};
@@ -14,7 +14,7 @@ struct SilentService;
 
 #[async_trait]
 impl ServiceHandler for SilentService {
-    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         std::future::pending().await
     }
 }

@@ -5,12 +5,12 @@ use std::net::SocketAddr;
 use bytes::Bytes;
 use link::drops::Cause;
 use link::record::Data;
-use ros::bus::{QosProfile, ServiceHandler, ServiceType, WireType};
+use ros::bus::{FailureReason, QosProfile, ServiceHandler, ServiceType, WireType};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, copy_bidirectional};
 use tokio::net::TcpStream;
 
 use super::*;
-use crate::links::node_link::NodeLink;
+use crate::links::state::NodeLink;
 
 /// A servant with a node, and a robot's link to it.
 struct RetryScene {
@@ -114,7 +114,7 @@ struct Echo;
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _: &str) -> Result<Bytes, FailureReason> {
         Ok(request)
     }
 }

@@ -1,36 +1,22 @@
 //! Calls to services of other nodes, over persistent connections that are kept between calls.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::link::from_tcpros_error;
 use super::registrar::Kind;
 use super::services::LABEL;
-use super::{HANDSHAKE, Ros1BusState};
+use super::state::{CallPool, HANDSHAKE, IdleConnection, Ros1BusState};
 use crate::bus::{BusError, CallFate, Digest, Graph, ServiceProvider, ServiceType};
 use crate::ros1::names::PeerUri;
 use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
 
 /// Maximum number of idle connections per service.
 const MAX_IDLE: usize = 8;
-
-/// Idle connections, by service.
-#[derive(Default)]
-pub(super) struct CallPool {
-    idle: Mutex<HashMap<String, Vec<IdleConnection>>>,
-}
-
-/// A connection, and the address of the server's node when it was made, if the graph showed it.
-struct IdleConnection {
-    connection: ServiceConnection,
-    address: Option<String>,
-}
 
 impl IdleConnection {
     /// Returns true if the connection's server still serves the service.
@@ -123,7 +109,7 @@ pub(super) async fn call(
                     bus.calls.put(service, kept, &bus.graph);
                     return answer.map_err(|reason| BusError::CallFailed {
                         service: service.to_owned(),
-                        reason,
+                        reason: reason.into_string(),
                         fate: CallFate::Answered,
                     });
                 }
@@ -244,7 +230,7 @@ mod tests {
     use async_trait::async_trait;
 
     use super::*;
-    use crate::bus::{Bus, ServiceHandler};
+    use crate::bus::{Bus, FailureReason, ServiceHandler};
     use crate::net::HostSockets;
     use crate::ros1::Ros1Bus;
     use crate::ros1::testing::TestMaster;
@@ -253,7 +239,7 @@ mod tests {
 
     #[async_trait]
     impl ServiceHandler for Echo {
-        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+        async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
             Ok(request)
         }
     }

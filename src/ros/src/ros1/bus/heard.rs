@@ -1,28 +1,19 @@
 //! The publishers' own reports about their subscribers (`getBusInfo` of the slave API). A publisher answers a
 //! subscriber's header before it sends to it: what it publishes in between never reaches the subscriber.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use async_trait::async_trait;
-use parking_lot::Mutex;
-
 use super::master_client::to_bus_error;
-use super::{HANDSHAKE, Ros1Bus, Ros1BusState};
-use crate::bus::{BusError, PeerId, PublisherReports};
+use super::state::{HANDSHAKE, PublisherClients, Ros1BusState};
+use crate::bus::{BusError, PeerId};
 use crate::ros1::reply::ApiReply;
 use crate::ros1::xmlrpc::{Value, XmlRpcClient};
 
 /// Time for which the connection to a publisher is kept after a query, because a node that waits for its subscription
 /// to take effect queries often.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// Clients of publishers that were queried recently.
-#[derive(Default)]
-pub(super) struct PublisherClients {
-    clients: Mutex<HashMap<String, (Arc<XmlRpcClient>, Instant)>>,
-}
 
 impl PublisherClients {
     /// Returns a client of the publisher at `uri`, already connected if it was queried recently.
@@ -50,13 +41,6 @@ async fn close_idle_clients(bus: Arc<Ros1BusState>) {
         if clients.is_empty() {
             return;
         }
-    }
-}
-
-#[async_trait]
-impl PublisherReports for Ros1Bus {
-    async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
-        connections(&self.inner, topic).await
     }
 }
 

@@ -1,24 +1,15 @@
 //! Services of another ROS system, lent to the nodes of this one: the Master queries this node, and callers connect
 //! here.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use parking_lot::Mutex;
 
-use super::services::ServiceEntry;
-use super::{Ros1Bus, Ros1BusState, calls};
+use super::state::{Loans, Ros1BusState, ServiceEntry};
+use super::{Ros1Bus, calls};
 use crate::bus::{BusError, Lender, Lending, LentService, ServiceProvider};
 use crate::ros1::master::lending::LEND_SERVICES;
 use crate::ros1::names;
-
-/// The lender and the services lent, by name.
-#[derive(Default)]
-pub(super) struct Loans {
-    lender: Mutex<Option<Arc<dyn Lender>>>,
-    lent: Mutex<HashMap<String, Arc<ServiceEntry>>>,
-}
 
 impl Loans {
     pub(super) fn set_lender(&self, lender: Arc<dyn Lender>) {

@@ -9,12 +9,11 @@ use bytes::BytesMut;
 use parking_lot::Mutex;
 use tokio::net::TcpStream;
 use tokio::sync::watch;
-use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
 use super::master_client::to_bus_error;
-use super::subscriptions::TopicIn;
-use super::{HANDSHAKE, Ros1BusState};
+use super::state::{HANDSHAKE, Ros1BusState, wire_type_from_header};
+use super::topic_in::{PublisherLink, TopicIn};
 use crate::bus::{BusError, Offer, PeerId, SerializedMessage, WireType};
 use crate::net;
 use crate::ros1::reply::ApiReply;
@@ -26,21 +25,6 @@ const PAUSE: Duration = Duration::from_millis(50);
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 /// Grace period for a publisher that is no longer listed; it may still have messages in transit.
 const GRACE: Duration = Duration::from_secs(2);
-
-/// One publisher, as seen by the topic.
-pub(super) struct PublisherLink {
-    pub(super) id: i32,
-    uri: String,
-    listed: watch::Sender<bool>,
-    task: Mutex<Option<AbortHandle>>,
-    /// Offer in the publisher's header, from the first connection on.
-    offer: Mutex<Option<Offer>>,
-    /// The publisher's id, from the first connection until it has left.
-    pub(super) publisher: Mutex<Option<PeerId>>,
-    pub(super) connected: AtomicBool,
-    pub(super) messages: AtomicU64,
-    pub(super) bytes: AtomicU64,
-}
 
 impl PublisherLink {
     pub(super) fn uri(&self) -> &str {
@@ -230,7 +214,7 @@ pub(super) async fn connect(
             });
         }
     };
-    let wire_type = super::wire_type_from_header(&answer);
+    let wire_type = wire_type_from_header(&answer);
     if !wanted.is_compatible_with(&wire_type) {
         return Err(BusError::TypeMismatch {
             what: topic.to_owned(),

@@ -9,7 +9,7 @@ use parking_lot::Mutex;
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::{Instant, timeout_at};
 
-use crate::bus::BusError;
+use crate::bus::{BusError, FailureReason};
 use crate::net::Sockets;
 use crate::ros1::reply::ApiReply;
 use crate::ros1::xmlrpc::{self, Value, XmlRpcClient};
@@ -64,7 +64,7 @@ impl MasterClient {
         let answer = self.ask(method, args).await?;
         answer.map_err(|reason| BusError::Master {
             call: method.to_owned(),
-            reason,
+            reason: reason.into_string(),
         })
     }
 
@@ -73,7 +73,7 @@ impl MasterClient {
         &self,
         method: &str,
         args: Vec<Value>,
-    ) -> Result<Result<Value, String>, BusError> {
+    ) -> Result<Result<Value, FailureReason>, BusError> {
         self.ask_in_name_of(&self.node, method, args).await
     }
 
@@ -83,7 +83,7 @@ impl MasterClient {
         caller: &str,
         method: &str,
         args: Vec<Value>,
-    ) -> Result<Result<Value, String>, BusError> {
+    ) -> Result<Result<Value, FailureReason>, BusError> {
         let Some(_turn) = self.turns.acquire().await else {
             return Err(BusError::Timeout {
                 what: format!("{method} of {}", self.uri),
@@ -96,7 +96,7 @@ impl MasterClient {
         Ok(if reply.code == 1 {
             Ok(reply.value)
         } else {
-            Err(reply.message)
+            Err(FailureReason::new(reply.message))
         })
     }
 

@@ -19,9 +19,9 @@ impl GlobalParameters for Ros1Bus {
     }
 
     async fn set(&self, key: &str, value: ParamValue) -> Result<(), BusError> {
-        let value = Value::try_from(value).map_err(|reason| BusError::BadParam {
+        let value = Value::try_from(value).map_err(|error| BusError::BadParam {
             key: key.to_owned(),
-            reason,
+            reason: error.to_string(),
         })?;
         let set = self.inner.master.call("setParam", vec![key.into(), value]);
         set.await.map(drop)

@@ -1,55 +1,21 @@
 //! Topics that this node publishes: several local advertisements share one set of subscribers.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
-use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 
+use super::endpoint_owner::EndpointOwner;
 use super::registrar::Kind;
-use super::{EndpointOwner, Ros1BusState, subscriptions};
+use super::state::Ros1BusState;
+use super::subscriptions;
+use super::topic_out::{LocalPublisher, State, Subscriber, TopicOut};
 use crate::bus::{
     BusError, MatchedPeers, PeerId, Publisher, QosProfile, SerializedMessage, TopicPeer, WireType,
 };
-use crate::ring::{DropCount, DropTally};
+use crate::ring::DropTally;
 use crate::ros1::tcpros::SendQueue;
-
-/// One topic with all its local publishers and all subscribers.
-#[derive(Default)]
-pub(super) struct TopicOut {
-    state: Mutex<State>,
-    matched: watch::Sender<MatchedPeers>,
-    dropped: DropCount,
-}
-
-#[derive(Default)]
-struct State {
-    advert: Option<WireType>,
-    locals: BTreeMap<i32, LocalPublisher>,
-    subscribers: Vec<Arc<Subscriber>>,
-    /// Listening actions of this node.
-    actions: Vec<PeerId>,
-    /// Pending queries for the type that subscribers request, with their ascending numbers.
-    askers: Vec<(i32, mpsc::UnboundedSender<WireType>)>,
-}
-
-struct LocalPublisher {
-    end: EndpointOwner,
-    qos: QosProfile,
-    last: Option<Bytes>,
-}
-
-/// One connected subscriber.
-pub(super) struct Subscriber {
-    pub(super) id: i32,
-    pub(super) peer: PeerId,
-    pub(super) send_queue: SendQueue,
-    pub(super) messages: AtomicU64,
-    pub(super) bytes: AtomicU64,
-    pub(super) closing: watch::Sender<bool>,
-}
 
 /// Advertises, and registers the topic if this is its first local publisher.
 pub(in crate::ros1) async fn advertise(

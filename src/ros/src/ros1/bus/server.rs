@@ -8,8 +8,9 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::publications::{Subscriber, TopicOut};
-use super::{FAREWELL, HANDSHAKE, Ros1BusState, services};
+use super::services;
+use super::state::{FAREWELL, HANDSHAKE, Ros1BusState, wire_type_from_header};
+use super::topic_out::{Subscriber, TopicOut};
 use crate::bus::WireType;
 use crate::net;
 use crate::ros1::tcpros::{Error, Header};
@@ -90,7 +91,7 @@ async fn serve_subscriber(
     header: &Header,
     mut stream: TcpStream,
 ) -> Result<(), Error> {
-    let asked = &super::wire_type_from_header(header);
+    let asked = &wire_type_from_header(header);
     let caller = header.get("callerid").unwrap_or("unknown");
     let mut waiting = PendingSubscriber {
         bus,

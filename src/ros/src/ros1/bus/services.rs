@@ -9,9 +9,9 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use super::Ros1BusState;
 use super::registrar::Kind;
 use super::server::refuse;
+use super::state::{Ros1BusState, ServiceEntry};
 use crate::bus::{BusError, Digest, ServiceHandler, ServiceType};
 use crate::ros1::tcpros::{Error, Header, serve_calls};
 
@@ -20,14 +20,6 @@ const TAKE: Duration = Duration::from_secs(10);
 
 /// Field of a server's header that contains its label.
 pub(super) const LABEL: &str = "cloudroid";
-
-/// One service.
-pub(super) struct ServiceEntry {
-    pub(super) service_type: ServiceType,
-    pub(super) handler: Arc<dyn ServiceHandler>,
-    /// True, or without a sender, once the service has ended.
-    pub(super) ended: watch::Receiver<bool>,
-}
 
 impl ServiceEntry {
     pub(super) fn has_ended(&self) -> bool {

@@ -1,6 +1,5 @@
 //! Topics that this node subscribes to: several local subscriptions share one set of connections.
 
-use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -8,44 +7,16 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::link::{self, PublisherLink};
+use super::endpoint_owner::EndpointOwner;
+use super::link;
 use super::registrar::Kind;
-use super::{EndpointOwner, Ros1BusState};
+use super::state::Ros1BusState;
+use super::topic_in::{LocalSubscriber, LocalSubscribers, PublisherLink, PublisherLinks, TopicIn};
 use crate::bus::{
-    BusError, MatchedPeers, MessageSender, PeerId, QosProfile, SerializedMessage, Subscription,
-    TopicPeer, WireType, message_queue,
+    BusError, MatchedPeers, PeerId, QosProfile, SerializedMessage, Subscription, TopicPeer,
+    WireType, message_queue,
 };
 use crate::ros1::tcpros;
-
-/// One topic with all its local subscriptions and publishers.
-pub(super) struct TopicIn {
-    pub(super) name: String,
-    locals: Mutex<LocalSubscribers>,
-    links: Mutex<PublisherLinks>,
-    /// Publishers that have not left.
-    matched: watch::Sender<MatchedPeers>,
-}
-
-/// One connection per publisher, by its address.
-#[derive(Default)]
-struct PublisherLinks {
-    by_uri: BTreeMap<String, Arc<PublisherLink>>,
-    ended: bool,
-}
-
-#[derive(Default)]
-struct LocalSubscribers {
-    list: Vec<LocalSubscriber>,
-    /// Last message of each latching publisher, by its address, for later local subscriptions.
-    latched: HashMap<String, SerializedMessage>,
-}
-
-struct LocalSubscriber {
-    id: i32,
-    end: EndpointOwner,
-    sender: MessageSender,
-    wanted: WireType,
-}
 
 impl LocalSubscriber {
     fn send(&self, message: SerializedMessage) {

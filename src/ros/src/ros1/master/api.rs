@@ -310,7 +310,7 @@ impl Api {
             self.master.sockets(),
             &self.master.limits.budget,
         );
-        lent.map_err(|reason| ApiReply::error(reason, 0))?;
+        lent.map_err(|error| ApiReply::error(error.to_string(), 0))?;
         Ok(ApiReply::success(format!("[{node}] lends services"), 1))
     }
 

@@ -16,7 +16,7 @@ use tokio::sync::Semaphore;
 
 use crate::net::Sockets;
 use crate::ros1::reply::ApiReply;
-use crate::ros1::xmlrpc::{Value, XmlRpcClient};
+use crate::ros1::xmlrpc::{self, Value, XmlRpcClient};
 
 /// `cloudroid.lendServices(caller_id, caller_api)`: registers the node as lender.
 pub(crate) const LEND_SERVICES: &str = "cloudroid.lendServices";
@@ -60,8 +60,8 @@ impl LenderSlot {
         api: &str,
         sockets: Arc<dyn Sockets>,
         budget: &Budget,
-    ) -> Result<(), String> {
-        let client = XmlRpcClient::new(sockets, api).map_err(|error| error.to_string())?;
+    ) -> Result<(), xmlrpc::Error> {
+        let client = XmlRpcClient::new(sockets, api)?;
         *self.lender.lock() = Some(RegisteredLender {
             node: node.to_owned(),
             client: Arc::new(client.with_budget(budget)),

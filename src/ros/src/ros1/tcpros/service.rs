@@ -12,7 +12,7 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 
 use super::{Error, FrameBounds, FrameReader, Header, write_messages};
-use crate::bus::ServiceHandler;
+use crate::bus::{FailureReason, ServiceHandler};
 use crate::net::{self, Sockets};
 
 /// A connection to a service's server, ready for calls.
@@ -71,7 +71,10 @@ impl ServiceConnection {
 
     /// Makes one call; returns the answer, or the server's reason for failing. After an error, or when the call is
     /// dropped half-way, the connection must be dropped too.
-    pub async fn call(&mut self, request: Bytes) -> Result<Result<Bytes, String>, CallError> {
+    pub async fn call(
+        &mut self,
+        request: Bytes,
+    ) -> Result<Result<Bytes, FailureReason>, CallError> {
         if let Err(error) = write_messages(&mut self.stream, &[request]).await {
             return Err(if was_reset(&error) {
                 CallError::NotTaken
@@ -91,7 +94,7 @@ impl ServiceConnection {
             None => return Err(Error::from(io::Error::from(io::ErrorKind::UnexpectedEof)).into()),
         };
         Ok(match done {
-            0 => Err(String::from_utf8_lossy(&payload).into_owned()),
+            0 => Err(FailureReason::new(String::from_utf8_lossy(&payload))),
             _ => Ok(payload),
         })
     }
@@ -133,7 +136,7 @@ pub async fn serve_calls(
         };
         let (done, payload) = match handler.call(request, caller).await {
             Ok(response) => (1, response),
-            Err(reason) => (0, Bytes::from(reason)),
+            Err(reason) => (0, Bytes::from(reason.into_string())),
         };
         // The flag is sent with the rest: a segment of its own would cost the peer a wake-up.
         let mut small = Vec::with_capacity(5 + payload.len().min(super::BIG));

@@ -315,7 +315,7 @@ impl<'a> Parser<'a> {
             }
             _ => {
                 let text = self.text_until_end(name)?;
-                scalar(name, text.trim()).map_err(|reason| self.error(reason))
+                self.scalar(name, text.trim())
             }
         }
     }
@@ -365,34 +365,34 @@ impl<'a> Parser<'a> {
             }
         }
     }
-}
 
-fn scalar(name: &str, text: &str) -> Result<Value, String> {
-    match name {
-        "int" | "i4" | "i1" | "i2" | "i8" => text
-            .parse()
-            .map(Value::Int)
-            .map_err(|_| format!("{} is not a 32-bit integer", quote(text))),
-        "boolean" => match text {
-            "1" | "true" => Ok(Value::Bool(true)),
-            "0" | "false" => Ok(Value::Bool(false)),
-            _ => Err(format!("{} is neither 0 nor 1", quote(text))),
-        },
-        "double" | "float" => text
-            .parse()
-            .map(Value::Double)
-            .map_err(|_| format!("{} is not a number", quote(text))),
-        "base64" => {
-            let dense: Vec<u8> = text
-                .bytes()
-                .filter(|byte| !byte.is_ascii_whitespace())
-                .collect();
-            base64_simd::STANDARD
-                .decode_to_vec(dense)
-                .map(Value::Base64)
-                .map_err(|_| format!("{} is not base64", quote(text)))
+    fn scalar(&self, name: &str, text: &str) -> Result<Value, Error> {
+        match name {
+            "int" | "i4" | "i1" | "i2" | "i8" => text
+                .parse()
+                .map(Value::Int)
+                .map_err(|_| self.error(format!("{} is not a 32-bit integer", quote(text)))),
+            "boolean" => match text {
+                "1" | "true" => Ok(Value::Bool(true)),
+                "0" | "false" => Ok(Value::Bool(false)),
+                _ => Err(self.error(format!("{} is neither 0 nor 1", quote(text)))),
+            },
+            "double" | "float" => text
+                .parse()
+                .map(Value::Double)
+                .map_err(|_| self.error(format!("{} is not a number", quote(text)))),
+            "base64" => {
+                let dense: Vec<u8> = text
+                    .bytes()
+                    .filter(|byte| !byte.is_ascii_whitespace())
+                    .collect();
+                base64_simd::STANDARD
+                    .decode_to_vec(dense)
+                    .map(Value::Base64)
+                    .map_err(|_| self.error(format!("{} is not base64", quote(text))))
+            }
+            _ => Err(self.error(format!("values of type {} are not known", quote(name)))),
         }
-        _ => Err(format!("values of type {} are not known", quote(name))),
     }
 }
 

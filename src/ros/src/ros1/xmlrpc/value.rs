@@ -177,21 +177,39 @@ impl From<Value> for ParamValue {
     }
 }
 
-/// Fails on `Nil` and on integers wider than XML-RPC's 32 bits; the error says where.
-impl TryFrom<ParamValue> for Value {
-    type Error = String;
+/// The reason why ROS 1 cannot send a value.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum UnsendableValue {
+    /// An integer has more than XML-RPC's 32 bits.
+    #[error("{0} does not fit XML-RPC's 32-bit integer")]
+    WideInteger(i64),
+    /// ROS 1 has no null.
+    #[error("ROS has no null value")]
+    Nil,
+    /// A member of a dictionary cannot be sent.
+    #[error("{name}: {reason}")]
+    InMember {
+        /// Name of the member.
+        name: String,
+        /// The reason.
+        reason: Box<UnsendableValue>,
+    },
+}
 
-    fn try_from(value: ParamValue) -> Result<Self, String> {
+/// Fails on `Nil` and on integers wider than XML-RPC's 32 bits.
+impl TryFrom<ParamValue> for Value {
+    type Error = UnsendableValue;
+
+    fn try_from(value: ParamValue) -> Result<Self, UnsendableValue> {
         Ok(match value {
             ParamValue::Bool(truth) => Value::Bool(truth),
-            ParamValue::Int(number) => Value::Int(
-                i32::try_from(number)
-                    .map_err(|_| format!("{number} does not fit XML-RPC's 32-bit integer"))?,
-            ),
+            ParamValue::Int(number) => {
+                Value::Int(i32::try_from(number).map_err(|_| UnsendableValue::WideInteger(number))?)
+            }
             ParamValue::Double(number) => Value::Double(number),
             ParamValue::String(text) => Value::String(text),
             ParamValue::Binary(bytes) => Value::Base64(bytes),
-            ParamValue::Nil => return Err("ROS has no null value".to_owned()),
+            ParamValue::Nil => return Err(UnsendableValue::Nil),
             ParamValue::List(elements) => Value::Array(
                 elements
                     .into_iter()
@@ -201,12 +219,14 @@ impl TryFrom<ParamValue> for Value {
             ParamValue::Map(members) => Value::Struct(
                 members
                     .into_iter()
-                    .map(|(name, value)| {
-                        let value =
-                            Value::try_from(value).map_err(|reason| format!("{name}: {reason}"))?;
-                        Ok((name, value))
+                    .map(|(name, value)| match Value::try_from(value) {
+                        Ok(value) => Ok((name, value)),
+                        Err(reason) => {
+                            let reason = Box::new(reason);
+                            Err(UnsendableValue::InMember { name, reason })
+                        }
                     })
-                    .collect::<Result<_, String>>()?,
+                    .collect::<Result<_, _>>()?,
             ),
         })
     }

@@ -15,13 +15,13 @@ use tokio::time::{sleep, timeout};
 use super::messages::{self, ActionGoalStatus, GoalInfo};
 use super::{ActionInterfaces, GoalId, QUEUE};
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, GoalOutcome, MessageReceiver,
+    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, MessageReceiver,
     MessageSender, PeerId, SerializedMessage, ServiceType, WireType, message_queue,
 };
 use crate::codec::{Time, default_message};
-use crate::ros2::bus::Ros2BusState;
 use crate::ros2::client::ServiceClient;
 use crate::ros2::raw::{self, RawListener, RawReader};
+use crate::ros2::state::Ros2BusState;
 use crate::ros2::{calls, names};
 use crate::schema::ActionDef;
 
@@ -33,7 +33,6 @@ const GRACE: Duration = Duration::from_secs(3);
 const CANCEL_WAITS: Duration = Duration::from_secs(10);
 /// No time limit: the call ends with the server.
 const FOREVER: Duration = Duration::MAX;
-const CLOSED: &str = "the connection to this ROS system was closed";
 
 /// A client of one action.
 pub(in crate::ros2) struct Ros2ActionClient {
@@ -54,7 +53,7 @@ struct ActionClientState {
     ended: mpsc::UnboundedSender<FinishedGoal>,
 }
 
-type FinishedGoal = (GoalId, Result<GoalEnd, String>);
+type FinishedGoal = (GoalId, Result<GoalEnd, GoalError>);
 
 #[derive(Default)]
 struct ActiveGoals {
@@ -169,8 +168,8 @@ impl ActionClient for Ros2ActionClient {
         let shared = &self.shared;
         let uuid = GoalId::parse(id).unwrap_or_else(GoalId::random);
         let Some(request) = messages::write_with_id(uuid, &shared.of.goal, &goal) else {
-            let reason = format!("the goal is not a serialized {}", shared.of.goal.name());
-            return events.on_ended(Err(reason));
+            let goal_type = shared.of.goal.name().to_owned();
+            return events.on_ended(Err(GoalError::NotAGoal(goal_type)));
         };
         let (wish, wished) = watch::channel(GoalIntent::GoOn);
         let known = ActiveGoal {
@@ -182,7 +181,7 @@ impl ActionClient for Ros2ActionClient {
             let mut goals = shared.goals.lock();
             if goals.named.contains_key(id) || goals.under_way.contains_key(&uuid) {
                 drop(goals);
-                return events.on_ended(Err(format!("a goal with id {id} is under way already")));
+                return events.on_ended(Err(GoalError::AlreadyUnderWay(id.to_owned())));
             }
             goals.named.insert(id.to_owned(), uuid);
             goals.under_way.insert(uuid, known);
@@ -194,7 +193,7 @@ impl ActionClient for Ros2ActionClient {
             let _ = carrying.ended.send((uuid, end));
         });
         if shared.bus.check_open().is_err() {
-            shared.finish_goal(uuid, Err(CLOSED.to_owned()));
+            shared.finish_goal(uuid, Err(BusError::Closed.into()));
         }
     }
 
@@ -250,42 +249,37 @@ impl ActionClientState {
         id: GoalId,
         request: Bytes,
         mut wished: watch::Receiver<GoalIntent>,
-    ) -> Result<GoalEnd, String> {
+    ) -> Result<GoalEnd, GoalError> {
         let taken = tokio::select! {
             taken = self.call_part(&self.send_goal, request) => taken?,
             // The goal may be accepted all the same, and is to be cancelled then.
-            () = wait_abandoned(CANCEL_WAITS, wished.clone()) => return Err(CLOSED.to_owned()),
+            () = wait_abandoned(CANCEL_WAITS, wished.clone()) => return Err(BusError::Closed.into()),
         };
         match messages::read_accepted(&taken) {
             Some(true) => self.report_accepted(id),
             Some(false) => return Ok(self.rejected_end()),
-            None => {
-                return Err(format!(
-                    "action {} sent an answer that cannot be read",
-                    self.name
-                ));
-            }
+            None => return Err(GoalError::UnreadableAnswer(self.name.clone())),
         }
         tokio::select! {
             result = self.call_part(&self.get_result, messages::write_id(id)) => self.parse_result(&result?),
-            () = self.forward_cancels(id, &mut wished) => Err(CLOSED.to_owned()),
+            () = self.forward_cancels(id, &mut wished) => Err(BusError::Closed.into()),
         }
     }
 
-    async fn call_part(&self, part: &ServiceClient, request: Bytes) -> Result<Bytes, String> {
+    async fn call_part(&self, part: &ServiceClient, request: Bytes) -> Result<Bytes, GoalError> {
         // The call itself would wait for a later server, which must not be given an old goal.
         let mut servers = part.servers();
         let there = servers.wait_for(|servers| servers.count() > 0);
         if timeout(GRACE, there).await.is_err() {
-            return Err(format!("action {} has no server", self.name));
+            return Err(GoalError::NoServer(self.name.clone()));
         }
         let answer = part.call(request, FOREVER).await;
         answer.map_err(|error| match error {
             BusError::CallFailed {
                 fate: CallFate::Unknown,
                 ..
-            } => format!("action server {} is gone", self.name),
-            other => other.to_string(),
+            } => GoalError::ServerGone(self.name.clone()),
+            other => other.into(),
         })
     }
 
@@ -334,17 +328,15 @@ impl ActionClientState {
         }
     }
 
-    fn parse_result(&self, answer: &[u8]) -> Result<GoalEnd, String> {
+    fn parse_result(&self, answer: &[u8]) -> Result<GoalEnd, GoalError> {
         let Some((status, result)) = messages::read_result(&self.of.result, answer) else {
-            return Err(format!("the result of action {} cannot be read", self.name));
+            return Err(GoalError::UnreadableResult(self.name.clone()));
         };
         let outcome = match status {
             Some(ActionGoalStatus::Succeeded) => GoalOutcome::Succeeded,
             Some(ActionGoalStatus::Canceled) => GoalOutcome::Canceled,
             Some(ActionGoalStatus::Aborted) => GoalOutcome::Aborted,
-            Some(ActionGoalStatus::Unknown) => {
-                return Err("the action server no longer knows the goal".to_owned());
-            }
+            Some(ActionGoalStatus::Unknown) => return Err(GoalError::Forgotten),
             _ => GoalOutcome::Unknown,
         };
         Ok(GoalEnd {
@@ -376,7 +368,7 @@ impl ActionClientState {
         }
     }
 
-    fn finish_goal(&self, id: GoalId, end: Result<GoalEnd, String>) {
+    fn finish_goal(&self, id: GoalId, end: Result<GoalEnd, GoalError>) {
         let goal = self.goals.lock().remove(id);
         if let Some(goal) = goal {
             goal.events.on_ended(end);
@@ -421,7 +413,7 @@ impl Drop for EndGoalsOnDrop {
     fn drop(&mut self) {
         let goals = std::mem::take(&mut *self.0.goals.lock());
         for goal in goals.under_way.into_values() {
-            goal.events.on_ended(Err(CLOSED.to_owned()));
+            goal.events.on_ended(Err(BusError::Closed.into()));
         }
     }
 }

@@ -17,6 +17,7 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::time::sleep_until;
 
+pub use self::goals::GoalRefusal;
 use self::goals::GoalTable;
 use super::GoalId;
 use super::messages::{self, ActionGoalStatus, CancelCode, GoalInfo};
@@ -114,13 +115,10 @@ impl<T: GoalServerTopics> GoalServer<T> {
 
     /// Receives a goal; returns it with the serialized goal message. An error is the reason for rejecting it;
     /// [`rejected_response`] is then the answer to its sender.
-    pub fn begin(&self, request: &[u8]) -> Result<(PendingGoal, Bytes), String> {
+    pub fn begin(&self, request: &[u8]) -> Result<(PendingGoal, Bytes), GoalRefusal> {
         let id = messages::read_id(request).filter(|id| *id != GoalId::NONE);
         let Some((id, goal)) = id.zip(messages::read_after_id(&self.of.goal, request)) else {
-            return Err(format!(
-                "it is not a serialized {}",
-                self.of.action_goal.name()
-            ));
+            return Err(GoalRefusal::NotAGoal(self.of.action_goal.name().to_owned()));
         };
         let accepted = Time::now();
         self.goals.lock().begin(id, accepted)?;

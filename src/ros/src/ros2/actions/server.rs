@@ -11,16 +11,15 @@ use bytes::Bytes;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-pub(in crate::ros2) use self::retired::RetiredServices;
-use self::retired::{BoxedGuard, RetiredGuard, release_retired};
+use self::retired::{RetiredGuard, release_retired};
 use super::ActionInterfaces;
 use super::goal_server::{self, GoalServer, GoalServerTopics};
 use crate::bus::{
-    ActionHandler, ActionServer, BusError, GoalEnd, QosProfile, ServiceHandler, ServiceType,
-    WireType,
+    ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, QosProfile, ServiceHandler,
+    ServiceType, WireType,
 };
-use crate::ros2::bus::Ros2BusState;
 use crate::ros2::raw::{self, RawWriter};
+use crate::ros2::state::{BoxedGuard, Ros2BusState};
 use crate::ros2::{names, quality, services};
 use crate::schema::ActionDef;
 
@@ -135,7 +134,7 @@ struct SendGoal(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for SendGoal {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         let ActionServerState {
             goals,
             handler,
@@ -148,13 +147,13 @@ impl ServiceHandler for SendGoal {
         let (begun, goal) = match goals.begin(&request) {
             Ok(begun) => begun,
             Err(reason) => {
-                refused(reason);
+                refused(reason.to_string());
                 return Ok(goal_server::rejected_response());
             }
         };
         let taken = handler.on_goal(&begun.id(), goal);
         let answer = goals.answer(&begun, taken.is_ok());
-        taken.unwrap_or_else(refused);
+        taken.unwrap_or_else(|reason| refused(reason.into_string()));
         Ok(answer)
     }
 }
@@ -164,7 +163,7 @@ struct GetResult(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for GetResult {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(self.0.goals.result(&request).await)
     }
 }
@@ -173,7 +172,7 @@ struct CancelGoal(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for CancelGoal {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let ActionServerState { goals, handler, .. } = &*self.0;
         let Some(wanted) = goals.parse_cancel(&request) else {
             return Ok(goal_server::cancel_rejected_response());

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use tokio::sync::mpsc;
 
-use crate::bus::{ActionHandler, GoalEnd, GoalEvents, RosVersion};
+use crate::bus::{ActionHandler, FailureReason, GoalEnd, GoalError, GoalEvents, RosVersion};
 use crate::codec::from_json;
 use crate::schema::{ActionDef, MessageType, Registry};
 
@@ -48,9 +48,10 @@ impl Handler {
 }
 
 impl ActionHandler for Handler {
-    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), FailureReason> {
         let _ = self.heard.send(Heard::Goal(id.to_owned(), goal));
-        self.takes.then_some(()).ok_or_else(|| "no".to_owned())
+        let taken = self.takes.then_some(());
+        taken.ok_or_else(|| FailureReason::new("no"))
     }
 
     fn on_cancel(&self, id: &str) {
@@ -83,7 +84,8 @@ impl GoalEvents for Events {
         let _ = self.0.send(Told::Feedback(feedback));
     }
 
-    fn on_ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
+        let end = end.map_err(|error| error.to_string());
         let _ = self.0.send(Told::Ended(end));
     }
 }

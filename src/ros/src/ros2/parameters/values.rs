@@ -51,8 +51,19 @@ pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
     )
 }
 
+/// The reason why no ROS 2 parameter can have a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum CoerceError {
+    #[error("a ROS 2 parameter cannot be a dictionary: set each of its values")]
+    Dictionary,
+    #[error("an empty list does not say what it is a list of")]
+    EmptyList,
+    #[error("a list holds values of one type: all booleans, numbers or strings")]
+    MixedList,
+}
+
 /// Converts the value to the parameter's type where that is lossless; otherwise leaves it for the node to judge.
-pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, String> {
+pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, CoerceError> {
     let natural = match (value, kind) {
         (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => {
             TypedValue::Double(value as f64)
@@ -75,15 +86,13 @@ pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValu
         (ParamValue::String(text), _) => TypedValue::String(text),
         (ParamValue::Binary(bytes), _) => TypedValue::Bytes(bytes),
         (ParamValue::Map(_), _) => {
-            return Err(
-                "a ROS 2 parameter cannot be a dictionary: set each of its values".to_owned(),
-            );
+            return Err(CoerceError::Dictionary);
         }
     };
     Ok(natural)
 }
 
-fn coerce_list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<TypedValue, String> {
+fn coerce_list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<TypedValue, CoerceError> {
     let by_kind = match kind {
         ParameterKind::Bytes => all(&items, byte).map(TypedValue::Bytes),
         ParameterKind::Bools => all(&items, bool).map(TypedValue::Bools),
@@ -96,7 +105,7 @@ fn coerce_list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<TypedValue
         return Ok(typed);
     }
     if items.is_empty() {
-        return Err("an empty list does not say what it is a list of".to_owned());
+        return Err(CoerceError::EmptyList);
     }
     let whole = |item: &ParamValue| match item {
         ParamValue::Int(value) => Some(*value),
@@ -107,9 +116,7 @@ fn coerce_list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<TypedValue
         .or_else(|| all(&items, whole).map(TypedValue::Integers))
         .or_else(|| all(&items, double).map(TypedValue::Doubles))
         .or_else(|| all(&items, text).map(TypedValue::Strings))
-        .ok_or_else(|| {
-            "a list holds values of one type: all booleans, numbers or strings".to_owned()
-        })
+        .ok_or(CoerceError::MixedList)
 }
 
 fn all<T>(items: &[ParamValue], one: impl Fn(&ParamValue) -> Option<T>) -> Option<Vec<T>> {

@@ -9,12 +9,13 @@ use futures_util::future::select_all;
 use rtps::{EndpointData, EndpointMatches, EndpointQos, Guid, TopicDescription};
 use tokio::sync::watch;
 
-use super::{KnownWriter, ReaderSink, TopicIn};
+use super::ReaderSink;
 use crate::bus::{BusError, IncompatiblePeer, MatchedPeers, PeerId, TopicPeer};
-use crate::ros2::bus::Ros2BusState;
 use crate::ros2::ends::ReaderEnd;
 use crate::ros2::quality::{self, Quality};
 use crate::ros2::seen::{self, DiscoverySnapshot};
+use crate::ros2::state::Ros2BusState;
+use crate::ros2::topic_in::{KnownWriter, TopicIn};
 use crate::ros2::{names, show, type_hash};
 
 /// Maximum number of types of one topic that a subscription to any type receives.

@@ -11,7 +11,7 @@ use rtps::{
 
 use super::*;
 use crate::JoinOptions;
-use crate::bus::{Digest, QosProfile, ServiceHandler, ServiceType};
+use crate::bus::{Digest, FailureReason, QosProfile, ServiceHandler, ServiceType};
 use crate::net::HostSockets;
 use crate::ros2::place::BusSockets;
 use crate::ros2::{Ros2Bus, entities};
@@ -234,7 +234,7 @@ struct Echo;
 
 #[async_trait::async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         Ok(request)
     }
 }

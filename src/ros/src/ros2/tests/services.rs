@@ -6,7 +6,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio::task::JoinSet;
 
 use super::*;
-use crate::bus::{BusError, CallFate, Digest, ServiceHandler, ServiceType};
+use crate::bus::{BusError, CallFate, Digest, FailureReason, ServiceHandler, ServiceType};
 use crate::ros2::Ros2Bus;
 use crate::schema::{Registry, ServiceDef};
 
@@ -32,7 +32,7 @@ struct Echo {
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         self.calls.fetch_add(1, Ordering::Relaxed);
         assert!(matches!(caller, "/client" | "/server"), "{caller}");
         Ok(request)
@@ -47,7 +47,7 @@ struct Slow {
 
 #[async_trait]
 impl ServiceHandler for Slow {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let _ = self.asked.send(());
         self.answer.notified().await;
         Ok(request)
@@ -58,8 +58,8 @@ struct Refuses;
 
 #[async_trait]
 impl ServiceHandler for Refuses {
-    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        Err("not today".to_owned())
+    async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
+        Err(FailureReason::new("not today"))
     }
 }
 

@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use crate::schema::description::PLACEHOLDER;
 use crate::schema::interface_files::{FieldLine, InterfaceFile, assemble, quote};
-use crate::schema::{MAX_TEXT_BYTES, SchemaError};
+use crate::schema::{ExceededLimit, MAX_TEXT_BYTES, SchemaError, SyntaxError};
 
 #[derive(Deserialize)]
 struct File {
@@ -52,29 +52,32 @@ struct Hash {
 }
 
 pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> {
-    let fail = |line, reason| SchemaError::Syntax {
+    let fail = |line, reason: SyntaxError| SchemaError::Syntax {
         name: key.to_owned(),
         line,
-        reason,
+        reason: Box::new(reason),
     };
     if json.len() > MAX_TEXT_BYTES {
         return Err(SchemaError::TooLarge {
             name: key.to_owned(),
-            reason: format!("more than {MAX_TEXT_BYTES} bytes of description"),
+            reason: ExceededLimit::DescriptionBytes,
         });
     }
     let file: File = serde_json::from_str(json).map_err(|error| {
-        fail(
-            error.line(),
-            format!("not a description of a type: {error}"),
-        )
+        let reason = SyntaxError::NotADescription(error.to_string());
+        fail(error.line(), reason)
     })?;
     let description = file.type_description_msg;
     let mut texts = BTreeMap::new();
     let types = description.referenced_type_descriptions.into_iter();
     for described in types.chain([description.type_description]) {
-        let text = definition_text(&described)
-            .map_err(|reason| fail(1, format!("{}: {reason}", described.type_name)))?;
+        let text = definition_text(&described).map_err(|reason| {
+            let in_type = SyntaxError::InType {
+                type_name: described.type_name.clone(),
+                reason: Box::new(reason),
+            };
+            fail(1, in_type)
+        })?;
         texts.insert(described.type_name, text);
     }
     let own = assemble(key, &texts)?;
@@ -90,7 +93,7 @@ pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> 
     })
 }
 
-fn definition_text(described: &Type) -> Result<String, String> {
+fn definition_text(described: &Type) -> Result<String, SyntaxError> {
     let mut text = String::new();
     for field in &described.fields {
         if field.name != PLACEHOLDER {
@@ -101,7 +104,7 @@ fn definition_text(described: &Type) -> Result<String, String> {
 }
 
 /// Converts a field; numbers are those of `type_description_interfaces/msg/FieldType`.
-fn field_line(field: &Field) -> Result<FieldLine, String> {
+fn field_line(field: &Field) -> Result<FieldLine, SyntaxError> {
     let FieldType {
         type_id,
         capacity,
@@ -129,10 +132,10 @@ fn field_line(field: &Field) -> Result<FieldLine, String> {
         21 => format!("string<={string_capacity}"),
         22 => format!("wstring<={string_capacity}"),
         _ => {
-            let name = &field.name;
-            return Err(format!(
-                "field {name} is of type {type_id}, which messages do not have"
-            ));
+            return Err(SyntaxError::BadTypeId {
+                field: field.name.clone(),
+                type_id,
+            });
         }
     };
     let brackets = match form {

@@ -1,5 +1,6 @@
 //! OMG IDL 4.2, the subset that rosidl reads: modules, structures, constants, `typedef` for arrays, annotations.
 
+mod error;
 mod tokens;
 
 use std::collections::BTreeMap;
@@ -7,17 +8,16 @@ use std::collections::BTreeMap;
 use crate::schema::interface_files::description::tuple_to_list;
 use crate::schema::interface_files::idl::tokens::{IdlToken, Tokens};
 use crate::schema::interface_files::{FieldLine, InterfaceFile, assemble, quote};
-use crate::schema::limits::MAX_NAME_BYTES;
-use crate::schema::{MAX_TEXT_BYTES, SchemaError};
+use crate::schema::limits::{MAX_NAME_BYTES, MOST_MODULES};
+use crate::schema::{ExceededLimit, MAX_TEXT_BYTES, SchemaError, SyntaxError};
 
-/// Maximum nesting of modules: package, kind, and the module of a structure's constants.
-const MOST_MODULES: usize = 3;
+pub use self::error::IdlError;
 
 pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
     if idl.len() > MAX_TEXT_BYTES {
         return Err(SchemaError::TooLarge {
             name: key.to_owned(),
-            reason: format!("more than {MAX_TEXT_BYTES} bytes of IDL"),
+            reason: ExceededLimit::IdlBytes,
         });
     }
     let mut reader = IdlReader {
@@ -31,7 +31,7 @@ pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
     reader.items().map_err(|reason| SchemaError::Syntax {
         name: key.to_owned(),
         line: reader.tokens.line(),
-        reason,
+        reason: Box::new(reason),
     })?;
     // Constants of a structure are in a module of their own, because IDL structures cannot contain any.
     let mut texts = reader.structures;
@@ -69,11 +69,11 @@ struct IdlReader<'a> {
 
 impl IdlReader<'_> {
     /// Parses items up to the end of the text, or to the brace that closes a module.
-    fn items(&mut self) -> Result<(), String> {
+    fn items(&mut self) -> Result<(), SyntaxError> {
         loop {
             match self.tokens.next()? {
                 None if self.scope.is_empty() => return Ok(()),
-                None => return Err("the text ends inside a module".to_owned()),
+                None => return Err(IdlError::UnclosedModule.into()),
                 Some(IdlToken::Mark('}')) if !self.scope.is_empty() => return Ok(()),
                 Some(IdlToken::Mark(';')) => {}
                 Some(IdlToken::Mark('@')) => drop(self.annotation()?),
@@ -85,18 +85,16 @@ impl IdlReader<'_> {
                     self.aliases.insert(alias.name.clone(), alias);
                 }
                 Some(other) => {
-                    return Err(format!(
-                        "{other} does not begin a definition that messages can have"
-                    ));
+                    return Err(IdlError::NotADefinition(other.to_string()).into());
                 }
             }
         }
     }
 
-    fn module(&mut self) -> Result<(), String> {
+    fn module(&mut self) -> Result<(), SyntaxError> {
         let name = self.name()?.to_owned();
         if self.scope.len() >= MOST_MODULES {
-            return Err(format!("modules nest deeper than {MOST_MODULES}"));
+            return Err(IdlError::DeepModules.into());
         }
         self.tokens.expect('{')?;
         self.scope.push(name);
@@ -105,7 +103,7 @@ impl IdlReader<'_> {
         Ok(())
     }
 
-    fn structure(&mut self) -> Result<(), String> {
+    fn structure(&mut self) -> Result<(), SyntaxError> {
         let name = self.full_name()?;
         self.tokens.expect('{')?;
         let (mut text, mut value) = (String::new(), None);
@@ -126,7 +124,7 @@ impl IdlReader<'_> {
         Ok(())
     }
 
-    fn constant(&mut self) -> Result<(), String> {
+    fn constant(&mut self) -> Result<(), SyntaxError> {
         let mut constant = self.declarator()?;
         self.tokens.expect('=')?;
         let value = self.literal()?;
@@ -142,37 +140,37 @@ impl IdlReader<'_> {
         Ok(())
     }
 
-    fn append(&mut self, line: &FieldLine, text: &mut String) -> Result<(), String> {
+    fn append(&mut self, line: &FieldLine, text: &mut String) -> Result<(), SyntaxError> {
         let before = text.len();
         line.append_to(text)?;
         self.written += text.len() - before;
         if self.written > MAX_TEXT_BYTES {
-            return Err(format!("it defines more than {MAX_TEXT_BYTES} bytes"));
+            return Err(IdlError::TooMuchText.into());
         }
         Ok(())
     }
 
-    fn name(&mut self) -> Result<&str, String> {
+    fn name(&mut self) -> Result<&str, SyntaxError> {
         let name = self.tokens.word()?;
         match name.len() {
             0..=MAX_NAME_BYTES => Ok(name),
-            _ => Err(format!("a name is longer than {MAX_NAME_BYTES} bytes")),
+            _ => Err(SyntaxError::LongName),
         }
     }
 
     /// Parses `TYPE NAME;` or `TYPE NAME[N];`
-    fn declaration(&mut self) -> Result<FieldLine, String> {
+    fn declaration(&mut self) -> Result<FieldLine, SyntaxError> {
         let line = self.declarator()?;
         self.tokens.expect(';')?;
         Ok(line)
     }
 
-    fn declarator(&mut self) -> Result<FieldLine, String> {
+    fn declarator(&mut self) -> Result<FieldLine, SyntaxError> {
         let mut line = self.parse_type(0)?;
         line.name = self.name()?.to_owned();
         if self.tokens.skip('[')? {
             if !line.brackets.is_empty() {
-                return Err(format!("{} is an array of arrays", line.name));
+                return Err(IdlError::ArrayOfArrays(line.name).into());
             }
             line.brackets = format!("[{}]", self.name()?);
             self.tokens.expect(']')?;
@@ -180,14 +178,14 @@ impl IdlReader<'_> {
         Ok(line)
     }
 
-    fn full_name(&mut self) -> Result<String, String> {
+    fn full_name(&mut self) -> Result<String, SyntaxError> {
         let name = self.name()?.to_owned();
         let outer = self.scope.iter().map(|module| format!("{module}/"));
         Ok(outer.chain([name]).collect())
     }
 
     /// Parses a type: its name in the `.msg` language, and its brackets.
-    fn parse_type(&mut self, depth: usize) -> Result<FieldLine, String> {
+    fn parse_type(&mut self, depth: usize) -> Result<FieldLine, SyntaxError> {
         let first = self.name()?.to_owned();
         let one = match &*first {
             "sequence" => return self.sequence(depth),
@@ -206,20 +204,20 @@ impl IdlReader<'_> {
             "double" => "float64".to_owned(),
             "short" => "int16".to_owned(),
             "long" if self.tokens.skip_word("double")? => {
-                return Err("messages have no long double".to_owned());
+                return Err(IdlError::NotInMessages("long double".to_owned()).into());
             }
             "long" => self.long("int")?,
             "unsigned" => match self.tokens.word()? {
                 "short" => "uint16".to_owned(),
                 "long" => self.long("uint")?,
-                other => return Err(format!("unsigned {other} is not a type")),
+                other => return Err(IdlError::NotUnsigned(other.to_owned()).into()),
             },
             "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64" | "uint64" => {
                 first
             }
             // `char` in `.msg` is uint8, which has another hash.
             "char" | "wchar" | "fixed" | "any" | "enum" | "union" | "map" => {
-                return Err(format!("messages have no {first}"));
+                return Err(IdlError::NotInMessages(first).into());
             }
             name => {
                 let mut path = vec![name.to_owned()];
@@ -227,7 +225,7 @@ impl IdlReader<'_> {
                     self.tokens.expect(':')?;
                     path.push(self.name()?.to_owned());
                     if path.len() > MOST_MODULES {
-                        return Err(format!("{name} is in more than {MOST_MODULES} modules"));
+                        return Err(IdlError::DeepType(name.to_owned()).into());
                     }
                 }
                 if let [name] = &path[..] {
@@ -247,14 +245,14 @@ impl IdlReader<'_> {
         })
     }
 
-    fn sequence(&mut self, depth: usize) -> Result<FieldLine, String> {
+    fn sequence(&mut self, depth: usize) -> Result<FieldLine, SyntaxError> {
         self.tokens.expect('<')?;
         if depth > 0 {
-            return Err("messages have no sequences of sequences".to_owned());
+            return Err(IdlError::NotInMessages("sequences of sequences".to_owned()).into());
         }
         let mut line = self.parse_type(depth + 1)?;
         if !line.brackets.is_empty() {
-            return Err("messages have no sequences of arrays".to_owned());
+            return Err(IdlError::NotInMessages("sequences of arrays".to_owned()).into());
         }
         line.brackets = if self.tokens.skip(',')? {
             format!("[<={}]", self.name()?)
@@ -266,7 +264,7 @@ impl IdlReader<'_> {
     }
 
     /// Parses the rest of a type that began with `long`: 64 bits if another `long` follows, otherwise 32.
-    fn long(&mut self, kind: &str) -> Result<String, String> {
+    fn long(&mut self, kind: &str) -> Result<String, SyntaxError> {
         let bits = if self.tokens.skip_word("long")? {
             64
         } else {
@@ -276,7 +274,7 @@ impl IdlReader<'_> {
     }
 
     /// Parses an annotation after the `@`; returns the value of a `default`.
-    fn annotation(&mut self) -> Result<Option<Literal>, String> {
+    fn annotation(&mut self) -> Result<Option<Literal>, SyntaxError> {
         let is_default = self.tokens.word()? == "default";
         let mut value = None;
         if !self.tokens.skip('(')? {
@@ -295,11 +293,11 @@ impl IdlReader<'_> {
         Ok(value)
     }
 
-    fn literal(&mut self) -> Result<Literal, String> {
+    fn literal(&mut self) -> Result<Literal, SyntaxError> {
         let mut text = match self.tokens.next()? {
             Some(IdlToken::Text(text)) => text,
             Some(IdlToken::Word(word)) => return Ok(Literal::Word(word.to_owned())),
-            other => return Err(format!("{} is not a value", IdlToken::describe(other))),
+            other => return Err(IdlError::NotAValue(IdlToken::describe(other)).into()),
         };
         // Adjacent texts are concatenated.
         while let Some(more) = self.tokens.skip_text()? {

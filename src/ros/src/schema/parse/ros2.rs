@@ -2,13 +2,18 @@
 //! bounds (`string<=8`, `int32[<=3]`), `wstring`, and default values.
 
 use crate::bus::RosVersion;
-use crate::schema::MAX_MESSAGE_BYTES;
 use crate::schema::initial::{Initial, InitialItem, parse_item, quoted_end};
 use crate::schema::parse::{Parsed, ParsedField, check_identifier};
-use crate::schema::types::{Arity, Constant, FieldBounds, Primitive};
+use crate::schema::primitive::Primitive;
+use crate::schema::types::{Arity, Constant, FieldBounds};
+use crate::schema::{MAX_MESSAGE_BYTES, SyntaxError};
 
 /// Parses a line and adds it to `parsed`. References are relative to `package`.
-pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), String> {
+pub(super) fn parse_line(
+    package: &str,
+    line: &str,
+    parsed: &mut Parsed,
+) -> Result<(), SyntaxError> {
     let line = line.trim();
     if line.is_empty() || line.starts_with('#') {
         return Ok(());
@@ -16,7 +21,7 @@ pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Resu
     let (written, rest) = line
         .split_once([' ', '\t'])
         .filter(|(written, _)| !written.contains('#'))
-        .ok_or_else(|| format!("{line:?} is not a field, write TYPE NAME"))?;
+        .ok_or_else(|| SyntaxError::NotAField(line.to_owned()))?;
     let rest = rest.trim_start();
     let name_ends = |byte: char| !byte.is_ascii_alphanumeric() && byte != '_';
     let (name, rest) = rest.split_at(rest.find(name_ends).unwrap_or(rest.len()));
@@ -33,7 +38,7 @@ pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Resu
 }
 
 /// Returns the value without a comment that follows it.
-fn strip_comment(rest: &str) -> Result<&str, String> {
+fn strip_comment(rest: &str) -> Result<&str, SyntaxError> {
     let rest = rest.trim();
     let Some(end) = quoted_end(rest) else {
         let listed = rest.starts_with('[').then(|| list_end(rest)).flatten();
@@ -44,7 +49,7 @@ fn strip_comment(rest: &str) -> Result<&str, String> {
     match after.trim_start() {
         "" => Ok(value),
         comment if comment.starts_with('#') => Ok(value),
-        more => Err(format!("{more:?} follows the closing quote")),
+        more => Err(SyntaxError::TextAfterQuote(more.to_owned())),
     }
 }
 
@@ -63,9 +68,9 @@ fn list_end(rest: &str) -> Option<usize> {
     }
 }
 
-fn constant(written: &str, name: &str, value: &str) -> Result<Constant, String> {
+fn constant(written: &str, name: &str, value: &str) -> Result<Constant, SyntaxError> {
     let primitive = Primitive::from_versioned_name(RosVersion::Two, written)
-        .ok_or_else(|| format!("a constant cannot be of type {written}"))?;
+        .ok_or_else(|| SyntaxError::BadConstantType(written.to_owned()))?;
     let value = match parse_item(primitive, value)? {
         InitialItem::Text(text) => text.into(),
         InitialItem::Scalar(_) => value.to_owned(),
@@ -77,11 +82,16 @@ fn constant(written: &str, name: &str, value: &str) -> Result<Constant, String> 
     })
 }
 
-fn field(package: &str, written: &str, name: &str, value: &str) -> Result<ParsedField, String> {
+fn field(
+    package: &str,
+    written: &str,
+    name: &str,
+    value: &str,
+) -> Result<ParsedField, SyntaxError> {
     let (bare, brackets) = written.split_at(written.find('[').unwrap_or(written.len()));
     let (bare, text_bound) = match bare.split_once("<=") {
         Some((text, bound)) if matches!(text, "string" | "wstring") => (text, Some(size(bound)?)),
-        Some((text, _)) => return Err(format!("{text} cannot be bounded")),
+        Some((text, _)) => return Err(SyntaxError::Unboundable(text.to_owned())),
         None => (bare, None),
     };
     let (arity, most) = parse_brackets(brackets)?;
@@ -93,9 +103,10 @@ fn field(package: &str, written: &str, name: &str, value: &str) -> Result<Parsed
     let initial = match primitive {
         _ if value.is_empty() => None,
         None => {
-            return Err(format!(
-                "a field of type {bare} takes no value, got {value:?}"
-            ));
+            return Err(SyntaxError::NoValueAllowed {
+                type_name: bare.to_owned(),
+                value: value.to_owned(),
+            });
         }
         Some(primitive) => {
             let initial = Initial::parse(primitive, arity != Arity::One, value)?;
@@ -115,13 +126,13 @@ fn field(package: &str, written: &str, name: &str, value: &str) -> Result<Parsed
     })
 }
 
-fn parse_brackets(brackets: &str) -> Result<(Arity, Option<u32>), String> {
+fn parse_brackets(brackets: &str) -> Result<(Arity, Option<u32>), SyntaxError> {
     let Some(inside) = brackets.strip_prefix('[') else {
         return Ok((Arity::One, None));
     };
     let inside = inside
         .strip_suffix(']')
-        .ok_or_else(|| format!("{brackets} is not an array suffix"))?;
+        .ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
     Ok(match inside.strip_prefix("<=") {
         Some(most) => (Arity::Variable, Some(size(most)?)),
         None if inside.is_empty() => (Arity::Variable, None),
@@ -129,24 +140,25 @@ fn parse_brackets(brackets: &str) -> Result<(Arity, Option<u32>), String> {
     })
 }
 
-fn size(written: &str) -> Result<u32, String> {
+fn size(written: &str) -> Result<u32, SyntaxError> {
     let digits = written.bytes().all(|byte| byte.is_ascii_digit());
     match written.parse::<u32>() {
         Ok(size) if digits && (1..=MAX_MESSAGE_BYTES).contains(&(size as usize)) => Ok(size),
-        _ => Err(format!(
-            "a size of {written} is not a number from 1 to {MAX_MESSAGE_BYTES}"
-        )),
+        _ => Err(SyntaxError::BadSize(written.to_owned())),
     }
 }
 
-fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result<(), String> {
+fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result<(), SyntaxError> {
     let found = initial.0.len();
     match (arity, bounds.elements) {
         (Arity::Fixed(count), _) if found != count as usize => {
-            return Err(format!("takes exactly {count} values, got {found}"));
+            return Err(SyntaxError::WrongValueCount {
+                expected: count,
+                found,
+            });
         }
         (Arity::Variable, Some(most)) if found > most as usize => {
-            return Err(format!("takes at most {most} values, got {found}"));
+            return Err(SyntaxError::TooManyValues { most, found });
         }
         _ => {}
     }
@@ -154,7 +166,7 @@ fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result
         if let (InitialItem::Text(text), Some(most)) = (item, bounds.text) {
             let found = text.chars().count();
             if found > most as usize {
-                return Err(format!("takes at most {most} characters, got {found}"));
+                return Err(SyntaxError::TooManyCharacters { most, found });
             }
         }
     }
@@ -163,19 +175,19 @@ fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result
 
 /// Resolves a type name. `package/Type` and bare names are messages; types generated from a service or action have the
 /// kind in their name.
-fn resolve_name(package: &str, bare: &str) -> Result<String, String> {
+fn resolve_name(package: &str, bare: &str) -> Result<String, SyntaxError> {
     if matches!(bare, "time" | "duration") {
-        let name = if bare == "time" { "Time" } else { "Duration" };
-        return Err(format!(
-            "ROS 2 has no {bare}, write builtin_interfaces/{name}"
-        ));
+        return Err(SyntaxError::TypeOfRos1 {
+            written: bare.to_owned(),
+            message: if bare == "time" { "Time" } else { "Duration" },
+        });
     }
     let parts: Vec<&str> = bare.split('/').collect();
     let (package, kind, short) = match parts[..] {
         [short] => (package, "msg", short),
         [package, short] => (package, "msg", short),
         [package, kind @ ("msg" | "srv" | "action"), short] => (package, kind, short),
-        _ => return Err(format!("{bare:?} is not a type name, write package/Type")),
+        _ => return Err(SyntaxError::BadTypeName(bare.to_owned())),
     };
     check_identifier(package)?;
     check_identifier(short)?;

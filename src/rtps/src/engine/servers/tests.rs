@@ -8,9 +8,9 @@ use crate::discovery::EndpointData;
 use crate::engine::{BUILTIN, Settings};
 use crate::locator::Ports;
 use crate::network::InterfaceSet;
-use crate::participant::TopicDescription;
 use crate::qos::EndpointQos;
 use crate::reader::ReaderLimits;
+use crate::shared::TopicDescription;
 use crate::wire::{DatagramWriter, ReceivedSubmessage, Submessage};
 
 const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);

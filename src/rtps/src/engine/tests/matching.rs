@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::world::{NetworkWorld, SECOND, SampleRecorder, best_effort_qos, keep_last_qos, topic};
-use crate::participant::TopicDescription;
+use crate::shared::TopicDescription;
 
 #[test]
 fn ends_that_do_not_fit_are_told_why_and_others_are_not_disturbed() {

@@ -13,9 +13,9 @@ use crate::discovery::ParticipantData;
 use crate::engine::{BUILTIN, Engine, Settings};
 use crate::locator::{Locator, Ports};
 use crate::network::InterfaceSet;
-use crate::participant::{EndpointMatches, ReceivedSample, Sink, TopicDescription};
 use crate::qos::{DurabilityKind, EndpointQos, HistoryKind, ReliabilityKind};
 use crate::reader::ReaderLimits;
+use crate::shared::{EndpointMatches, ReceivedSample, Sink, TopicDescription};
 use crate::{Guid, GuidPrefix, VendorId};
 
 /// Collects the samples of a reader.

@@ -9,8 +9,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{GrantError, ResolvedGrants};
+use super::ResolvedGrants;
 use crate::container::Mount;
+use crate::grant_error::{CdiError, GrantError};
 
 /// Returns the standard directories of specifications; later ones override earlier ones.
 pub(super) fn directories() -> Vec<PathBuf> {
@@ -143,32 +144,39 @@ fn specification_files(directories: &[PathBuf]) -> Vec<PathBuf> {
 }
 
 fn read_specification(path: &Path) -> Result<Specification, GrantError> {
-    let broken = |reason: String| GrantError::Specification {
+    let broken = |reason: CdiError| GrantError::Specification {
         path: path.to_owned(),
         reason,
     };
-    let text = std::fs::read_to_string(path).map_err(|error| broken(error.to_string()))?;
+    let text =
+        std::fs::read_to_string(path).map_err(|error| broken(CdiError::Unreadable(error)))?;
     // Every JSON text is valid YAML.
-    serde_norway::from_str(&text).map_err(|error| broken(error.to_string()))
+    serde_norway::from_str(&text).map_err(|error| broken(CdiError::Malformed(error)))
 }
 
-fn resolve_edits(edits: &Edits) -> Result<ResolvedGrants, String> {
+fn resolve_edits(edits: &Edits) -> Result<ResolvedGrants, CdiError> {
     let mut granted = ResolvedGrants::default();
     for variable in &edits.env {
         let (name, value) = variable
             .split_once('=')
-            .ok_or_else(|| format!("{variable:?} is not NAME=VALUE"))?;
+            .ok_or_else(|| CdiError::Variable(variable.clone()))?;
         granted
             .environment
             .insert(name.to_owned(), value.to_owned());
     }
     for node in &edits.device_nodes {
         let source = node.host_path.clone().unwrap_or_else(|| node.path.clone());
-        let kind = std::fs::metadata(&source)
-            .map_err(|error| format!("{}: {error}", source.display()))?
-            .file_type();
+        let kind = match std::fs::metadata(&source) {
+            Ok(metadata) => metadata.file_type(),
+            Err(error) => {
+                return Err(CdiError::Device {
+                    path: source,
+                    error,
+                });
+            }
+        };
         if !kind.is_char_device() && !kind.is_block_device() {
-            return Err(format!("{} is not a device node", source.display()));
+            return Err(CdiError::NotADevice(source));
         }
         granted.mounts.push(Mount {
             source,

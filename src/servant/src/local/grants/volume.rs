@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use nix::errno::Errno;
 use nix::fcntl::{OFlag, OpenHow, ResolveFlag, openat2};
 
-use super::{GrantError, not_allowed};
+use super::not_allowed;
 use crate::container::{Mount, OpenedSource};
+use crate::grant_error::GrantError;
 
 /// Number of retries while something is being renamed.
 const AGAIN: u32 = 100;

@@ -8,6 +8,7 @@ use init::Scope;
 use super::Driver;
 use crate::engine::{ContainerState, NodeExit};
 use crate::launch::{self, ExitRecord};
+use crate::shim::command_error::StartError;
 use crate::shim::input::{ShimEvent, StopStage};
 use crate::shim::nodes;
 use crate::{Error, sys};
@@ -101,10 +102,10 @@ impl Driver {
             }
         }
         for number in self.nodes.starting_numbers() {
-            let reason = "its init ended before it was executed".to_owned();
-            if let Some((event, _)) = self.nodes.on_exec_failed(number, reason.clone()) {
+            let error = StartError::InitEnded;
+            if let Some((event, _)) = self.nodes.on_exec_failed(number, error.to_string()) {
                 self.report_node(event);
-                self.answer_start(number, Err(reason));
+                self.answer_start(number, Err(error.into()));
             }
         }
         let limit = self.memory_limit();

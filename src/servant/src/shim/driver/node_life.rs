@@ -3,23 +3,21 @@
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::time::Duration;
 
-use init::{InitReply, Scope, StartRequest, StartStage};
+use init::{InitReply, Scope, StartRequest};
 
 use super::Driver;
 use crate::engine::{ContainerState, NodeEvent, NodeExit};
 use crate::process;
+use crate::shim::command_error::{CommandError, StartError};
 use crate::shim::input::ShimEvent;
 use crate::shim::input::StopStage;
 use crate::shim::nodes::{self, Consequence};
 use crate::spec::NodeSpec;
 
 impl Driver {
-    pub(super) async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
+    pub(super) async fn signal(&self, node: &str, signal: i32) -> Result<(), CommandError> {
         let pid = self.nodes.pid_inside(node)?;
-        self.link
-            .signal(pid, signal, Scope::Group)
-            .await
-            .map_err(|error| error.to_string())
+        Ok(self.link.signal(pid, signal, Scope::Group).await?)
     }
 
     pub(super) async fn start_node(&mut self, name: &str) {
@@ -29,8 +27,8 @@ impl Driver {
     }
 
     pub(super) async fn request_start(&mut self, number: u32, spec: &NodeSpec) {
-        if let Err(reason) = self.send_start_request(number, spec).await {
-            self.on_start_failed(number, reason).await;
+        if let Err(error) = self.send_start_request(number, spec).await {
+            self.on_start_failed(number, error).await;
         }
     }
 
@@ -38,12 +36,8 @@ impl Driver {
         &mut self,
         number: u32,
         spec: &NodeSpec,
-    ) -> Result<(), String> {
-        let open = |stream| {
-            self.streams
-                .open(&spec.name, stream)
-                .map_err(|error| error.to_string())
-        };
+    ) -> Result<(), StartError> {
+        let open = |stream| self.streams.open(&spec.name, stream);
         let (out, err) = (open("stdout")?, open("stderr")?);
         let mut environment = self.begun.launch.spec.environment.clone();
         environment.extend(spec.environment.clone());
@@ -58,10 +52,7 @@ impl Driver {
             environment: &environment,
         };
         let streams = [out.as_raw_fd(), err.as_raw_fd()];
-        self.link
-            .start(&request, streams)
-            .await
-            .map_err(|error| error.to_string())
+        Ok(self.link.start(&request, streams).await?)
     }
 
     pub(super) async fn respawn(&mut self, name: &str) {
@@ -87,7 +78,8 @@ impl Driver {
                 }
             }
             InitReply::Failed { id, errno, stage } => {
-                self.on_start_failed(id, describe(errno, stage)).await
+                self.on_start_failed(id, StartError::from_init(errno, stage))
+                    .await
             }
             InitReply::Exited { pid, status } => {
                 self.resident.process_exited(pid);
@@ -101,7 +93,7 @@ impl Driver {
         }
     }
 
-    pub(super) fn answer_start(&mut self, number: u32, outcome: Result<(), String>) {
+    pub(super) fn answer_start(&mut self, number: u32, outcome: Result<(), CommandError>) {
         if let Some((client, request)) = self.waiting.remove(&number) {
             self.clients.answer(client, request, outcome);
         }
@@ -133,10 +125,11 @@ impl Driver {
         more
     }
 
-    pub(super) async fn on_start_failed(&mut self, number: u32, reason: String) {
+    pub(super) async fn on_start_failed(&mut self, number: u32, error: StartError) {
+        let reason = error.to_string();
         if let Some((event, consequence)) = self.nodes.on_exec_failed(number, reason.clone()) {
             self.report_node(event.clone());
-            self.answer_start(number, Err(reason.clone()));
+            self.answer_start(number, Err(error.into()));
             self.early_signals.retain(|(node, _)| node != event.node());
             let exit = NodeExit {
                 code: None,
@@ -212,24 +205,8 @@ impl Driver {
 
     pub(super) fn memory_limit(&self) -> String {
         match self.begun.enforced.limits.memory {
-            // As `api::Size` formats it, so that it reads as in the configuration and in the event.
-            Some(bytes) if bytes % (1 << 20) == 0 => {
-                format!("out of memory, the limit is {}M", bytes >> 20)
-            }
-            Some(bytes) => format!("out of memory, the limit is {bytes} bytes"),
+            Some(limit) => format!("out of memory, the limit is {limit}"),
             None => "out of memory".into(),
-        }
-    }
-}
-
-fn describe(errno: i32, stage: StartStage) -> String {
-    let error = std::io::Error::from_raw_os_error(errno);
-    match stage {
-        StartStage::Execute => format!("its program could not be executed: {error}"),
-        StartStage::Directory => format!("its working directory could not be entered: {error}"),
-        StartStage::Fork => format!("fork: {error}"),
-        StartStage::Request | StartStage::Prepare => {
-            format!("init could not prepare it: {error}")
         }
     }
 }

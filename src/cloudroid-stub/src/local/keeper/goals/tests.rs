@@ -115,7 +115,7 @@ impl Scene {
 }
 
 /// A call of the application.
-struct ApplicationCall(tokio::task::JoinHandle<Result<Bytes, String>>);
+struct ApplicationCall(tokio::task::JoinHandle<Result<Bytes, FailureReason>>);
 
 impl ApplicationCall {
     async fn answer(self) -> Bytes {

@@ -12,8 +12,8 @@ use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, GoalOutcome, Graph, MatchedPeers,
-    Publisher, Subscription,
+    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph,
+    MatchedPeers, Publisher, Subscription,
 };
 use crate::codec::Time;
 use crate::ros1::actions::messages::{self, ActionlibStatus, GoalId};
@@ -53,7 +53,7 @@ struct ActionClientPublishers {
     cancel: Box<dyn Publisher>,
 }
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug)]
 enum State {
     Opening,
     /// The topics are advertised and subscribed to.
@@ -61,7 +61,7 @@ enum State {
     /// A status message of the server has arrived.
     Heard,
     /// The topics cannot be used.
-    Failed(String),
+    Failed(GoalError),
 }
 
 struct TrackedGoal {
@@ -114,7 +114,7 @@ impl Ros1ActionClient {
         let follow = bus.spawn(async move {
             match following.open(&of).await {
                 Ok(heard) => following.follow(heard).await,
-                Err(error) => following.fail_all(&error.to_string()),
+                Err(error) => following.fail_all(error.into()),
             }
         });
         let tasks = [follow, bus.spawn(watch_server(shared.clone()))];
@@ -148,7 +148,7 @@ impl ActionClient for Ros1ActionClient {
             if let Ok(State::Failed(reason)) = heard.await.as_deref() {
                 return Err(BusError::CallFailed {
                     service: format!("action {}", shared.name),
-                    reason: reason.clone(),
+                    reason: reason.to_string(),
                     fate: CallFate::NotTaken,
                 });
             }
@@ -179,7 +179,7 @@ impl ActionClient for Ros1ActionClient {
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
         let Some(ends) = self.shared.ends.get() else {
-            return events.on_ended(Err(format!("action {} is not ready", self.shared.name)));
+            return events.on_ended(Err(GoalError::NotReady(self.shared.name.clone())));
         };
         let known = TrackedGoal::new(Instant::now(), events);
         self.shared.goals.lock().insert(id.to_owned(), known);
@@ -249,7 +249,7 @@ impl ActionlibClientState {
                 Some(message) = heard.feedback.messages.recv() => self.on_feedback(&message.bytes),
                 Some(message) = heard.result.messages.recv() => self.on_result(&message.bytes),
                 Some(message) = heard.status.messages.recv() => self.on_status(&message.bytes),
-                else => return self.fail_all("the connection to this ROS system was closed"),
+                else => return self.fail_all(BusError::Closed.into()),
             }
         }
     }
@@ -355,7 +355,7 @@ impl ActionlibClientState {
             return;
         };
         self.state.send_if_modified(|state| {
-            let first = *state == State::Open;
+            let first = matches!(state, State::Open);
             if first {
                 *state = State::Heard;
             }
@@ -374,21 +374,20 @@ impl ActionlibClientState {
         let lost: Vec<_> = lost.iter().filter_map(|id| goals.remove(id)).collect();
         drop(goals);
         for goal in lost {
-            let reason = "the action server no longer knows the goal";
-            goal.events.on_ended(Err(reason.to_owned()));
+            goal.events.on_ended(Err(GoalError::Forgotten));
         }
     }
 
-    fn end_all(&self, reason: &str) {
+    fn end_all(&self, reason: &GoalError) {
         let goals = std::mem::take(&mut *self.goals.lock());
         for goal in goals.into_values() {
-            goal.events.on_ended(Err(reason.to_owned()));
+            goal.events.on_ended(Err(reason.clone()));
         }
     }
 
-    fn fail_all(&self, reason: &str) {
-        self.state.send_replace(State::Failed(reason.to_owned()));
-        self.end_all(reason);
+    fn fail_all(&self, reason: GoalError) {
+        self.state.send_replace(State::Failed(reason.clone()));
+        self.end_all(&reason);
     }
 }
 
@@ -407,7 +406,7 @@ async fn watch_server(shared: Arc<ActionlibClientState>) {
         if timeout(GONE_AFTER, graph.wait_for(there)).await.is_ok() {
             continue;
         }
-        shared.end_all(&format!("action server {} is gone", shared.name));
+        shared.end_all(&GoalError::ServerGone(shared.name.clone()));
         if graph.wait_for(there).await.is_err() {
             return;
         }
@@ -423,7 +422,7 @@ mod tests {
     impl GoalEvents for Nobody {
         fn on_feedback(&self, _: Bytes) {}
 
-        fn on_ended(&self, _: Result<GoalEnd, String>) {}
+        fn on_ended(&self, _: Result<GoalEnd, GoalError>) {}
     }
 
     #[test]

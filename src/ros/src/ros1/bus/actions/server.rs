@@ -203,7 +203,7 @@ impl ActionlibServerState {
         if state.status == ActionlibStatus::Active {
             if let Err(reason) = self.handler.on_goal(&id, body) {
                 state.status = ActionlibStatus::Rejected;
-                state.text = reason;
+                state.text = reason.into_string();
                 let ended = Some(Instant::now());
                 let state = state.clone();
                 self.goals.lock().insert(id, ServedGoal { state, ended });

@@ -2,7 +2,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::*;
-use crate::bus::{ActionHandler, ActionServer};
+use crate::bus::{ActionHandler, ActionServer, FailureReason};
 use crate::ros1::testing::TestNode;
 use crate::ros1::xmlrpc::Value;
 use crate::schema::{ActionDef, Registry};
@@ -10,7 +10,7 @@ use crate::schema::{ActionDef, Registry};
 struct Nothing;
 
 impl ActionHandler for Nothing {
-    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), FailureReason> {
         Ok(())
     }
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::bus::{Lender, LentService};
+use crate::bus::{FailureReason, Lender, LentService};
 use crate::ros1::master::{Master, MasterOptions};
 use crate::ros1::testing::args;
 use crate::ros1::xmlrpc::Value;
@@ -15,9 +15,9 @@ struct Counter;
 
 #[async_trait]
 impl ServiceHandler for Counter {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         match &request[..] {
-            b"fail" => Err(format!("not for {caller}")),
+            b"fail" => Err(FailureReason::new(format!("not for {caller}"))),
             _ => Ok(request),
         }
     }

@@ -5,6 +5,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Barrier;
 
 use super::*;
+use crate::bus::FailureReason;
 use crate::ros1::tcpros::{self, Header};
 use crate::ros1::testing::TestNode;
 use crate::ros1::xmlrpc::Value;
@@ -16,9 +17,9 @@ struct Echo {
 
 #[async_trait]
 impl ServiceHandler for Echo {
-    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
         match &request[..] {
-            b"fail" => Err(format!("not for {caller}")),
+            b"fail" => Err(FailureReason::new(format!("not for {caller}"))),
             b"meet" => {
                 self.meeting.wait().await;
                 Ok(request)

@@ -22,6 +22,26 @@ const MAX_KEPT_BYTES: usize = 64 << 20;
 /// Receives the response to a result request, once the goal has ended.
 pub(super) type ResultReceiver = watch::Receiver<Option<Bytes>>;
 
+/// The reason for rejecting a goal without asking those who would execute it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum GoalRefusal {
+    /// The bytes are no message of the action's goal type.
+    #[error("it is not a serialized {0}")]
+    NotAGoal(
+        /// Name of the goal type.
+        String,
+    ),
+    /// The server is closed.
+    #[error("its server is gone")]
+    ServerGone,
+    /// Another goal has this id, or had it until its result was forgotten.
+    #[error("there is already a goal with this id")]
+    AlreadyThere,
+    /// As many goals have not ended as a server can have.
+    #[error("{MAX_GOALS} goals wait for this server already")]
+    TooMany,
+}
+
 pub(super) struct GoalTable {
     known: HashMap<GoalId, GoalEntry>,
     /// Ended goals with their expiry, in order of expiry.
@@ -58,16 +78,16 @@ impl GoalTable {
         }
     }
 
-    /// Adds a goal; the error is the reason why there is no room.
-    pub(super) fn begin(&mut self, id: GoalId, accepted: Time) -> Result<(), String> {
+    /// Adds a goal, unless there is no room for it.
+    pub(super) fn begin(&mut self, id: GoalId, accepted: Time) -> Result<(), GoalRefusal> {
         if self.closed {
-            return Err("its server is gone".to_owned());
+            return Err(GoalRefusal::ServerGone);
         }
         if self.known.contains_key(&id) {
-            return Err("there is already a goal with this id".to_owned());
+            return Err(GoalRefusal::AlreadyThere);
         }
         if self.known.len() - self.ended.len() >= MAX_GOALS {
-            return Err(format!("{MAX_GOALS} goals wait for this server already"));
+            return Err(GoalRefusal::TooMany);
         }
         self.begun += 1;
         let known = GoalEntry {

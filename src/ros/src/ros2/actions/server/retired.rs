@@ -1,27 +1,9 @@
 //! Result services of action servers that are gone: a client that has just been told that its goal was accepted
 //! requests the result a moment later, and would wait forever if nobody answered.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
-use parking_lot::Mutex;
-
-use crate::ros2::bus::Ros2BusState;
-
-/// Keeps a service running until dropped.
-pub(super) type BoxedGuard = Box<dyn Send + Sync>;
-
-/// The services of a bus that answer a little longer, by action.
-#[derive(Default)]
-pub(in crate::ros2) struct RetiredServices {
-    actions: Mutex<RetiredActions>,
-}
-
-#[derive(Default)]
-struct RetiredActions {
-    count: u64,
-    kept: HashMap<String, (u64, BoxedGuard)>,
-}
+use crate::ros2::state::{BoxedGuard, Ros2BusState};
 
 /// Keeps a retired service running; dropping it ends the service.
 pub(super) struct RetiredGuard {

@@ -18,7 +18,7 @@ struct Says {
 
 #[async_trait]
 impl ServiceHandler for Says {
-    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
+    async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let mut json = Vec::new();
         to_json(&self.request, &request, &mut json, &Default::default()).unwrap();
         Ok((self.answer)(&String::from_utf8(json).unwrap()))
@@ -152,10 +152,11 @@ async fn what_cannot_be_sent_is_not_and_the_rest_is() {
         ("gone".to_owned(), None),
     ];
     let set = bus.set("/odd", changes.clone()).await.unwrap();
-    let empty = "an empty list does not say what it is a list of".to_owned();
-    assert_eq!(set, [Err(empty.clone()), Err("no".to_owned()), Ok(())]);
+    let empty = "an empty list does not say what it is a list of";
+    let refused = |reason| Err(FailureReason::new(reason));
+    assert_eq!(set, [refused(empty), refused("no"), Ok(())]);
     match bus.set_atomically("/odd", changes).await.unwrap_err() {
-        BusError::BadParam { key, reason } => assert_eq!((&*key, reason), ("list", empty)),
+        BusError::BadParam { key, reason } => assert_eq!((&*key, &*reason), ("list", empty)),
         other => panic!("{other}"),
     }
 }

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use super::IdlError;
+
 /// A word, a text, or a punctuation mark.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum IdlToken<'a> {
@@ -44,7 +46,7 @@ impl<'a> Tokens<'a> {
         self.text[..self.at].matches('\n').count() + 1
     }
 
-    pub(super) fn next(&mut self) -> Result<Option<IdlToken<'a>>, String> {
+    pub(super) fn next(&mut self) -> Result<Option<IdlToken<'a>>, IdlError> {
         self.skip_space()?;
         let rest = &self.text[self.at..];
         let Some(first) = rest.chars().next() else {
@@ -75,40 +77,37 @@ impl<'a> Tokens<'a> {
         Ok(Some(IdlToken::Word(&rest[..end])))
     }
 
-    pub(super) fn word(&mut self) -> Result<&'a str, String> {
+    pub(super) fn word(&mut self) -> Result<&'a str, IdlError> {
         match self.next()? {
             Some(IdlToken::Word(word)) => Ok(word),
-            other => Err(format!(
-                "expected a name, got {}",
-                IdlToken::describe(other)
-            )),
+            other => Err(IdlError::NotAName(IdlToken::describe(other))),
         }
     }
 
-    pub(super) fn expect(&mut self, mark: char) -> Result<(), String> {
+    pub(super) fn expect(&mut self, mark: char) -> Result<(), IdlError> {
         match self.next()? {
             Some(IdlToken::Mark(found)) if found == mark => Ok(()),
-            other => Err(format!(
-                "expected {mark}, got {}",
-                IdlToken::describe(other)
-            )),
+            other => Err(IdlError::MissingMark {
+                expected: mark,
+                found: IdlToken::describe(other),
+            }),
         }
     }
 
     /// Skips the mark if it follows.
-    pub(super) fn skip(&mut self, mark: char) -> Result<bool, String> {
+    pub(super) fn skip(&mut self, mark: char) -> Result<bool, IdlError> {
         self.skip_if(|token| *token == IdlToken::Mark(mark))
             .map(|skipped| skipped.is_some())
     }
 
     /// Skips the word if it follows.
-    pub(super) fn skip_word(&mut self, word: &str) -> Result<bool, String> {
+    pub(super) fn skip_word(&mut self, word: &str) -> Result<bool, IdlError> {
         self.skip_if(|token| *token == IdlToken::Word(word))
             .map(|skipped| skipped.is_some())
     }
 
     /// Skips and returns a text if one follows.
-    pub(super) fn skip_text(&mut self) -> Result<Option<String>, String> {
+    pub(super) fn skip_text(&mut self) -> Result<Option<String>, IdlError> {
         let skipped = self.skip_if(|token| matches!(token, IdlToken::Text(_)))?;
         Ok(match skipped {
             Some(IdlToken::Text(text)) => Some(text),
@@ -119,7 +118,7 @@ impl<'a> Tokens<'a> {
     fn skip_if(
         &mut self,
         is: impl Fn(&IdlToken<'_>) -> bool,
-    ) -> Result<Option<IdlToken<'a>>, String> {
+    ) -> Result<Option<IdlToken<'a>>, IdlError> {
         let before = self.at;
         match self.next()? {
             Some(token) if is(&token) => Ok(Some(token)),
@@ -131,7 +130,7 @@ impl<'a> Tokens<'a> {
     }
 
     /// Skips white space, comments and preprocessor lines.
-    fn skip_space(&mut self) -> Result<(), String> {
+    fn skip_space(&mut self) -> Result<(), IdlError> {
         loop {
             let rest = &self.text[self.at..];
             let space = rest.len() - rest.trim_start().len();
@@ -140,7 +139,7 @@ impl<'a> Tokens<'a> {
             if rest.starts_with("//") || rest.starts_with('#') {
                 self.at += rest.find('\n').unwrap_or(rest.len());
             } else if rest.starts_with("/*") {
-                let end = rest.find("*/").ok_or("a comment without an end")?;
+                let end = rest.find("*/").ok_or(IdlError::UnclosedComment)?;
                 self.at += end + 2;
             } else {
                 return Ok(());
@@ -149,7 +148,7 @@ impl<'a> Tokens<'a> {
     }
 
     /// Reads a quoted text after its opening quote.
-    fn take_quoted(&mut self) -> Result<String, String> {
+    fn take_quoted(&mut self) -> Result<String, IdlError> {
         let mut text = String::new();
         let mut characters = self.text[self.at..].char_indices();
         while let Some((at, character)) = characters.next() {
@@ -168,6 +167,6 @@ impl<'a> Tokens<'a> {
                 other => text.push(other),
             }
         }
-        Err("a text without a closing quote".to_owned())
+        Err(IdlError::UnclosedText)
     }
 }

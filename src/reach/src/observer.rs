@@ -1,0 +1,31 @@
+//! The daemon and the user of a servant, as its reach sees them.
+
+use std::time::SystemTime;
+
+use link::control::RequestTiming;
+use ros::bus::FailureReason;
+
+use crate::links::RequestUpdate;
+
+/// The daemon as seen from one servant's reach.
+pub trait Observer: Send + Sync + 'static {
+    /// Checks that a stub generated from this revision and image can use the servant; otherwise returns the reason.
+    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), FailureReason>;
+    /// Records an event about the servant and its robot for the operator.
+    fn record_event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
+    /// Records that from `at` on a node of the robot is served by its local original, with the reason; `None`: by the
+    /// cloud again.
+    fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
+    /// Records an update about a request; an answered one has its response time and phases.
+    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate);
+}
+
+/// The user of a servant. A warm container has none.
+pub trait Tenant: Send + Sync + 'static {
+    /// Returns the name of the robot.
+    fn robot(&self) -> &str;
+    /// Returns the limits of the servant.
+    fn limits(&self) -> api::Limits;
+    /// Hands the control of nodes to the robot's stubs; returns whether the revision's own nodes were running before.
+    fn take_over(&self) -> bool;
+}
