@@ -170,11 +170,7 @@ macro_rules! of_both {
 }
 
 /// Creates a story for robots of one version of ROS.
-fn story_for(
-    version: RosVersion,
-    name: &'static str,
-    tell: fn(RosVersion) -> Verdict,
-) -> RunnableStory {
+fn story_for(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) -> RunnableStory {
     let tell = Box::new(move || tell(version));
     RunnableStory { name, tell }
 }

@@ -66,11 +66,7 @@ struct StoryArguments {
 impl StoryArguments {
     fn is_selected(&self, story: &str) -> bool {
         let is_named = |name: &String| {
-            if self.exact {
-                story == name
-            } else {
-                story.contains(name)
-            }
+            if self.exact { story == name } else { story.contains(name) }
         };
         self.names.is_empty() || self.names.iter().any(is_named)
     }
@@ -89,10 +85,7 @@ struct StoryOutcome {
 /// therefore run on their own. A story that takes longer than `limit` ends the run with a failure.
 pub fn run(stories: Vec<RunnableStory>, alone: &[&str], limit: Duration) -> ExitCode {
     let arguments = StoryArguments::parse();
-    let stories: Vec<RunnableStory> = stories
-        .into_iter()
-        .filter(|story| arguments.is_selected(story.name))
-        .collect();
+    let stories: Vec<RunnableStory> = stories.into_iter().filter(|story| arguments.is_selected(story.name)).collect();
     if arguments.list {
         for story in &stories {
             println!("{}: test", story.name);
@@ -100,10 +93,7 @@ pub fn run(stories: Vec<RunnableStory>, alone: &[&str], limit: Duration) -> Exit
         return ExitCode::SUCCESS;
     }
     if stories.is_empty() {
-        eprintln!(
-            "no story is called {}; --list lists them",
-            arguments.names.join(" or ")
-        );
+        eprintln!("no story is called {}; --list lists them", arguments.names.join(" or "));
         return ExitCode::FAILURE;
     }
     if let Err(lack) = machine::prepare() {
@@ -113,36 +103,22 @@ pub fn run(stories: Vec<RunnableStory>, alone: &[&str], limit: Duration) -> Exit
     }
     let record = StoryTimes::read();
     let is_strict = std::env::var("STRICT").is_ok_and(|strict| !strict.is_empty() && strict != "0");
-    let runner = StoryRunner {
-        is_strict,
-        outcomes: Mutex::default(),
-        watchdog: Watchdog::start(limit),
-    };
+    let runner = StoryRunner { is_strict, outcomes: Mutex::default(), watchdog: Watchdog::start(limit) };
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
-    let at_a_time = arguments
-        .test_threads
-        .map_or(AT_A_TIME * cores, NonZero::get);
-    let (last, mut first): (Vec<&RunnableStory>, Vec<&RunnableStory>) = stories
-        .iter()
-        .partition(|story| alone.contains(&story.name));
+    let at_a_time = arguments.test_threads.map_or(AT_A_TIME * cores, NonZero::get);
+    let (last, mut first): (Vec<&RunnableStory>, Vec<&RunnableStory>) =
+        stories.iter().partition(|story| alone.contains(&story.name));
     first.sort_by_key(|story| std::cmp::Reverse(record.expected_time(story.name)));
     println!("telling {} stories, {at_a_time} at a time", stories.len());
     runner.run_all(first, at_a_time);
     runner.run_all(last, 1);
     let again = runner.repeat_failed(&stories);
-    let told = runner
-        .outcomes
-        .into_inner()
-        .unwrap_or_else(PoisonError::into_inner);
+    let told = runner.outcomes.into_inner().unwrap_or_else(PoisonError::into_inner);
     record.update(&told);
     let left = support::world::end();
     let report = RunReport::new(&stories, told, again, left, is_strict);
     report.print();
-    if report.is_good() {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    }
+    if report.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
 struct StoryRunner {
@@ -167,35 +143,21 @@ impl StoryRunner {
     }
 
     /// Returns the next story, unless the run has failed already.
-    fn next_story<'a>(
-        &self,
-        pending: &Mutex<VecDeque<&'a RunnableStory>>,
-    ) -> Option<&'a RunnableStory> {
+    fn next_story<'a>(&self, pending: &Mutex<VecDeque<&'a RunnableStory>>) -> Option<&'a RunnableStory> {
         if self.is_strict && self.failure_count() > 0 {
             return None;
         }
-        pending
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .pop_front()
+        pending.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
     }
 
     /// Repeats the failed stories, one at a time.
     fn repeat_failed(&self, stories: &[RunnableStory]) -> Vec<StoryOutcome> {
-        let failed: Vec<&'static str> = self
-            .outcomes()
-            .iter()
-            .filter(|outcome| outcome.failure.is_some())
-            .map(|outcome| outcome.name)
-            .collect();
+        let failed: Vec<&'static str> =
+            self.outcomes().iter().filter(|outcome| outcome.failure.is_some()).map(|outcome| outcome.name).collect();
         if self.is_strict || failed.len() > MOST_TOLD_AGAIN {
             return Vec::new();
         }
-        stories
-            .iter()
-            .filter(|story| failed.contains(&story.name))
-            .map(|story| self.run_story(story, 2))
-            .collect()
+        stories.iter().filter(|story| failed.contains(&story.name)).map(|story| self.run_story(story, 2)).collect()
     }
 
     fn run_story(&self, story: &RunnableStory, attempt: usize) -> StoryOutcome {
@@ -207,10 +169,7 @@ impl StoryRunner {
 
     fn failure_count(&self) -> usize {
         let outcomes = self.outcomes();
-        outcomes
-            .iter()
-            .filter(|outcome| outcome.failure.is_some())
-            .count()
+        outcomes.iter().filter(|outcome| outcome.failure.is_some()).count()
     }
 
     fn outcomes(&self) -> std::sync::MutexGuard<'_, Vec<StoryOutcome>> {
@@ -220,14 +179,8 @@ impl StoryRunner {
 
 /// Returns the directory for the evidence of a failed run of a story.
 fn evidence_directory(story: &str, attempt: usize) -> std::path::PathBuf {
-    let place = binaries::target()
-        .join("stories")
-        .join(story.replace("::", "/"));
-    if attempt == 1 {
-        place
-    } else {
-        place.join("again")
-    }
+    let place = binaries::target().join("stories").join(story.replace("::", "/"));
+    if attempt == 1 { place } else { place.join("again") }
 }
 
 /// Runs one story on a thread of its own, and keeps its files if it fails.
@@ -237,12 +190,10 @@ fn run_once(story: &RunnableStory, attempt: usize) -> StoryOutcome {
     let telling = StoryRun::new(story.name, attempt, place);
     let began = Instant::now();
     let failure = std::thread::scope(|scope| {
-        let teller = std::thread::Builder::new()
-            .name(story.name.to_owned())
-            .spawn_scoped(scope, || {
-                story::begin(telling.clone());
-                catch_unwind(AssertUnwindSafe(|| (story.tell)()))
-            });
+        let teller = std::thread::Builder::new().name(story.name.to_owned()).spawn_scoped(scope, || {
+            story::begin(telling.clone());
+            catch_unwind(AssertUnwindSafe(|| (story.tell)()))
+        });
         match teller.map(|teller| teller.join()) {
             Ok(Ok(Ok(verdict))) => verdict.err().map(|error| format!("{error:#}")),
             Ok(Ok(Err(panic)) | Err(panic)) => Some(describe_panic(&*panic)),
@@ -267,17 +218,8 @@ fn run_once(story: &RunnableStory, attempt: usize) -> StoryOutcome {
         let _ = std::fs::remove_dir_all(directory);
     }
     let verdict = if failure.is_some() { "FAILED" } else { "ok" };
-    println!(
-        "test {} ... {verdict} ({:.1} s)",
-        story.name,
-        took.as_secs_f64()
-    );
-    StoryOutcome {
-        name: story.name,
-        took,
-        waited: telling.waiting_time(),
-        failure,
-    }
+    println!("test {} ... {verdict} ({:.1} s)", story.name, took.as_secs_f64());
+    StoryOutcome { name: story.name, took, waited: telling.waiting_time(), failure }
 }
 
 fn describe_panic(panic: &(dyn std::any::Any + Send)) -> String {

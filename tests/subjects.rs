@@ -51,10 +51,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("people", &["portal", "store"]),
     ("portal", &["bridge", "portal", "ws"]),
     ("privileges", &["privilege"]),
-    (
-        "push",
-        &["catalogue", "image", "package", "push", "rootfs_builder"],
-    ),
+    ("push", &["catalogue", "image", "package", "push", "rootfs_builder"]),
     ("queue", &["choreographer"]),
     ("quotas", &["foreign", "servant"]),
     ("readiness", &["choreographer"]),

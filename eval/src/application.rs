@@ -51,12 +51,7 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
     let begun = Instant::now();
     let bystander = site.node("/bystander")?;
     let mut heard = site.subscribe(&bystander, &plan.answer)?;
-    let mut record = RosbagProgram::start(
-        site,
-        place.path(),
-        RECORD,
-        &["-O", "/mnt/heard.bag", &plan.answer],
-    )?;
+    let mut record = RosbagProgram::start(site, place.path(), RECORD, &["-O", "/mnt/heard.bag", &plan.answer])?;
     site.wait_for_graph(&bystander, "a node that answers, and a recorder", |graph| {
         let ends = graph.topics.get(&*plan.answer);
         ends.is_some_and(|ends| !ends.publishers.is_empty() && ends.subscribers.len() > 1)
@@ -80,8 +75,7 @@ pub fn run(site: &Site, plan: &RobotPlan, seconds: f64, node: &NodeProcess) -> R
     }
     while site.next_message_within(&mut heard, SILENCE)?.is_some() {}
     record.stop()?;
-    let file =
-        Bytes::from(std::fs::read(shared.join("heard.bag")).with_context(|| record.output())?);
+    let file = Bytes::from(std::fs::read(shared.join("heard.bag")).with_context(|| record.output())?);
     let messages = ros::bag::read(&file, usize::MAX)?;
     let first = messages.first().map_or(0, |message| message.time);
     let answer = |message: &ros::bag::BagMessage| {

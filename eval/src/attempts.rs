@@ -17,9 +17,7 @@ static FAILED: Mutex<BTreeMap<String, String>> = Mutex::new(BTreeMap::new());
 pub fn try_once(name: &str, does: impl FnOnce() -> Result<()>) -> Result<()> {
     let failed = || FAILED.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(why) = failed().get(name) {
-        return Err(anyhow!(
-            "{why} (it failed before in this run and was not tried again)"
-        ));
+        return Err(anyhow!("{why} (it failed before in this run and was not tried again)"));
     }
     does().inspect_err(|error| {
         failed().insert(name.to_owned(), format!("{error:#}"));
@@ -41,11 +39,7 @@ mod tests {
         };
         assert_eq!(fails().expect_err("it fails").to_string(), "no compiler");
         let again = fails().expect_err("it has failed");
-        assert!(
-            again
-                .to_string()
-                .starts_with("no compiler (it failed before")
-        );
+        assert!(again.to_string().starts_with("no compiler (it failed before"));
         assert_eq!(tries, 1);
         try_once("test: another", || Ok(())).expect("it is another");
     }

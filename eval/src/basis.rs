@@ -12,11 +12,7 @@ use crate::examples;
 use crate::place::NetworkProfile;
 
 /// The programs under measurement: the daemon, the init of each servant, and the robot's stub.
-const PROGRAMS: [&str; 3] = [
-    "cloudroidd",
-    "cloudroid-init",
-    "stubs/x86_64/cloudroid-stub",
-];
+const PROGRAMS: [&str; 3] = ["cloudroidd", "cloudroid-init", "stubs/x86_64/cloudroid-stub"];
 
 /// Returns the SHA-256 of all these inputs.
 ///

@@ -55,12 +55,7 @@ impl<T> CachedResult<T> {
     }
 
     /// Returns the measurement; without one, lists it in the section as missing, with the next step.
-    pub fn require(
-        &self,
-        section: &mut Section,
-        what: impl Into<String>,
-        next: &str,
-    ) -> Option<&T> {
+    pub fn require(&self, section: &mut Section, what: impl Into<String>, next: &str) -> Option<&T> {
         match self {
             Self::Done(measured) => Some(measured),
             Self::Missing(why) => {
@@ -84,12 +79,7 @@ impl RunCache {
             }
         }
         std::fs::create_dir_all(&directory).with_context(|| directory.display().to_string())?;
-        Ok(Self {
-            directory,
-            basis: String::new(),
-            begun: Instant::now(),
-            used: Mutex::default(),
-        })
+        Ok(Self { directory, basis: String::new(), begun: Instant::now(), used: Mutex::default() })
     }
 
     /// Sets the digest of common inputs; results with another one are measured again.
@@ -124,11 +114,7 @@ impl RunCache {
             Ok(measured) => {
                 let took = begun.elapsed().as_secs_f64();
                 self.log_progress(&format!("{name}: {took:.0} s"));
-                let cell = CachedRun {
-                    of,
-                    measured: serde_json::to_value(&measured)?,
-                    on: current_date(),
-                };
+                let cell = CachedRun { of, measured: serde_json::to_value(&measured)?, on: current_date() };
                 self.store(name, &cell)?;
                 self.record_use(name, cell.on, cell.measured);
                 Ok(CachedResult::Done(measured))
@@ -144,9 +130,7 @@ impl RunCache {
     pub fn used_figures(&self) -> BTreeMap<String, Value> {
         let used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
         let measured = used.iter().map(|(name, (_, measured))| (name, measured));
-        measured
-            .map(|(name, measured)| (name.clone(), measured.clone()))
-            .collect()
+        measured.map(|(name, measured)| (name.clone(), measured.clone())).collect()
     }
 
     /// Returns the times of the oldest and the newest result; `None` without results.
@@ -163,16 +147,8 @@ impl RunCache {
     }
 
     fn path(&self, name: &str) -> PathBuf {
-        let name: String = name
-            .chars()
-            .map(|letter| {
-                if letter.is_ascii_alphanumeric() {
-                    letter
-                } else {
-                    '-'
-                }
-            })
-            .collect();
+        let name: String =
+            name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' }).collect();
         self.directory.join(format!("{name}.json"))
     }
 
@@ -188,8 +164,7 @@ impl RunCache {
     fn store(&self, name: &str, cell: &CachedRun) -> Result<()> {
         let path = self.path(name);
         let half = path.with_extension("half");
-        std::fs::write(&half, serde_json::to_vec(cell)?)
-            .with_context(|| half.display().to_string())?;
+        std::fs::write(&half, serde_json::to_vec(cell)?).with_context(|| half.display().to_string())?;
         Ok(std::fs::rename(half, path)?)
     }
 }
@@ -261,8 +236,7 @@ mod tests {
     #[test]
     fn raw_figures_are_those_of_the_runs_that_were_asked_for() {
         let (place, cells) = new_cache();
-        let run =
-            serde_json::json!([0.1234567, {"map": {"width": 1, "resolution": 0.5, "cells": [0]}}]);
+        let run = serde_json::json!([0.1234567, {"map": {"width": 1, "resolution": 0.5, "cells": [0]}}]);
         let told = serde_json::json!([0.1234567, {"map": {"width": 1, "resolution": 0.5}}]);
         cells.measure("a", &1, || Ok(run)).expect("it is kept");
         cells.measure("b", &1, || Ok(2)).expect("it is kept");
@@ -270,10 +244,7 @@ mod tests {
         let later = RunCache::new(place.path().join("cells"), false).expect("a directory");
         let again = later.measure::<Value>("a", &1, || bail!("it ran again"));
         assert!(again.expect("it is read").value().is_some());
-        assert_eq!(
-            later.used_figures(),
-            BTreeMap::from([("a".to_owned(), told)])
-        );
+        assert_eq!(later.used_figures(), BTreeMap::from([("a".to_owned(), told)]));
     }
 
     #[test]

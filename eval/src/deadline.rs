@@ -27,14 +27,8 @@ pub fn wait_for_exit(child: &mut Child, what: &str, longest: Duration) -> Result
         if is_late || interrupt::is_requested() {
             let _ = child.kill();
             let _ = child.wait();
-            ensure!(
-                is_late,
-                "the evaluation was asked to end while this was measured"
-            );
-            bail!(
-                "{what} had not ended after {:.0} s and was killed",
-                longest.as_secs_f64()
-            );
+            ensure!(is_late, "the evaluation was asked to end while this was measured");
+            bail!("{what} had not ended after {:.0} s and was killed", longest.as_secs_f64());
         }
         std::thread::sleep(LOOK);
     }
@@ -61,11 +55,7 @@ pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
         file.read_to_end(&mut bytes)?;
         Ok(bytes)
     };
-    Ok(Output {
-        status,
-        stdout: read(out)?,
-        stderr: read(said)?,
-    })
+    Ok(Output { status, stdout: read(out)?, stderr: read(said)? })
 }
 
 #[cfg(test)]
@@ -79,10 +69,7 @@ mod tests {
         command.args(["-c", "sleep 5 & echo out; echo said >&2; exit 3"]);
         let begun = Instant::now();
         let output = output(&mut command, Duration::from_secs(60)).expect("it ends");
-        assert_eq!(
-            (&output.stdout[..], &output.stderr[..]),
-            (&b"out\n"[..], &b"said\n"[..])
-        );
+        assert_eq!((&output.stdout[..], &output.stderr[..]), (&b"out\n"[..], &b"said\n"[..]));
         assert_eq!(output.status.code(), Some(3));
         assert!(begun.elapsed() < Duration::from_secs(4));
     }
@@ -90,8 +77,7 @@ mod tests {
     #[test]
     fn a_program_that_takes_too_long_is_killed() {
         let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
-        let error =
-            wait_for_exit(&mut child, "sleep", Duration::ZERO).expect_err("it takes a minute");
+        let error = wait_for_exit(&mut child, "sleep", Duration::ZERO).expect_err("it takes a minute");
         assert!(error.to_string().contains("sleep had not ended"), "{error}");
         let mut child = Command::new("false").spawn().expect("false");
         let status = wait_for_exit(&mut child, "false", Duration::from_secs(60)).expect("it ends");

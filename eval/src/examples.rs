@@ -21,8 +21,7 @@ use crate::weights;
 use crate::{attempts, deadline};
 
 pub use packages::{
-    ALL, DETECTOR, DISPARITY, EvalPackage, GRAPH_SLAM, InputRecording, LASER_SLAM,
-    LASER_SLAM_SIMULATED, Origin, PEOPLE,
+    ALL, DETECTOR, DISPARITY, EvalPackage, GRAPH_SLAM, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED, Origin, PEOPLE,
 };
 use packages::{DATA, DRIVE, SIMULATED, VIDEO};
 
@@ -62,9 +61,7 @@ impl<'a> EvalFixtures<'a> {
     /// Publishes an example, unless it has been published, or has failed, before.
     pub fn publish(&self, example: &EvalPackage) -> Result<()> {
         let services = self.daemon.deployer().run_json(&["services"])?;
-        let known = services
-            .as_array()
-            .is_some_and(|all| all.iter().any(|service| service["name"] == example.name));
+        let known = services.as_array().is_some_and(|all| all.iter().any(|service| service["name"] == example.name));
         if known {
             return Ok(());
         }
@@ -72,10 +69,7 @@ impl<'a> EvalFixtures<'a> {
     }
 
     fn push(&self, example: &EvalPackage) -> Result<()> {
-        eprintln!(
-            "pushing {}: the first time takes some minutes",
-            example.name
-        );
+        eprintln!("pushing {}: the first time takes some minutes", example.name);
         example.input.check_files()?;
         let mut push = vec!["push".to_owned()];
         match example.origin {
@@ -104,18 +98,11 @@ impl<'a> EvalFixtures<'a> {
 
     /// Creates a temporary directory for one run.
     pub fn directory(&self) -> Result<TempDir> {
-        Ok(tempfile::Builder::new()
-            .prefix("run-")
-            .tempdir_in(self.place)?)
+        Ok(tempfile::Builder::new().prefix("run-").tempdir_in(self.place)?)
     }
 
     /// Returns the plan of a robot that makes one request after the other.
-    pub fn plan(
-        &self,
-        example: &EvalPackage,
-        at: ExecutionSite,
-        directory: &Path,
-    ) -> Result<RobotPlan> {
+    pub fn plan(&self, example: &EvalPackage, at: ExecutionSite, directory: &Path) -> Result<RobotPlan> {
         let (name, installed) = match example.origin {
             Origin::Checkout => (example.name, COMPILED),
             Origin::Debian => (example.executable, PACKAGED),
@@ -131,14 +118,9 @@ impl<'a> EvalFixtures<'a> {
                 let mut words: Vec<String> = words
                     .filter_map(|one| one.as_str().map(str::to_owned))
                     // The Master's address comes from the robot.
-                    .filter(|one| {
-                        !one.starts_with("ROS_MASTER_URI=") && !one.starts_with("ROS_HOSTNAME=")
-                    })
+                    .filter(|one| !one.starts_with("ROS_MASTER_URI=") && !one.starts_with("ROS_HOSTNAME="))
                     .collect();
-                words.push(format!(
-                    "{installed}/{}/{}",
-                    example.name, example.executable
-                ));
+                words.push(format!("{installed}/{}/{}", example.name, example.executable));
                 words.extend(argv);
                 NodeUnderTest::Native {
                     script: image_shell(self.daemon, example.name, &directory.join("root"))?,
@@ -165,10 +147,7 @@ impl<'a> EvalFixtures<'a> {
                 InputRecording::Pictures | InputRecording::Stereo => Vec::new(),
             },
             answer: example.answer.to_owned(),
-            tells_pose: matches!(
-                example.input,
-                InputRecording::Drive | InputRecording::Simulated
-            ),
+            tells_pose: matches!(example.input, InputRecording::Drive | InputRecording::Simulated),
             timing: example.timing.map(str::to_owned),
             map: example.map.map(str::to_owned),
             pace: RequestPacing::OneByOne,
@@ -251,9 +230,7 @@ impl<'a> EvalFixtures<'a> {
 pub fn fingerprint() -> Result<String> {
     let mut files = Vec::new();
     let directories = ["examples", "eval/packages", "tests/packages/receipts_py"];
-    let mut pending = directories
-        .map(|name| binaries::checkout().join(name))
-        .to_vec();
+    let mut pending = directories.map(|name| binaries::checkout().join(name)).to_vec();
     while let Some(directory) = pending.pop() {
         let entries = std::fs::read_dir(&directory);
         for entry in entries.with_context(|| directory.display().to_string())? {
@@ -281,15 +258,7 @@ pub fn fingerprint() -> Result<String> {
 fn extract_pictures(to: &Path) -> Result<()> {
     let mut child = Command::new("ffmpeg")
         .args(["-v", "error", "-i", VIDEO, "-vf", "scale=640:480"])
-        .args([
-            "-frames:v",
-            "60",
-            "-pix_fmt",
-            "bgr24",
-            "-f",
-            "rawvideo",
-            "-y",
-        ])
+        .args(["-frames:v", "60", "-pix_fmt", "bgr24", "-f", "rawvideo", "-y"])
         .arg(to)
         .spawn()
         .context("ffmpeg")?;

@@ -13,15 +13,10 @@ const AT_ONCE: i32 = 130;
 
 /// Installs the signal handlers.
 pub fn listen() -> Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let (mut interrupt, mut terminate) = {
         let _inside = runtime.enter();
-        (
-            signal(SignalKind::interrupt())?,
-            signal(SignalKind::terminate())?,
-        )
+        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
     };
     std::thread::spawn(move || {
         runtime.block_on(async {
@@ -33,9 +28,7 @@ pub fn listen() -> Result<()> {
                 if ASKED.swap(true, Ordering::Relaxed) {
                     std::process::exit(AT_ONCE);
                 }
-                eprintln!(
-                    "ending: the report is written of what was measured; once more ends it at once"
-                );
+                eprintln!("ending: the report is written of what was measured; once more ends it at once");
             }
         });
     });
@@ -52,9 +45,6 @@ pub fn is_requested() -> bool {
 /// # Errors
 /// If it was: nothing more is to be measured.
 pub fn ensure_not_requested() -> Result<()> {
-    ensure!(
-        !is_requested(),
-        "the evaluation was asked to end before this was measured"
-    );
+    ensure!(!is_requested(), "the evaluation was asked to end before this was measured");
     Ok(())
 }

@@ -12,9 +12,7 @@ use support::daemon::DaemonSetup;
 use eval::cells::RunCache;
 use eval::examples::EvalFixtures;
 use eval::experiments::crowd::CrowdDaemon;
-use eval::experiments::{
-    codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
-};
+use eval::experiments::{codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency};
 use eval::section::{MissingMeasurement, Section};
 use eval::{basis, interrupt, rehearsal, report, robot, sweep};
 
@@ -66,11 +64,7 @@ static EXPERIMENTS: [Experiment; 10] = [
         left_out: None,
         run: |all| {
             let runs = outsourcing::measure(all.cells, all.workshop, all.most())?;
-            Ok(vec![
-                outsourcing::response_times(&runs)?,
-                outsourcing::phases(&runs)?,
-                outsourcing::jitter(&runs)?,
-            ])
+            Ok(vec![outsourcing::response_times(&runs)?, outsourcing::phases(&runs)?, outsourcing::jitter(&runs)?])
         },
     },
     Experiment {
@@ -98,11 +92,7 @@ static EXPERIMENTS: [Experiment; 10] = [
     Experiment {
         numbers: &[6],
         seconds: [30, 390],
-        left_out: Some([
-            "failover",
-            "A network that becomes bad",
-            "the stories failover and fallback",
-        ]),
+        left_out: Some(["failover", "A network that becomes bad", "the stories failover and fallback"]),
         run: |all| {
             let runs = failover::measure(all.cells, all.workshop, all.quick)?;
             Ok(vec![failover::section(&runs)?])
@@ -130,11 +120,7 @@ static EXPERIMENTS: [Experiment; 10] = [
     Experiment {
         numbers: &[9],
         seconds: [20, 500],
-        left_out: Some([
-            "neighbours",
-            "Robots beside each other",
-            "the stories limits and sla of the virtual machine",
-        ]),
+        left_out: Some(["neighbours", "Robots beside each other", "the stories limits and sla of the virtual machine"]),
         run: |all| {
             let runs = neighbours::measure(all.cells, &mut all.crowd, all.quick)?;
             Ok(vec![neighbours::section(&runs)?])
@@ -152,11 +138,7 @@ static EXPERIMENTS: [Experiment; 10] = [
     Experiment {
         numbers: &[11],
         seconds: [0, 300],
-        left_out: Some([
-            "overhead",
-            "What the system itself adds",
-            "benches/servant, benches/portal and benches/link",
-        ]),
+        left_out: Some(["overhead", "What the system itself adds", "benches/servant, benches/portal and benches/link"]),
         run: |all| {
             let runs = overhead::measure(all.cells)?;
             Ok(vec![overhead::section(&runs)?])
@@ -220,16 +202,9 @@ fn main() -> ExitCode {
 
 /// Runs the evaluation; returns whether everything was measured.
 fn evaluate(arguments: &EvalArguments) -> Result<bool> {
-    ensure!(
-        nix::unistd::geteuid().is_root(),
-        "robots' places and servants are made by root: sudo make eval"
-    );
+    ensure!(nix::unistd::geteuid().is_root(), "robots' places and servants are made by root: sudo make eval");
     let target = arguments.target.clone().unwrap_or_else(|| {
-        let name = if arguments.quick {
-            "eval-quick"
-        } else {
-            "eval"
-        };
+        let name = if arguments.quick { "eval-quick" } else { "eval" };
         bench_report::root().join("target").join(name)
     });
     let cells = RunCache::new(target.join("cells"), arguments.fresh)?;
@@ -268,11 +243,8 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
 fn run_experiments(arguments: &EvalArguments, mut evaluation: Evaluation) -> Vec<Section> {
     let quick = evaluation.quick;
     let is_wanted = |number: &u8| arguments.only.is_empty() || arguments.only.contains(number);
-    let is_omitted =
-        |one: &Experiment| quick && arguments.only.is_empty() && one.left_out.is_some();
-    let wanted = EXPERIMENTS
-        .iter()
-        .filter(|one| one.numbers.iter().any(is_wanted));
+    let is_omitted = |one: &Experiment| quick && arguments.only.is_empty() && one.left_out.is_some();
+    let wanted = EXPERIMENTS.iter().filter(|one| one.numbers.iter().any(is_wanted));
     let (omitted, wanted): (Vec<&Experiment>, Vec<_>) = wanted.partition(|one| is_omitted(one));
     let seconds = wanted.iter().map(|one| one.seconds[usize::from(!quick)]);
     eprintln!(
@@ -287,11 +259,7 @@ fn run_experiments(arguments: &EvalArguments, mut evaluation: Evaluation) -> Vec
             Ok(made) => sections.extend(made.into_iter().filter(|made| is_wanted(&made.number))),
             Err(error) => {
                 let numbers = one.numbers.iter().copied().filter(is_wanted);
-                sections.extend(
-                    numbers
-                        .take(1)
-                        .map(|number| failure_section(number, &error)),
-                );
+                sections.extend(numbers.take(1).map(|number| failure_section(number, &error)));
             }
         }
     }
@@ -313,8 +281,6 @@ fn failure_section(number: u8, error: &anyhow::Error) -> Section {
     let title = format!("Experiment {number}");
     let mut section = Section::new(number, format!("failed-{number}"), title);
     let why = format!("{error:#}");
-    section
-        .missing
-        .push(MissingMeasurement::retryable("the whole experiment", why));
+    section.missing.push(MissingMeasurement::retryable("the whole experiment", why));
     section
 }

@@ -39,13 +39,7 @@ impl NetworkProfile {
             Self::Wifi => (40_000, 5, 4, 0.01),
             Self::Bad => (2000, 100, 0, 0.01),
         };
-        NetworkImpairment {
-            rate,
-            delay,
-            jitter,
-            loss,
-            limit: if self == Self::Bad { 100 } else { 1000 },
-        }
+        NetworkImpairment { rate, delay, jitter, loss, limit: if self == Self::Bad { 100 } else { 1000 } }
     }
 
     /// Describes its properties in words.

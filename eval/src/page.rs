@@ -13,12 +13,7 @@ use tables::render_table;
 
 /// Renders the page. `machine` describes where it was measured, `made` is the date; `reproduced` lists what could not
 /// be reproduced here, the substitute, and the reason.
-pub fn render(
-    sections: &[Section],
-    machine: &str,
-    made: &str,
-    reproduced: &[(String, String, String)],
-) -> String {
+pub fn render(sections: &[Section], machine: &str, made: &str, reproduced: &[(String, String, String)]) -> String {
     let mut page = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
@@ -42,10 +37,8 @@ pub fn render(
     }
     if !reproduced.is_empty() {
         page.push_str("<section id=\"reproduced\">\n<h2>What could not be reproduced here</h2>\n");
-        let mut table = Table::new(
-            "What the publication used, and what stands for it",
-            "published | stand-in | reason",
-        );
+        let mut table =
+            Table::new("What the publication used, and what stands for it", "published | stand-in | reason");
         for (what, instead, why) in reproduced {
             table.push([what, instead, why]);
         }
@@ -81,21 +74,15 @@ fn escape(text: &str) -> String {
 
 /// Returns the anchor of a section or figure: letters, digits and dashes.
 fn anchor(kind: &str, id: &str) -> String {
-    let plain = id.chars().map(|character| {
-        if character.is_ascii_alphanumeric() {
-            character.to_ascii_lowercase()
-        } else {
-            '-'
-        }
-    });
+    let plain = id.chars().map(
+        |character| {
+            if character.is_ascii_alphanumeric() { character.to_ascii_lowercase() } else { '-' }
+        },
+    );
     format!("{kind}-{}", plain.collect::<String>())
 }
 
-fn render_contents(
-    page: &mut String,
-    sections: &[Section],
-    reproduced: &[(String, String, String)],
-) {
+fn render_contents(page: &mut String, sections: &[Section], reproduced: &[(String, String, String)]) {
     page.push_str("<nav aria-label=\"Contents\">\n<h2>Contents</h2>\n<ul>\n");
     for section in sections {
         let missing = match section.missing.len() {
@@ -130,13 +117,7 @@ fn render_section(page: &mut String, section: &Section) {
         ),
     );
     if !section.published.is_empty() {
-        append(
-            page,
-            format_args!(
-                "<h3>Published</h3>\n<p>{}</p>\n",
-                escape(&section.published)
-            ),
-        );
+        append(page, format_args!("<h3>Published</h3>\n<p>{}</p>\n", escape(&section.published)));
     }
     render_sentences(page, "What is different here", &section.differs);
     let measured = !(section.tables.is_empty() && section.figures.is_empty());
@@ -200,13 +181,9 @@ mod tests {
         section.published = EVIL.into();
         section.differs.push(EVIL.into());
         section.findings.push(EVIL.into());
-        section
-            .tables
-            .push(Table::new(EVIL, &format!("{EVIL} | {EVIL}")).row([EVIL, EVIL]));
+        section.tables.push(Table::new(EVIL, &format!("{EVIL} | {EVIL}")).row([EVIL, EVIL]));
         section.figures.push(Figure::png(EVIL, EVIL, vec![1, 2, 3]));
-        section
-            .missing
-            .push(MissingMeasurement::new(EVIL, EVIL, EVIL));
+        section.missing.push(MissingMeasurement::new(EVIL, EVIL, EVIL));
         section
     }
 
@@ -216,9 +193,7 @@ mod tests {
         let page = render(&[hostile_section()], EVIL, EVIL, &[row]);
         assert!(!page.contains("<script"), "{page}");
         assert!(!page.contains('\u{0}') && !page.contains("& '"), "{page}");
-        assert!(
-            page.contains("&lt;script&gt;alert(&quot;1&quot;)&lt;/script&gt; &amp; &#39;x&#39;")
-        );
+        assert!(page.contains("&lt;script&gt;alert(&quot;1&quot;)&lt;/script&gt; &amp; &#39;x&#39;"));
     }
 
     #[test]
@@ -237,17 +212,12 @@ mod tests {
             "t",
             "x",
             "y < z",
-            &[crate::plots::Series::new(
-                "one",
-                vec![(0.0, 1.0), (1.0, 2.0)],
-            )],
+            &[crate::plots::Series::new("one", vec![(0.0, 1.0), (1.0, 2.0)])],
             false,
         )
         .expect("it is drawn");
         let mut section = Section::new(2, "rrt", "RRT");
-        section
-            .figures
-            .push(Figure::svg("fig-5", "by request", plot));
+        section.figures.push(Figure::svg("fig-5", "by request", plot));
         let page = render(&[section], "m", "d", &[]);
         assert_tells(&page, "<figure id=\"figure-fig-5\">");
         assert_tells(&page, "role=\"img\" aria-label=\"by request\"><svg ");
@@ -261,14 +231,8 @@ mod tests {
         section.published = "as published".into();
         section.differs.push("two cores".into());
         section.findings.push("worse than hoped, because".into());
-        section
-            .tables
-            .push(Table::new("RRT", "set-up | RRT (s) | note").row(["none", "0.20", "n"]));
-        section.missing.push(MissingMeasurement::new(
-            "8 neighbours",
-            "out of memory",
-            "more memory",
-        ));
+        section.tables.push(Table::new("RRT", "set-up | RRT (s) | note").row(["none", "0.20", "n"]));
+        section.missing.push(MissingMeasurement::new("8 neighbours", "out of memory", "more memory"));
         let row = ("GPU".into(), "CPU".into(), "there is none".into());
         let page = render(&[section], "2 × some processor", "2026-11-25", &[row]);
         for wanted in [

@@ -39,15 +39,9 @@ pub struct RobotHardware {
 
 impl RobotHardware {
     /// A Raspberry Pi: a quarter of a core and 1 GiB.
-    pub const PI: Self = Self {
-        cores: 0.25,
-        memory: GIB,
-    };
+    pub const PI: Self = Self { cores: 0.25, memory: GIB };
     /// An ultrabook: half a core and 4 GiB.
-    pub const ULTRABOOK: Self = Self {
-        cores: 0.5,
-        memory: 4 * GIB,
-    };
+    pub const ULTRABOOK: Self = Self { cores: 0.5, memory: 4 * GIB };
 
     /// Name in tables.
     pub fn name(self) -> &'static str {
@@ -91,11 +85,7 @@ impl RobotSandbox {
              are delegated",
             parent.reason
         );
-        let limits = Limits {
-            cpus: Some(class.cores),
-            memory: Some(Size(class.memory)),
-            ..Limits::default()
-        };
+        let limits = Limits { cpus: Some(class.cores), memory: Some(Size(class.memory)), ..Limits::default() };
         let name = cable.namespace();
         let name = name.file_name().and_then(|name| name.to_str());
         let cgroup = Cgroup::for_servant(&parent, &spec(name.unwrap_or("robot"), &limits));
@@ -136,12 +126,8 @@ impl RobotSandbox {
     /// If the robot was killed (by a signal, or by the kernel for lack of memory), reports why it cannot continue, or
     /// exceeds the time limit of its plan.
     pub fn run(&self, plan: &RobotPlan, directory: &Path) -> Result<(Trace, RunCost)> {
-        let [order, answer, log] =
-            ["plan.json", "trace.json", "log"].map(|name| directory.join(name));
-        let plan = RobotPlan {
-            server: self.server(),
-            ..plan.clone()
-        };
+        let [order, answer, log] = ["plan.json", "trace.json", "log"].map(|name| directory.join(name));
+        let plan = RobotPlan { server: self.server(), ..plan.clone() };
         std::fs::write(&order, serde_json::to_vec(&(&plan, &self.cgroup))?)?;
         let begun = (self.cgroup.usage(), self.cable.transferred_bytes()?);
         let said = File::create(&log)?;
@@ -170,16 +156,9 @@ impl RobotSandbox {
             let said = std::fs::read_to_string(&log).unwrap_or_default();
             // Also ends processes that the robot has started.
             for pid in self.cgroup.processes() {
-                let _ = nix::sys::signal::kill(
-                    nix::unistd::Pid::from_raw(pid),
-                    nix::sys::signal::Signal::SIGKILL,
-                );
+                let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
             }
-            let memory = if killed > 0 {
-                "; the kernel has ended a process of it for want of memory"
-            } else {
-                ""
-            };
+            let memory = if killed > 0 { "; the kernel has ended a process of it for want of memory" } else { "" };
             bail!("{error:#}{memory}; its last words: {}", output_tail(&said));
         }
         let trace = serde_json::from_slice(&std::fs::read(&answer)?)?;
@@ -239,9 +218,7 @@ pub fn remove_abandoned() -> Vec<String> {
         return Vec::new();
     };
     let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
-    let names = entries
-        .flatten()
-        .filter_map(|entry| entry.file_name().into_string().ok());
+    let names = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
     let mut told = Vec::new();
     for name in names {
         let Some((pid, number)) = parse_owner(&name) else {
@@ -279,10 +256,7 @@ fn wait_for_robot(child: &mut Child, patience: Duration) -> Result<()> {
 
 /// Returns the end of the output in one line.
 fn output_tail(said: &str) -> String {
-    let lines: Vec<&str> = said
-        .lines()
-        .filter(|line| !line.trim().is_empty())
-        .collect();
+    let lines: Vec<&str> = said.lines().filter(|line| !line.trim().is_empty()).collect();
     let from = lines.len().saturating_sub(6);
     lines[from..].join(" | ")
 }
@@ -310,10 +284,7 @@ mod tests {
     #[test]
     fn a_network_is_told_by_its_rules() {
         assert_eq!(NetworkProfile::Lan.describe(), "1 ms each way, 100 Mbit/s");
-        assert_eq!(
-            NetworkProfile::Wifi.describe(),
-            "5 ms each way, more or less 4 ms, 40 Mbit/s, 1 % of packets lost"
-        );
+        assert_eq!(NetworkProfile::Wifi.describe(), "5 ms each way, more or less 4 ms, 40 Mbit/s, 1 % of packets lost");
         assert!((NetworkProfile::Bad.transfer_time(250_000) - 1.0).abs() < 1e-9);
     }
 

@@ -27,10 +27,7 @@ pub struct Series {
 impl Series {
     /// Creates a series.
     pub fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
-        Self {
-            name: name.into(),
-            points,
-        }
+        Self { name: name.into(), points }
     }
 }
 
@@ -78,11 +75,7 @@ mod tests {
     /// Every kind of plot, without values and with values that cannot be drawn.
     #[test]
     fn nothing_measured_is_said() {
-        let unusable = [
-            (f64::NAN, 1.0),
-            (1.0, f64::INFINITY),
-            (f64::NEG_INFINITY, 2.0),
-        ];
+        let unusable = [(f64::NAN, 1.0), (1.0, f64::INFINITY), (f64::NEG_INFINITY, 2.0)];
         for given in [Vec::new(), series(&[]), series(&unusable)] {
             for text in [
                 lines("t", "x", "y", &given, false),
@@ -94,21 +87,12 @@ mod tests {
                 assert_tells(&text, "nothing was measured");
             }
         }
-        let bar = |value| Bar {
-            group: "g".into(),
-            name: "n".into(),
-            value,
-            spread: Some((f64::NAN, 1.0)),
-        };
+        let bar = |value| Bar { group: "g".into(), name: "n".into(), value, spread: Some((f64::NAN, 1.0)) };
         for given in [vec![], vec![bar(f64::NAN), bar(f64::INFINITY)]] {
             let text = bars("t", "y", &given, false).expect("it is drawn");
             assert_tells(&text, "nothing was measured");
         }
-        for given in [
-            vec![],
-            vec![("a".to_owned(), vec![])],
-            vec![("a".to_owned(), vec![f64::NAN])],
-        ] {
+        for given in [vec![], vec![("a".to_owned(), vec![])], vec![("a".to_owned(), vec![f64::NAN])]] {
             let text = distribution("t", "x", &given, true).expect("it is drawn");
             assert_tells(&text, "nothing was measured");
         }
@@ -159,22 +143,9 @@ mod tests {
     /// Three points, the middle one unknown: no line crosses the gap.
     #[test]
     fn a_line_stops_where_a_value_is_left_out() {
-        let whole = lines(
-            "t",
-            "x",
-            "y",
-            &series(&[(0.0, 1.0), (1.0, 2.0), (2.0, 3.0)]),
-            false,
-        )
-        .expect("it is drawn");
-        let broken = lines(
-            "t",
-            "x",
-            "y",
-            &series(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0)]),
-            false,
-        )
-        .expect("it is drawn");
+        let whole = lines("t", "x", "y", &series(&[(0.0, 1.0), (1.0, 2.0), (2.0, 3.0)]), false).expect("it is drawn");
+        let broken =
+            lines("t", "x", "y", &series(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0)]), false).expect("it is drawn");
         assert!(count(&whole, "stroke=\"#0072B2\"") > count(&broken, "stroke=\"#0072B2\""));
     }
 
@@ -183,32 +154,17 @@ mod tests {
     fn curves_are_lines_and_measurements_are_points() {
         let curve: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), f64::from(x * x))).collect();
         let points = [Series::new("held back", vec![(3.0, 9.5), (20.0, 390.0)])];
-        let text = curves(
-            "t",
-            "x",
-            "y",
-            &[Series::new("model", curve)],
-            &points,
-            false,
-        )
-        .expect("it is drawn");
+        let text = curves("t", "x", "y", &[Series::new("model", curve)], &points, false).expect("it is drawn");
         let same = lines("t", "x", "y", &points, false).expect("it is drawn");
-        assert!(
-            text.contains("model") && text.contains("held back"),
-            "{text}"
-        );
+        assert!(text.contains("model") && text.contains("held back"), "{text}");
         assert!(!text.contains("points=\"\"") && count(&text, "#E69F00") < count(&text, "#0072B2"));
         assert!(count(&same, "<polyline") > 0, "{same}");
     }
 
     #[test]
     fn bars_show_their_values_and_groups() {
-        let bar = |group: &str, name: &str, value, spread| Bar {
-            group: group.into(),
-            name: name.into(),
-            value,
-            spread,
-        };
+        let bar =
+            |group: &str, name: &str, value, spread| Bar { group: group.into(), name: name.into(), value, spread };
         for log in [false, true] {
             let text = bars(
                 "t",
@@ -229,12 +185,7 @@ mod tests {
 
     #[test]
     fn bars_of_nothing_and_below_nothing_are_drawn() {
-        for values in [
-            vec![0.0, 0.0],
-            vec![-1.0, -2.0],
-            vec![0.0, 5.0],
-            vec![1e299, -1e-299],
-        ] {
+        for values in [vec![0.0, 0.0], vec![-1.0, -2.0], vec![0.0, 5.0], vec![1e299, -1e-299]] {
             let given: Vec<Bar> = values
                 .iter()
                 .map(|value| Bar {
@@ -271,10 +222,7 @@ mod tests {
     /// Among 1, 2, 2 and 4, three quarters are at most 2; together with an unanswered one, three fifths are.
     #[test]
     fn shares_are_of_all_values() {
-        assert_eq!(
-            super::series::cumulative_shares(&[4.0, 1.0, 2.0, 2.0]),
-            [(1.0, 25.0), (2.0, 75.0), (4.0, 100.0)]
-        );
+        assert_eq!(super::series::cumulative_shares(&[4.0, 1.0, 2.0, 2.0]), [(1.0, 25.0), (2.0, 75.0), (4.0, 100.0)]);
         assert_eq!(
             super::series::cumulative_shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
             [(1.0, 20.0), (2.0, 60.0), (4.0, 80.0)]

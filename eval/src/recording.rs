@@ -119,9 +119,7 @@ fn from_pictures(file: &Bytes) -> Recording {
         time: u64::from(number) * PERIOD,
         bytes: support::people::picture(number, SIZE, pixels),
     });
-    Recording {
-        messages: messages.collect(),
-    }
+    Recording { messages: messages.collect() }
 }
 
 /// The `std_msgs/Header` at the beginning of a serialized message.
@@ -140,10 +138,7 @@ pub fn read_header(bytes: &[u8]) -> Option<Header> {
         Some(u32::from_le_bytes(bytes.try_into().ok()?))
     };
     let end = 16 + word(12)? as usize;
-    (end <= bytes.len()).then_some(Header {
-        stamp: (word(4)?, word(8)?),
-        end,
-    })
+    (end <= bytes.len()).then_some(Header { stamp: (word(4)?, word(8)?), end })
 }
 
 /// Reads x, y (metres) and heading (radians) of a `geometry_msgs/PoseStamped` or a message with the same beginning.
@@ -172,9 +167,7 @@ pub fn with_stamp(bytes: &Bytes, number: u32) -> Option<Bytes> {
 pub fn with_relative_stamp(message: &BagMessage, request: &BagMessage, number: u32) -> Bytes {
     let begins = |line: &str| matches!(line.trim(), "Header header" | "std_msgs/Header header");
     let fields = message.wire_type.definition.lines().map(str::trim);
-    let first = fields
-        .clone()
-        .find(|line| !line.is_empty() && !line.starts_with('#'));
+    let first = fields.clone().find(|line| !line.is_empty() && !line.starts_with('#'));
     if !first.is_some_and(begins) {
         return message.bytes.clone();
     }
@@ -213,8 +206,7 @@ mod tests {
             bytes.extend(u32::to_le_bytes(word));
         }
         bytes.extend(b"map");
-        rest.iter()
-            .for_each(|number| bytes.extend(number.to_le_bytes()));
+        rest.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
         bytes
     }
 
@@ -249,10 +241,7 @@ mod tests {
             test_message("/odom", 15, b"f"),
         ]);
         let steps = recording.steps("/scan");
-        let told: Vec<_> = steps
-            .iter()
-            .map(|step| (step.before.len(), step.at))
-            .collect();
+        let told: Vec<_> = steps.iter().map(|step| (step.before.len(), step.at)).collect();
         assert_eq!(told, [(1, 1.0), (2, 4.0)]);
         assert_eq!(recording.topics(&["/odom".to_owned()]).len(), 1);
     }
@@ -261,10 +250,7 @@ mod tests {
     fn an_answer_is_told_by_the_stamp() {
         let bytes = Bytes::from(stamped_bytes(42, &[]));
         let again = with_stamp(&bytes, 1001).expect("it has a header");
-        assert_eq!(
-            read_header(&again).map(|header| header.stamp),
-            Some((1001, 0))
-        );
+        assert_eq!(read_header(&again).map(|header| header.stamp), Some((1001, 0)));
         assert_eq!(with_stamp(&Bytes::from_static(b"short"), 1), None);
     }
 

@@ -20,22 +20,14 @@ const BYTES: usize = 640 * 480 * 3;
 pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Result<Section> {
     let mut section = Section::new(0, "rehearsal", "Nothing");
     let place = cells.measure("rehearsal place", &(), || {
-        RobotSandbox::new(
-            &workshop.daemon.address,
-            RobotHardware::PI,
-            NetworkProfile::Lan,
-        )?;
+        RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NetworkProfile::Lan)?;
         Ok("made".to_owned())
     })?;
     // As for packages, another duration of the node does not make it another run.
     let robot = cells.measure("rehearsal robot", &(), || {
         let directory = workshop.directory()?;
         let plan = plan(directory.path(), seconds)?;
-        let place = RobotSandbox::new(
-            &workshop.daemon.address,
-            RobotHardware::PI,
-            NetworkProfile::Lan,
-        )?;
+        let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NetworkProfile::Lan)?;
         let seen: (Trace, RunCost) = place.run(&plan, directory.path())?;
         Ok(seen.0.node_ended.unwrap_or_default())
     })?;

@@ -20,11 +20,7 @@ const STAND_INS: [(&str, &str, &str); 5] = [
         "laser_slam, graph_slam and object_detector of examples/",
         "they are not packaged for Debian 12, and their data sets are not in its archive",
     ),
-    (
-        "a GPU in the cloud",
-        "none: all computes on processor cores",
-        "the packages that stand in have no code for one",
-    ),
+    ("a GPU in the cloud", "none: all computes on processor cores", "the packages that stand in have no code for one"),
     (
         "a real robot, a Raspberry Pi, an ultrabook",
         "control groups with a part of a core, in network namespaces",
@@ -35,11 +31,7 @@ const STAND_INS: [(&str, &str, &str); 5] = [
         "the rest of the machine; delays, rates and losses of packets between namespaces",
         "one machine has to do",
     ),
-    (
-        "KinectFusion's SLAMBench",
-        "the same three phases, told by laser_slam",
-        "it needs a depth camera's data set",
-    ),
+    ("KinectFusion's SLAMBench", "the same three phases, told by laser_slam", "it needs a depth camera's data set"),
 ];
 
 #[derive(Serialize)]
@@ -78,21 +70,11 @@ pub fn write(target: &Path, sections: &[Section], cells: &RunCache) -> Result<bo
         Some((oldest, _)) => format!("{made}, of what was measured on {oldest}"),
         None => made.clone(),
     };
-    let stand_ins = STAND_INS
-        .map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
+    let stand_ins = STAND_INS.map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
     let html = target.join("report.html");
     std::fs::write(&html, page::render(sections, &told, &from_to, &stand_ins))?;
-    let whole = ReportFile {
-        made,
-        machine,
-        sections,
-        measured,
-        runs: cells.used_figures(),
-    };
-    std::fs::write(
-        target.join("report.json"),
-        serde_json::to_vec_pretty(&whole)?,
-    )?;
+    let whole = ReportFile { made, machine, sections, measured, runs: cells.used_figures() };
+    std::fs::write(target.join("report.json"), serde_json::to_vec_pretty(&whole)?)?;
     print_summary(sections);
     println!("the report is {}", html.display());
     Ok(sections.iter().all(|section| section.missing.is_empty()))
@@ -106,10 +88,7 @@ fn print_summary(sections: &[Section]) {
             println!("   {finding}");
         }
         for missing in &section.missing {
-            println!(
-                "   NOT measured: {}: {} ({})",
-                missing.what, missing.why, missing.next
-            );
+            println!("   NOT measured: {}: {} ({})", missing.what, missing.why, missing.next);
         }
     }
 }

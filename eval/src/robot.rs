@@ -43,13 +43,7 @@ fn run(plan: &RobotPlan) -> Result<Trace> {
     }
     let recording = Recording::read(&plan.recording)?;
     let steps: Vec<RecordedStep> = recording.steps(&plan.request);
-    ensure!(
-        steps.len() > WARM_UP,
-        "{} has {} messages of {}",
-        plan.recording.display(),
-        steps.len(),
-        plan.request
-    );
+    ensure!(steps.len() > WARM_UP, "{} has {} messages of {}", plan.recording.display(), steps.len(), plan.request);
     let site = Site::new()?;
     let mut ends = ends::create_endpoints(&site, plan, &recording)?;
     let mut node = start_node(&site, plan)?;
@@ -59,12 +53,7 @@ fn run(plan: &RobotPlan) -> Result<Trace> {
         trace.handovers = rate::count_handovers(&node.output());
         rate::apply_stub_log(&node.output(), &mut trace.requests);
         let warns = |line: &&str| line.contains(" WARN ");
-        trace.warnings = node
-            .output()
-            .lines()
-            .filter(warns)
-            .map(str::to_owned)
-            .collect();
+        trace.warnings = node.output().lines().filter(warns).map(str::to_owned).collect();
     }
     if trace.node_ended.is_none() {
         // SIGINT, as roslaunch sends it.
@@ -76,25 +65,12 @@ fn run(plan: &RobotPlan) -> Result<Trace> {
 
 fn start_node(site: &Site, plan: &RobotPlan) -> Result<NodeProcess> {
     match &plan.node {
-        NodeUnderTest::Native {
-            script,
-            program,
-            argv,
-        } => site.start_in_image(script, program, argv),
-        NodeUnderTest::Stub {
-            package,
-            executable,
-            argv,
-            settings,
-            environment: besides,
-        } => {
+        NodeUnderTest::Native { script, program, argv } => site.start_in_image(script, program, argv),
+        NodeUnderTest::Stub { package, executable, argv, settings, environment: besides } => {
             let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
             let toml = format!("server = \"{}\"\n{settings}\n", plan.server);
-            let mut environment = vec![
-                ("ROS_IP", "127.0.0.1"),
-                ("NO_COLOR", "1"),
-                ("CLOUDROID_LOG", "info,requests=debug"),
-            ];
+            let mut environment =
+                vec![("ROS_IP", "127.0.0.1"), ("NO_COLOR", "1"), ("CLOUDROID_LOG", "info,requests=debug")];
             environment.extend(besides.iter().map(|(name, value)| (&**name, &**value)));
             site.start_stub_with_environment(&environment, &toml, package, executable, &argv)
         }

@@ -73,11 +73,7 @@ pub struct Table {
 impl Table {
     /// Creates a table without rows, of heads parted by ` | `.
     pub fn new(caption: impl Into<String>, head: &str) -> Self {
-        Self {
-            caption: caption.into(),
-            head: head.split(" | ").map(str::to_owned).collect(),
-            rows: Vec::new(),
-        }
+        Self { caption: caption.into(), head: head.split(" | ").map(str::to_owned).collect(), rows: Vec::new() }
     }
 
     /// Returns the table with one more row.
@@ -106,20 +102,12 @@ pub struct Figure {
 impl Figure {
     /// Creates a figure from an SVG document.
     pub fn svg(id: impl Into<String>, caption: impl Into<String>, text: impl Into<String>) -> Self {
-        Self {
-            id: id.into(),
-            caption: caption.into(),
-            image: FigureImage::Svg(text.into()),
-        }
+        Self { id: id.into(), caption: caption.into(), image: FigureImage::Svg(text.into()) }
     }
 
     /// Creates a figure from a PNG file.
     pub fn png(id: impl Into<String>, caption: impl Into<String>, bytes: Vec<u8>) -> Self {
-        Self {
-            id: id.into(),
-            caption: caption.into(),
-            image: FigureImage::Png(bytes),
-        }
+        Self { id: id.into(), caption: caption.into(), image: FigureImage::Png(bytes) }
     }
 }
 
@@ -149,11 +137,7 @@ pub struct MissingMeasurement {
 impl MissingMeasurement {
     /// Creates an entry from these three texts.
     pub fn new(what: impl Into<String>, why: impl Into<String>, next: impl Into<String>) -> Self {
-        Self {
-            what: what.into(),
-            why: why.into(),
-            next: next.into(),
-        }
+        Self { what: what.into(), why: why.into(), next: next.into() }
     }
 
     /// Creates an entry for something that may succeed in another run.

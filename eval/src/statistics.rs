@@ -9,20 +9,13 @@ mod paths;
 mod queues;
 
 pub use bench_report::{median, quantile};
-pub use figures::{
-    FittedLine, least_squares, mean, median_interval, root_mean_square_error, standard_deviation,
-};
+pub use figures::{FittedLine, least_squares, mean, median_interval, root_mean_square_error, standard_deviation};
 pub use models::RrtModel;
 pub use paths::{TrajectoryError, trajectory_error};
-pub use queues::{
-    NodeModel, QueueObservation, QueuePrediction, machine_repair, response_time, robots_per_node,
-};
+pub use queues::{NodeModel, QueueObservation, QueuePrediction, machine_repair, response_time, robots_per_node};
 
 #[cfg(test)]
 #[track_caller]
 fn assert_near(one: f64, other: f64) {
-    assert!(
-        (one - other).abs() < 1e-9 * (1.0 + other.abs()),
-        "{one} is not {other}"
-    );
+    assert!((one - other).abs() < 1e-9 * (1.0 + other.abs()), "{one} is not {other}");
 }

@@ -11,10 +11,8 @@ use ros::bag::BagMessage;
 use ros::bus::WireType;
 
 /// Photographs of the left and of the right camera.
-pub const PICTURES: [&str; 2] = [
-    "/usr/share/doc/opencv-doc/examples/data/aloeL.jpg",
-    "/usr/share/doc/opencv-doc/examples/data/aloeR.jpg",
-];
+pub const PICTURES: [&str; 2] =
+    ["/usr/share/doc/opencv-doc/examples/data/aloeL.jpg", "/usr/share/doc/opencv-doc/examples/data/aloeR.jpg"];
 /// Topic of the last message of each moment.
 pub const LAST: &str = "/right/image_raw";
 /// Size of a window, in pixels.
@@ -42,12 +40,7 @@ pub fn write(to: &Path) -> Result<()> {
             .output()
             .context("ffmpeg")?;
         let said = String::from_utf8_lossy(&output.stderr);
-        ensure!(
-            output.status.success(),
-            "ffmpeg ended with {}: {}",
-            output.status,
-            said.trim()
-        );
+        ensure!(output.status.success(), "ffmpeg ended with {}: {}", output.status, said.trim());
         whole.extend(output.stdout);
     }
     std::fs::write(to, whole).with_context(|| to.display().to_string())
@@ -60,25 +53,13 @@ pub fn read(file: &Bytes) -> Vec<BagMessage> {
     let size = (width * height) as usize;
     let pairs = left.chunks_exact(size).zip(right.chunks_exact(size));
     let image = Arc::new(support::people::image_type());
-    let info = Arc::new(WireType::new(
-        "sensor_msgs/CameraInfo",
-        "c9a58c1b0b154e0e6da7578cb991d214",
-        CAMERA_INFO,
-    ));
+    let info = Arc::new(WireType::new("sensor_msgs/CameraInfo", "c9a58c1b0b154e0e6da7578cb991d214", CAMERA_INFO));
     let mut messages = Vec::new();
     for ((left, right), number) in pairs.zip(0..) {
         let all = [
             ("/left/image_raw", &image, serialize_image(number, left)),
-            (
-                "/left/camera_info",
-                &info,
-                serialize_camera_info(number, 0.0),
-            ),
-            (
-                "/right/camera_info",
-                &info,
-                serialize_camera_info(number, BASELINE),
-            ),
+            ("/left/camera_info", &info, serialize_camera_info(number, 0.0)),
+            ("/right/camera_info", &info, serialize_camera_info(number, BASELINE)),
             (LAST, &image, serialize_image(number, right)),
         ];
         messages.extend(all.map(|(topic, wire_type, bytes)| BagMessage {
@@ -98,9 +79,7 @@ fn put_string(out: &mut BytesMut, text: &str) {
 
 /// Writes a `std_msgs/Header` whose stamp is its number.
 fn put_header(out: &mut BytesMut, number: u32) {
-    [number, number, 0]
-        .iter()
-        .for_each(|word| out.put_u32_le(*word));
+    [number, number, 0].iter().for_each(|word| out.put_u32_le(*word));
     put_string(out, "camera");
 }
 
@@ -121,11 +100,7 @@ fn serialize_image(number: u32, pixels: &[u8]) -> Bytes {
 /// Serializes a `sensor_msgs/CameraInfo` of an ideal camera, `baseline` metres to the right of the left one.
 fn serialize_camera_info(number: u32, baseline: f64) -> Bytes {
     let (width, height) = SIZE;
-    let (f, x, y) = (
-        FOCAL_LENGTH,
-        f64::from(width) / 2.0,
-        f64::from(height) / 2.0,
-    );
+    let (f, x, y) = (FOCAL_LENGTH, f64::from(width) / 2.0, f64::from(height) / 2.0);
     let mut out = BytesMut::new();
     put_header(&mut out, number);
     out.put_u32_le(height);
@@ -135,11 +110,7 @@ fn serialize_camera_info(number: u32, baseline: f64) -> Bytes {
     let distortion = [0.0; 5];
     let intrinsic = [f, 0.0, x, 0.0, f, y, 0.0, 0.0, 1.0];
     let rectifying = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-    let projecting = [
-        [f, 0.0, x, -f * baseline],
-        [0.0, f, y, 0.0],
-        [0.0, 0.0, 1.0, 0.0],
-    ];
+    let projecting = [[f, 0.0, x, -f * baseline], [0.0, f, y, 0.0], [0.0, 0.0, 1.0, 0.0]];
     let numbers = distortion.iter().chain(&intrinsic).chain(&rectifying);
     let numbers = numbers.chain(projecting.as_flattened());
     numbers.for_each(|number| out.put_f64_le(*number));

@@ -40,11 +40,7 @@ impl StreamHeader {
 
     /// Header for a topic of maps.
     pub fn for_maps(rounds: usize) -> Self {
-        let of = WireType::new(
-            "nav_msgs/OccupancyGrid",
-            "3381f2d731d4076ec5c71b0759edbe4e",
-            MAP,
-        );
+        let of = WireType::new("nav_msgs/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e", MAP);
         Self::new("/map", &of, rounds)
     }
 
@@ -62,10 +58,7 @@ impl StreamHeader {
 
 /// Writes a file, whose name ends with `.messages`.
 pub fn write(path: &Path, head: &StreamHeader, messages: &[Bytes]) -> Result<()> {
-    let head = StreamHeader {
-        lengths: messages.iter().map(Bytes::len).collect(),
-        ..head.clone()
-    };
+    let head = StreamHeader { lengths: messages.iter().map(Bytes::len).collect(), ..head.clone() };
     let mut file = std::fs::File::create(path).with_context(|| path.display().to_string())?;
     serde_json::to_writer(&mut file, &head)?;
     file.write_all(b"\n")?;
@@ -80,22 +73,12 @@ pub fn read(file: &Bytes) -> Result<Vec<BagMessage>> {
     let line = file.iter().position(|byte| *byte == b'\n');
     let line = line.context("the file has no first line")?;
     let head: StreamHeader = serde_json::from_slice(&file[..line])?;
-    let (topic, wire_type) = (
-        Arc::<str>::from(head.topic),
-        Arc::new(WireType::new(
-            head.of,
-            head.digest.as_str(),
-            head.definition,
-        )),
-    );
+    let (topic, wire_type) =
+        (Arc::<str>::from(head.topic), Arc::new(WireType::new(head.of, head.digest.as_str(), head.definition)));
     let mut from = line + 1;
     let mut messages = Vec::new();
     for length in head.lengths {
-        ensure!(
-            length <= file.len() - from,
-            "the file breaks off in message {}",
-            messages.len() + 1
-        );
+        ensure!(length <= file.len() - from, "the file breaks off in message {}", messages.len() + 1);
         messages.push(file.slice(from..from + length));
         from += length;
     }

@@ -55,8 +55,7 @@ fn abandoned_directories(temporary: &Path) -> Vec<PathBuf> {
 /// Returns whether the process that wrote this note still exists.
 fn is_running(owner: &str) -> bool {
     let (pid, since) = owner.split_once(' ').unwrap_or((owner, ""));
-    pid.parse()
-        .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == since))
+    pid.parse().is_ok_and(|pid| start_time(pid).is_some_and(|now| now == since))
 }
 
 /// Returns the start time of a process in ticks since boot, because pids are reused (proc(5): field 22 of `stat`).

@@ -85,10 +85,7 @@ pub struct Trace {
 impl Trace {
     /// Response times of the answered requests, in seconds.
     pub fn responses(&self) -> Vec<f64> {
-        self.requests
-            .iter()
-            .filter_map(|one| one.response)
-            .collect()
+        self.requests.iter().filter_map(|one| one.response).collect()
     }
 
     /// Number of answered requests.
@@ -100,8 +97,7 @@ impl Trace {
     /// answer to the last one. `None` without counters, or with too few answers.
     pub fn bytes_per_request(&self, from: usize) -> Option<[f64; 2]> {
         let known = |(index, request): (usize, &RequestSample)| Some((index, request.carried?));
-        let all: Vec<(usize, [u64; 2])> =
-            self.requests.iter().enumerate().filter_map(known).collect();
+        let all: Vec<(usize, [u64; 2])> = self.requests.iter().enumerate().filter_map(known).collect();
         let first = all.iter().rfind(|(index, _)| *index < from)?;
         let last = all.last().filter(|last| last.0 >= from)?;
         let requests = (last.0 - first.0) as f64;

@@ -26,9 +26,7 @@ pub fn install(package: &Path) -> Result<()> {
 fn install_from(package: &Path, cache: &Path) -> Result<()> {
     let (script, file) = (package.join("fetch_weights"), package.join(FILE));
     let text = std::fs::read_to_string(&script).with_context(|| script.display().to_string())?;
-    let expected = text
-        .split_once(EXPECTED)
-        .and_then(|(_, rest)| rest.get(..64));
+    let expected = text.split_once(EXPECTED).and_then(|(_, rest)| rest.get(..64));
     let expected = expected.with_context(|| format!("{} names no SHA-256", script.display()))?;
     let kept = cache.join(format!("{expected}.onnx"));
     if !has_digest(&file, expected) {
@@ -36,11 +34,8 @@ fn install_from(package: &Path, cache: &Path) -> Result<()> {
             copy(&kept, &file)?;
             return Ok(());
         }
-        let status = deadline::wait_for_exit(
-            &mut Command::new(&script).spawn()?,
-            &script.display().to_string(),
-            LONGEST,
-        )?;
+        let status =
+            deadline::wait_for_exit(&mut Command::new(&script).spawn()?, &script.display().to_string(), LONGEST)?;
         ensure!(
             status.success() && has_digest(&file, expected),
             "the detector's weights could not be fetched ({status}): run {}, which takes them from the registry of npm",
@@ -71,9 +66,7 @@ fn cache_directory() -> Result<PathBuf> {
     let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let caches = variable("XDG_CACHE_HOME").map(PathBuf::from);
     let caches = caches.or_else(|| Some(PathBuf::from(variable("HOME")?).join(".cache")));
-    Ok(caches
-        .context("neither XDG_CACHE_HOME nor HOME is set")?
-        .join("cloudroid/weights"))
+    Ok(caches.context("neither XDG_CACHE_HOME nor HOME is set")?.join("cloudroid/weights"))
 }
 
 #[cfg(test)]
@@ -107,9 +100,6 @@ mod tests {
         std::fs::write(package.join(FILE), "lear").expect("ours");
         install_from(&package, &cache).expect("it is kept");
         let read = |name: &str| std::fs::read_to_string(package.join(name)).expect("a file");
-        assert_eq!(
-            (read(FILE), read("runs")),
-            ("learned".into(), "run\n".into())
-        );
+        assert_eq!((read(FILE), read("runs")), ("learned".into(), "run\n".into()));
     }
 }

@@ -10,9 +10,7 @@ pub fn or_dash<T>(value: Option<T>, says: impl FnOnce(T) -> String) -> String {
 /// Formats a fraction as a percentage with one decimal; a dash if it is unknown.
 pub fn percent(share: Option<f64>) -> String {
     // Adding zero turns a rounded minus zero into zero.
-    or_dash(share, |share| {
-        format!("{:.1} %", (share * 1000.0).round() / 10.0 + 0.0)
-    })
+    or_dash(share, |share| format!("{:.1} %", (share * 1000.0).round() / 10.0 + 0.0))
 }
 
 /// Formats seconds as milliseconds with three digits; a dash if unknown.
@@ -22,13 +20,7 @@ pub fn milliseconds(seconds: Option<f64>) -> String {
 
 /// Formats a ratio; a dash if it is unknown.
 pub fn ratio(times: Option<f64>) -> String {
-    or_dash(times, |times| {
-        if times < 1.0 {
-            format!("{times:.2}")
-        } else {
-            format!("{times:.1}")
-        }
-    })
+    or_dash(times, |times| if times < 1.0 { format!("{times:.2}") } else { format!("{times:.1}") })
 }
 
 /// Checks that a text contains these words.

@@ -26,12 +26,7 @@ struct RehearsedEvaluation {
 
 impl RehearsedEvaluation {
     fn start(target: &Path, temporary: &Path, seconds: f64) -> Self {
-        Self::spawn(
-            Command::new(env!("CARGO_BIN_EXE_eval")),
-            target,
-            temporary,
-            seconds,
-        )
+        Self::spawn(Command::new(env!("CARGO_BIN_EXE_eval")), target, temporary, seconds)
     }
 
     fn spawn(mut command: Command, target: &Path, temporary: &Path, seconds: f64) -> Self {
@@ -66,9 +61,7 @@ impl RehearsedEvaluation {
 
     /// Waits for its end; returns its status and all output.
     fn wait(mut self) -> (ExitStatus, String) {
-        self.said
-            .read_to_string(&mut self.heard)
-            .expect("what it says");
+        self.said.read_to_string(&mut self.heard).expect("what it says");
         (self.child.wait().expect("its end"), self.heard)
     }
 
@@ -79,11 +72,7 @@ impl RehearsedEvaluation {
             .iter()
             .map(|path| path.display().to_string())
             .collect::<Vec<_>>();
-        for entry in std::fs::read_dir("/run/netns")
-            .into_iter()
-            .flatten()
-            .flatten()
-        {
+        for entry in std::fs::read_dir("/run/netns").into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
             found.extend(name.starts_with(&prefix).then_some(name));
         }
@@ -95,8 +84,7 @@ impl RehearsedEvaluation {
 /// into which cargo builds them.
 fn binaries() -> PathBuf {
     let beside = Path::new(env!("CARGO_BIN_EXE_eval")).parent();
-    std::env::var_os("CLOUDROID_BIN")
-        .map_or_else(|| beside.expect("a directory").to_owned(), PathBuf::from)
+    std::env::var_os("CLOUDROID_BIN").map_or_else(|| beside.expect("a directory").to_owned(), PathBuf::from)
 }
 
 fn directories() -> (tempfile::TempDir, PathBuf, PathBuf) {
@@ -111,8 +99,7 @@ fn report(target: &Path) -> String {
 }
 
 fn serialize_tests() -> std::sync::MutexGuard<'static, ()> {
-    ONE.lock()
-        .unwrap_or_else(std::sync::PoisonError::into_inner)
+    ONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 #[test]
@@ -166,11 +153,7 @@ fn what_a_killed_evaluation_leaves_the_next_takes_away() {
         let (status, said) = RehearsedEvaluation::start(&target, &temporary, 0.0).wait();
         assert!(status.success(), "{said}");
         assert!(said.contains("taken away"), "{said}");
-        assert_eq!(
-            RehearsedEvaluation::sandboxes_of(pid),
-            Vec::<String>::new(),
-            "{said}"
-        );
+        assert_eq!(RehearsedEvaluation::sandboxes_of(pid), Vec::<String>::new(), "{said}");
         assert!(support::procfs::command_line(robot).is_none_or(|line| line.is_empty()));
         assert_eq!(find_daemon(&temporary), None);
         let left = std::fs::read_dir(&temporary).expect("a directory").count();
@@ -262,8 +245,7 @@ fn children(pid: i32) -> Vec<i32> {
 
 fn find_daemon(temporary: &Path) -> Option<i32> {
     let home = format!("cloudroidd --home {}", temporary.display());
-    let is =
-        |pid: &i32| support::procfs::command_line(*pid).is_some_and(|line| line.contains(&home));
+    let is = |pid: &i32| support::procfs::command_line(*pid).is_some_and(|line| line.contains(&home));
     support::procfs::pids().into_iter().find(is)
 }
 

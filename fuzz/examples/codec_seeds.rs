@@ -27,10 +27,7 @@ impl SeedMessage {
             SeedFormat::Ros1 => [1, 0, 0, 0],
             SeedFormat::Cdr => [0, 1, 0, 0],
         };
-        let message = Self {
-            bytes: seq.to_vec(),
-            format,
-        };
+        let message = Self { bytes: seq.to_vec(), format };
         message.u32(2).u32(3).text("map")
     }
 
@@ -56,9 +53,7 @@ impl SeedMessage {
     }
 
     fn doubles(self, values: &[f64]) -> Self {
-        values.iter().fold(self.align(8), |message, value| {
-            message.raw(&value.to_le_bytes())
-        })
+        values.iter().fold(self.align(8), |message, value| message.raw(&value.to_le_bytes()))
     }
 
     fn bytes(self, bytes: &[u8]) -> Self {
@@ -74,9 +69,7 @@ impl SeedMessage {
 
     fn floats(self, values: &[f32]) -> Self {
         let message = self.u32(values.len() as u32);
-        values
-            .iter()
-            .fold(message, |message, &value| message.f32(value))
+        values.iter().fold(message, |message, &value| message.f32(value))
     }
 
     /// Returns the message, padded to a multiple of four bytes.
@@ -85,43 +78,21 @@ impl SeedMessage {
     }
 }
 
-fn image(
-    format: SeedFormat,
-    encoding: &str,
-    width: u32,
-    height: u32,
-    step: u32,
-    data: &[u8],
-) -> Vec<u8> {
+fn image(format: SeedFormat, encoding: &str, width: u32, height: u32, step: u32, data: &[u8]) -> Vec<u8> {
     let message = SeedMessage::with_header(format).u32(height).u32(width);
-    message
-        .text(encoding)
-        .raw(&[0])
-        .u32(step)
-        .bytes(data)
-        .finish()
+    message.text(encoding).raw(&[0]).u32(step).bytes(data).finish()
 }
 
 /// Returns a slope with some noise.
 fn slope_samples(count: usize) -> Vec<u8> {
-    (0..count)
-        .map(|index| (index / 5 + ((index * 7919) >> 4) % 3) as u8)
-        .collect()
+    (0..count).map(|index| (index / 5 + ((index * 7919) >> 4) % 3) as u8).collect()
 }
 
 fn images(format: SeedFormat) -> Vec<Vec<u8>> {
-    let depths: Vec<u8> = (0..40 * 36u16)
-        .map(|at| if at % 11 == 0 { 0 } else { 900 + at % 40 * 3 })
-        .flat_map(u16::to_le_bytes)
-        .collect();
+    let depths: Vec<u8> =
+        (0..40 * 36u16).map(|at| if at % 11 == 0 { 0 } else { 900 + at % 40 * 3 }).flat_map(u16::to_le_bytes).collect();
     let metres: Vec<u8> = (0..24 * 24)
-        .map(|at| {
-            if at % 13 == 0 {
-                f32::NAN
-            } else {
-                (1000 + at) as f32 * 0.001
-            }
-        })
+        .map(|at| if at % 13 == 0 { f32::NAN } else { (1000 + at) as f32 * 0.001 })
         .flat_map(f32::to_le_bytes)
         .collect();
     vec![
@@ -192,18 +163,10 @@ fn cloud(
     padding: u32,
     data: &[u8],
 ) -> Vec<u8> {
-    let message = SeedMessage::with_header(format)
-        .u32(height)
-        .u32(width)
-        .u32(fields.len() as u32);
-    let message = fields.iter().fold(message, |message, &(name, at, number)| {
-        message.text(name).u32(at).raw(&[number]).u32(1)
-    });
-    let message = message
-        .raw(&[0])
-        .u32(step)
-        .u32(step * width + padding)
-        .bytes(data);
+    let message = SeedMessage::with_header(format).u32(height).u32(width).u32(fields.len() as u32);
+    let message =
+        fields.iter().fold(message, |message, &(name, at, number)| message.text(name).u32(at).raw(&[number]).u32(1));
+    let message = message.raw(&[0]).u32(step).u32(step * width + padding).bytes(data);
     message.raw(&[1]).finish()
 }
 
@@ -213,10 +176,7 @@ fn clouds(format: SeedFormat) -> Vec<Vec<u8>> {
     for v in 0..12 {
         for u in 0..16 {
             let z = 1.0 + (u * v) as f32 * 0.002;
-            let (x, y) = (
-                (u as f32 - 8.0) * z * (1.0 / 525.0),
-                (v as f32 - 6.0) * z * (1.0 / 525.0),
-            );
+            let (x, y) = ((u as f32 - 8.0) * z * (1.0 / 525.0), (v as f32 - 6.0) * z * (1.0 / 525.0));
             for value in [x, y, if (u + v) % 9 == 0 { f32::NAN } else { z }] {
                 camera.extend_from_slice(&value.to_le_bytes());
             }
@@ -239,25 +199,13 @@ fn clouds(format: SeedFormat) -> Vec<Vec<u8>> {
     }
     let xyz = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)];
     vec![
-        cloud(
-            format,
-            16,
-            12,
-            18,
-            &[&xyz[..], &[("rgb", 12, 7)]].concat(),
-            3,
-            &camera,
-        ),
+        cloud(format, 16, 12, 18, &[&xyz[..], &[("rgb", 12, 7)]].concat(), 3, &camera),
         cloud(
             format,
             160,
             1,
             27,
-            &[
-                &xyz[..],
-                &[("ring", 12, 4), ("time", 14, 8), ("t", 22, 6), ("i", 26, 2)],
-            ]
-            .concat(),
+            &[&xyz[..], &[("ring", 12, 4), ("time", 14, 8), ("t", 22, 6), ("i", 26, 2)]].concat(),
             0,
             &laser,
         ),
@@ -289,9 +237,7 @@ fn frames(schema: Schema, codec: Codec, messages: &[Vec<u8>]) -> Vec<Vec<u8>> {
 }
 
 fn write(target: &str, name: &str, bytes: &[u8]) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("corpus")
-        .join(target);
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(target);
     fs::create_dir_all(&folder).expect("the corpus can be written");
     fs::write(folder.join(name), bytes).expect("the corpus can be written");
 }
@@ -313,10 +259,7 @@ fn write_typed_seeds(format: SeedFormat) {
     let kinds = [
         (Schema::Image, images(format)),
         (Schema::OccupancyGrid, maps),
-        (
-            Schema::LaserScan,
-            vec![scan(format, false), scan(format, true)],
-        ),
+        (Schema::LaserScan, vec![scan(format, false), scan(format, true)]),
         (Schema::PointCloud2, clouds(format)),
     ];
     let mut mixed = Vec::new();
@@ -343,10 +286,7 @@ fn write_typed_seeds(format: SeedFormat) {
     write("codec_video", &format!("moving{suffix}"), &list(&made, 2));
     mixed.extend(made);
     let grey = image(format, "mono8", 33, 25, 40, &slope_samples(40 * 25));
-    let made = [
-        frames(Schema::Image, Codec::Jpeg, &rgb[..1]),
-        frames(Schema::Image, Codec::Jpeg, &[grey]),
-    ];
+    let made = [frames(Schema::Image, Codec::Jpeg, &rgb[..1]), frames(Schema::Image, Codec::Jpeg, &[grey])];
     let name = format!("kinds{suffix}");
     write("codec_jpeg", &name, &list(&made.concat(), 2));
     mixed.extend(made.concat());
@@ -355,11 +295,7 @@ fn write_typed_seeds(format: SeedFormat) {
 
 fn main() {
     let text = slope_samples(700);
-    for (target, codec) in [
-        ("zlib", Codec::Zlib(6)),
-        ("deflate", Codec::Deflate(9)),
-        ("zstd", Codec::Zstd(3)),
-    ] {
+    for (target, codec) in [("zlib", Codec::Zlib(6)), ("deflate", Codec::Deflate(9)), ("zstd", Codec::Zstd(3))] {
         let frames = frames(Schema::Other, codec, &[text.clone(), vec![0; 5000]]);
         write(&format!("codec_{target}"), "two", &list(&frames, 2));
     }

@@ -26,11 +26,7 @@ pub fn certificate(data: &[u8]) {
     let certificate = CertificateDer::from(data);
     if let Ok(shown) = ::authority::read_robot_certificate(&certificate) {
         let named = format!("robot:{}", shown.robot);
-        assert!(
-            data.windows(named.len())
-                .any(|bytes| bytes == named.as_bytes()),
-            "a name that is not in it: {named}"
-        );
+        assert!(data.windows(named.len()).any(|bytes| bytes == named.as_bytes()), "a name that is not in it: {named}");
         let period = ::authority::read_validity(&certificate).expect("it was read");
         assert_eq!(period.until, shown.until);
     }

@@ -113,9 +113,7 @@ pub fn message(data: &[u8]) {
             let encoded = encoder.encode(codec, message, &mut frame);
             assert_eq!(encoded.bytes, frame.len());
             let mut back = Vec::new();
-            decoder
-                .decode(&frame, &mut back)
-                .expect("what was encoded decodes");
+            decoder.decode(&frame, &mut back).expect("what was encoded decodes");
             assert_eq!(back, message, "bit by bit");
         }
     }

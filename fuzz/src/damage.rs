@@ -22,8 +22,7 @@ impl Dice {
     }
 
     fn byte(&mut self) -> u8 {
-        const LIKELY: &[u8] =
-            b"{}[]\",:\\u0-1.eE+tfn \x00\x01\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xd8\xf9";
+        const LIKELY: &[u8] = b"{}[]\",:\\u0-1.eE+tfn \x00\x01\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xd8\xf9";
         match self.next_below(3) {
             0 => self.next_below(256) as u8,
             _ => LIKELY[self.next_below(LIKELY.len())],
@@ -74,9 +73,7 @@ impl Dice {
 /// # Panics
 /// If there are no seeds, or if they cannot be read.
 pub fn load_corpus(name: &str) -> Vec<Vec<u8>> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("corpus")
-        .join(name);
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(name);
     let entries = fs::read_dir(&folder).unwrap_or_else(|error| panic!("{folder:?}: {error}"));
     let mut files: Vec<_> = entries.map(|entry| entry.unwrap().path()).collect();
     files.sort();

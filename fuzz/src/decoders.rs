@@ -55,14 +55,7 @@ pub struct Decoder {
 }
 
 const fn decoder(name: &'static str, decode: fn(&[u8]), times: usize, fixed: usize) -> Decoder {
-    Decoder {
-        name,
-        decode,
-        times,
-        fixed,
-        weigh: None,
-        repeats: &[],
-    }
+    Decoder { name, decode, times, fixed, weigh: None, repeats: &[] }
 }
 
 impl Decoder {
@@ -71,28 +64,17 @@ impl Decoder {
     }
 
     const fn with_weigh(self, weigh: fn(&[u8]) -> usize) -> Self {
-        Self {
-            weigh: Some(weigh),
-            ..self
-        }
+        Self { weigh: Some(weigh), ..self }
     }
 }
 
 /// All decoders.
 pub const DECODERS: &[Decoder] = &[
-    decoder("ros_parameter", read::<ParamValue>, TREE, LITTLE)
-        .with_repeats(VALUES)
-        .with_weigh(weigh),
-    decoder("link_hello", hello, TREE, LITTLE)
-        .with_repeats(HELLO)
-        .with_weigh(weigh),
-    decoder("link_orders", orders, TREE, LITTLE)
-        .with_repeats(ORDERS)
-        .with_weigh(weigh),
+    decoder("ros_parameter", read::<ParamValue>, TREE, LITTLE).with_repeats(VALUES).with_weigh(weigh),
+    decoder("link_hello", hello, TREE, LITTLE).with_repeats(HELLO).with_weigh(weigh),
+    decoder("link_orders", orders, TREE, LITTLE).with_repeats(ORDERS).with_weigh(weigh),
     decoder("link_frame", frame, 4, LITTLE),
-    decoder("viewer_json", viewer, 4 * JsonWeight::MOST_TIMES, LITTLE)
-        .with_repeats(VIEWER)
-        .with_weigh(weigh_copied),
+    decoder("viewer_json", viewer, 4 * JsonWeight::MOST_TIMES, LITTLE).with_repeats(VIEWER).with_weigh(weigh_copied),
     decoder("ws_frames", frames, 8, 64 << 10),
     decoder("rosbridge_json", op_json, 4, LITTLE).with_repeats(ROSBRIDGE),
     decoder("rosbridge_cbor", op_cbor, 4, LITTLE),
@@ -103,9 +85,7 @@ pub const DECODERS: &[Decoder] = &[
     decoder("ros_bytes", bytes, 96, 4 * WRITTEN),
     decoder("ros_definition", definition, 64, 64 << 10).with_repeats(DEFINITIONS),
     decoder("ros_tcpros", tcpros, 8, LITTLE),
-    decoder("ros_xmlrpc", xml_rpc, 16, LITTLE)
-        .with_repeats(XML_RPC)
-        .with_weigh(xmlrpc::weight),
+    decoder("ros_xmlrpc", xml_rpc, 16, LITTLE).with_repeats(XML_RPC).with_weigh(xmlrpc::weight),
     decoder("ros2_json", json_2, 4, 4 * WRITTEN).with_repeats(VALUES),
     decoder("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
     decoder("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
@@ -167,9 +147,7 @@ fn frames(input: &[u8]) {
     loop {
         let next = poll_fn(|cx| socket.poll_next(cx));
         let next = pin!(next).poll(&mut Context::from_waker(Waker::noop()));
-        if !matches!(next, Poll::Ready(Ok(_)))
-            || matches!(next, Poll::Ready(Ok(WsMessage::Close(..))))
-        {
+        if !matches!(next, Poll::Ready(Ok(_))) || matches!(next, Poll::Ready(Ok(WsMessage::Close(..)))) {
             return;
         }
     }
@@ -188,20 +166,10 @@ fn op_cbor(input: &[u8]) {
 }
 
 fn fragments(input: &[u8]) {
-    let limits = FragmentLimits {
-        messages: 4,
-        parts: 64,
-        bytes: 1 << 20,
-        age: std::time::Duration::from_secs(100),
-    };
+    let limits = FragmentLimits { messages: 4, parts: 64, bytes: 1 << 20, age: std::time::Duration::from_secs(100) };
     let mut fragments = Fragments::new(limits);
     for (num, data) in (0..).zip(input.chunks(1 + input.len() / 64)) {
-        let fragment = Fragment {
-            id: Id::Integer(1),
-            data: String::from_utf8_lossy(data),
-            num,
-            total: 64,
-        };
+        let fragment = Fragment { id: Id::Integer(1), data: String::from_utf8_lossy(data), num, total: 64 };
         let _ = fragments.add(&fragment, Instant::now());
     }
 }
@@ -217,10 +185,7 @@ fn message_of(version: RosVersion) -> Arc<MessageType> {
     for (key, text) in [
         ("a/msg/Nothing", ""),
         ("a/msg/Text", "string data\nuint8[] bytes\n"),
-        (
-            "a/msg/All",
-            "Text[] a\nNothing[] b\nuint8[] c\nstring[] d\nfloat64[3] e\nbool[] f\n",
-        ),
+        ("a/msg/All", "Text[] a\nNothing[] b\nuint8[] c\nstring[] d\nfloat64[3] e\nbool[] f\n"),
     ] {
         registry.insert(key, text).expect("these are definitions");
     }
@@ -231,10 +196,7 @@ static ONE: LazyLock<Arc<MessageType>> = LazyLock::new(|| message_of(RosVersion:
 static TWO: LazyLock<Arc<MessageType>> = LazyLock::new(|| message_of(RosVersion::Two));
 
 fn fill() -> FillOptions {
-    FillOptions {
-        max_bytes: WRITTEN,
-        ..FillOptions::default()
-    }
+    FillOptions { max_bytes: WRITTEN, ..FillOptions::default() }
 }
 
 fn json_of(of: &MessageType, input: &[u8]) {
@@ -263,14 +225,8 @@ fn cbor_2(input: &[u8]) {
 
 fn bytes_of(of: &MessageType, input: &[u8]) {
     let _ = Value::read(of, input);
-    let json = JsonOptions {
-        max_bytes: WRITTEN,
-        ..JsonOptions::default()
-    };
-    let cbor = CborOptions {
-        max_bytes: WRITTEN,
-        ..CborOptions::default()
-    };
+    let json = JsonOptions { max_bytes: WRITTEN, ..JsonOptions::default() };
+    let cbor = CborOptions { max_bytes: WRITTEN, ..CborOptions::default() };
     let _ = codec::to_json(of, input, &mut Vec::new(), &json);
     let _ = codec::to_cbor(of, input, &mut Vec::new(), &cbor);
 }

@@ -5,8 +5,8 @@ use std::sync::{Arc, LazyLock};
 
 use ::ros::bus::{ParamValue, RosVersion};
 use ::ros::codec::{
-    self, CborOptions, CodecErrorKind, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Stamps,
-    Time, Value, cbor_item_len, json_value_len,
+    self, CborOptions, CodecErrorKind, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Stamps, Time, Value,
+    cbor_item_len, json_value_len,
 };
 use ::ros::ros1::tcpros::{FrameReader, Header};
 use ::ros::ros1::xmlrpc::{self, parse_call, parse_response, print_call, print_response};
@@ -32,16 +32,10 @@ static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
              float64[2] i\nstring[] j\ntime[] k\nduration[1] l\na/Nothing[] m\na/Text[2] n\n",
         ),
         ("a/msg/Nothing", ""),
-        (
-            "a/msg/Picture",
-            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8[] data\n",
-        ),
+        ("a/msg/Picture", "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8[] data\n"),
         ("a/msg/Point", "float64 x\nfloat64 y\n"),
         ("a/msg/Place", "Header header\nPoint point\nstring name\n"),
-        (
-            "a/msg/Way",
-            "Header header\nPlace[] places\nint32[] indices\n",
-        ),
+        ("a/msg/Way", "Header header\nPlace[] places\nint32[] indices\n"),
     ] {
         registry.insert(key, text).expect("these are definitions");
     }
@@ -50,27 +44,14 @@ static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
     names.into_iter().map(find).collect()
 });
 
-const JSON: JsonOptions = JsonOptions {
-    non_finite: NonFinite::String,
-    invalid_utf8: InvalidUtf8::Replace,
-    max_bytes: MAX_BYTES,
-};
+const JSON: JsonOptions =
+    JsonOptions { non_finite: NonFinite::String, invalid_utf8: InvalidUtf8::Replace, max_bytes: MAX_BYTES };
 
-const CBOR: CborOptions = CborOptions {
-    typed_arrays: true,
-    invalid_utf8: InvalidUtf8::Replace,
-    max_bytes: MAX_BYTES,
-};
+const CBOR: CborOptions = CborOptions { typed_arrays: true, invalid_utf8: InvalidUtf8::Replace, max_bytes: MAX_BYTES };
 
-const FILL: FillOptions = FillOptions {
-    now: Some(Time { secs: 1, nsecs: 2 }),
-    max_bytes: MAX_BYTES,
-};
+const FILL: FillOptions = FillOptions { now: Some(Time { secs: 1, nsecs: 2 }), max_bytes: MAX_BYTES };
 
-fn choose<'a>(
-    types: &'a [Arc<MessageType>],
-    data: &'a [u8],
-) -> Option<(&'a MessageType, &'a [u8])> {
+fn choose<'a>(types: &'a [Arc<MessageType>], data: &'a [u8]) -> Option<(&'a MessageType, &'a [u8])> {
     let (first, rest) = data.split_first()?;
     Some((&types[usize::from(*first) % types.len()], rest))
 }
@@ -190,10 +171,7 @@ pub fn definition(data: &[u8]) {
 }
 
 pub(crate) fn definition_of(version: RosVersion, data: &[u8]) {
-    let at = data
-        .iter()
-        .position(|byte| *byte == 0)
-        .unwrap_or(data.len());
+    let at = data.iter().position(|byte| *byte == 0).unwrap_or(data.len());
     let (text, bytes) = (&data[..at], data.get(at + 1..).unwrap_or_default());
     let Ok(text) = std::str::from_utf8(text) else {
         return;
@@ -231,11 +209,7 @@ pub fn tcpros(data: &[u8]) {
         }
         assert!(total <= data.len());
     };
-    tokio::runtime::Builder::new_current_thread()
-        .enable_time()
-        .build()
-        .expect("a runtime")
-        .block_on(read);
+    tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime").block_on(read);
 }
 
 /// An XML-RPC document.
@@ -246,9 +220,7 @@ pub fn xmlrpc(data: &[u8]) {
         assert_eq!(again.params.len(), call.params.len());
     }
     if let Ok(Ok(value)) = parse_response(data) {
-        parse_response(print_response(&value).as_bytes())
-            .expect("its own response")
-            .expect("a value");
+        parse_response(print_response(&value).as_bytes()).expect("its own response").expect("a value");
     }
 }
 

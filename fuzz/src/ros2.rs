@@ -23,33 +23,17 @@ static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
              float64[2] i\nstring[] j\nbuiltin_interfaces/Time[] k\nwstring[2] l\na/Nothing[] m\na/Text[2] n\n",
         ),
         ("a/msg/Nothing", ""),
-        (
-            "a/msg/Picture",
-            "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8[] data\n",
-        ),
+        ("a/msg/Picture", "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8[] data\n"),
         (
             "a/msg/Bounds",
             "string<=4 a 'abc'\nint64[<=2] b [1, 2]\nwstring<=2[<=2] c\nfloat64 d 0.5\na/Nothing e\nbyte[<=3] f\n",
         ),
-        (
-            "a/msg/Place",
-            "uint8 n 7\nstd_msgs/Header header\nfloat64 x\nstring name\n",
-        ),
-        (
-            "a/msg/Way",
-            "std_msgs/Header header\nPlace[] places\nint32[] indices\n",
-        ),
+        ("a/msg/Place", "uint8 n 7\nstd_msgs/Header header\nfloat64 x\nstring name\n"),
+        ("a/msg/Way", "std_msgs/Header header\nPlace[] places\nint32[] indices\n"),
     ] {
         registry.insert(key, text).expect("these are definitions");
     }
-    let names = [
-        "a/Text",
-        "a/Numbers",
-        "a/Lists",
-        "a/Picture",
-        "a/Bounds",
-        "a/Way",
-    ];
+    let names = ["a/Text", "a/Numbers", "a/Lists", "a/Picture", "a/Bounds", "a/Way"];
     let find = |name| registry.message(name).expect("these were inserted");
     names.into_iter().map(find).collect()
 });
@@ -73,10 +57,7 @@ pub fn bytes(data: &[u8]) {
 pub fn definition(data: &[u8]) {
     if let Ok(text) = std::str::from_utf8(data) {
         for key in ["b/msg/X", "b/srv/X", "b/action/X"] {
-            let files = [
-                InterfaceFile::read_idl(key, text),
-                InterfaceFile::read_description(key, text),
-            ];
+            let files = [InterfaceFile::read_idl(key, text), InterfaceFile::read_description(key, text)];
             for file in files.into_iter().flatten() {
                 let registry = file.registry().expect("its keys are names");
                 let _ = (registry.message(key), registry.service(key));

@@ -3,8 +3,7 @@
 use std::time::{Duration, Instant};
 
 use rosbridge::{
-    Format, Fragment, FragmentLimits, Fragments, Id, Op, Payload, ProtocolFrame, decode_png,
-    encode_png, unknown_fields,
+    Format, Fragment, FragmentLimits, Fragments, Id, Op, Payload, ProtocolFrame, decode_png, encode_png, unknown_fields,
 };
 
 /// A text frame.
@@ -25,11 +24,7 @@ fn frame(frame: ProtocolFrame<'_>) {
     };
     unknown_fields(frame);
     if let Some(payload) = payload(&op) {
-        let _ = (
-            payload.raw(),
-            payload.text(),
-            payload.to_named_object(["a", "data"]),
-        );
+        let _ = (payload.raw(), payload.text(), payload.to_named_object(["a", "data"]));
     }
     let mut printed = Vec::new();
     op.print(&mut printed, frame.format());
@@ -55,12 +50,7 @@ fn payload<'a>(op: &Op<'a>) -> Option<Payload<'a>> {
 /// Fragments of several messages, in any order: five bytes each give message, index, total, time since the previous one
 /// and length; the text follows.
 pub fn fragments(mut data: &[u8]) {
-    let limits = FragmentLimits {
-        messages: 4,
-        parts: 64,
-        bytes: 2048,
-        age: Duration::from_secs(100),
-    };
+    let limits = FragmentLimits { messages: 4, parts: 64, bytes: 2048, age: Duration::from_secs(100) };
     let mut fragments = Fragments::new(limits);
     let mut now = Instant::now();
     while let [id, num, total, wait, length, rest @ ..] = data {

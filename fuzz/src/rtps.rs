@@ -2,9 +2,7 @@
 
 use std::fmt::Debug;
 
-use ::rtps::wire::{
-    self, Data, DatagramWriter, ParticipantMessage, ReceivedSubmessage, Submessage, WireError,
-};
+use ::rtps::wire::{self, Data, DatagramWriter, ParticipantMessage, ReceivedSubmessage, Submessage, WireError};
 use ::rtps::{EndpointData, ParticipantData};
 use bytes::Bytes;
 
@@ -14,10 +12,7 @@ pub fn datagram(data: &[u8]) {
     let parsed = wire::parse(&datagram);
     assert!(parsed.received.len() <= wire::MOST_SUBMESSAGES);
     let payloads: usize = parsed.received.iter().map(payload_length).sum();
-    assert!(
-        payloads <= data.len(),
-        "payloads that are not of the datagram"
-    );
+    assert!(payloads <= data.len(), "payloads that are not of the datagram");
     for received in parsed.received {
         let again = wire::parse(&encode_submessage(&received).into());
         assert_eq!(again.fault, None, "{received:?}");
@@ -30,17 +25,9 @@ pub fn datagram(data: &[u8]) {
 /// The payload of a discovery sample. Whatever is read is written again and must be read as the same.
 pub fn discovery(data: &[u8]) {
     let payload = Bytes::copy_from_slice(data);
-    check_round_trip(
-        &payload,
-        ParticipantData::from_payload,
-        ParticipantData::to_bytes,
-    );
+    check_round_trip(&payload, ParticipantData::from_payload, ParticipantData::to_bytes);
     check_round_trip(&payload, EndpointData::from_payload, EndpointData::to_bytes);
-    check_round_trip(
-        &payload,
-        ParticipantMessage::from_payload,
-        ParticipantMessage::to_bytes,
-    );
+    check_round_trip(&payload, ParticipantMessage::from_payload, ParticipantMessage::to_bytes);
 }
 
 /// Above this length a value that was read can be too long for a parameter when it is written.
@@ -88,11 +75,7 @@ fn encode_submessage(received: &ReceivedSubmessage) -> Vec<u8> {
 
 /// Pads the payload of a sample to a multiple of four bytes, as writing does.
 fn pad_payload(mut submessage: Submessage) -> Submessage {
-    if let Submessage::Data(Data {
-        payload: Some(payload),
-        ..
-    }) = &mut submessage
-    {
+    if let Submessage::Data(Data { payload: Some(payload), .. }) = &mut submessage {
         let mut bytes = payload.to_vec();
         bytes.resize(bytes.len().next_multiple_of(4), 0);
         *payload = bytes.into();

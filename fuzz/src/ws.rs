@@ -19,10 +19,7 @@ pub fn frames(data: &[u8]) {
         match next {
             // UTF-8 is checked by the reader of a text message.
             Poll::Ready(Ok(
-                WsMessage::Text(bytes)
-                | WsMessage::Binary(bytes)
-                | WsMessage::Ping(bytes)
-                | WsMessage::Pong(bytes),
+                WsMessage::Text(bytes) | WsMessage::Binary(bytes) | WsMessage::Ping(bytes) | WsMessage::Pong(bytes),
             )) => {
                 assert!(bytes.len() <= MOST);
                 come += bytes.len();

@@ -34,27 +34,16 @@ fn measure(decoder: &Decoder, input: &[u8], worst: &mut WorstInput) {
         format!("{}, {} bytes: {begin:?}", decoder.name, input.len())
     };
     let most = decoder.times * input.len() + decoder.fixed;
-    assert!(
-        taken <= most,
-        "{taken} bytes were taken, {most} may be, for {}",
-        shown()
-    );
+    assert!(taken <= most, "{taken} bytes were taken, {most} may be, for {}", shown());
     if let Some(weigh) = decoder.weigh {
         let weight = weigh(input);
         // The message of an error is not part of the estimate.
         let most = weight + (4 << 10);
-        assert!(
-            taken <= most,
-            "{taken} bytes were taken, {weight} counted, for {}",
-            shown()
-        );
+        assert!(taken <= most, "{taken} bytes were taken, {weight} counted, for {}", shown());
     }
     let times = taken.saturating_sub(decoder.fixed) as f64 / input.len().max(1) as f64;
     if times > worst.times {
-        *worst = WorstInput {
-            times,
-            input: shown(),
-        };
+        *worst = WorstInput { times, input: shown() };
     }
 }
 

@@ -42,19 +42,13 @@ struct Ros2Base<'a> {
 impl<'a> AdviceIndex<'a> {
     /// Returns the index of a base and its archive.
     pub(crate) fn for_base(archive: &'a Archive, base: &'a Base) -> Self {
-        Self {
-            contents: &archive.contents,
-            two: (base.ros != Version::Ros1).then_some(Ros2Base { archive, base }),
-        }
+        Self { contents: &archive.contents, two: (base.ros != Version::Ros1).then_some(Ros2Base { archive, base }) }
     }
 
     /// Returns the index of an archive for a base of ROS 1.
     #[cfg(test)]
     pub(crate) fn for_ros1(contents: &'a Contents) -> Self {
-        Self {
-            contents,
-            two: None,
-        }
+        Self { contents, two: None }
     }
 
     /// Returns the package that provides a CMake configuration.
@@ -143,10 +137,9 @@ pub(crate) fn advise_for_output(words: &str, known: AdviceIndex<'_>) -> Vec<Stri
                 ),
                 found => advise(&format!("the CMake package {name}"), found),
             },
-            MissingDependency::PkgConfig(name) => advise(
-                &format!("the pkg-config module {name}"),
-                known.pkg_config(name),
-            ),
+            MissingDependency::PkgConfig(name) => {
+                advise(&format!("the pkg-config module {name}"), known.pkg_config(name))
+            }
             MissingDependency::Module(name) => advise(&format!("the Python module {name}"), known.module(name)),
             MissingDependency::Library(name) => advise(&format!("the library {name}"), known.library(&name)),
         })
@@ -156,32 +149,16 @@ pub(crate) fn advise_for_output(words: &str, known: AdviceIndex<'_>) -> Vec<Stri
 /// Adds the advice to the error of a failed build.
 pub(crate) fn add_advice(error: Error, known: AdviceIndex<'_>) -> Error {
     match error {
-        Error::BuildFailed {
-            package,
-            log,
-            last_lines,
-            ..
-        } => Error::BuildFailed {
-            advice: advise_for_output(&last_lines, known),
-            package,
-            log,
-            last_lines,
-        },
-        Error::NotInPackage {
-            what: what @ "executable",
-            name,
-            known: there,
-            ..
-        } => Error::NotInPackage {
+        Error::BuildFailed { package, log, last_lines, .. } => {
+            Error::BuildFailed { advice: advise_for_output(&last_lines, known), package, log, last_lines }
+        }
+        Error::NotInPackage { what: what @ "executable", name, known: there, .. } => Error::NotInPackage {
             elsewhere: known.programs(name.rsplit('/').next().unwrap_or(&name)),
             what,
             name,
             known: there,
         },
-        Error::NoLaunch { module, .. } => Error::NoLaunch {
-            with: known.module(&module),
-            module,
-        },
+        Error::NoLaunch { module, .. } => Error::NoLaunch { with: known.module(&module), module },
         other => other,
     }
 }
@@ -198,9 +175,7 @@ fn advise(what: &str, with: Option<String>) -> String {
 /// Returns the Debian package whose name is closest to what is looked for.
 pub(crate) fn nearest_name<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a str> {
     let plain = name.to_lowercase().replace('_', "-");
-    debs.iter()
-        .min_by_key(|deb| (!deb.contains(&plain), deb.len(), **deb))
-        .copied()
+    debs.iter().min_by_key(|deb| (!deb.contains(&plain), deb.len(), **deb)).copied()
 }
 
 /// Returns whether a line of output names a missing dependency.
@@ -238,9 +213,7 @@ fn parse_missing(line: &str) -> Option<MissingDependency<'_>> {
         return Some(MissingDependency::Library(format!("lib{name}.so")));
     }
     if line.contains("cannot open shared object file") {
-        let name = line
-            .split([' ', ':'])
-            .find(|word| word.starts_with("lib") && word.contains(".so"))?;
+        let name = line.split([' ', ':']).find(|word| word.starts_with("lib") && word.contains(".so"))?;
         return Some(MissingDependency::Library(name.to_owned()));
     }
     None
@@ -269,8 +242,7 @@ mod tests {
              usr/share/pkgconfig/eigen3.pc libdevel/libeigen3-dev\n\
              usr/share/eigen3/cmake/Eigen3Config.cmake libdevel/libeigen3-dev\n"
         );
-        let contents = Contents::open(directory.path(), &[list(directory.path(), "c.gz", &text)])
-            .expect("read");
+        let contents = Contents::open(directory.path(), &[list(directory.path(), "c.gz", &text)]).expect("read");
         (directory, contents)
     }
 
@@ -290,10 +262,7 @@ mod tests {
                 "ModuleNotFoundError: No module named 'joblib.memory'",
                 "the Python module joblib is missing: push with `--with python3-joblib`",
             ),
-            (
-                "ImportError: No module named six",
-                "the Python module six is missing: push with `--with python3-six`",
-            ),
+            ("ImportError: No module named six", "the Python module six is missing: push with `--with python3-six`"),
             (
                 "/usr/bin/ld: cannot find -lgsl: No such file or directory",
                 "the library libgsl.so is missing: push with `--with libgsl-dev`",
@@ -325,11 +294,7 @@ mod tests {
                     contains its source",
             ),
         ] {
-            assert_eq!(
-                advise_for_output(words, AdviceIndex::for_ros1(&contents)),
-                [advice],
-                "{words}"
-            );
+            assert_eq!(advise_for_output(words, AdviceIndex::for_ros1(&contents)), [advice], "{words}");
         }
         for words in [
             "main.cpp:3: error: expected ;",
@@ -339,10 +304,7 @@ mod tests {
              CMake Error at /usr/share/cmake-3.25/Modules/FindPkgConfig.cmake:607 (message):",
             "-- Could NOT find Eigen3 (missing: Eigen3_DIR)",
         ] {
-            assert!(
-                advise_for_output(words, AdviceIndex::for_ros1(&contents)).is_empty(),
-                "{words}"
-            );
+            assert!(advise_for_output(words, AdviceIndex::for_ros1(&contents)).is_empty(), "{words}");
         }
     }
 
@@ -357,9 +319,7 @@ mod tests {
         };
         let text = add_advice(error, AdviceIndex::for_ros1(&contents)).to_string();
         assert!(
-            text.contains("available: none")
-                && text.contains("`--apt topic_tools`")
-                && !text.contains("gcc"),
+            text.contains("available: none") && text.contains("`--apt topic_tools`") && !text.contains("gcc"),
             "{text}"
         );
     }
@@ -381,13 +341,8 @@ mod tests {
         base.definition.ros_distribution = "jazzy".to_owned();
         let mut archive = Archive {
             apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
-            contents: Contents::open(directory.path(), &lists)
-                .expect("read")
-                .into(),
-            candidates: crate::candidates::tests::candidates_named(&[
-                "python3-tf2-ros",
-                "python3-joblib",
-            ]),
+            contents: Contents::open(directory.path(), &lists).expect("read").into(),
+            candidates: crate::candidates::tests::candidates_named(&["python3-tf2-ros", "python3-joblib"]),
             stamp: String::new(),
             sources: String::new(),
         };
@@ -395,18 +350,10 @@ mod tests {
                      Could not find a package configuration file provided by \"tf2_ros\"\n\
                      ModuleNotFoundError: No module named 'joblib'";
         let advice = advise_for_output(words, AdviceIndex::for_base(&archive, &base)).join("\n");
-        assert_eq!(
-            advice.matches("no package of the archive has it").count(),
-            2,
-            "{advice}"
-        );
+        assert_eq!(advice.matches("no package of the archive has it").count(), 2, "{advice}");
         assert!(advice.contains("`--with python3-joblib`"), "{advice}");
         archive.candidates = crate::candidates::tests::candidates_named(&["ros-jazzy-tf2-ros"]);
         let advice = advise_for_output(words, AdviceIndex::for_base(&archive, &base)).join("\n");
-        assert_eq!(
-            advice.matches("`--with ros-jazzy-tf2-ros`").count(),
-            2,
-            "{advice}"
-        );
+        assert_eq!(advice.matches("`--with ros-jazzy-tf2-ros`").count(), 2, "{advice}");
     }
 }

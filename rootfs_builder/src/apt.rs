@@ -46,20 +46,14 @@ impl Apt {
             fs::create_dir_all(&path).io_context("making", &path)?;
         }
         let conf = CONFIGURATION.replace("@ROOT@", &root.display().to_string());
-        for (name, text) in [
-            ("empty-status", ""),
-            ("sources.list", sources),
-            ("apt.conf", &conf),
-        ] {
+        for (name, text) in [("empty-status", ""), ("sources.list", sources), ("apt.conf", &conf)] {
             // Another daemon may be reading it, so a file with the right content is not touched.
             let path = root.join(name);
             if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
                 write_atomically(&path, text.as_bytes())?;
             }
         }
-        Ok(Self {
-            root: root.to_owned(),
-        })
+        Ok(Self { root: root.to_owned() })
     }
 
     fn command(&self, program: &str) -> Command {
@@ -91,11 +85,7 @@ impl Apt {
             tokio::time::sleep(std::time::Duration::from_millis(50)).await;
         };
         let age = file_age(&stamp);
-        let warning = if !force && self.is_fresh() {
-            None
-        } else {
-            self.update(&stamp, age, progress).await?
-        };
+        let warning = if !force && self.is_fresh() { None } else { self.update(&stamp, age, progress).await? };
         for list in self.compressed_lists()? {
             self.unpack_list(&list).await?;
         }
@@ -103,22 +93,16 @@ impl Apt {
     }
 
     /// Fetches the lists; `age` is that of the existing ones.
-    async fn update(
-        &self,
-        stamp: &Path,
-        age: Option<Duration>,
-        progress: &Progress,
-    ) -> Result<Option<String>, Error> {
+    async fn update(&self, stamp: &Path, age: Option<Duration>, progress: &Progress) -> Result<Option<String>, Error> {
         progress.step("fetching package lists").await;
         let mut update = self.command("apt-get");
         update.args(["-q", "--error-on=any", "update"]);
         let mut lines = Vec::new();
         let result = process::run(update, "apt", |_, line| lines.push(line.to_owned())).await;
         let result = result.map_err(|error| match error {
-            Error::Program { last_lines, .. } => Error::Lists {
-                next: suggest_next_step(&last_lines),
-                words: extract_errors(&last_lines),
-            },
+            Error::Program { last_lines, .. } => {
+                Error::Lists { next: suggest_next_step(&last_lines), words: extract_errors(&last_lines) }
+            }
             error => error,
         });
         for line in lines {
@@ -129,9 +113,7 @@ impl Apt {
                 fs::write(stamp, "").io_context("writing", stamp)?;
                 Ok(None)
             }
-            Err(error) if age.is_some() => {
-                Ok(Some(format!("using the existing package lists: {error}")))
-            }
+            Err(error) if age.is_some() => Ok(Some(format!("using the existing package lists: {error}"))),
             Err(error) => Err(error),
         }
     }
@@ -160,11 +142,7 @@ impl Apt {
             .io_context("creating a file in", directory)?;
         let out = plain.reopen().io_context("opening", plain.path())?;
         let mut unpack = self.command("/usr/lib/apt/apt-helper");
-        unpack
-            .arg("cat-file")
-            .arg(list)
-            .stdout(out)
-            .stderr(std::process::Stdio::null());
+        unpack.arg("cat-file").arg(list).stdout(out).stderr(std::process::Stdio::null());
         match unpack.status().await {
             Ok(status) if status.success() => {}
             result => {
@@ -174,9 +152,7 @@ impl Apt {
             }
         }
         let to = list.with_extension("");
-        plain
-            .persist(&to)
-            .map_err(|error| Error::io("writing", &to, error.error))?;
+        plain.persist(&to).map_err(|error| Error::io("writing", &to, error.error))?;
         fs::remove_file(list).io_context("removing", list)
     }
 
@@ -209,9 +185,7 @@ impl Apt {
         query.arg("dumpavail");
         let (mut debs, mut stanza) = (Vec::new(), String::new());
         process::run(query, "apt", |stream, line| match stream {
-            Stream::Out if line.is_empty() => {
-                debs.extend(parse_stanza(&std::mem::take(&mut stanza)))
-            }
+            Stream::Out if line.is_empty() => debs.extend(parse_stanza(&std::mem::take(&mut stanza))),
             Stream::Out if NAMING.iter().any(|field| line.starts_with(field)) => {
                 stanza.push_str(line);
                 stanza.push('\n');
@@ -228,11 +202,7 @@ impl Apt {
 
     /// Returns the packages to install, in an order accepted by dpkg, so that all of `names` are installed, given a
     /// dpkg status file (none for an empty system). Recommended packages are not installed.
-    pub async fn resolve(
-        &self,
-        status: Option<&Path>,
-        names: &BTreeSet<String>,
-    ) -> Result<Vec<Deb>, Error> {
+    pub async fn resolve(&self, status: Option<&Path>, names: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
         if names.is_empty() {
             return Ok(Vec::new());
         }
@@ -246,26 +216,13 @@ impl Apt {
         // Derived from what apt would fetch, which is in the order of unpacking. A simulated installation gives the
         // same result but takes five times as long, since it goes through all packages after each one.
         let mut ask = self.command("apt-get");
-        ask.arg("-o")
-            .arg(format!("Dir::State::status={}", status.display()));
-        ask.args([
-            "-q",
-            "--print-uris",
-            "-y",
-            "--no-install-recommends",
-            "--no-remove",
-            "install",
-            "--",
-        ]);
+        ask.arg("-o").arg(format!("Dir::State::status={}", status.display()));
+        ask.args(["-q", "--print-uris", "-y", "--no-install-recommends", "--no-remove", "install", "--"]);
         ask.args(names);
         match process::output(ask, "apt").await {
             Ok(text) => Ok(text.lines().filter_map(parse_uri).collect()),
             Err(Error::Program { last_lines, .. }) => Err(Error::Unsolvable {
-                wanted: names
-                    .iter()
-                    .map(String::as_str)
-                    .collect::<Vec<_>>()
-                    .join(", "),
+                wanted: names.iter().map(String::as_str).collect::<Vec<_>>().join(", "),
                 words: extract_errors(&last_lines),
             }),
             Err(error) => Err(error),
@@ -301,29 +258,18 @@ impl Apt {
     /// Returns the files of packages, in the same order; those not in the cache are fetched and verified by apt.
     pub async fn download(&self, debs: &[Deb], progress: &Progress) -> Result<Vec<PathBuf>, Error> {
         let archives = self.root.join("archives");
-        let missing: Vec<&Deb> = debs
-            .iter()
-            .filter(|deb| !archives.join(deb.file_name()).is_file())
-            .collect();
+        let missing: Vec<&Deb> = debs.iter().filter(|deb| !archives.join(deb.file_name()).is_file()).collect();
         if !missing.is_empty() {
             let total = missing.len() as u64;
-            progress
-                .step(&format!("downloading {total} packages"))
-                .await;
+            progress.step(&format!("downloading {total} packages")).await;
             // Downloaded into a separate directory and then renamed, so that files in `archives` are complete.
             let partial = tempfile::Builder::new()
                 .prefix(".partial-")
                 .tempdir_in(&archives)
                 .io_context("creating a directory in", &archives)?;
             let mut download = self.command("apt-get");
-            download
-                .current_dir(partial.path())
-                .args(["-q", "download", "--"]);
-            download.args(
-                missing
-                    .iter()
-                    .map(|deb| format!("{}={}", deb.name, deb.version)),
-            );
+            download.current_dir(partial.path()).args(["-q", "download", "--"]);
+            download.args(missing.iter().map(|deb| format!("{}={}", deb.name, deb.version)));
             let mut done = 0;
             let result = process::run(download, "apt", |stream, line| {
                 if stream == Stream::Out && line.starts_with("Get:") {
@@ -337,9 +283,7 @@ impl Apt {
                 Err(Error::Program { last_lines, .. }) => {
                     // Usually the mirror has newer versions by now: the next push fetches the lists again.
                     let _ = fs::remove_file(self.root.join("updated"));
-                    return Err(Error::Download {
-                        words: extract_errors(&last_lines),
-                    });
+                    return Err(Error::Download { words: extract_errors(&last_lines) });
                 }
                 Err(error) => return Err(error),
             }
@@ -348,10 +292,7 @@ impl Apt {
                 fs::rename(&from, archives.join(deb.file_name())).io_context("keeping", &from)?;
             }
         }
-        let files: Vec<PathBuf> = debs
-            .iter()
-            .map(|deb| archives.join(deb.file_name()))
-            .collect();
+        let files: Vec<PathBuf> = debs.iter().map(|deb| archives.join(deb.file_name())).collect();
         for file in &files {
             unused::mark_used(file);
         }
@@ -374,16 +315,12 @@ impl Apt {
         let lists = self.root.join("state/lists");
         for entry in fs::read_dir(&lists).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
-            if name.ends_with("Release") || name.ends_with("Packages") || name.contains("Packages.")
-            {
+            if name.ends_with("Release") || name.ends_with("Packages") || name.contains("Packages.") {
                 let about = entry.metadata().ok();
                 let changed = about.as_ref().and_then(|m| m.modified().ok());
                 let seconds = changed.and_then(|t| t.duration_since(SystemTime::UNIX_EPOCH).ok());
                 let size = about.map_or(0, |m| m.len());
-                parts.push(format!(
-                    "{name} {size} {}",
-                    seconds.map_or(0, |s| s.as_secs())
-                ));
+                parts.push(format!("{name} {size} {}", seconds.map_or(0, |s| s.as_secs())));
             }
         }
         parts.sort();
@@ -398,8 +335,7 @@ fn is_package_name(name: &str) -> bool {
     let fits = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit();
     let mut bytes = name.bytes();
     name == "?essential"
-        || bytes.next().is_some_and(fits)
-            && bytes.all(|byte| fits(byte) || matches!(byte, b'+' | b'-' | b'.'))
+        || bytes.next().is_some_and(fits) && bytes.all(|byte| fits(byte) || matches!(byte, b'+' | b'-' | b'.'))
 }
 
 /// Returns the time since a file was modified.

@@ -24,12 +24,7 @@ pub(crate) struct Archive {
 
 impl Archive {
     /// Opens the archive; fetches the lists if they are missing or old (or if `force`d).
-    pub(crate) async fn open(
-        cache: &Path,
-        sources: String,
-        force: bool,
-        progress: &Progress,
-    ) -> Result<Self, Error> {
+    pub(crate) async fn open(cache: &Path, sources: String, force: bool, progress: &Progress) -> Result<Self, Error> {
         let name = &crate::key::sha256(sources.as_bytes())[..12];
         let apt = Apt::open(&cache.join("apt").join(name), &sources)?;
         if let Some(warning) = apt.refresh(force, progress).await? {
@@ -43,13 +38,7 @@ impl Archive {
         let contents = crate::blocking::spawn(move || Contents::open(&root, &lists)).await??;
         let candidates = apt.candidates().await?;
         let stamp = apt.stamp();
-        Ok(Self {
-            apt,
-            contents: Arc::new(contents),
-            candidates,
-            stamp,
-            sources,
-        })
+        Ok(Self { apt, contents: Arc::new(contents), candidates, stamp, sources })
     }
 
     /// Returns whether the lists are recent enough to be used.
@@ -60,10 +49,7 @@ impl Archive {
     /// Returns names similar to a key, closest first; at most three.
     pub(crate) fn similar(&self, key: &str) -> Vec<String> {
         let plain = key.replace('_', "-").to_lowercase();
-        let bare = plain
-            .trim_start_matches("lib")
-            .trim_end_matches("-dev")
-            .to_owned();
+        let bare = plain.trim_start_matches("lib").trim_end_matches("-dev").to_owned();
         if bare.len() < 3 {
             return Vec::new();
         }
@@ -75,18 +61,13 @@ impl Archive {
 
     /// Returns the packages to install to run with a ROS package, and the development packages that contain further
     /// files of it.
-    pub(crate) fn runtime_packages(
-        &self,
-        ros_package: &str,
-        depth: DependencyDepth,
-    ) -> RosPackageDebs {
+    pub(crate) fn runtime_packages(&self, ros_package: &str, depth: DependencyDepth) -> RosPackageDebs {
         let mut carried = RosPackageDebs::default();
         for (deb, parts) in self.contents.ros_package(ros_package) {
             let wanted = match depth {
                 DependencyDepth::Itself { python } => {
                     let only_python = parts.iter().all(|part| *part == RosPackagePart::Python);
-                    parts.iter().any(|part| *part != RosPackagePart::CMake)
-                        && (python || !only_python)
+                    parts.iter().any(|part| *part != RosPackagePart::CMake) && (python || !only_python)
                 }
                 DependencyDepth::Needed => {
                     let useful = [
@@ -97,9 +78,7 @@ impl Archive {
                     ];
                     useful.iter().any(|part| parts.contains(part)) && !deb.starts_with("python3-")
                 }
-                DependencyDepth::Beyond => {
-                    parts.contains(&RosPackagePart::Definitions) && !deb.ends_with("-dev")
-                }
+                DependencyDepth::Beyond => parts.contains(&RosPackagePart::Definitions) && !deb.ends_with("-dev"),
             };
             match (wanted, deb.ends_with("-dev")) {
                 (true, true) => carried.unpack.insert(deb),
@@ -112,27 +91,15 @@ impl Archive {
 
     /// Returns the packages to install to compile against a ROS package.
     pub(crate) fn build_packages(&self, ros_package: &str) -> BTreeSet<String> {
-        let needed = [
-            RosPackagePart::Manifest,
-            RosPackagePart::CMake,
-            RosPackagePart::Definitions,
-            RosPackagePart::Python,
-        ];
+        let needed =
+            [RosPackagePart::Manifest, RosPackagePart::CMake, RosPackagePart::Definitions, RosPackagePart::Python];
         let carriers: Carriers = self.contents.ros_package(ros_package);
-        let wanted =
-            |parts: &BTreeSet<RosPackagePart>| needed.iter().any(|part| parts.contains(part));
-        carriers
-            .into_iter()
-            .filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev"))
-            .map(|(deb, _)| deb)
-            .collect()
+        let wanted = |parts: &BTreeSet<RosPackagePart>| needed.iter().any(|part| parts.contains(part));
+        carriers.into_iter().filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev")).map(|(deb, _)| deb).collect()
     }
 
     /// Returns the Debian packages that contain these libraries, and the libraries contained in none.
-    pub(crate) fn libraries(
-        &self,
-        names: &BTreeSet<String>,
-    ) -> (BTreeMap<String, String>, Vec<String>) {
+    pub(crate) fn libraries(&self, names: &BTreeSet<String>) -> (BTreeMap<String, String>, Vec<String>) {
         let (mut found, mut missing) = (BTreeMap::new(), Vec::new());
         for name in names {
             match self.contents.library(name) {

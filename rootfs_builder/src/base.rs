@@ -29,11 +29,7 @@ pub struct Base {
 impl Base {
     /// Returns the ROS flavour recorded with revisions.
     pub fn flavour(&self) -> Flavour {
-        Flavour {
-            base: self.name.clone(),
-            ros: self.ros,
-            distribution: self.ros_distribution.clone(),
-        }
+        Flavour { base: self.name.clone(), ros: self.ros, distribution: self.ros_distribution.clone() }
     }
 
     /// Returns the properties that affect installed trees, as a part of their cache keys. A new rosdep key does not
@@ -150,30 +146,19 @@ pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
         Some(wheels) => RequiredWheels::read(directory, wheels)?,
         None => RequiredWheels::default(),
     };
-    Ok(Base {
-        name: name.to_owned(),
-        definition,
-        required,
-    })
+    Ok(Base { name: name.to_owned(), definition, required })
 }
 
 /// Reads a single definition file.
 fn read(directory: &Path, name: &str) -> Result<Definition, Error> {
-    let plain = !name.is_empty()
-        && name
-            .bytes()
-            .all(|b| b.is_ascii_alphanumeric() || b"-_.".contains(&b));
+    let plain = !name.is_empty() && name.bytes().all(|b| b.is_ascii_alphanumeric() || b"-_.".contains(&b));
     let path = directory.join(format!("{name}.toml"));
     if !plain || !path.is_file() {
         let known = names(directory)?;
         return Err(Error::UnknownBase {
             name: name.to_owned(),
             directory: directory.to_owned(),
-            known: if known.is_empty() {
-                "none".into()
-            } else {
-                known.join(", ")
-            },
+            known: if known.is_empty() { "none".into() } else { known.join(", ") },
         });
     }
     let text = fs::read_to_string(&path).io_context("reading", &path)?;
@@ -197,26 +182,16 @@ pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
 
 /// Parses and validates a definition; the error does not contain the file name yet.
 fn parse(text: &str) -> Result<Definition, BaseFileError> {
-    let definition: Definition =
-        toml::from_str(text).map_err(|error: toml::de::Error| BaseFileError {
-            line: error
-                .span()
-                .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1),
-            problem: BaseFileProblem::Toml(Box::new(error)),
-        })?;
+    let definition: Definition = toml::from_str(text).map_err(|error: toml::de::Error| BaseFileError {
+        line: error.span().map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1),
+        problem: BaseFileProblem::Toml(Box::new(error)),
+    })?;
     let wrong = |needle: &str, problem: BaseFileProblem| {
         let index = text.lines().position(|line| line.contains(needle));
-        BaseFileError {
-            line: index.map(|index| index + 1),
-            problem,
-        }
+        BaseFileError { line: index.map(|index| index + 1), problem }
     };
     let packages = [&definition.runtime.packages, &definition.build.packages];
-    for package in packages
-        .into_iter()
-        .flatten()
-        .chain(definition.keys.values().flatten())
-    {
+    for package in packages.into_iter().flatten().chain(definition.keys.values().flatten()) {
         if !is_debian_name(package) {
             let problem = BaseFileProblem::PackageName(package.clone());
             return Err(wrong(&format!("{package:?}"), problem));
@@ -232,9 +207,7 @@ fn parse(text: &str) -> Result<Definition, BaseFileError> {
         }
     }
     if let Some(wheels) = &definition.wheels {
-        wheels
-            .check()
-            .map_err(|error| wrong("[wheels]", error.into()))?;
+        wheels.check().map_err(|error| wrong("[wheels]", error.into()))?;
     }
     let absolute = definition
         .build
@@ -243,9 +216,7 @@ fn parse(text: &str) -> Result<Definition, BaseFileError> {
         .chain([&definition.build.prefix])
         .chain(definition.wheels.as_ref().map(|wheels| &wheels.prefix));
     for path in absolute {
-        let climbs = path
-            .components()
-            .any(|part| part == std::path::Component::ParentDir);
+        let climbs = path.components().any(|part| part == std::path::Component::ParentDir);
         if !path.is_absolute() || climbs || path == Path::new("/") {
             let shown = path.display().to_string();
             return Err(wrong(&shown, BaseFileProblem::Path(shown.clone())));
@@ -259,9 +230,7 @@ fn parse(text: &str) -> Result<Definition, BaseFileError> {
 pub(crate) fn is_debian_name(name: &str) -> bool {
     name.len() >= 2
         && name.as_bytes()[0].is_ascii_alphanumeric()
-        && name
-            .bytes()
-            .all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b"+-.".contains(&b))
+        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b"+-.".contains(&b))
 }
 
 #[cfg(test)]

@@ -62,9 +62,6 @@ mod tests {
         }));
         on.await.expect("it runs");
         build.abort();
-        tokio::task::spawn_blocking(move || end.recv())
-            .await
-            .expect("no panic")
-            .expect("the work has ended");
+        tokio::task::spawn_blocking(move || end.recv()).await.expect("no panic").expect("the work has ended");
     }
 }

@@ -31,12 +31,7 @@ const FILES: [(&str, &str); 4] = [
 /// Returns the options for packing trees into layers.
 pub(crate) fn tree_options(base: &Base) -> TreeOptions {
     TreeOptions {
-        exclude: base
-            .strip
-            .paths
-            .iter()
-            .map(|path| path.trim_start_matches('/').to_owned())
-            .collect(),
+        exclude: base.strip.paths.iter().map(|path| path.trim_start_matches('/').to_owned()).collect(),
         mtime: Mtime::Clamp(EPOCH),
         // For hundreds of megabytes: four times as fast as the default level, and 20 % larger.
         level: 1,
@@ -45,26 +40,16 @@ pub(crate) fn tree_options(base: &Base) -> TreeOptions {
 }
 
 /// Resolves the packages of the base with the current lists. Cached, since apt takes seconds.
-pub(crate) async fn resolve_base(
-    shop: &BuildContext,
-    archive: &Archive,
-    base: &Base,
-) -> Result<Vec<Deb>, Error> {
+pub(crate) async fn resolve_base(shop: &BuildContext, archive: &Archive, base: &Base) -> Result<Vec<Deb>, Error> {
     let mut names: BTreeSet<String> = base.runtime.packages.iter().cloned().collect();
     // Added by mmdebstrap's minbase variant.
     names.extend(["?essential".to_owned(), "apt".to_owned()]);
-    let note = Key::new("base-resolved")
-        .input("archive", &archive.stamp)
-        .inputs("package", &names)
-        .finish();
+    let note = Key::new("base-resolved").input("archive", &archive.stamp).inputs("package", &names).finish();
     if let Some(debs) = shop.layers.read_note(&note) {
         return Ok(debs);
     }
-    let debs = archive
-        .apt
-        .resolve(None, &names)
-        .await
-        .map_err(|error| explain_missing_packages(error, archive, base))?;
+    let debs =
+        archive.apt.resolve(None, &names).await.map_err(|error| explain_missing_packages(error, archive, base))?;
     shop.layers.write_note(&note, &debs)?;
     Ok(debs)
 }
@@ -72,15 +57,11 @@ pub(crate) async fn resolve_base(
 /// Explains a failure to install a base: most often the archive is not the one that the base is made for.
 fn explain_missing_packages(error: Error, archive: &Archive, base: &Base) -> Error {
     let packages = base.runtime.packages.iter();
-    let missing: Vec<&str> = packages
-        .filter(|name| !archive.candidates.contains(name))
-        .map(String::as_str)
-        .collect();
+    let missing: Vec<&str> = packages.filter(|name| !archive.candidates.contains(name)).map(String::as_str).collect();
     match error {
-        Error::Unsolvable { .. } if !missing.is_empty() => Error::BaseLacks {
-            base: base.name.clone(),
-            missing: missing.join(", "),
-        },
+        Error::Unsolvable { .. } if !missing.is_empty() => {
+            Error::BaseLacks { base: base.name.clone(), missing: missing.join(", ") }
+        }
         error => error,
     }
 }
@@ -89,10 +70,7 @@ fn explain_missing_packages(error: Error, archive: &Archive, base: &Base) -> Err
 pub(crate) fn base_key(base: &Base, debs: &[Deb]) -> String {
     let mut names: Vec<String> = debs.iter().map(Deb::to_string).collect();
     names.sort();
-    Key::new("base")
-        .input("system", base.system_key())
-        .inputs("deb", names)
-        .finish()
+    Key::new("base").input("system", base.system_key()).inputs("deb", names).finish()
 }
 
 /// Creates the base layer.
@@ -102,12 +80,7 @@ pub(crate) async fn make_base_layer(
     sources: &str,
     progress: &Progress,
 ) -> Result<LayerEntry, Error> {
-    progress
-        .step(&format!(
-            "bootstrapping base {} (once; about a minute)",
-            base.name
-        ))
-        .await;
+    progress.step(&format!("bootstrapping base {} (once; about a minute)", base.name)).await;
     let root = shop.site.fresh_directory("base")?;
     let list = root.join("sources.list");
     fs::write(&list, sources).io_context("writing", &list)?;
@@ -119,12 +92,7 @@ pub(crate) async fn make_base_layer(
         .env("TMPDIR", &root)
         .args(["--mode=root", "--variant=minbase", "--format=directory"])
         .arg(format!("--include={}", base.runtime.packages.join(",")))
-        .args(
-            base.strip
-                .unpacked
-                .iter()
-                .map(|rule| format!("--dpkgopt={rule}")),
-        )
+        .args(base.strip.unpacked.iter().map(|rule| format!("--dpkgopt={rule}")))
         .arg("--aptopt=APT::Install-Recommends \"false\"")
         .arg(&base.suite)
         .arg(&tree)
@@ -156,10 +124,7 @@ pub(crate) async fn make_base_layer(
         Ok(layer)
     })
     .await??;
-    Ok(LayerEntry {
-        layer: Some(layer),
-        made_from: status,
-    })
+    Ok(LayerEntry { layer: Some(layer), made_from: status })
 }
 
 /// Makes the content independent of the host.
@@ -188,10 +153,7 @@ pub(crate) fn installed_packages(tree: &Path) -> Result<Vec<String>, Error> {
 }
 
 fn parse_installed(text: &str) -> Option<String> {
-    let field = |name: &str| {
-        text.lines()
-            .find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
-    };
+    let field = |name: &str| text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": "));
     (field("Status")? == "install ok installed").then_some(())?;
     let deb = Deb {
         name: field("Package")?.to_owned(),
@@ -215,18 +177,9 @@ mod tests {
         std::os::unix::fs::symlink(&outside, etc.join("resolv.conf")).expect("linked");
         fs::write(etc.join("hostname"), "build-host-7\n").expect("written");
         normalize_tree(tree.path()).expect("done");
-        assert_eq!(
-            fs::read_to_string(etc.join("hosts")).expect("there"),
-            "127.0.0.1 localhost\n"
-        );
-        assert_eq!(
-            fs::read_to_string(etc.join("hostname")).expect("there"),
-            "localhost\n"
-        );
-        assert_eq!(
-            fs::read_to_string(etc.join("resolv.conf")).expect("there"),
-            ""
-        );
+        assert_eq!(fs::read_to_string(etc.join("hosts")).expect("there"), "127.0.0.1 localhost\n");
+        assert_eq!(fs::read_to_string(etc.join("hostname")).expect("there"), "localhost\n");
+        assert_eq!(fs::read_to_string(etc.join("resolv.conf")).expect("there"), "");
         assert_eq!(fs::read_to_string(outside).expect("there"), "the host's");
     }
 
@@ -242,9 +195,6 @@ mod tests {
              Package: a\nStatus: install ok installed\nArchitecture: amd64\nVersion: 1:1-1\n",
         )
         .expect("written");
-        assert_eq!(
-            installed_packages(tree.path()).expect("read"),
-            ["a=1:1-1:amd64", "b=2:all"]
-        );
+        assert_eq!(installed_packages(tree.path()).expect("read"), ["a=1:1-1:amd64", "b=2:all"]);
     }
 }

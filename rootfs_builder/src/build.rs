@@ -59,10 +59,7 @@ impl Build<'_> {
     }
 
     /// Returns the ROS 2 packages in these layers.
-    pub(crate) async fn indexed_packages(
-        &self,
-        layers: &[Digest],
-    ) -> Result<BTreeSet<String>, Error> {
+    pub(crate) async fn indexed_packages(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
         let trees = self.shop.extract_layers(layers).await?;
         indexed::find_packages(&self.base, trees).await
     }
@@ -76,28 +73,12 @@ impl Build<'_> {
         extras: Vec<crate::deb::DebMember>,
     ) -> Result<LayerSet, Error> {
         let debs = self.resolve(below, packages).await?;
-        let addition = LayerAddition {
-            name,
-            below,
-            debs,
-            extras,
-        };
-        install::add_layers(
-            &self.shop,
-            &self.archive,
-            &self.base,
-            addition,
-            self.progress,
-        )
-        .await
+        let addition = LayerAddition { name, below, debs, extras };
+        install::add_layers(&self.shop, &self.archive, &self.base, addition, self.progress).await
     }
 
     /// Resolves the packages to install on top of `below`. Cached, since apt takes seconds.
-    async fn resolve(
-        &self,
-        below: &[Digest],
-        packages: &BTreeSet<String>,
-    ) -> Result<Vec<Deb>, Error> {
+    async fn resolve(&self, below: &[Digest], packages: &BTreeSet<String>) -> Result<Vec<Deb>, Error> {
         if packages.is_empty() {
             return Ok(Vec::new());
         }
@@ -116,19 +97,13 @@ impl Build<'_> {
             // Looked up in the layer itself: apt, which runs on the host, would follow a link to the host.
             .find(|tree| foreign::Tree::open(tree).is_ok_and(|tree| tree.has_file(STATUS)))
             .map(|tree| tree.join(STATUS));
-        let debs = self
-            .archive
-            .apt
-            .resolve(status.as_deref(), packages)
-            .await?;
+        let debs = self.archive.apt.resolve(status.as_deref(), packages).await?;
         self.shop.layers.write_note(&key, &debs)?;
         Ok(debs)
     }
 
     /// Returns the names given with `--with`: first ROS packages, then Debian packages.
-    pub(crate) async fn extra_packages(
-        &self,
-    ) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
+    pub(crate) async fn extra_packages(&self) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
         if self.base.ros != Version::Ros1 {
             return Ok((BTreeSet::new(), self.ros2_extra_packages().await?));
         }
@@ -138,13 +113,7 @@ impl Build<'_> {
             if !self.archive.contents.ros_package(name).is_empty() {
                 ros.insert(name.clone());
             } else if self.archive.candidates.contains(name) {
-                ros.extend(
-                    self.archive
-                        .contents
-                        .ros_packages_in(name)
-                        .into_iter()
-                        .map(str::to_owned),
-                );
+                ros.extend(self.archive.contents.ros_packages_in(name).into_iter().map(str::to_owned));
                 debs.insert(name.clone());
             } else {
                 missing.push(crate::error::Unresolved {
@@ -154,11 +123,7 @@ impl Build<'_> {
                 });
             }
         }
-        if missing.is_empty() {
-            Ok((ros, debs))
-        } else {
-            Err(Error::Unresolved(missing))
-        }
+        if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }
     }
 
     /// Returns the names given with `--with` on a base of ROS 2: Debian packages, without ROS packages that are already
@@ -175,35 +140,16 @@ impl Build<'_> {
                 Some(deb) => {
                     debs.insert(deb);
                 }
-                None => missing.push(keys::unresolved_name(
-                    &self.archive,
-                    &self.base,
-                    name,
-                    "--with",
-                )),
+                None => missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with")),
             }
         }
-        if missing.is_empty() {
-            Ok(debs)
-        } else {
-            Err(Error::Unresolved(missing))
-        }
+        if missing.is_empty() { Ok(debs) } else { Err(Error::Unresolved(missing)) }
     }
 
     /// Resolves what to run and writes the image.
-    pub(crate) async fn finish(
-        &self,
-        made: BuildParts,
-        hold: image::GcHold,
-    ) -> Result<BuildOutcome, Error> {
-        let parts = [
-            ("base", &self.base_layer),
-            ("dependencies", &made.dependencies),
-            ("package", &made.package),
-        ];
-        let parts = parts
-            .into_iter()
-            .flat_map(|(name, part)| part.layers.iter().map(move |layer| (name, *layer)));
+    pub(crate) async fn finish(&self, made: BuildParts, hold: image::GcHold) -> Result<BuildOutcome, Error> {
+        let parts = [("base", &self.base_layer), ("dependencies", &made.dependencies), ("package", &made.package)];
+        let parts = parts.into_iter().flat_map(|(name, part)| part.layers.iter().map(move |layer| (name, *layer)));
         let parts: Vec<(&'static str, StagedLayer)> = parts.collect();
         let diff_ids: Vec<Digest> = parts.iter().map(|(_, layer)| layer.diff_id).collect();
         let trees = self.shop.extract_layers(&diff_ids).await?;
@@ -211,27 +157,16 @@ impl Build<'_> {
         let request = self.request;
         let ask = LaunchQuery {
             packages: made.packages.clone(),
-            prefix: made
-                .prefix
-                .as_deref()
-                .map_or_else(String::new, |prefix| prefix.display().to_string()),
+            prefix: made.prefix.as_deref().map_or_else(String::new, |prefix| prefix.display().to_string()),
             launch: request.launch.clone().unwrap_or_default(),
             nodes: request.nodes.clone(),
             args: request.args.clone(),
             remaps: request.remaps.clone(),
             params: request.params.clone(),
         };
-        let answer = launch::query_plan(
-            &self.shop,
-            self.base.ros,
-            trees.clone(),
-            self.base.environment.clone(),
-            &ask,
-        )
-        .await
-        .map_err(|error| {
-            advice::add_advice(error, AdviceIndex::for_base(&self.archive, &self.base))
-        })?;
+        let answer = launch::query_plan(&self.shop, self.base.ros, trees.clone(), self.base.environment.clone(), &ask)
+            .await
+            .map_err(|error| advice::add_advice(error, AdviceIndex::for_base(&self.archive, &self.base)))?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }
@@ -249,19 +184,13 @@ impl Build<'_> {
         let (inventory, undeclared) = crate::blocking::spawn_reader(move || {
             let (package, environment, nodes) = of;
             let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
-            let of = SearchHints {
-                package: &package,
-                environment: &environment,
-                commands: &commands,
-            };
+            let of = SearchHints { package: &package, environment: &environment, commands: &commands };
             let inventory = Inventory::scan(&trees, of)?;
             let (archive, base) = known;
             let undeclared = match base.ros {
-                Version::Ros1 => undeclared::missing_module_advice(
-                    &trees,
-                    &inventory,
-                    AdviceIndex::for_base(&archive, &base),
-                ),
+                Version::Ros1 => {
+                    undeclared::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
+                }
                 // Its programs are created by setuptools and import their packages by name.
                 Version::Ros2 => Vec::new(),
             };
@@ -282,10 +211,7 @@ impl Build<'_> {
             ]),
             annotations: BTreeMap::from([
                 ("org.opencontainers.image.title".to_owned(), package.clone()),
-                (
-                    "org.opencontainers.image.version".to_owned(),
-                    version.clone(),
-                ),
+                ("org.opencontainers.image.version".to_owned(), version.clone()),
             ]),
             ..ImageSpec::default()
         };
@@ -300,21 +226,14 @@ impl Build<'_> {
             image,
             layers,
             environment,
-            plan: LaunchPlan {
-                nodes: answer.nodes,
-                parameters: answer.parameters,
-                components: answer.components,
-            },
+            plan: LaunchPlan { nodes: answer.nodes, parameters: answer.parameters, components: answer.components },
             inventory,
             hold,
         })
     }
 
     /// Completes the layers with their archives.
-    async fn pack_layers(
-        &self,
-        parts: Vec<(&'static str, StagedLayer)>,
-    ) -> Result<Vec<BuiltLayer>, Error> {
+    async fn pack_layers(&self, parts: Vec<(&'static str, StagedLayer)>) -> Result<Vec<BuiltLayer>, Error> {
         if self.shop.is_packing() {
             self.progress.step("packing the rest of the layers").await;
         }
@@ -327,11 +246,7 @@ impl Build<'_> {
                     diff_id: layer.diff_id,
                     store: store.images_dir().to_owned(),
                 })?;
-                Ok(BuiltLayer {
-                    name,
-                    info,
-                    cached: layer.cached,
-                })
+                Ok(BuiltLayer { name, info, cached: layer.cached })
             });
             whole.collect()
         })

@@ -29,8 +29,7 @@ use crate::request::{BuildOutcome, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
 use crate::{
-    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources,
-    unused, wheels,
+    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, unused, wheels,
 };
 
 /// Default base for packages that support ROS 1.
@@ -103,10 +102,7 @@ impl PushContent<'_> {
 
 impl OpenedArchive {
     fn from_parts(base: &Base, archive: &Arc<Archive>) -> Self {
-        Self {
-            base: base.clone(),
-            archive: archive.clone(),
-        }
+        Self { base: base.clone(), archive: archive.clone() }
     }
 }
 
@@ -128,11 +124,7 @@ impl Builder {
 
     /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
     /// directory is removed ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
-    pub async fn build(
-        &self,
-        request: &PushRequest,
-        events: mpsc::Sender<BuildEvent>,
-    ) -> Result<BuildOutcome, Error> {
+    pub async fn build(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
         blocking::cancellable(self.make(request, events)).await
     }
 
@@ -146,20 +138,12 @@ impl Builder {
         self.removals.wait(id).await;
     }
 
-    async fn make(
-        &self,
-        request: &PushRequest,
-        events: mpsc::Sender<BuildEvent>,
-    ) -> Result<BuildOutcome, Error> {
+    async fn make(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
         let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
-            choice::choose_base(
-                &self.config.bases_dir,
-                request.base.as_deref(),
-                &request.source,
-            )
+            choice::choose_base(&self.config.bases_dir, request.base.as_deref(), &request.source)
         })?;
         if let Some(note) = note {
             progress.warn(note).await;
@@ -184,17 +168,8 @@ impl Builder {
             }
             PushSource::Packaged(name) => PushContent::Packaged(name),
         };
-        let push = PushLabel {
-            id: request.id.clone(),
-            name: request.name.clone().unwrap_or_else(|| what.name()),
-        };
-        let shop = BuildContext::new(
-            site,
-            self.layers.clone(),
-            self.turns.clone(),
-            push,
-            progress.clone(),
-        );
+        let push = PushLabel { id: request.id.clone(), name: request.name.clone().unwrap_or_else(|| what.name()) };
+        let shop = BuildContext::new(site, self.layers.clone(), self.turns.clone(), push, progress.clone());
         let archive = self.archive(&shop, &base, progress).await?;
         match &what {
             PushContent::Tree(pushed) => check_dependencies(&archive, &base, request, pushed)?,
@@ -203,27 +178,15 @@ impl Builder {
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
         let base_layer = wheels::add_runtime_wheels(&shop, &base, base_layer, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
-        let build = Build {
-            shop,
-            base,
-            archive,
-            base_layer,
-            request,
-            progress,
-            log,
-        };
+        let build = Build { shop, base, archive, base_layer, request, progress, log };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
         let swept = cache.clone();
         blocking::spawn(move || unused::sweep(&swept)).await?;
         let work = async {
             let made = match what {
-                PushContent::Tree(PushedDirectory::Source(workspace)) => {
-                    source::build(&build, workspace).await?
-                }
-                PushContent::Tree(PushedDirectory::Installed(space)) => {
-                    prebuilt::build(&build, space).await?
-                }
+                PushContent::Tree(PushedDirectory::Source(workspace)) => source::build(&build, workspace).await?,
+                PushContent::Tree(PushedDirectory::Installed(space)) => prebuilt::build(&build, space).await?,
                 PushContent::Packaged(name) => packaged::build(&build, name).await?,
             };
             build.finish(made, hold).await
@@ -256,18 +219,11 @@ impl Builder {
     /// the store's garbage collector; otherwise they are imported from the cache again.
     pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
-        let notes = names
-            .iter()
-            .filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
+        let notes = names.iter().filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
         notes.flatten().collect()
     }
 
-    async fn archive(
-        &self,
-        shop: &BuildContext,
-        base: &Base,
-        progress: &Progress,
-    ) -> Result<Arc<Archive>, Error> {
+    async fn archive(&self, shop: &BuildContext, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
         let mut archives = self.archives.lock().await;
         if let Some(opened) = archives.get_mut(&base.name)
             && opened.archive.is_fresh()
@@ -277,8 +233,7 @@ impl Builder {
         }
         let scratch = shop.site.directory("sources")?;
         let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
-        let archive =
-            Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
+        let archive = Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
         archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         Ok(archive)
     }
@@ -299,37 +254,20 @@ impl Builder {
         let entry = bootstrap::make_base_layer(shop, base, &archive.sources, progress).await?;
         let (made, layer) = (to_layer_set(&entry, false), entry.layer);
         let present: BTreeSet<&String> = entry.made_from.iter().collect();
-        let all_there = resolved
-            .iter()
-            .all(|deb| present.contains(&deb.to_string()));
+        let all_there = resolved.iter().all(|deb| present.contains(&deb.to_string()));
         shop.put_cached(&key, entry).await?;
         if all_there {
             return Ok((made, archive));
         }
         // The archive has changed since the lists were fetched: fetch them again, so that what is resolved from now on
         // is consistent, and store the layer under what it contains.
-        let archive = Arc::new(
-            Archive::open(
-                &self.config.cache_dir,
-                archive.sources.clone(),
-                true,
-                progress,
-            )
-            .await?,
-        );
-        self.archives
-            .lock()
-            .await
-            .insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
+        let archive = Arc::new(Archive::open(&self.config.cache_dir, archive.sources.clone(), true, progress).await?);
+        self.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         let resolved = bootstrap::resolve_base(shop, &archive, base).await?;
         if let Some(layer) = layer {
             let made_from = resolved.iter().map(Deb::to_string).collect();
-            let entry = LayerEntry {
-                layer: Some(layer),
-                made_from,
-            };
-            shop.put_cached(&bootstrap::base_key(base, &resolved), entry)
-                .await?;
+            let entry = LayerEntry { layer: Some(layer), made_from };
+            shop.put_cached(&bootstrap::base_key(base, &resolved), entry).await?;
         }
         Ok((made, archive))
     }
@@ -340,8 +278,7 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
     if request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen =
-        privilege::run_as_reader(|| foreseen::scan_sources(workspace, base.ros.ros_version()));
+    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, base.ros.ros_version()));
     if !foreseen.must_be_chosen() {
         return Ok(());
     }
@@ -374,9 +311,7 @@ fn check_dependencies(
 }
 
 fn to_layer_set(entry: &LayerEntry, cached: bool) -> LayerSet {
-    let layer = entry
-        .layer
-        .map(|layer| LayerSet::single(layer.diff_id, cached));
+    let layer = entry.layer.map(|layer| LayerSet::single(layer.diff_id, cached));
     layer.unwrap_or_default()
 }
 
@@ -384,12 +319,7 @@ fn to_layer_set(entry: &LayerEntry, cached: bool) -> LayerSet {
 fn sweep_logs(directory: &Path) {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
     let mut logs: Vec<_> = entries
-        .filter(|entry| {
-            entry
-                .path()
-                .extension()
-                .is_some_and(|extension| extension == "log")
-        })
+        .filter(|entry| entry.path().extension().is_some_and(|extension| extension == "log"))
         .filter_map(|entry| Some((entry.metadata().ok()?.modified().ok()?, entry.path())))
         .collect();
     logs.sort();
@@ -411,10 +341,7 @@ mod tests {
 
     #[async_trait]
     impl Sandbox for UnusedSandbox {
-        async fn start_sandbox(
-            &self,
-            spec: ContainerSpec,
-        ) -> Result<SandboxContainer, servant::Error> {
+        async fn start_sandbox(&self, spec: ContainerSpec) -> Result<SandboxContainer, servant::Error> {
             panic!("container {} is started", spec.id)
         }
     }
@@ -459,10 +386,7 @@ mod tests {
                     ..PushRequest::default()
                 };
                 let (sender, mut events) = mpsc::channel(100);
-                let refused = builder
-                    .build(&request, sender)
-                    .await
-                    .expect_err("no package");
+                let refused = builder.build(&request, sender).await.expect_err("no package");
                 let text = refused.to_string();
                 assert!(text.contains("package.xml"), "{files:?} {base:?}: {text}");
                 assert_eq!(events.recv().await, None, "nothing is begun");
@@ -485,8 +409,6 @@ mod tests {
         sweep_logs(directory.path());
         let left = fs::read_dir(directory.path()).expect("listed").count();
         assert_eq!(left, LOGS_KEPT + 1);
-        assert!(
-            !directory.path().join("2.log").exists() && directory.path().join("3.log").exists()
-        );
+        assert!(!directory.path().join("2.log").exists() && directory.path().join("3.log").exists());
     }
 }

@@ -35,11 +35,7 @@ impl LayerCache {
         for path in [&directory, &notes] {
             fs::create_dir_all(path).io_context("making", path)?;
         }
-        Ok(Self {
-            directory,
-            notes,
-            store,
-        })
+        Ok(Self { directory, notes, store })
     }
 
     pub(crate) fn store(&self) -> &Arc<Store> {
@@ -54,23 +50,16 @@ impl LayerCache {
     /// Returns whether [`LayerCache::get`] would find a layer, which need not be in the store yet. Blocking.
     pub(crate) fn contains(&self, key: &str) -> bool {
         let (about, archive) = self.paths(key);
-        let entry = fs::read(&about)
-            .ok()
-            .and_then(|text| serde_json::from_slice::<LayerEntry>(&text).ok());
+        let entry = fs::read(&about).ok().and_then(|text| serde_json::from_slice::<LayerEntry>(&text).ok());
         match entry.map(|entry| entry.layer) {
             None => false,
             Some(None) => true,
-            Some(Some(layer)) => {
-                archive.is_file() || matches!(self.store.layer(&layer.diff_id), Ok(Some(_)))
-            }
+            Some(Some(layer)) => archive.is_file() || matches!(self.store.layer(&layer.diff_id), Ok(Some(_))),
         }
     }
 
     fn paths(&self, key: &str) -> (PathBuf, PathBuf) {
-        (
-            self.directory.join(format!("{key}.json")),
-            self.directory.join(format!("{key}.tar.gz")),
-        )
+        (self.directory.join(format!("{key}.json")), self.directory.join(format!("{key}.tar.gz")))
     }
 
     /// Returns the layer of a key, importing it into the store if needed. Damaged or incomplete entries count as
@@ -95,10 +84,7 @@ impl LayerCache {
             return Ok(None);
         }
         match self.store.import_layer(&archive) {
-            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(LayerEntry {
-                layer: Some(found),
-                ..entry
-            })),
+            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(LayerEntry { layer: Some(found), ..entry })),
             Ok(_) | Err(image::Error::Archive { .. }) => {
                 tracing::warn!(path = %archive.display(), "a cached layer is damaged and will be rebuilt");
                 Ok(None)
@@ -117,10 +103,7 @@ impl LayerCache {
 
     /// Stores a note.
     pub(crate) fn write_note<T: Serialize>(&self, key: &str, value: &T) -> Result<(), Error> {
-        write_atomically(
-            &self.notes.join(key),
-            &serde_json::to_vec(value).unwrap_or_default(),
-        )
+        write_atomically(&self.notes.join(key), &serde_json::to_vec(value).unwrap_or_default())
     }
 
     /// Stores a layer that is in the image store. Blocking.
@@ -129,10 +112,7 @@ impl LayerCache {
         if let Some(layer) = &entry.layer {
             self.store.export_layer(&layer.diff_id, &archive)?;
         }
-        write_atomically(
-            &about,
-            &serde_json::to_vec_pretty(entry).unwrap_or_default(),
-        )
+        write_atomically(&about, &serde_json::to_vec_pretty(entry).unwrap_or_default())
     }
 }
 

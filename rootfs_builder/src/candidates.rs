@@ -53,16 +53,10 @@ impl Candidates {
 
     /// Returns the candidate with this name.
     pub fn get(&self, name: &str) -> Option<Deb> {
-        let found = self
-            .starts
-            .binary_search_by(|start| self.name(*start).cmp(name));
+        let found = self.starts.binary_search_by(|start| self.name(*start).cmp(name));
         let start = self.starts.get(found.ok()?)?;
         let mut fields = self.line(*start).split(' ').map(str::to_owned);
-        Some(Deb {
-            name: fields.next()?,
-            version: fields.next()?,
-            architecture: fields.next()?,
-        })
+        Some(Deb { name: fields.next()?, version: fields.next()?, architecture: fields.next()? })
     }
 
     /// Returns whether a candidate has this name.
@@ -100,11 +94,7 @@ pub(crate) mod tests {
 
     /// Returns candidates with these names.
     pub(crate) fn candidates_named(names: &[&str]) -> Candidates {
-        let deb = |name: &&str| Deb {
-            name: (*name).to_owned(),
-            version: "1".into(),
-            architecture: "all".into(),
-        };
+        let deb = |name: &&str| Deb { name: (*name).to_owned(), version: "1".into(), architecture: "all".into() };
         names.iter().map(deb).collect()
     }
 
@@ -116,16 +106,9 @@ pub(crate) mod tests {
         let read = Candidates::from_lines(made.as_text());
         for candidates in [made, read] {
             for name in names {
-                assert_eq!(
-                    candidates.get(name).expect(name).to_string(),
-                    format!("{name}=1:all")
-                );
+                assert_eq!(candidates.get(name).expect(name).to_string(), format!("{name}=1:all"));
             }
-            assert!(
-                !candidates.contains("b")
-                    && !candidates.contains("")
-                    && !candidates.contains("zlib")
-            );
+            assert!(!candidates.contains("b") && !candidates.contains("") && !candidates.contains("zlib"));
             let listed: Vec<&str> = candidates.names().collect();
             assert_eq!(listed, ["a", "a+b", "a-b", "a.b", "a0", "zlib1g"]);
         }

@@ -51,10 +51,7 @@ impl Chains {
             .input("system", system)
             .inputs("below", below.iter().map(Digest::to_string))
             .finish();
-        Self {
-            directory: cache.join("chains").join(&ground),
-            ground,
-        }
+        Self { directory: cache.join("chains").join(&ground), ground }
     }
 
     /// Returns the key of a link.
@@ -68,10 +65,7 @@ impl Chains {
 
     /// Returns the key of the note with the chain used for a whole set.
     pub(crate) fn memo_key(&self, items: &BTreeSet<String>) -> String {
-        Key::new("chain")
-            .input("ground", &self.ground)
-            .inputs("item", items)
-            .finish()
+        Key::new("chain").input("ground", &self.ground).inputs("item", items).finish()
     }
 
     /// Writes the record of a link whose layer is in the cache. Blocking.
@@ -91,11 +85,7 @@ impl Chains {
     /// Returns all links by key. Records that are damaged or inconsistent with their name count as missing.
     fn links(&self) -> BTreeMap<String, Link> {
         let mut links = BTreeMap::new();
-        for entry in fs::read_dir(&self.directory)
-            .into_iter()
-            .flatten()
-            .flatten()
-        {
+        for entry in fs::read_dir(&self.directory).into_iter().flatten().flatten() {
             let name = entry.file_name();
             let Some(key) = name.to_str().and_then(|name| name.strip_suffix(".json")) else {
                 continue;
@@ -120,17 +110,9 @@ impl Chains {
     /// Blocking.
     pub(crate) fn find_subsets(&self, wanted: &BTreeSet<String>) -> Vec<FoundChain> {
         let links = self.links();
-        let fits: BTreeMap<&String, &Link> = links
-            .iter()
-            .filter(|(_, link)| link.items.is_subset(wanted))
-            .collect();
-        let mut found: Vec<FoundChain> = fits
-            .keys()
-            .filter_map(|tip| collect_chain(&fits, tip))
-            .collect();
-        found.sort_by(|a, b| {
-            (b.bytes, a.keys.len(), &a.keys).cmp(&(a.bytes, b.keys.len(), &b.keys))
-        });
+        let fits: BTreeMap<&String, &Link> = links.iter().filter(|(_, link)| link.items.is_subset(wanted)).collect();
+        let mut found: Vec<FoundChain> = fits.keys().filter_map(|tip| collect_chain(&fits, tip)).collect();
+        found.sort_by(|a, b| (b.bytes, a.keys.len(), &a.keys).cmp(&(a.bytes, b.keys.len(), &b.keys)));
         found
     }
 }
@@ -184,11 +166,7 @@ mod tests {
 
     impl ChainFixture {
         fn add(&self, parent: Option<&str>, items: &[&str], bytes: u64) -> String {
-            let link = Link {
-                parent: parent.map(str::to_owned),
-                items: set(items),
-                bytes,
-            };
+            let link = Link { parent: parent.map(str::to_owned), items: set(items), bytes };
             let key = self.chains.key(parent, &link.items);
             self.chains.write_link(&key, &link).expect("kept");
             key
@@ -224,20 +202,12 @@ mod tests {
         for other in [
             Chains::new(root, "dependencies", "another system", &[]),
             Chains::new(root, "build-dependencies", "system", &[]),
-            Chains::new(
-                root,
-                "dependencies",
-                "system",
-                &[Digest::compute("another base")],
-            ),
+            Chains::new(root, "dependencies", "system", &[Digest::compute("another base")]),
         ] {
             assert_ne!(other.key(None, &set(&["c"])), of(None));
             assert!(other.find_subsets(&set(&["a", "b"])).is_empty());
         }
-        assert_ne!(
-            lab.chains.key(None, &set(&["ab"])),
-            lab.chains.key(None, &set(&["a", "b"]))
-        );
+        assert_ne!(lab.chains.key(None, &set(&["ab"])), lab.chains.key(None, &set(&["a", "b"])));
     }
 
     #[test]

@@ -24,11 +24,7 @@ pub(crate) struct ChosenBase {
 }
 
 /// Chooses among the definitions in a directory. Blocking; reads what was pushed.
-pub(crate) fn choose_base(
-    directory: &Path,
-    asked: Option<&str>,
-    source: &PushSource,
-) -> Result<ChosenBase, Error> {
+pub(crate) fn choose_base(directory: &Path, asked: Option<&str>, source: &PushSource) -> Result<ChosenBase, Error> {
     let PushSource::Tree(tree) = source else {
         // The name of a packaged ROS package does not reveal its ROS version.
         let base = base::load(directory, asked.unwrap_or(DEFAULT_BASE))?;
@@ -60,21 +56,14 @@ fn load_usable_bases(directory: &Path, asked: Option<&Base>) -> Result<Vec<Base>
 }
 
 fn distributions(bases: &[Base]) -> Vec<Distribution> {
-    let of = |base: &Base| Distribution {
-        version: base.ros.ros_version(),
-        name: base.ros_distribution.clone(),
-    };
+    let of = |base: &Base| Distribution { version: base.ros.ros_version(), name: base.ros_distribution.clone() };
     bases.iter().map(of).collect()
 }
 
 fn check_requested_base(base: Base, bases: &[Base], fits: RosSupport) -> Result<ChosenBase, Error> {
     let given = base.ros.ros_version();
     match fits {
-        RosSupport::Only {
-            version,
-            package,
-            because,
-        } if version != given => Err(Error::WrongRos {
+        RosSupport::Only { version, package, because } if version != given => Err(Error::WrongRos {
             package,
             because,
             version: version.number(),
@@ -93,15 +82,12 @@ fn first_fitting_base(mut bases: Vec<Base>, fits: RosSupport) -> Result<ChosenBa
     };
     bases.sort_by_key(rank);
     let other = match &fits {
-        RosSupport::Either => bases
-            .iter()
-            .find(|base| base.ros.ros_version() == RosVersion::Two)
-            .map(|base| base.name.clone()),
+        RosSupport::Either => {
+            bases.iter().find(|base| base.ros.ros_version() == RosVersion::Two).map(|base| base.name.clone())
+        }
         RosSupport::Only { .. } => None,
     };
-    let found = bases
-        .into_iter()
-        .find(|base| fits.supports(base.ros.ros_version()));
+    let found = bases.into_iter().find(|base| fits.supports(base.ros.ros_version()));
     match (found, fits) {
         (Some(base), _) => {
             let note = other.filter(|name| *name != base.name).map(|other| {
@@ -114,18 +100,9 @@ fn first_fitting_base(mut bases: Vec<Base>, fits: RosSupport) -> Result<ChosenBa
             });
             Ok(ChosenBase { base, note })
         }
-        (
-            None,
-            RosSupport::Only {
-                version,
-                package,
-                because,
-            },
-        ) => Err(Error::NoBase {
-            package,
-            because,
-            version: version.number(),
-        }),
+        (None, RosSupport::Only { version, package, because }) => {
+            Err(Error::NoBase { package, because, version: version.number() })
+        }
         (None, RosSupport::Either) => no_base_error(),
     }
 }
@@ -140,17 +117,10 @@ fn no_base_error() -> Result<ChosenBase, Error> {
 
 /// Formats the names of the bases of a version.
 fn list_bases(bases: &[Base], version: RosVersion) -> String {
-    let of_version = bases
-        .iter()
-        .filter(|base| base.ros.ros_version() == version);
-    let names: Vec<String> = of_version
-        .map(|base| format!("--base {}", base.name))
-        .collect();
+    let of_version = bases.iter().filter(|base| base.ros.ros_version() == version);
+    let names: Vec<String> = of_version.map(|base| format!("--base {}", base.name)).collect();
     if names.is_empty() {
-        format!(
-            "a base of ROS {}, of which this server has none",
-            version.number()
-        )
+        format!("a base of ROS {}, of which this server has none", version.number())
     } else {
         names.join(" or ")
     }
@@ -180,9 +150,7 @@ mod tests {
         for (number, export) in exports.iter().enumerate() {
             let directory = root.path().join(format!("src/p{number}"));
             std::fs::create_dir_all(&directory).expect("made");
-            let text = format!(
-                "<package format=\"3\"><name>p{number}</name><export>{export}</export></package>"
-            );
+            let text = format!("<package format=\"3\"><name>p{number}</name><export>{export}</export></package>");
             std::fs::write(directory.join("package.xml"), text).expect("written");
         }
         let source = PushSource::Tree(root.path().to_owned());
@@ -194,18 +162,10 @@ mod tests {
     const CMAKE: &str = "<build_type>cmake</build_type>";
     const BOTH: &str = "<build_type condition=\"$ROS_VERSION == 1\">catkin</build_type>\
                         <build_type condition=\"$ROS_VERSION == 2\">ament_cmake</build_type>";
-    const ALL: [(&str, &str); 4] = [
-        ("another", "ros2"),
-        ("bookworm-jazzy-wheels", "ros2"),
-        ("bookworm-ros1", "ros1"),
-        ("zesty", "ros1"),
-    ];
+    const ALL: [(&str, &str); 4] =
+        [("another", "ros2"), ("bookworm-jazzy-wheels", "ros2"), ("bookworm-ros1", "ros1"), ("zesty", "ros1")];
 
-    fn chosen_name(
-        definitions: &[(&str, &str)],
-        asked: Option<&str>,
-        exports: &[&str],
-    ) -> Result<ChosenBase, Error> {
+    fn chosen_name(definitions: &[(&str, &str)], asked: Option<&str>, exports: &[&str]) -> Result<ChosenBase, Error> {
         let (bases, (_root, source)) = (bases(definitions), pushed_packages(exports));
         choose_base(bases.path(), asked, &source)
     }
@@ -232,9 +192,7 @@ mod tests {
 
     #[test]
     fn a_package_of_the_other_ros_is_told_which_base_fits() {
-        let text = chosen_name(&ALL, Some("bookworm-ros1"), &[CMAKE, AMENT])
-            .expect_err("ROS 2")
-            .to_string();
+        let text = chosen_name(&ALL, Some("bookworm-ros1"), &[CMAKE, AMENT]).expect_err("ROS 2").to_string();
         for words in [
             "p1 has build type ament_python",
             "bookworm-ros1 is of ROS 1",
@@ -242,22 +200,11 @@ mod tests {
         ] {
             assert!(text.contains(words), "{text}");
         }
-        let text = chosen_name(&ALL, Some("another"), &[CATKIN])
-            .expect_err("ROS 1")
-            .to_string();
-        assert!(
-            text.contains("--base bookworm-ros1 or --base zesty"),
-            "{text}"
-        );
+        let text = chosen_name(&ALL, Some("another"), &[CATKIN]).expect_err("ROS 1").to_string();
+        assert!(text.contains("--base bookworm-ros1 or --base zesty"), "{text}");
         for exports in [&[BOTH][..], &[CMAKE]] {
             for base in ["another", "zesty"] {
-                assert_eq!(
-                    chosen_name(&ALL, Some(base), exports)
-                        .expect("fits")
-                        .base
-                        .name,
-                    base
-                );
+                assert_eq!(chosen_name(&ALL, Some(base), exports).expect("fits").base.name, base);
             }
         }
     }
@@ -265,9 +212,7 @@ mod tests {
     #[test]
     fn two_flavours_are_refused_whatever_is_asked() {
         for asked in [None, Some("another"), Some("zesty")] {
-            let text = chosen_name(&ALL, asked, &[CATKIN, AMENT])
-                .expect_err("two flavours")
-                .to_string();
+            let text = chosen_name(&ALL, asked, &[CATKIN, AMENT]).expect_err("two flavours").to_string();
             assert!(
                 text.contains("p0 has build type catkin (ROS 1)")
                     && text.contains("p1 has build type ament_python (ROS 2)"),
@@ -279,11 +224,7 @@ mod tests {
     #[test]
     fn where_no_base_fits_it_is_said() {
         let text = chosen_name(&[("zesty", "ros1")], None, &[AMENT]).expect_err("none");
-        assert!(
-            text.to_string()
-                .contains("no base supports build type ament_python"),
-            "{text}"
-        );
+        assert!(text.to_string().contains("no base supports build type ament_python"), "{text}");
         // An unreadable definition does not prevent the use of others.
         let (bases, (_root, source)) = (bases(&ALL), pushed_packages(&[AMENT]));
         std::fs::write(bases.path().join("broken.toml"), "ros = 7").expect("written");

@@ -96,18 +96,10 @@ pub(crate) struct BuildLog {
 
 impl BuildLog {
     pub(crate) fn create(path: &Path) -> Result<Self, Error> {
-        let file = fs::File::options()
-            .read(true)
-            .append(true)
-            .create(true)
-            .open(path)
-            .io_context("making", path)?;
+        let file = fs::File::options().read(true).append(true).create(true).open(path).io_context("making", path)?;
         crate::modes::set_mode(path, 0o600)?;
         file.set_len(0).io_context("emptying", path)?;
-        Ok(Self {
-            path: path.to_owned(),
-            file,
-        })
+        Ok(Self { path: path.to_owned(), file })
     }
 
     /// Returns the current size in bytes.
@@ -151,42 +143,21 @@ pub(crate) async fn run_task(
             .iter()
             .map(|(unit, needs)| JobPackage {
                 unit,
-                needs: needs
-                    .iter()
-                    .map(|&index| order.units[index].0.name.as_str())
-                    .collect(),
+                needs: needs.iter().map(|&index| order.units[index].0.name.as_str()).collect(),
             })
             .collect(),
-        workspace: order
-            .workspace
-            .iter()
-            .map(|unit| unit.name.as_str())
-            .collect(),
+        workspace: order.workspace.iter().map(|unit| unit.name.as_str()).collect(),
         prefix: &base.build.prefix,
         cmake: &base.build.cmake,
         jobs: std::thread::available_parallelism().map_or(1, usize::from),
     };
     let mut files = BTreeMap::from([
-        (
-            PathBuf::from("cloudroid/compile.py"),
-            build_script(base.ros).as_bytes().to_vec(),
-        ),
-        (
-            PathBuf::from("cloudroid/second_look.py"),
-            include_str!("inside/second_look.py").as_bytes().to_vec(),
-        ),
-        (
-            PathBuf::from("cloudroid/job.json"),
-            serde_json::to_vec(&job).unwrap_or_default(),
-        ),
+        (PathBuf::from("cloudroid/compile.py"), build_script(base.ros).as_bytes().to_vec()),
+        (PathBuf::from("cloudroid/second_look.py"), include_str!("inside/second_look.py").as_bytes().to_vec()),
+        (PathBuf::from("cloudroid/job.json"), serde_json::to_vec(&job).unwrap_or_default()),
         (PathBuf::from("cloudroid/source/.keep"), Vec::new()),
     ]);
-    files.extend(
-        base.build
-            .files
-            .iter()
-            .map(|(path, text)| (path.clone(), text.clone().into_bytes())),
-    );
+    files.extend(base.build.files.iter().map(|(path, text)| (path.clone(), text.clone().into_bytes())));
     write_tree(&tools, &files)?;
     let mut layers = order.layers.clone();
     layers.push(tools);
@@ -212,10 +183,7 @@ pub(crate) async fn run_task(
     let owned = vec!["/build".into(), base.build.prefix.clone()];
     let (mut writing, mut logged) = (Ok(()), log.len());
     let mut failed: Vec<String> = Vec::new();
-    let mut current = order
-        .units
-        .first()
-        .map_or_else(String::new, |(unit, _)| unit.name.clone());
+    let mut current = order.units.first().map_or_else(String::new, |(unit, _)| unit.name.clone());
     let mut excerpt = Excerpt::default();
     let mut looked_at = 0;
     let (mut lines, mut told) = crate::lines::channel();
@@ -245,9 +213,7 @@ pub(crate) async fn run_task(
                         opened: None,
                     }],
                     environment,
-                    argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"]
-                        .map(str::to_owned)
-                        .into(),
+                    argv: ["/usr/bin/python3", "-u", "/cloudroid/compile.py"].map(str::to_owned).into(),
                 },
                 |line| {
                     // Only the beginning is stored: a build that prints without end must not fill the disk.
@@ -278,43 +244,23 @@ pub(crate) async fn run_task(
     writing.io_context("writing", &log.path)?;
     if task == Task::Check && failed.is_empty() {
         // However it ended, it found no error in a package.
-        return Ok(CompileOutput {
-            tree: upper,
-            directory,
-            uid_offset: finished.uid_offset,
-        });
+        return Ok(CompileOutput { tree: upper, directory, uid_offset: finished.uid_offset });
     }
     if !finished.success() {
         let mut last_lines = excerpt.text();
         if finished.exit.code != Some(1) {
             last_lines = format!("{last_lines}\n{}", finished.last_output());
         }
-        let package = if failed.is_empty() {
-            current
-        } else {
-            failed.join(", ")
-        };
+        let package = if failed.is_empty() { current } else { failed.join(", ") };
         if last_lines.contains("No space left on device") {
-            return Err(Error::DiskFull {
-                path: upper,
-                what: format!("compiling {package}"),
-            });
+            return Err(Error::DiskFull { path: upper, what: format!("compiling {package}") });
         }
-        return Err(Error::BuildFailed {
-            package,
-            log: log.path.clone(),
-            last_lines,
-            advice: Vec::new(),
-        });
+        return Err(Error::BuildFailed { package, log: log.path.clone(), last_lines, advice: Vec::new() });
     }
     let (prefix, tree) = (base.build.prefix.clone(), directory.join("tree"));
     let result = tree.clone();
     blocking::spawn(move || extract_prefix(&upper, &prefix, &tree)).await??;
-    Ok(CompileOutput {
-        tree: result,
-        directory,
-        uid_offset: finished.uid_offset,
-    })
+    Ok(CompileOutput { tree: result, directory, uid_offset: finished.uid_offset })
 }
 
 /// Returns the script that compiles packages of a ROS version.
@@ -348,11 +294,7 @@ fn step_title(line: &str, units: &[BuildUnit]) -> Option<String> {
 pub(crate) fn make_readable(source: &Path) -> Result<(), Error> {
     foreign::walk(source, |entry| {
         let mode = entry.stat.st_mode & 0o777;
-        let run = if entry.kind() == FileType::Directory || mode & 0o100 != 0 {
-            0o111
-        } else {
-            0
-        };
+        let run = if entry.kind() == FileType::Directory || mode & 0o100 != 0 { 0o111 } else { 0 };
         if entry.kind() != FileType::Symlink && mode != mode | 0o444 | run {
             let (parent, name) = entry.parent_and_name();
             let mode = Mode::from_raw_mode(mode | 0o444 | run);
@@ -369,10 +311,7 @@ fn extract_prefix(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error>
     let target = tree.join(inside);
     let parent = target.parent().unwrap_or(tree);
     fs::create_dir_all(parent).io_context("making", parent)?;
-    for directory in parent
-        .ancestors()
-        .take_while(|directory| directory.starts_with(tree))
-    {
+    for directory in parent.ancestors().take_while(|directory| directory.starts_with(tree)) {
         set_mode(directory, 0o755)?;
     }
     let from = upper.join(inside);
@@ -382,23 +321,13 @@ fn extract_prefix(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error>
 /// Returns the options for packing compiled packages into a layer of the cache; files keep the compiling user as their
 /// owner.
 pub(crate) fn unit_options(base: &Base, uid_offset: u32) -> TreeOptions {
-    TreeOptions {
-        uid_offset,
-        exclude: Vec::new(),
-        overlay_upper: true,
-        ..tree_options(base)
-    }
+    TreeOptions { uid_offset, exclude: Vec::new(), overlay_upper: true, ..tree_options(base) }
 }
 
 /// Returns the options for packing an install space into a layer of an image, with all files owned by root. `owner` is
 /// their current owner.
 pub(crate) fn package_options(base: &Base, owner: u32) -> TreeOptions {
-    TreeOptions {
-        uid_offset: owner,
-        exclude: Vec::new(),
-        level: 6,
-        ..tree_options(base)
-    }
+    TreeOptions { uid_offset: owner, exclude: Vec::new(), level: 6, ..tree_options(base) }
 }
 
 #[cfg(test)]
@@ -421,24 +350,14 @@ mod tests {
         set_mode(&root.path().join("d"), 0o700).expect("set");
         make_readable(root.path()).expect("done");
         let mode = |path: &Path| path.metadata().expect("there").permissions().mode() & 0o777;
-        assert_eq!(
-            (mode(&script), mode(&text), mode(&root.path().join("d"))),
-            (0o755, 0o644, 0o755)
-        );
+        assert_eq!((mode(&script), mode(&text), mode(&root.path().join("d"))), (0o755, 0o644, 0o755));
     }
 
     #[test]
     fn steps_count_packages() {
-        let unit = |name: &str| BuildUnit {
-            name: name.into(),
-            path: name.into(),
-            build_type: "catkin".into(),
-        };
+        let unit = |name: &str| BuildUnit { name: name.into(), path: name.into(), build_type: "catkin".into() };
         let units = [unit("a"), unit("b")];
-        assert_eq!(
-            step_title("::package b", &units).as_deref(),
-            Some("compiling b (2 of 2)")
-        );
+        assert_eq!(step_title("::package b", &units).as_deref(), Some("compiling b (2 of 2)"));
         assert_eq!(step_title("anything", &units), None);
     }
 }

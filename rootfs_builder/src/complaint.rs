@@ -25,15 +25,9 @@ impl FirstError {
             self.over = true;
             return;
         }
-        let another = [
-            "Setting up ",
-            "Preparing to unpack ",
-            "Unpacking ",
-            "Selecting previously ",
-            "(Reading ",
-        ]
-        .iter()
-        .any(|start| line.starts_with(start));
+        let another = ["Setting up ", "Preparing to unpack ", "Unpacking ", "Selecting previously ", "(Reading "]
+            .iter()
+            .any(|start| line.starts_with(start));
         if another {
             self.lines.clear();
         }
@@ -72,10 +66,7 @@ mod tests {
         let text = complaint.text().expect("dpkg complained");
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), 4, "{text}");
-        assert!(
-            lines[1].contains("man1/java.1.gz") && lines[3].ends_with("exit status 2"),
-            "{text}"
-        );
+        assert!(lines[1].contains("man1/java.1.gz") && lines[3].ends_with("exit status 2"), "{text}");
     }
 
     #[test]

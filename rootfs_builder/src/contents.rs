@@ -50,10 +50,7 @@ impl RosPackagePart {
     ];
 
     fn letter(self) -> char {
-        Self::ALL
-            .into_iter()
-            .find(|(part, _)| *part == self)
-            .map_or('?', |(_, letter)| letter)
+        Self::ALL.into_iter().find(|(part, _)| *part == self).map_or('?', |(_, letter)| letter)
     }
 }
 
@@ -70,38 +67,27 @@ impl Contents {
         let path = cache.join(format!("contents-{}.txt", stamp(lists)?));
         if !path.is_file() {
             let lines = build_index(lists)?;
-            let mut file =
-                tempfile::NamedTempFile::new_in(cache).io_context("creating a file in", cache)?;
-            file.write_all(lines.join("\n").as_bytes())
-                .io_context("writing", file.path())?;
-            file.as_file()
-                .sync_data()
-                .io_context("writing", file.path())?;
-            file.persist(&path)
-                .map_err(|error| Error::io("writing", &path, error.error))?;
+            let mut file = tempfile::NamedTempFile::new_in(cache).io_context("creating a file in", cache)?;
+            file.write_all(lines.join("\n").as_bytes()).io_context("writing", file.path())?;
+            file.as_file().sync_data().io_context("writing", file.path())?;
+            file.persist(&path).map_err(|error| Error::io("writing", &path, error.error))?;
             sweep(cache, &path);
         }
         let text = fs::read_to_string(&path).io_context("reading", &path)?;
-        Ok(Self {
-            lines: text.lines().map(str::to_owned).collect(),
-        })
+        Ok(Self { lines: text.lines().map(str::to_owned).collect() })
     }
 
     /// Returns the lines that begin with `prefix`, without it.
     fn with_prefix<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = &'a str> {
         let start = self.lines.partition_point(|line| line.as_str() < prefix);
-        self.lines[start..]
-            .iter()
-            .map_while(move |line| line.strip_prefix(prefix))
+        self.lines[start..].iter().map_while(move |line| line.strip_prefix(prefix))
     }
 
     /// Returns the Debian package with this shared library, by its soname (`libfoo.so.1`). If there are several, the
     /// one whose name is closest to the library's.
     pub fn library(&self, name: &str) -> Option<&str> {
         let prefix = format!("l{name}\t");
-        let start = self
-            .lines
-            .partition_point(|line| line.as_str() < prefix.as_str());
+        let start = self.lines.partition_point(|line| line.as_str() < prefix.as_str());
         self.lines[start..]
             .iter()
             .map_while(|line| line.strip_prefix(prefix.as_str()))
@@ -112,12 +98,8 @@ impl Contents {
     /// first.
     pub fn library_versions(&self, name: &str) -> Vec<(String, &str)> {
         let prefix = format!("l{name}.");
-        let start = self
-            .lines
-            .partition_point(|line| line.as_str() < prefix.as_str());
-        let of_name = self.lines[start..]
-            .iter()
-            .map_while(|line| line.strip_prefix(prefix.as_str()));
+        let start = self.lines.partition_point(|line| line.as_str() < prefix.as_str());
+        let of_name = self.lines[start..].iter().map_while(|line| line.strip_prefix(prefix.as_str()));
         let mut versions: Vec<(String, &str)> = of_name
             .filter_map(|rest| rest.split_once('\t'))
             .filter(|(_, deb)| !deb.ends_with("-dev"))
@@ -133,10 +115,8 @@ impl Contents {
         let mut carriers = Carriers::new();
         for rest in self.with_prefix(&prefix) {
             let (deb, letters) = rest.split_once('\t').unwrap_or((rest, ""));
-            let parts = RosPackagePart::ALL
-                .into_iter()
-                .filter(|(_, letter)| letters.contains(*letter))
-                .map(|(part, _)| part);
+            let parts =
+                RosPackagePart::ALL.into_iter().filter(|(_, letter)| letters.contains(*letter)).map(|(part, _)| part);
             carriers.insert(deb.to_owned(), parts.collect());
         }
         carriers
@@ -160,10 +140,7 @@ impl Contents {
     /// Returns the ROS packages with a program of this name, and their Debian packages.
     pub fn programs(&self, name: &str) -> BTreeSet<(&str, &str)> {
         let of_name = self.with_kind('p', name);
-        of_name
-            .filter_map(|rest| rest.split_once('\t'))
-            .map(|(deb, package)| (package, deb))
-            .collect()
+        of_name.filter_map(|rest| rest.split_once('\t')).map(|(deb, package)| (package, deb)).collect()
     }
 
     fn debs_with(&self, kind: char, name: &str) -> BTreeSet<&str> {
@@ -172,31 +149,20 @@ impl Contents {
 
     fn with_kind(&self, kind: char, name: &str) -> impl Iterator<Item = &str> {
         let prefix = format!("{kind}{name}\t");
-        let start = self
-            .lines
-            .partition_point(|line| line.as_str() < prefix.as_str());
-        self.lines[start..]
-            .iter()
-            .map_while(move |line| line.strip_prefix(prefix.as_str()))
+        let start = self.lines.partition_point(|line| line.as_str() < prefix.as_str());
+        self.lines[start..].iter().map_while(move |line| line.strip_prefix(prefix.as_str()))
     }
 
     /// Returns the Debian packages that contain parts of any ROS package.
     pub fn ros_carriers(&self) -> BTreeSet<String> {
-        let fields = self
-            .with_prefix("r")
-            .filter_map(|rest| rest.split('\t').nth(1));
+        let fields = self.with_prefix("r").filter_map(|rest| rest.split('\t').nth(1));
         fields.map(str::to_owned).collect()
     }
 
     /// Returns the ROS packages of which a Debian package contains parts.
     pub fn ros_packages_in(&self, deb: &str) -> Vec<&str> {
-        let fields = self
-            .with_prefix("r")
-            .filter_map(|rest| rest.split_once('\t'));
-        fields
-            .filter(|(_, rest)| rest.split('\t').next() == Some(deb))
-            .map(|(name, _)| name)
-            .collect()
+        let fields = self.with_prefix("r").filter_map(|rest| rest.split_once('\t'));
+        fields.filter(|(_, rest)| rest.split('\t').next() == Some(deb)).map(|(name, _)| name).collect()
     }
 }
 
@@ -205,10 +171,7 @@ fn stamp(lists: &[PathBuf]) -> Result<String, Error> {
     let mut key = crate::key::Key::new("contents").input("version", VERSION.to_string());
     for list in lists {
         let about = list.metadata().io_context("reading", list)?;
-        let changed = about
-            .modified()
-            .ok()
-            .and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
+        let changed = about.modified().ok().and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
         // Only the file name counts, since a cache may be moved.
         let name = list.file_name().unwrap_or_default().to_string_lossy();
         let text = format!("{name} {} {changed:?}", about.len());
@@ -261,21 +224,18 @@ impl OwnedListedFile {
             ListedFile::Config(name) => Self::Config(name.to_ascii_lowercase()),
             ListedFile::PkgConfig(name) => Self::PkgConfig(name.to_owned()),
             ListedFile::Module(name) => Self::Module(name.to_owned()),
-            ListedFile::Program(name, package) => {
-                Self::Program(name.to_owned(), package.to_owned())
-            }
+            ListedFile::Program(name, package) => Self::Program(name.to_owned(), package.to_owned()),
         }
     }
 
     fn is_same(&self, what: ListedFile<'_>) -> bool {
         match (self, what) {
             (Self::Library(name), ListedFile::Library(new)) => name == new,
-            (Self::Ros(name, part), ListedFile::Ros(new, new_part)) => {
-                *part == new_part && name == new
-            }
+            (Self::Ros(name, part), ListedFile::Ros(new, new_part)) => *part == new_part && name == new,
             (Self::Config(name), ListedFile::Config(new)) => name.eq_ignore_ascii_case(new),
-            (Self::PkgConfig(name), ListedFile::PkgConfig(new))
-            | (Self::Module(name), ListedFile::Module(new)) => name == new,
+            (Self::PkgConfig(name), ListedFile::PkgConfig(new)) | (Self::Module(name), ListedFile::Module(new)) => {
+                name == new
+            }
             _ => false,
         }
     }
@@ -285,10 +245,7 @@ impl OwnedListedFile {
 /// at the end; the candidates are few once duplicates are removed.
 fn build_index(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
     let found = std::thread::scope(|scope| {
-        let threads: Vec<_> = lists
-            .iter()
-            .map(|list| scope.spawn(move || scan(list)))
-            .collect();
+        let threads: Vec<_> = lists.iter().map(|list| scope.spawn(move || scan(list))).collect();
         let mut all = BTreeSet::new();
         for thread in threads {
             match thread.join() {
@@ -317,10 +274,7 @@ fn build_index(lists: &[PathBuf]) -> Result<Vec<String>, Error> {
                     lines.insert(format!("l{}\t{deb}", text(name)));
                 }
                 OwnedListedFile::Ros(name, part) if ros.contains(name.as_slice()) => {
-                    parts
-                        .entry((text(name), deb.to_owned()))
-                        .or_default()
-                        .insert(*part);
+                    parts.entry((text(name), deb.to_owned())).or_default().insert(*part);
                 }
                 OwnedListedFile::Ros(..) => {}
                 OwnedListedFile::Config(name) => {
@@ -354,9 +308,7 @@ fn scan(list: &Path) -> Result<Vec<(OwnedListedFile, Vec<u8>)>, Error> {
     let mut buffer = vec![0; 1 << 20];
     let mut filled = 0;
     loop {
-        let read = reader
-            .read(&mut buffer[filled..])
-            .io_context("reading", list)?;
+        let read = reader.read(&mut buffer[filled..]).io_context("reading", list)?;
         if read == 0 {
             break;
         }
@@ -383,10 +335,7 @@ fn keep_new(line: &[u8], kept: &mut Vec<(OwnedListedFile, Vec<u8>)>) {
         return;
     };
     let debs = &line[space + 1..];
-    for what in [classify(line), classify_lookup(line)]
-        .into_iter()
-        .flatten()
-    {
+    for what in [classify(line), classify_lookup(line)].into_iter().flatten() {
         let mut last = kept.iter().rev().take(2);
         if !last.any(|(last, of)| of == debs && last.is_same(what)) {
             kept.push((OwnedListedFile::from_listed(what), debs.to_owned()));
@@ -441,22 +390,15 @@ fn classify(line: &[u8]) -> Option<ListedFile<'_>> {
             Some((b"msg" | b"srv" | b"action", _)) => RosPackagePart::Definitions,
             Some((b"cmake", _)) => RosPackagePart::CMake,
             // Directly in the directory, not in a subdirectory. Followed by spaces and a section that contains a slash.
-            _ if rest.starts_with(b"package.xml ") || rest.starts_with(b"package.xml\t") => {
-                RosPackagePart::Manifest
-            }
+            _ if rest.starts_with(b"package.xml ") || rest.starts_with(b"package.xml\t") => RosPackagePart::Manifest,
             _ => RosPackagePart::Share,
         };
         return Some(ListedFile::Ros(name, part));
     }
     if let Some(rest) = line.strip_prefix(b"usr/lib/python3/dist-packages/") {
-        return Some(ListedFile::Ros(
-            split_first(rest)?.0,
-            RosPackagePart::Python,
-        ));
+        return Some(ListedFile::Ros(split_first(rest)?.0, RosPackagePart::Python));
     }
-    let rest = line
-        .strip_prefix(b"usr/lib/")
-        .or_else(|| line.strip_prefix(b"lib/"))?;
+    let rest = line.strip_prefix(b"usr/lib/").or_else(|| line.strip_prefix(b"lib/"))?;
     let end = memchr::memchr2(b' ', b'\t', rest)?;
     let path = &rest[..end];
     let own = triplet().as_bytes();
@@ -467,10 +409,7 @@ fn classify(line: &[u8]) -> Option<ListedFile<'_>> {
     let name = match split_first(inner) {
         None => inner,
         Some((b"cmake", below)) => {
-            return Some(ListedFile::Ros(
-                split_first(below)?.0,
-                RosPackagePart::CMake,
-            ));
+            return Some(ListedFile::Ros(split_first(below)?.0, RosPackagePart::CMake));
         }
         // Directories of alternatives, and where Debian puts plugins of ROS packages.
         Some((b"blas" | b"lapack" | b"ros", name)) => name,

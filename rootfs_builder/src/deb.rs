@@ -52,32 +52,19 @@ pub(crate) fn runtime_members(deb: &Path, cache: &Path) -> Result<Vec<DebMember>
     found.sort_by(|a, b| a.path.cmp(&b.path));
     found.dedup_by(|later, first| later.path == first.path);
     std::fs::create_dir_all(&directory).io_context("making", &directory)?;
-    let made =
-        tempfile::NamedTempFile::new_in(&directory).io_context("creating a file in", &directory)?;
+    let made = tempfile::NamedTempFile::new_in(&directory).io_context("creating a file in", &directory)?;
     write_tar(&found, made.path())?;
     made.as_file().sync_data().io_context("writing", &path)?;
-    made.persist(&path)
-        .map_err(|error| Error::io("writing", &path, error.error))?;
+    made.persist(&path).map_err(|error| Error::io("writing", &path, error.error))?;
     Ok(found)
 }
 
 /// Returns the members that `keep` accepts. Blocking.
-pub(crate) fn read_members(
-    deb: &Path,
-    keep: impl Fn(&Path) -> bool,
-) -> Result<Vec<DebMember>, Error> {
+pub(crate) fn read_members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<DebMember>, Error> {
     let mut unpack = Command::new("dpkg-deb");
-    unpack
-        .arg("--fsys-tarfile")
-        .arg(deb)
-        .stdin(Stdio::null())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null());
+    unpack.arg("--fsys-tarfile").arg(deb).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
     let mut child = unpack.spawn().map_err(|error| match error.kind() {
-        std::io::ErrorKind::NotFound => Error::MissingProgram {
-            program: "dpkg-deb",
-            package: "dpkg",
-        },
+        std::io::ErrorKind::NotFound => Error::MissingProgram { program: "dpkg-deb", package: "dpkg" },
         _ => Error::io("reading", deb, error),
     })?;
     let found = match child.stdout.take() {
@@ -96,11 +83,7 @@ pub(crate) fn read_members(
 }
 
 /// Reads files and links of a tar archive that is part of, or derived from, the package `deb`.
-fn read_archive(
-    archive: impl Read,
-    deb: &Path,
-    keep: impl Fn(&Path) -> bool,
-) -> Result<Vec<DebMember>, Error> {
+fn read_archive(archive: impl Read, deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<DebMember>, Error> {
     let mut found = Vec::new();
     let mut archive = tar::Archive::new(archive);
     for entry in archive.entries().io_context("reading", deb)? {
@@ -115,10 +98,7 @@ fn read_archive(
             continue;
         }
         let header = entry.header();
-        let (mode, mtime) = (
-            header.mode().io_context("reading", deb)?,
-            header.mtime().io_context("reading", deb)?,
-        );
+        let (mode, mtime) = (header.mode().io_context("reading", deb)?, header.mtime().io_context("reading", deb)?);
         let kind = header.entry_type();
         let content = if kind.is_symlink() {
             match entry.link_name().io_context("reading", deb)? {
@@ -132,12 +112,7 @@ fn read_archive(
         } else {
             continue;
         };
-        found.push(DebMember {
-            path,
-            mode: mode & 0o777,
-            mtime,
-            content,
-        });
+        found.push(DebMember { path, mode: mode & 0o777, mtime, content });
     }
     Ok(found)
 }
@@ -148,10 +123,7 @@ pub(crate) fn is_needed_at_runtime(path: &Path) -> bool {
     let parts: Vec<&str> = path.iter().filter_map(|part| part.to_str()).collect();
     match parts.as_slice() {
         ["usr", "share", directory, inner, ..] => {
-            !matches!(
-                *directory,
-                "doc" | "man" | "cmake" | "pkgconfig" | "lintian" | "bug"
-            ) && *inner != "cmake"
+            !matches!(*directory, "doc" | "man" | "cmake" | "pkgconfig" | "lintian" | "bug") && *inner != "cmake"
         }
         ["usr", "lib", name] | ["usr", "lib", _, name] => name.ends_with(".so"),
         _ => false,
@@ -176,23 +148,16 @@ pub(crate) fn write_tar(members: &[DebMember], to: &Path) -> Result<(), Error> {
             MemberContent::File(bytes) => {
                 header.set_entry_type(tar::EntryType::Regular);
                 header.set_size(bytes.len() as u64);
-                archive
-                    .append_data(&mut header, &member.path, bytes.as_slice())
-                    .io_context("writing", to)?;
+                archive.append_data(&mut header, &member.path, bytes.as_slice()).io_context("writing", to)?;
             }
             MemberContent::Link(target) => {
                 header.set_entry_type(tar::EntryType::Symlink);
                 header.set_size(0);
-                archive
-                    .append_link(&mut header, &member.path, target)
-                    .io_context("writing", to)?;
+                archive.append_link(&mut header, &member.path, target).io_context("writing", to)?;
             }
         }
     }
-    archive
-        .into_inner()
-        .and_then(|mut file| file.flush())
-        .io_context("writing", to)
+    archive.into_inner().and_then(|mut file| file.flush()).io_context("writing", to)
 }
 
 #[cfg(test)]
@@ -234,10 +199,7 @@ mod tests {
         }
         let deb = directory.join("robot-dev_1_all.deb");
         let mut build = Command::new("dpkg-deb");
-        build
-            .args(["--root-owner-group", "--build"])
-            .arg(&tree)
-            .arg(&deb);
+        build.args(["--root-owner-group", "--build"]).arg(&tree).arg(&deb);
         let said = build.output().expect("run");
         assert!(said.status.success(), "{said:?}");
         deb
@@ -254,17 +216,8 @@ mod tests {
         ];
         let deb = package(directory.path(), &files);
         let first = runtime_members(&deb, &cache).expect("unpacked");
-        let paths: Vec<&str> = first
-            .iter()
-            .filter_map(|member| member.path.to_str())
-            .collect();
-        assert_eq!(
-            paths,
-            [
-                "usr/share/robot/launch/a.launch",
-                "usr/share/robot/package.xml"
-            ]
-        );
+        let paths: Vec<&str> = first.iter().filter_map(|member| member.path.to_str()).collect();
+        assert_eq!(paths, ["usr/share/robot/launch/a.launch", "usr/share/robot/package.xml"]);
         std::fs::remove_file(&deb).expect("removed");
         assert_eq!(runtime_members(&deb, &cache).expect("kept"), first);
         // Nothing is cached for a package that cannot be unpacked.
@@ -276,12 +229,7 @@ mod tests {
 
     #[test]
     fn members_become_the_same_archive_whatever_their_order() {
-        let member = |path: &str, content| DebMember {
-            path: path.into(),
-            mode: 0o644,
-            mtime: 5,
-            content,
-        };
+        let member = |path: &str, content| DebMember { path: path.into(), mode: 0o644, mtime: 5, content };
         let file = member("usr/share/x/a", MemberContent::File(b"text".to_vec()));
         let link = member("usr/lib/t/libx.so", MemberContent::Link("libx.so.1".into()));
         let directory = tempfile::tempdir().expect("a directory");
@@ -296,9 +244,6 @@ mod tests {
             .expect("an archive")
             .map(|e| e.expect("one").path().expect("named").into_owned())
             .collect();
-        assert_eq!(
-            names,
-            [Path::new("usr/lib/t/libx.so"), Path::new("usr/share/x/a")]
-        );
+        assert_eq!(names, [Path::new("usr/lib/t/libx.so"), Path::new("usr/share/x/a")]);
     }
 }

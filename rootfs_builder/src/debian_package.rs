@@ -37,11 +37,6 @@ impl std::fmt::Display for Deb {
 impl Deb {
     /// Returns the file name that apt uses, in which the colon of the epoch is escaped.
     pub(crate) fn file_name(&self) -> String {
-        format!(
-            "{}_{}_{}.deb",
-            self.name,
-            self.version.replace(':', "%3a"),
-            self.architecture
-        )
+        format!("{}_{}_{}.deb", self.name, self.version.replace(':', "%3a"), self.architecture)
     }
 }

@@ -36,10 +36,7 @@ struct Segment {
 /// Reads a file; `None` if it is not a dynamically linked, little-endian ELF file.
 fn read_dynamic(mut file: File, path: &Path) -> Result<Option<Dynamic>, Error> {
     let mut magic = Vec::new();
-    (&mut file)
-        .take(64)
-        .read_to_end(&mut magic)
-        .io_context("reading", path)?;
+    (&mut file).take(64).read_to_end(&mut magic).io_context("reading", path)?;
     if magic.len() < 52 || !magic.starts_with(b"\x7fELF") || magic[5] != 1 {
         return Ok(None);
     }
@@ -50,23 +47,13 @@ fn read_dynamic(mut file: File, path: &Path) -> Result<Option<Dynamic>, Error> {
 fn parse_dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     let wide = header[4] == 2;
     let (table, size, count) = if wide {
-        (
-            u64_at(header, 32)?,
-            u16_at(header, 54)?,
-            u16_at(header, 56)?,
-        )
+        (u64_at(header, 32)?, u16_at(header, 54)?, u16_at(header, 56)?)
     } else {
-        (
-            u32_at(header, 28)?.into(),
-            u16_at(header, 42)?,
-            u16_at(header, 44)?,
-        )
+        (u32_at(header, 28)?.into(), u16_at(header, 42)?, u16_at(header, 44)?)
     };
     let headers = read_range(file, table, u64::from(size) * u64::from(count))?;
-    let segments: Vec<Segment> = headers
-        .chunks_exact(usize::from(size).max(1))
-        .filter_map(|raw| parse_segment(raw, wide))
-        .collect();
+    let segments: Vec<Segment> =
+        headers.chunks_exact(usize::from(size).max(1)).filter_map(|raw| parse_segment(raw, wide)).collect();
     let place = segments.iter().find(|s| s.kind == PT_DYNAMIC)?;
     let entries = read_range(file, place.offset, place.size)?;
     let mut names = Vec::new();
@@ -99,28 +86,16 @@ fn parse_dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
         let name = String::from_utf8(rest[..end].to_vec()).ok()?;
         (!name.is_empty()).then_some(name)
     });
-    Some(Dynamic {
-        needed: needed.collect(),
-    })
+    Some(Dynamic { needed: needed.collect() })
 }
 
 fn parse_segment(raw: &[u8], wide: bool) -> Option<Segment> {
     let kind = u32_at(raw, 0)?;
     Some(if wide {
-        Segment {
-            kind,
-            offset: u64_at(raw, 8)?,
-            address: u64_at(raw, 16)?,
-            size: u64_at(raw, 32)?,
-        }
+        Segment { kind, offset: u64_at(raw, 8)?, address: u64_at(raw, 16)?, size: u64_at(raw, 32)? }
     } else {
         let field = |at| u32_at(raw, at).map(u64::from);
-        Segment {
-            kind,
-            offset: field(4)?,
-            address: field(8)?,
-            size: field(16)?,
-        }
+        Segment { kind, offset: field(4)?, address: field(8)?, size: field(16)? }
     })
 }
 
@@ -177,13 +152,7 @@ mod tests {
     fn a_program_tells_what_it_needs() {
         let own = std::env::current_exe().expect("known");
         let dynamic = read(&own).expect("read").expect("an ELF file");
-        assert!(
-            dynamic
-                .needed
-                .iter()
-                .any(|name| name.starts_with("libc.so.")),
-            "{dynamic:?}"
-        );
+        assert!(dynamic.needed.iter().any(|name| name.starts_with("libc.so.")), "{dynamic:?}");
     }
 
     #[test]
@@ -200,32 +169,14 @@ mod tests {
 
     /// Creates a 64-bit file with one loaded segment and a dynamic section whose string table is at `address`.
     fn elf_file(segment: Segment, address: u64) -> Vec<u8> {
-        let entries = [
-            (DT_NEEDED, 1),
-            (DT_STRTAB, address),
-            (DT_STRSZ, 9),
-            (DT_NULL, 0),
-        ];
-        let dynamic = Segment {
-            kind: PT_DYNAMIC,
-            offset: 64 + 2 * 56,
-            address: 0,
-            size: 16 * entries.len() as u64,
-        };
+        let entries = [(DT_NEEDED, 1), (DT_STRTAB, address), (DT_STRSZ, 9), (DT_NULL, 0)];
+        let dynamic = Segment { kind: PT_DYNAMIC, offset: 64 + 2 * 56, address: 0, size: 16 * entries.len() as u64 };
         let mut bytes = b"\x7fELF\x02\x01".to_vec();
         bytes.resize(64, 0);
         bytes[32..40].copy_from_slice(&64_u64.to_le_bytes());
         bytes[54..58].copy_from_slice(&[56, 0, 2, 0]);
         for segment in [segment, dynamic] {
-            let fields = [
-                segment.kind.into(),
-                segment.offset,
-                segment.address,
-                0,
-                segment.size,
-                0,
-                0,
-            ];
+            let fields = [segment.kind.into(), segment.offset, segment.address, 0, segment.size, 0, 0];
             bytes.extend(fields.iter().flat_map(|field: &u64| field.to_le_bytes()));
         }
         for (tag, value) in entries {
@@ -241,54 +192,30 @@ mod tests {
         let path = directory.path().join("x");
         let needs = |offset, address, size, table| {
             let kind = PT_LOAD;
-            let segment = Segment {
-                kind,
-                offset,
-                address,
-                size,
-            };
+            let segment = Segment { kind, offset, address, size };
             std::fs::write(&path, elf_file(segment, table)).expect("written");
             let dynamic = read(&path).expect("read")?;
             dynamic.needed.into_iter().next()
         };
         let strings = 64 + 2 * 56 + 4 * 16;
-        assert_eq!(
-            needs(0, 0x1000, 1 << 20, 0x1000 + strings).as_deref(),
-            Some("libx.so")
-        );
+        assert_eq!(needs(0, 0x1000, 1 << 20, 0x1000 + strings).as_deref(), Some("libx.so"));
         for (offset, address, size, table) in [
             (0, u64::MAX - 8, 100, u64::MAX - 1),
             (u64::MAX - 8, 0, u64::MAX, 100),
             (u64::MAX, u64::MAX, u64::MAX, u64::MAX),
             (0, 0x1000, 100, 0),
         ] {
-            assert_eq!(
-                needs(offset, address, size, table),
-                None,
-                "{offset} {address}"
-            );
+            assert_eq!(needs(offset, address, size, table), None, "{offset} {address}");
         }
     }
 
     #[test]
     fn what_is_beside_it_is_not_needed_from_elsewhere() {
         let directory = tempfile::tempdir().expect("a directory");
-        std::fs::copy(
-            std::env::current_exe().expect("known"),
-            directory.path().join("x"),
-        )
-        .expect("copied");
+        std::fs::copy(std::env::current_exe().expect("known"), directory.path().join("x")).expect("copied");
         let before = needed_libraries(directory.path()).expect("read");
-        let libc = before
-            .iter()
-            .find(|name| name.starts_with("libc.so."))
-            .expect("needed")
-            .clone();
+        let libc = before.iter().find(|name| name.starts_with("libc.so.")).expect("needed").clone();
         std::fs::write(directory.path().join(&libc), "").expect("written");
-        assert!(
-            !needed_libraries(directory.path())
-                .expect("read")
-                .contains(&libc)
-        );
+        assert!(!needed_libraries(directory.path()).expect("read").contains(&libc));
     }
 }

@@ -75,9 +75,7 @@ pub enum Error {
         next: &'static str,
     },
     /// Packages could not be downloaded.
-    #[error(
-        "packages could not be downloaded: {words}; push again: the package lists are then fetched again first"
-    )]
+    #[error("packages could not be downloaded: {words}; push again: the package lists are then fetched again first")]
     Download {
         /// Message of apt.
         words: String,
@@ -288,9 +286,7 @@ pub enum Error {
         there: String,
     },
     /// The base cannot build a package of this build type.
-    #[error(
-        "package {package} has build type {build_type}, which base {base} cannot build: it builds {builds}"
-    )]
+    #[error("package {package} has build type {build_type}, which base {base} cannot build: it builds {builds}")]
     BuildType {
         /// Name of the package.
         package: String,
@@ -365,11 +361,7 @@ pub struct Unresolved {
 fn unresolved_text(all: &[Unresolved]) -> String {
     let mut text = String::from("nothing provides:");
     for one in all {
-        text.push_str(&format!(
-            "\n  {} (wanted by {})",
-            one.key,
-            one.wanted_by.join(", ")
-        ));
+        text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
         if !one.similar.is_empty() {
             text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
         }
@@ -384,9 +376,7 @@ impl Error {
     /// Creates an I/O error, or the error of a full disk.
     pub fn io(what: impl Into<String>, path: impl Into<PathBuf>, source: io::Error) -> Self {
         let (what, path) = (what.into(), path.into());
-        if source.kind() == io::ErrorKind::StorageFull
-            || source.raw_os_error() == Some(nix::libc::ENOSPC)
-        {
+        if source.kind() == io::ErrorKind::StorageFull || source.raw_os_error() == Some(nix::libc::ENOSPC) {
             Self::DiskFull { path, what }
         } else {
             Self::Io { what, path, source }
@@ -397,11 +387,7 @@ impl Error {
 impl From<foreign::Error> for Error {
     fn from(error: foreign::Error) -> Self {
         match error {
-            foreign::Error::File {
-                action,
-                path,
-                source,
-            } => Self::io(format!("cannot {action}"), path, source),
+            foreign::Error::File { action, path, source } => Self::io(format!("cannot {action}"), path, source),
             other => Self::Foreign(other),
         }
     }
@@ -426,39 +412,21 @@ mod tests {
     #[test]
     fn all_that_is_missing_is_named_with_the_next_step() {
         let error = Error::Unresolved(vec![
-            Unresolved {
-                key: "warp".into(),
-                wanted_by: vec!["a".into(), "b".into()],
-                similar: vec![],
-            },
-            Unresolved {
-                key: "eigne".into(),
-                wanted_by: vec!["a".into()],
-                similar: vec!["libeigen3-dev".into()],
-            },
+            Unresolved { key: "warp".into(), wanted_by: vec!["a".into(), "b".into()], similar: vec![] },
+            Unresolved { key: "eigne".into(), wanted_by: vec!["a".into()], similar: vec!["libeigen3-dev".into()] },
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
-        assert!(
-            text.contains("eigne (wanted by a); perhaps libeigen3-dev"),
-            "{text}"
-        );
+        assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
         assert!(text.contains("--map KEY=DEB"), "{text}");
     }
 
     #[test]
     fn a_full_disk_is_told_apart() {
-        let error = std::fs::write("/dev/full", "x")
-            .io_context("writing", "/dev/full")
-            .expect_err("full");
+        let error = std::fs::write("/dev/full", "x").io_context("writing", "/dev/full").expect_err("full");
         assert!(matches!(error, Error::DiskFull { .. }), "{error}");
-        assert!(
-            error.to_string().contains("the disk of /dev/full"),
-            "{error}"
-        );
-        let error = std::fs::write("/nonexistent/x", "x")
-            .io_context("writing", "/nonexistent/x")
-            .expect_err("absent");
+        assert!(error.to_string().contains("the disk of /dev/full"), "{error}");
+        let error = std::fs::write("/nonexistent/x", "x").io_context("writing", "/nonexistent/x").expect_err("absent");
         assert!(matches!(error, Error::Io { .. }), "{error}");
     }
 }

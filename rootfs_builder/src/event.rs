@@ -49,21 +49,11 @@ impl Progress {
     }
 
     pub(crate) async fn step(&self, title: &str) {
-        let _ = self
-            .0
-            .send(BuildEvent::Step {
-                title: title.to_owned(),
-            })
-            .await;
+        let _ = self.0.send(BuildEvent::Step { title: title.to_owned() }).await;
     }
 
     pub(crate) async fn log(&self, line: &str) {
-        let _ = self
-            .0
-            .send(BuildEvent::Log {
-                line: line.to_owned(),
-            })
-            .await;
+        let _ = self.0.send(BuildEvent::Log { line: line.to_owned() }).await;
     }
 
     pub(crate) async fn waits(&self, push: String) {
@@ -71,12 +61,7 @@ impl Progress {
     }
 
     pub(crate) async fn warn(&self, message: impl Into<String>) {
-        let _ = self
-            .0
-            .send(BuildEvent::Warning {
-                message: message.into(),
-            })
-            .await;
+        let _ = self.0.send(BuildEvent::Warning { message: message.into() }).await;
     }
 
     /// Sends a progress count; dropped if the listener is busy, since only the latest one matters.

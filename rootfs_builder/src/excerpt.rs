@@ -39,17 +39,8 @@ impl Excerpt {
 /// Returns whether a line is relevant: progress messages of make, Ninja, CMake and setuptools would displace the
 /// compiler's errors.
 fn is_worth_showing(line: &str) -> bool {
-    const CHATTER: [&str; 9] = [
-        "make[",
-        "gmake[",
-        "-- ",
-        "copying ",
-        "creating ",
-        "running ",
-        "writing ",
-        "reading ",
-        "byte-compiling ",
-    ];
+    const CHATTER: [&str; 9] =
+        ["make[", "gmake[", "-- ", "copying ", "creating ", "running ", "writing ", "reading ", "byte-compiling "];
     let is_chatter = CHATTER.iter().any(|start| line.starts_with(start));
     let is_told = is_progress(line) && !line.contains("Error");
     (!is_chatter || advice::mentions_missing(line)) && !is_told && !line.trim().is_empty()
@@ -63,9 +54,7 @@ fn is_progress(line: &str) -> bool {
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
     match inside.split_once('/') {
         Some((done, all)) => is_number(done) && is_number(all),
-        None => inside
-            .strip_suffix('%')
-            .is_some_and(|part| is_number(part.trim())),
+        None => inside.strip_suffix('%').is_some_and(|part| is_number(part.trim())),
     }
 }
 
@@ -112,9 +101,6 @@ mod tests {
         let text = excerpt.text();
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), LAST_LINES + 1);
-        assert!(
-            lines[0].contains("\"csm\"") && lines[1] == "later line 0",
-            "{text}"
-        );
+        assert!(lines[0].contains("\"csm\"") && lines[1] == "later line 0", "{text}");
     }
 }

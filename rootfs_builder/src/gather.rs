@@ -71,8 +71,7 @@ pub(crate) async fn gather_packages(
                 let carriers = archive.contents.ros_package(&name);
                 let imports = |deb: &&String| {
                     carriers.get(*deb).is_some_and(|parts| {
-                        parts.contains(&RosPackagePart::Programs)
-                            || python && parts.contains(&RosPackagePart::Python)
+                        parts.contains(&RosPackagePart::Programs) || python && parts.contains(&RosPackagePart::Python)
                     })
                 };
                 importing.extend(carried.install.iter().filter(imports).cloned());
@@ -81,18 +80,14 @@ pub(crate) async fn gather_packages(
             if depth != DependencyDepth::Beyond {
                 let tells = archive.contents.ros_package(&name).into_iter();
                 let tells = tells.filter(|(_, parts)| {
-                    parts.contains(&RosPackagePart::Manifest)
-                        || parts.contains(&RosPackagePart::Share)
+                    parts.contains(&RosPackagePart::Manifest) || parts.contains(&RosPackagePart::Share)
                 });
                 round.extend(tells.map(|(deb, _)| deb));
                 round.extend(carried.unpack);
             }
         }
         round.retain(|deb| looked_into.insert(deb.clone()));
-        let debs: Vec<Deb> = round
-            .iter()
-            .filter_map(|name| archive.candidates.get(name))
-            .collect();
+        let debs: Vec<Deb> = round.iter().filter_map(|name| archive.candidates.get(name)).collect();
         let of_round = inspect_each(archive, &debs, progress, deb::runtime_members).await?;
         for (deb, members) in debs.iter().zip(of_round) {
             let report = report_members(&members, base);
@@ -123,13 +118,9 @@ pub(crate) async fn gather_packages(
             DependencyDepth::Needed | DependencyDepth::Beyond => DependencyDepth::Beyond,
         };
     }
-    wanted
-        .install
-        .extend(imported_packages(archive, &importing, programs, progress).await?);
+    wanted.install.extend(imported_packages(archive, &importing, programs, progress).await?);
     wanted.extras.sort_by(|a, b| a.path.cmp(&b.path));
-    wanted
-        .extras
-        .dedup_by(|later, first| later.path == first.path);
+    wanted.extras.dedup_by(|later, first| later.path == first.path);
     // Library links whose target is not installed would be dangling.
     let plugin_targets = wanted.install.clone();
     wanted.extras.retain(|member| match &member.content {
@@ -171,18 +162,10 @@ async fn imported_packages(
     programs: &SelectedPrograms,
     progress: &Progress,
 ) -> Result<BTreeSet<String>, Error> {
-    let debs: Vec<Deb> = importing
-        .iter()
-        .filter_map(|name| archive.candidates.get(name))
-        .collect();
+    let debs: Vec<Deb> = importing.iter().filter_map(|name| archive.candidates.get(name)).collect();
     let found = inspect_each(archive, &debs, progress, imports::read_imports).await?;
-    let modules: BTreeSet<String> = found
-        .into_iter()
-        .flat_map(|imports| imports.for_programs(programs))
-        .collect();
-    let debs = modules
-        .iter()
-        .filter_map(|module| imports::provider_package(archive, module));
+    let modules: BTreeSet<String> = found.into_iter().flat_map(|imports| imports.for_programs(programs)).collect();
+    let debs = modules.iter().filter_map(|module| imports::provider_package(archive, module));
     Ok(debs.map(str::to_owned).collect())
 }
 
@@ -205,11 +188,7 @@ fn find_provider(archive: &Archive, base: &Base, name: &str) -> NameProvider {
         None if archive.candidates.contains(name) => vec![name.to_owned()],
         None => return NameProvider::Nothing,
     };
-    NameProvider::Debs(
-        debs.into_iter()
-            .filter(|deb| !deb.ends_with("-dev"))
-            .collect(),
-    )
+    NameProvider::Debs(debs.into_iter().filter(|deb| !deb.ends_with("-dev")).collect())
 }
 
 /// Content of the package.xml files and plugin lists among some members.
@@ -234,9 +213,7 @@ fn report_members(members: &[DebMember], base: &Base) -> MemberReport {
         let Ok(text) = std::str::from_utf8(bytes) else {
             continue;
         };
-        if path.file_name().is_some_and(|name| name == "package.xml")
-            && path.components().count() == 4
-        {
+        if path.file_name().is_some_and(|name| name == "package.xml") && path.components().count() == 4 {
             match manifest::run_dependencies(text, path, base) {
                 Ok(names) => report.needed.extend(names),
                 Err(problem) => report.warnings.push(format!("in the archive: {problem}")),
@@ -258,20 +235,13 @@ fn add_plugin_library(
     members: &[DebMember],
     wanted: &mut GatheredPackages,
 ) {
-    let link = members.iter().find(|member| {
-        member
-            .path
-            .file_name()
-            .is_some_and(|name| name == library.name.as_str())
-    });
+    let link = members.iter().find(|member| member.path.file_name().is_some_and(|name| name == library.name.as_str()));
     let target: Option<PathBuf> = link.and_then(|member| match &member.content {
         MemberContent::Link(target) => Some(target.clone()),
         MemberContent::File(_) => None,
     });
     let linked = target.as_deref().and_then(Path::file_name);
-    let mut name = linked.map_or(library.name.clone(), |name| {
-        name.to_string_lossy().into_owned()
-    });
+    let mut name = linked.map_or(library.name.clone(), |name| name.to_string_lossy().into_owned());
     let mut deb = archive.contents.library(&name);
     if deb.is_none_or(|deb| deb.ends_with("-dev"))
         && let Some((version, of)) = archive.contents.library_versions(&library.name).first()
@@ -303,12 +273,7 @@ mod tests {
     use super::*;
 
     fn file(path: &str, text: &str) -> DebMember {
-        DebMember {
-            path: path.into(),
-            mode: 0o644,
-            mtime: 0,
-            content: MemberContent::File(text.into()),
-        }
+        DebMember { path: path.into(), mode: 0o644, mtime: 0, content: MemberContent::File(text.into()) }
     }
 
     #[test]
@@ -322,21 +287,12 @@ mod tests {
                  <maintainer email=\"a@b.invalid\">m</maintainer><license>l</license>\
                  <run_depend>nodelet</run_depend><build_depend>rostest</build_depend></package>",
             ),
-            file(
-                "usr/share/x/nodelet_plugins.xml",
-                "<library path=\"lib/libx_nodelets\"><class/></library>",
-            ),
+            file("usr/share/x/nodelet_plugins.xml", "<library path=\"lib/libx_nodelets\"><class/></library>"),
             file("usr/share/x/launch/other.xml", "<launch/>"),
         ];
         let report = report_members(&members, &base);
-        assert!(
-            report.needed.contains("nodelet") && !report.needed.contains("rostest"),
-            "{report:?}"
-        );
-        let plugin = PluginLibrary {
-            name: "libx_nodelets.so".to_owned(),
-            in_directory: true,
-        };
+        assert!(report.needed.contains("nodelet") && !report.needed.contains("rostest"), "{report:?}");
+        let plugin = PluginLibrary { name: "libx_nodelets.so".to_owned(), in_directory: true };
         assert_eq!(report.plugins, [plugin].into());
     }
 
@@ -363,26 +319,15 @@ mod tests {
         );
         let archive = archive(directory.path(), &text, &[]);
         for in_directory in [false, true] {
-            let library = PluginLibrary {
-                name: "libpcl_ros_filters.so".to_owned(),
-                in_directory,
-            };
+            let library = PluginLibrary { name: "libpcl_ros_filters.so".to_owned(), in_directory };
             let mut wanted = GatheredPackages::default();
             add_plugin_library(&archive, &library, &[], &mut wanted);
             assert_eq!(wanted.install, ["libpcl-ros-filters0d".to_owned()].into());
             assert!(wanted.warnings.is_empty(), "{wanted:?}");
-            let links: Vec<_> = wanted
-                .extras
-                .iter()
-                .map(|member| (&member.path, &member.content))
-                .collect();
+            let links: Vec<_> = wanted.extras.iter().map(|member| (&member.path, &member.content)).collect();
             let path = PathBuf::from("usr/lib/libpcl_ros_filters.so");
             let content = MemberContent::Link(format!("{triplet}/libpcl_ros_filters.so.0d").into());
-            let expected = if in_directory {
-                vec![(&path, &content)]
-            } else {
-                Vec::new()
-            };
+            let expected = if in_directory { vec![(&path, &content)] } else { Vec::new() };
             assert_eq!(links, expected);
         }
     }
@@ -390,19 +335,15 @@ mod tests {
     /// Creates the file of a Debian package where apt would put it.
     fn package(archive: &Archive, name: &str, files: &[(&str, &str)]) {
         let place = tempfile::tempdir().expect("a directory");
-        let control = format!(
-            "Package: {name}\nVersion: 1\nArchitecture: all\nMaintainer: a <a@b.invalid>\nDescription: d\n"
-        );
+        let control =
+            format!("Package: {name}\nVersion: 1\nArchitecture: all\nMaintainer: a <a@b.invalid>\nDescription: d\n");
         let tree = place.path().join("tree");
         for (path, text) in files.iter().copied().chain([("DEBIAN/control", &*control)]) {
             let path = tree.join(path);
             std::fs::create_dir_all(path.parent().expect("below")).expect("made");
             std::fs::write(path, text).expect("written");
         }
-        let deb = archive
-            .apt
-            .root()
-            .join(format!("archives/{name}_1_all.deb"));
+        let deb = archive.apt.root().join(format!("archives/{name}_1_all.deb"));
         let mut build = std::process::Command::new("dpkg-deb");
         build.args(["--root-owner-group", "--build"]);
         let said = build.arg(&tree).arg(&deb).output().expect("run");
@@ -422,13 +363,7 @@ mod tests {
              {modules}/numpy/__init__.py python/python3-numpy\n\
              {modules}/unused/__init__.py python/python3-unused\n"
         );
-        let names = [
-            "python3-monitor",
-            "python3-updater",
-            "python3-numpy",
-            "python3-unused",
-            "libupdater-dev",
-        ];
+        let names = ["python3-monitor", "python3-updater", "python3-numpy", "python3-unused", "libupdater-dev"];
         let archive = archive(directory.path(), &text, &names);
         let manifest = |name: &str, needs: &str| {
             format!(
@@ -438,10 +373,7 @@ mod tests {
         };
         let about = manifest("monitor", "<run_depend>updater</run_depend>");
         let program = "#!/usr/bin/python3\nimport os, numpy\nfrom updater import Updater\n";
-        let files = [
-            ("usr/share/monitor/package.xml", about.as_str()),
-            ("usr/lib/monitor/cpu_monitor", program),
-        ];
+        let files = [("usr/share/monitor/package.xml", about.as_str()), ("usr/lib/monitor/cpu_monitor", program)];
         package(&archive, "python3-monitor", &files);
         let about = manifest("updater", "");
         let files = [("usr/share/updater/package.xml", about.as_str())];
@@ -458,9 +390,7 @@ mod tests {
             (SelectedPrograms::All, all),
             (named("other"), vec!["python3-monitor"]),
         ] {
-            let wanted = gather_packages(&archive, &base, &roots, true, &programs, &progress)
-                .await
-                .expect("gathered");
+            let wanted = gather_packages(&archive, &base, &roots, true, &programs, &progress).await.expect("gathered");
             let install: Vec<&str> = wanted.install.iter().map(String::as_str).collect();
             assert_eq!(install, expected, "{programs:?}");
         }
@@ -470,16 +400,10 @@ mod tests {
     fn what_a_package_xml_asks_for_is_found_as_ros_package_as_key_and_by_its_debian_name() {
         let directory = tempfile::tempdir().expect("a directory");
         let text = "usr/share/tf/package.xml libdevel/libtf-dev\n";
-        let archive = archive(
-            directory.path(),
-            text,
-            &["python3-numpy", "libeigen3-dev", "opencv-data"],
-        );
+        let archive = archive(directory.path(), text, &["python3-numpy", "libeigen3-dev", "opencv-data"]);
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let debs = |names: &[&str]| {
-            NameProvider::Debs(names.iter().map(|&name| name.to_owned()).collect())
-        };
+        let debs = |names: &[&str]| NameProvider::Debs(names.iter().map(|&name| name.to_owned()).collect());
         for (name, expected) in [
             ("tf", NameProvider::Ros),
             ("python-numpy", debs(&["python3-numpy"])),

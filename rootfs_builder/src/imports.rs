@@ -44,9 +44,7 @@ impl Imports {
             SelectedPrograms::All => true,
         };
         let run = self.programs.into_iter().filter(|(name, _)| runs(name));
-        run.flat_map(|(_, modules)| modules)
-            .chain(self.modules)
-            .collect()
+        run.flat_map(|(_, modules)| modules).chain(self.modules).collect()
     }
 }
 
@@ -54,10 +52,7 @@ impl Imports {
 pub(crate) fn read_imports(deb: &Path, cache: &Path) -> Result<Imports, Error> {
     let directory = cache.join(KEPT);
     let path = directory.join(deb.file_name().unwrap_or_default());
-    if let Some(found) = fs::read(&path)
-        .ok()
-        .and_then(|text| serde_json::from_slice(&text).ok())
-    {
+    if let Some(found) = fs::read(&path).ok().and_then(|text| serde_json::from_slice(&text).ok()) {
         unused::mark_used(&path);
         return Ok(found);
     }
@@ -68,9 +63,7 @@ pub(crate) fn read_imports(deb: &Path, cache: &Path) -> Result<Imports, Error> {
         };
         let name = member.path.file_name().unwrap_or_default();
         if member.path.starts_with(MODULES) {
-            found
-                .modules
-                .extend(parse_imports(&String::from_utf8_lossy(bytes)));
+            found.modules.extend(parse_imports(&String::from_utf8_lossy(bytes)));
         } else if let Some(modules) = program_imports(bytes) {
             let name = name.to_string_lossy().into_owned();
             found.programs.insert(name, modules);
@@ -105,10 +98,7 @@ pub(crate) fn program_imports(bytes: &[u8]) -> Option<BTreeSet<String>> {
 }
 
 fn is_python_program(bytes: &[u8]) -> bool {
-    let first = bytes
-        .split(|byte| *byte == b'\n')
-        .next()
-        .unwrap_or_default();
+    let first = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
     first.starts_with(b"#!") && String::from_utf8_lossy(first).contains("python")
 }
 
@@ -118,10 +108,7 @@ fn parse_imports(text: &str) -> BTreeSet<String> {
     for line in text.lines() {
         let names: Vec<&str> = if let Some(names) = line.strip_prefix("import ") {
             names.split(',').collect()
-        } else if let Some((name, _)) = line
-            .strip_prefix("from ")
-            .and_then(|rest| rest.split_once(" import "))
-        {
+        } else if let Some((name, _)) = line.strip_prefix("from ").and_then(|rest| rest.split_once(" import ")) {
             vec![name]
         } else {
             continue;
@@ -180,16 +167,11 @@ mod tests {
     fn only_what_is_run_counts() {
         let imports = || Imports {
             modules: set(&["genpy"]),
-            programs: [("a", "numpy"), ("b", "cv2")]
-                .map(|(name, module)| (name.to_owned(), set(&[module])))
-                .into(),
+            programs: [("a", "numpy"), ("b", "cv2")].map(|(name, module)| (name.to_owned(), set(&[module]))).into(),
         };
         let named = |names: &[&str]| imports().for_programs(&SelectedPrograms::Named(set(names)));
         assert_eq!(named(&[]), set(&["genpy"]));
         assert_eq!(named(&["a", "other"]), set(&["genpy", "numpy"]));
-        assert_eq!(
-            imports().for_programs(&SelectedPrograms::All),
-            set(&["cv2", "genpy", "numpy"])
-        );
+        assert_eq!(imports().for_programs(&SelectedPrograms::All), set(&["cv2", "genpy", "numpy"]));
     }
 }

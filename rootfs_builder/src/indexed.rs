@@ -34,18 +34,14 @@ pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
     }
     named.push(format!("/opt/ros/{}", base.ros_distribution));
     let mut seen = BTreeSet::new();
-    named.retain(|prefix| {
-        prefix.len() > 1 && prefix.starts_with('/') && seen.insert(prefix.clone())
-    });
+    named.retain(|prefix| prefix.len() > 1 && prefix.starts_with('/') && seen.insert(prefix.clone()));
     named
 }
 
 /// Returns the directories of shared libraries searched by a base's own programs, relative to the root.
 pub(crate) fn library_directories(base: &Base) -> Vec<String> {
-    let mut places: Vec<String> = install_prefixes(base)
-        .iter()
-        .map(|prefix| format!("{}/lib", prefix.trim_matches('/')))
-        .collect();
+    let mut places: Vec<String> =
+        install_prefixes(base).iter().map(|prefix| format!("{}/lib", prefix.trim_matches('/'))).collect();
     if base.ros != Version::Ros1 {
         let given = base.environment.get("LD_LIBRARY_PATH");
         let given = given.map_or("", String::as_str).split(':');
@@ -56,10 +52,7 @@ pub(crate) fn library_directories(base: &Base) -> Vec<String> {
 }
 
 /// Returns the packages in the indexes of trees, given lowest first.
-pub(crate) async fn find_packages(
-    base: &Base,
-    trees: Vec<PathBuf>,
-) -> Result<BTreeSet<String>, Error> {
+pub(crate) async fn find_packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
     let prefixes = install_prefixes(base);
     if prefixes.is_empty() {
         return Ok(BTreeSet::new());
@@ -79,36 +72,21 @@ mod tests {
         let mut base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
         base.definition.ros = ros;
         base.definition.ros_distribution = "jazzy".to_owned();
-        let variables = [
-            ("AMENT_PREFIX_PATH", "/opt/wheels:relative:"),
-            ("LD_LIBRARY_PATH", "/opt/wheels/lib:/opt/more"),
-        ];
-        base.definition.environment = variables
-            .map(|(name, value)| (name.to_owned(), value.to_owned()))
-            .into();
-        base.definition.build.environment = BTreeMap::from([(
-            "CMAKE_PREFIX_PATH".to_owned(),
-            "/opt/tools:/opt/wheels".to_owned(),
-        )]);
+        let variables =
+            [("AMENT_PREFIX_PATH", "/opt/wheels:relative:"), ("LD_LIBRARY_PATH", "/opt/wheels/lib:/opt/more")];
+        base.definition.environment = variables.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
+        base.definition.build.environment =
+            BTreeMap::from([("CMAKE_PREFIX_PATH".to_owned(), "/opt/tools:/opt/wheels".to_owned())]);
         base
     }
 
     #[test]
     fn spaces_are_those_that_the_base_names() {
         let two = base(Version::Ros2);
-        assert_eq!(
-            install_prefixes(&two),
-            ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]
-        );
+        assert_eq!(install_prefixes(&two), ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]);
         assert_eq!(
             library_directories(&two),
-            [
-                "opt/wheels/lib",
-                "opt/tools/lib",
-                "opt/ros/jazzy/lib",
-                "opt/wheels/lib",
-                "opt/more"
-            ]
+            ["opt/wheels/lib", "opt/tools/lib", "opt/ros/jazzy/lib", "opt/wheels/lib", "opt/more"]
         );
         let one = base(Version::Ros1);
         assert!(install_prefixes(&one).is_empty() && library_directories(&one).is_empty());
@@ -117,29 +95,15 @@ mod tests {
     #[tokio::test]
     async fn packages_are_found_by_looking() {
         let tree = tempfile::tempdir().expect("a directory");
-        for (prefix, name) in [
-            ("opt/wheels", "rclpy"),
-            ("opt/ros/jazzy", "std_msgs"),
-            ("opt/elsewhere", "hidden"),
-        ] {
-            let index = tree
-                .path()
-                .join(prefix)
-                .join("share/ament_index/resource_index/packages");
+        for (prefix, name) in [("opt/wheels", "rclpy"), ("opt/ros/jazzy", "std_msgs"), ("opt/elsewhere", "hidden")] {
+            let index = tree.path().join(prefix).join("share/ament_index/resource_index/packages");
             std::fs::create_dir_all(&index).expect("made");
             std::fs::write(index.join(name), "").expect("written");
         }
         let trees = vec![tree.path().to_owned()];
-        let found = find_packages(&base(Version::Ros2), trees.clone())
-            .await
-            .expect("read");
+        let found = find_packages(&base(Version::Ros2), trees.clone()).await.expect("read");
         let names: Vec<&str> = found.iter().map(String::as_str).collect();
         assert_eq!(names, ["rclpy", "std_msgs"]);
-        assert!(
-            find_packages(&base(Version::Ros1), trees)
-                .await
-                .expect("read")
-                .is_empty()
-        );
+        assert!(find_packages(&base(Version::Ros1), trees).await.expect("read").is_empty());
     }
 }

@@ -44,9 +44,7 @@ pub(crate) struct LayerSet {
 
 impl LayerSet {
     pub(crate) fn single(diff_id: Digest, cached: bool) -> Self {
-        Self {
-            layers: vec![StagedLayer { diff_id, cached }],
-        }
+        Self { layers: vec![StagedLayer { diff_id, cached }] }
     }
 
     pub(crate) fn diff_ids(&self) -> impl Iterator<Item = Digest> + '_ {
@@ -72,10 +70,7 @@ impl LinkContents {
 fn member_item(member: &DebMember) -> String {
     let content = match &member.content {
         MemberContent::File(bytes) => format!("file {}", sha256(bytes)),
-        MemberContent::Link(target) => format!(
-            "link {}",
-            hex::encode(target.as_os_str().as_encoded_bytes())
-        ),
+        MemberContent::Link(target) => format!("link {}", hex::encode(target.as_os_str().as_encoded_bytes())),
     };
     let path = hex::encode(member.path.as_os_str().as_encoded_bytes());
     format!("{path} {:o} {} {content}", member.mode, member.mtime)
@@ -93,20 +88,10 @@ pub(crate) async fn add_layers(
         return Ok(LayerSet::default());
     }
     addition.extras.sort_by(|a, b| a.path.cmp(&b.path));
-    addition
-        .extras
-        .dedup_by(|later, first| later.path == first.path);
-    let whole = LinkContents {
-        debs: std::mem::take(&mut addition.debs),
-        extras: std::mem::take(&mut addition.extras),
-    };
+    addition.extras.dedup_by(|later, first| later.path == first.path);
+    let whole = LinkContents { debs: std::mem::take(&mut addition.debs), extras: std::mem::take(&mut addition.extras) };
     let items = whole.items();
-    let chains = Arc::new(Chains::new(
-        shop.layers.cache(),
-        addition.name,
-        &base.system_key(),
-        addition.below,
-    ));
+    let chains = Arc::new(Chains::new(shop.layers.cache(), addition.name, &base.system_key(), addition.below));
     let memo = chains.memo_key(&items);
     let _turn = shop.lock_key(&memo).await;
     // The same set gets the same chain again, even if better ones have been cached since.
@@ -134,28 +119,16 @@ pub(crate) async fn add_layers(
     chains.mark_used(&keys);
     let parts = missing_parts(archive, shop, whole, &found.items, MOST_LINKS - keys.len()).await?;
     for part in parts {
-        let link = Link {
-            parent: keys.last().cloned(),
-            items: part.items(),
-            bytes: 0,
-        };
+        let link = Link { parent: keys.last().cloned(), items: part.items(), bytes: 0 };
         let key = chains.key(link.parent.as_deref(), &link.items);
         let turn = shop.lock_key(&key).await;
         let layer = match cached_layers(shop, std::slice::from_ref(&key)).await? {
             Some(mut layers) => layers.remove(0),
             None => {
-                let below: Vec<Digest> = addition
-                    .below
-                    .iter()
-                    .copied()
-                    .chain(made.diff_ids())
-                    .collect();
+                let below: Vec<Digest> = addition.below.iter().copied().chain(made.diff_ids()).collect();
                 let (upper, options) =
-                    install_part(shop, archive, base, addition.name, &below, &part, progress)
-                        .await?;
-                progress
-                    .step(&format!("packing the {}", addition.name))
-                    .await;
+                    install_part(shop, archive, base, addition.name, &below, &part, progress).await?;
+                progress.step(&format!("packing the {}", addition.name)).await;
                 let packing = PackJob {
                     key: key.clone(),
                     made_from: link.items.iter().cloned().collect(),
@@ -166,10 +139,7 @@ pub(crate) async fn add_layers(
                 };
                 let (chains, named) = (chains.clone(), key.clone());
                 let record = move |bytes| chains.write_link(&named, &Link { bytes, ..link });
-                StagedLayer {
-                    diff_id: shop.pack(packing, record).await?,
-                    cached: false,
-                }
+                StagedLayer { diff_id: shop.pack(packing, record).await?, cached: false }
             }
         };
         made.layers.push(layer);
@@ -180,17 +150,11 @@ pub(crate) async fn add_layers(
 }
 
 /// Returns the layers of these keys, if all of them are in the cache.
-async fn cached_layers(
-    shop: &BuildContext,
-    keys: &[String],
-) -> Result<Option<Vec<StagedLayer>>, Error> {
+async fn cached_layers(shop: &BuildContext, keys: &[String]) -> Result<Option<Vec<StagedLayer>>, Error> {
     let mut layers = Vec::new();
     for key in keys {
         match shop.get_cached(key).await?.and_then(|entry| entry.layer) {
-            Some(layer) => layers.push(StagedLayer {
-                diff_id: layer.diff_id,
-                cached: true,
-            }),
+            Some(layer) => layers.push(StagedLayer { diff_id: layer.diff_id, cached: true }),
             None => return Ok(None),
         }
     }
@@ -207,8 +171,7 @@ async fn missing_parts(
 ) -> Result<Vec<LinkContents>, Error> {
     let mut left = whole;
     left.debs.retain(|deb| !there.contains(&deb.to_string()));
-    left.extras
-        .retain(|member| !there.contains(&member_item(member)));
+    left.extras.retain(|member| !there.contains(&member_item(member)));
     if left.debs.is_empty() && left.extras.is_empty() {
         return Ok(Vec::new());
     }
@@ -218,10 +181,7 @@ async fn missing_parts(
         let relations = archive.apt.relations(versioned_names(&left.debs)).await?;
         let (first, last) = split::split(&left.debs, &relations, |source| of_ros.contains(source));
         if !first.is_empty() {
-            parts.push(LinkContents {
-                debs: first,
-                extras: Vec::new(),
-            });
+            parts.push(LinkContents { debs: first, extras: Vec::new() });
         }
         left.debs = last;
     }
@@ -231,15 +191,12 @@ async fn missing_parts(
 
 /// Returns the names of packages as apt expects them.
 fn versioned_names(debs: &[Deb]) -> impl Iterator<Item = String> + '_ {
-    debs.iter()
-        .map(|deb| format!("{}={}", deb.name, deb.version))
+    debs.iter().map(|deb| format!("{}={}", deb.name, deb.version))
 }
 
 /// Returns the source packages that contain ROS packages. Cached, since it queries about a thousand packages.
 async fn ros_sources(archive: &Archive, shop: &BuildContext) -> Result<BTreeSet<String>, Error> {
-    let note = Key::new("ros-sources")
-        .input("archive", &archive.stamp)
-        .finish();
+    let note = Key::new("ros-sources").input("archive", &archive.stamp).finish();
     if let Some(sources) = shop.layers.read_note(&note) {
         return Ok(sources);
     }
@@ -274,11 +231,7 @@ async fn install_part(
         })
         .await;
     let directory = shop.site.fresh_directory(name)?;
-    let (tools, debs, upper) = (
-        directory.join("tools"),
-        directory.join("debs"),
-        directory.join("upper"),
-    );
+    let (tools, debs, upper) = (directory.join("tools"), directory.join("debs"), directory.join("upper"));
     fs::create_dir(&debs).io_context("making", &debs)?;
     fs::create_dir(&upper).io_context("making", &upper)?;
     set_mode(&debs, 0o755)?;
@@ -291,10 +244,7 @@ async fn install_part(
     let relations = archive.apt.relations(versioned_names(&part.debs)).await?;
     let steps = steps::script_files(&steps::plan_steps(&part.debs, &relations), &inside);
     let mut given = BTreeMap::from([
-        (
-            PathBuf::from("cloudroid/install.sh"),
-            INSTALL.as_bytes().to_vec(),
-        ),
+        (PathBuf::from("cloudroid/install.sh"), INSTALL.as_bytes().to_vec()),
         (PathBuf::from("cloudroid/debs/.keep"), Vec::new()),
     ]);
     given.extend(steps.into_iter().map(|(name, text)| {
@@ -304,10 +254,7 @@ async fn install_part(
     if !part.extras.is_empty() {
         let path = directory.join("extras.tar");
         deb::write_tar(&part.extras, &path)?;
-        given.insert(
-            "cloudroid/extras.tar".into(),
-            fs::read(&path).io_context("reading", &path)?,
-        );
+        given.insert("cloudroid/extras.tar".into(), fs::read(&path).io_context("reading", &path)?);
     }
     write_tree(&tools, &given)?;
     // Prevents services from being started by package scripts; this file is in a layer that does not become part of the
@@ -325,11 +272,7 @@ async fn install_part(
         ("LC_ALL".to_owned(), "C.UTF-8".to_owned()),
         ("HOME".to_owned(), "/root".to_owned()),
     ]);
-    environment.extend(
-        base.environment
-            .get_key_value("PATH")
-            .map(|(key, value)| (key.clone(), value.clone())),
-    );
+    environment.extend(base.environment.get_key_value("PATH").map(|(key, value)| (key.clone(), value.clone())));
     let total = part.debs.len() as u64;
     let mut done = 0;
     let mut complaint = FirstError::default();
@@ -350,9 +293,7 @@ async fn install_part(
                     opened: None,
                 }],
                 environment,
-                argv: ["/bin/sh", "/cloudroid/install.sh"]
-                    .map(str::to_owned)
-                    .into(),
+                argv: ["/bin/sh", "/cloudroid/install.sh"].map(str::to_owned).into(),
             },
             |line| {
                 complaint.push_line(line);
@@ -364,15 +305,9 @@ async fn install_part(
         )
         .await?;
     if !finished.success() {
-        return Err(Error::InstallFailed {
-            first_error: complaint.text().unwrap_or_else(|| finished.last_output()),
-        });
+        return Err(Error::InstallFailed { first_error: complaint.text().unwrap_or_else(|| finished.last_output()) });
     }
-    let options = TreeOptions {
-        uid_offset: finished.uid_offset,
-        overlay_upper: true,
-        ..tree_options(base)
-    };
+    let options = TreeOptions { uid_offset: finished.uid_offset, overlay_upper: true, ..tree_options(base) };
     Ok((upper, options))
 }
 
@@ -383,11 +318,7 @@ pub(crate) fn write_tree(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Res
     fs::create_dir_all(root).io_context("making", root)?;
     set_mode(root, 0o755)?;
     for (path, bytes) in files {
-        write_file(
-            &root.join(path.strip_prefix("/").unwrap_or(path)),
-            bytes,
-            0o644,
-        )?;
+        write_file(&root.join(path.strip_prefix("/").unwrap_or(path)), bytes, 0o644)?;
     }
     Ok(())
 }
@@ -395,10 +326,7 @@ pub(crate) fn write_tree(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Res
 fn write_file(path: &Path, bytes: &[u8], mode: u32) -> Result<(), Error> {
     if let Some(parent) = path.parent() {
         let mut new = Vec::new();
-        for directory in parent
-            .ancestors()
-            .take_while(|directory| !directory.exists())
-        {
+        for directory in parent.ancestors().take_while(|directory| !directory.exists()) {
             new.push(directory.to_owned());
         }
         fs::create_dir_all(parent).io_context("making", parent)?;
@@ -425,25 +353,13 @@ mod tests {
 
     #[test]
     fn items_tell_everything_that_makes_a_difference() {
-        let member = |path: &str, mode, mtime, content| DebMember {
-            path: path.into(),
-            mode,
-            mtime,
-            content,
-        };
+        let member = |path: &str, mode, mtime, content| DebMember { path: path.into(), mode, mtime, content };
         let text = |text: &str| MemberContent::File(text.into());
         let deb = |name: &str, version: &str, architecture: &str| LinkContents {
-            debs: vec![Deb {
-                name: name.into(),
-                version: version.into(),
-                architecture: architecture.into(),
-            }],
+            debs: vec![Deb { name: name.into(), version: version.into(), architecture: architecture.into() }],
             extras: Vec::new(),
         };
-        let extra = |member| LinkContents {
-            debs: Vec::new(),
-            extras: vec![member],
-        };
+        let extra = |member| LinkContents { debs: Vec::new(), extras: vec![member] };
         let parts = [
             deb("a", "1", "amd64"),
             deb("a", "2", "amd64"),
@@ -453,12 +369,7 @@ mod tests {
             extra(member("usr/share/x", 0o755, 1, text("1"))),
             extra(member("usr/share/x", 0o644, 2, text("1"))),
             extra(member("usr/share/x", 0o644, 1, text("2"))),
-            extra(member(
-                "usr/share/x",
-                0o644,
-                1,
-                MemberContent::Link("1".into()),
-            )),
+            extra(member("usr/share/x", 0o644, 1, MemberContent::Link("1".into()))),
             // A file whose name looks like a package.
             extra(member("a=1:amd64", 0o644, 1, text("1"))),
         ];
@@ -470,22 +381,8 @@ mod tests {
     fn what_the_sandbox_is_given_can_be_read_by_all() {
         let root = tempfile::tempdir().expect("a directory");
         let tree = root.path().join("t");
-        write_tree(
-            &tree,
-            &BTreeMap::from([(PathBuf::from("/a/b/c"), b"x".to_vec())]),
-        )
-        .expect("made");
-        let mode = |path: &str| {
-            tree.join(path)
-                .metadata()
-                .expect("there")
-                .permissions()
-                .mode()
-                & 0o777
-        };
-        assert_eq!(
-            (mode(""), mode("a"), mode("a/b"), mode("a/b/c")),
-            (0o755, 0o755, 0o755, 0o644)
-        );
+        write_tree(&tree, &BTreeMap::from([(PathBuf::from("/a/b/c"), b"x".to_vec())])).expect("made");
+        let mode = |path: &str| tree.join(path).metadata().expect("there").permissions().mode() & 0o777;
+        assert_eq!((mode(""), mode("a"), mode("a/b"), mode("a/b/c")), (0o755, 0o755, 0o755, 0o644));
     }
 }

@@ -24,9 +24,7 @@ pub(crate) struct Key(Sha256);
 impl Key {
     /// Starts a key for a kind of result, such as `base`.
     pub(crate) fn new(kind: &str) -> Self {
-        Self(Sha256::new())
-            .input("builder", BUILDER)
-            .input("kind", kind)
+        Self(Sha256::new()).input("builder", BUILDER).input("kind", kind)
     }
 
     /// Adds an input.
@@ -39,11 +37,7 @@ impl Key {
     }
 
     /// Adds several inputs of the same name.
-    pub(crate) fn inputs<T: AsRef<[u8]>>(
-        mut self,
-        name: &str,
-        values: impl IntoIterator<Item = T>,
-    ) -> Self {
+    pub(crate) fn inputs<T: AsRef<[u8]>>(mut self, name: &str, values: impl IntoIterator<Item = T>) -> Self {
         for value in values {
             self = self.input(name, value);
         }
@@ -78,9 +72,7 @@ pub(crate) fn hash_tree(root: &Path) -> Result<String, Error> {
                 hash.update((entry.stat.st_size as u64).to_le_bytes());
                 loop {
                     foreign::cancel::check().map_err(foreign::Error::from)?;
-                    let read = file
-                        .read(&mut buffer)
-                        .io_context("reading", entry.display_path())?;
+                    let read = file.read(&mut buffer).io_context("reading", entry.display_path())?;
                     if read == 0 {
                         break;
                     }

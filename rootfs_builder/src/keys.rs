@@ -86,12 +86,7 @@ pub(crate) fn resolve_keys(
     };
     let mut resolved = ResolvedKeys::default();
     let mut missing: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    let mut miss = |key: &str, by: &BTreeSet<String>| {
-        missing
-            .entry(key.to_owned())
-            .or_default()
-            .extend(by.clone())
-    };
+    let mut miss = |key: &str, by: &BTreeSet<String>| missing.entry(key.to_owned()).or_default().extend(by.clone());
     for (key, by) in asked.build.iter().filter(|(key, _)| !own.contains(*key)) {
         match find(key, &there.build) {
             KeyProvider::Debs(debs) => resolved.build.extend(debs),
@@ -104,9 +99,7 @@ pub(crate) fn resolve_keys(
     for (key, by) in asked.run.iter().filter(|(key, _)| !own.contains(*key)) {
         match find(key, &there.run) {
             // Libraries of a development package are found by what the compiled result needs.
-            KeyProvider::Debs(debs) => resolved
-                .run
-                .extend(debs.into_iter().filter(|deb| !deb.ends_with("-dev"))),
+            KeyProvider::Debs(debs) => resolved.run.extend(debs.into_iter().filter(|deb| !deb.ends_with("-dev"))),
             KeyProvider::Ros | KeyProvider::Nothing if base.ros_packages.ignore.contains(key) => {}
             KeyProvider::Ros => {
                 resolved.run_ros.insert(key.clone());
@@ -147,11 +140,7 @@ fn split_names(debs: &str) -> impl Iterator<Item = &str> {
 }
 
 /// Adds the names in `--map` that are not in the archive, with the option that contains them.
-fn add_unknown(
-    archive: &Archive,
-    map: &BTreeMap<String, String>,
-    missing: &mut BTreeMap<String, BTreeSet<String>>,
-) {
+fn add_unknown(archive: &Archive, map: &BTreeMap<String, String>, missing: &mut BTreeMap<String, BTreeSet<String>>) {
     for (key, debs) in map {
         for deb in split_names(debs).filter(|deb| !archive.candidates.contains(deb)) {
             let by = missing.entry(deb.to_owned()).or_default();
@@ -161,11 +150,7 @@ fn add_unknown(
 }
 
 /// Fails with all missing names, if there are any.
-fn refuse_missing(
-    archive: &Archive,
-    base: &Base,
-    missing: BTreeMap<String, BTreeSet<String>>,
-) -> Result<(), Error> {
+fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTreeSet<String>>) -> Result<(), Error> {
     if missing.is_empty() {
         return Ok(());
     }
@@ -184,9 +169,7 @@ fn refuse_missing(
 /// Returns whether, on a base of ROS 2, a Debian package belongs to the distribution's own ROS 1.
 pub(crate) fn is_of_other_ros(archive: &Archive, base: &Base, deb: &str) -> bool {
     let own = format!("ros-{}-", base.ros_distribution);
-    base.ros != Version::Ros1
-        && !deb.starts_with(&own)
-        && !archive.contents.ros_packages_in(deb).is_empty()
+    base.ros != Version::Ros1 && !deb.starts_with(&own) && !archive.contents.ros_packages_in(deb).is_empty()
 }
 
 /// Finds the Debian package for a name given on a base of ROS 2: that of a ROS package, or the package itself.
@@ -197,11 +180,7 @@ pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Opti
 
 /// Creates the error entry for a name that nothing provides.
 pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
-    Unresolved {
-        key: name.to_owned(),
-        wanted_by: vec![by.to_owned()],
-        similar: similar(archive, base, name),
-    }
+    Unresolved { key: name.to_owned(), wanted_by: vec![by.to_owned()], similar: similar(archive, base, name) }
 }
 
 /// Returns names similar to a key. A name of the distribution's own ROS 1 is similar only to packages of the base's
@@ -211,8 +190,7 @@ fn similar(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
     if base.ros != Version::Ros1 {
         let of_one = !archive.contents.ros_package(key).is_empty();
         let own = format!("ros-{}-", base.ros_distribution);
-        similar
-            .retain(|deb| deb.starts_with(&own) || !of_one && !is_of_other_ros(archive, base, deb));
+        similar.retain(|deb| deb.starts_with(&own) || !of_one && !is_of_other_ros(archive, base, deb));
     }
     similar
 }
@@ -236,14 +214,7 @@ mod tests {
                     usr/share/tf/msg/tfMessage.msg devel/ros-tf-msgs\n\
                     usr/share/message_generation/package.xml devel/ros-message-generation\n";
         let lists = [list(directory.path(), "c.gz", text)];
-        let names = [
-            "libtf-dev",
-            "ros-tf-msgs",
-            "libfrob3-dev",
-            "libfrob3",
-            "libeigen3-dev",
-            "python3-six",
-        ];
+        let names = ["libtf-dev", "ros-tf-msgs", "libfrob3-dev", "libfrob3", "libeigen3-dev", "python3-six"];
         let archive = Archive {
             apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
             contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
@@ -253,11 +224,7 @@ mod tests {
         };
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        KeysFixture {
-            _directory: directory,
-            archive,
-            base,
-        }
+        KeysFixture { _directory: directory, archive, base }
     }
 
     fn set(keys: &[&str]) -> BTreeSet<String> {
@@ -265,39 +232,19 @@ mod tests {
     }
 
     fn new_required_keys(build: &[&str], run: &[&str]) -> RequiredKeys {
-        let by = |keys: &[&str]| {
-            keys.iter()
-                .map(|&key| (key.to_owned(), set(&["app"])))
-                .collect()
-        };
-        RequiredKeys {
-            build: by(build),
-            run: by(run),
-        }
+        let by = |keys: &[&str]| keys.iter().map(|&key| (key.to_owned(), set(&["app"]))).collect();
+        RequiredKeys { build: by(build), run: by(run) }
     }
 
     #[test]
     fn each_name_is_found_where_it_is_known() {
         let lab = new_fixture();
         let map = BTreeMap::from([("frob".to_owned(), "libfrob3-dev libfrob3".to_owned())]);
-        let keys = [
-            "frob",
-            "eigen",
-            "tf",
-            "python3-six",
-            "app_msgs",
-            "message_generation",
-        ];
+        let keys = ["frob", "eigen", "tf", "python3-six", "app_msgs", "message_generation"];
         let asked = new_required_keys(&keys, &keys);
-        let resolved = resolve_keys(
-            &lab.archive,
-            &lab.base,
-            &map,
-            &set(&["app_msgs"]),
-            &asked,
-            &IndexedPackages::default(),
-        )
-        .expect("all known");
+        let resolved =
+            resolve_keys(&lab.archive, &lab.base, &map, &set(&["app_msgs"]), &asked, &IndexedPackages::default())
+                .expect("all known");
         assert_eq!(
             resolved.build,
             set(&[
@@ -339,10 +286,7 @@ mod tests {
         ] {
             let error = mapped(wrong).expect_err(wrong).to_string();
             let name = wrong.split(',').next_back().unwrap_or(wrong);
-            assert!(
-                error.contains(&format!("{name} (wanted by --map frob={wrong})")),
-                "{error}"
-            );
+            assert!(error.contains(&format!("{name} (wanted by --map frob={wrong})")), "{error}");
         }
     }
 
@@ -352,11 +296,8 @@ mod tests {
         let map = BTreeMap::from([("frob".to_owned(), "libfrob9".to_owned())]);
         let asked = new_required_keys(&["warp", "frob"], &["flux", "tf"]);
         let (none, there) = (BTreeSet::new(), IndexedPackages::default());
-        let error = resolve_keys(&lab.archive, &lab.base, &map, &none, &asked, &there)
-            .expect_err("two are missing");
-        let Error::Unresolved(missing) = error else {
-            panic!("{error}")
-        };
+        let error = resolve_keys(&lab.archive, &lab.base, &map, &none, &asked, &there).expect_err("two are missing");
+        let Error::Unresolved(missing) = error else { panic!("{error}") };
         let keys: Vec<_> = missing.iter().map(|one| one.key.as_str()).collect();
         assert_eq!(keys, ["flux", "libfrob9", "warp"]);
         assert_eq!(missing[1].wanted_by, ["--map frob=libfrob9"]);
@@ -368,12 +309,7 @@ mod tests {
         let mut lab = new_fixture();
         lab.base.definition.ros = Version::Ros2;
         lab.base.definition.ros_distribution = "jazzy".to_owned();
-        let more = [
-            "ros-jazzy-nav-msgs",
-            "libtf-dev",
-            "ros-tf-msgs",
-            "python3-six",
-        ];
+        let more = ["ros-jazzy-nav-msgs", "libtf-dev", "ros-tf-msgs", "python3-six"];
         lab.archive.candidates = crate::candidates::tests::candidates_named(&more);
         lab
     }
@@ -386,19 +322,9 @@ mod tests {
             build: set(&["rclpy", "ament_cmake", "rosidl_default_generators"]),
             run: set(&["rclpy"]),
         };
-        let run = [
-            "rclpy",
-            "app_msgs",
-            "nav_msgs",
-            "python3-six",
-            "ament_cmake",
-        ];
-        let asked = new_required_keys(
-            &["ament_cmake", "rosidl_default_generators", "nav_msgs"],
-            &run,
-        );
-        let resolved =
-            resolve_keys(&lab.archive, &lab.base, &map, &own, &asked, &there).expect("all known");
+        let run = ["rclpy", "app_msgs", "nav_msgs", "python3-six", "ament_cmake"];
+        let asked = new_required_keys(&["ament_cmake", "rosidl_default_generators", "nav_msgs"], &run);
+        let resolved = resolve_keys(&lab.archive, &lab.base, &map, &own, &asked, &there).expect("all known");
         assert_eq!(resolved.build, set(&["ros-jazzy-nav-msgs"]));
         assert_eq!(resolved.run, set(&["ros-jazzy-nav-msgs", "python3-six"]));
         assert!(resolved.run_ros.is_empty());
@@ -415,24 +341,12 @@ mod tests {
         let lab = new_ros2_fixture();
         let (own, map) = (BTreeSet::new(), BTreeMap::new());
         let asked = new_required_keys(&["tf", "rclcpp"], &["libtf-dev", "rclcpp"]);
-        let error = resolve_keys(
-            &lab.archive,
-            &lab.base,
-            &map,
-            &own,
-            &asked,
-            &IndexedPackages::default(),
-        )
-        .expect_err("nothing of it is there");
-        let Error::Unresolved(missing) = &error else {
-            panic!("{error}")
-        };
+        let error = resolve_keys(&lab.archive, &lab.base, &map, &own, &asked, &IndexedPackages::default())
+            .expect_err("nothing of it is there");
+        let Error::Unresolved(missing) = &error else { panic!("{error}") };
         let keys: Vec<_> = missing.iter().map(|one| one.key.as_str()).collect();
         assert_eq!(keys, ["libtf-dev", "rclcpp", "tf"]);
-        assert!(
-            missing.iter().all(|one| one.similar.is_empty()),
-            "{missing:?}"
-        );
+        assert!(missing.iter().all(|one| one.similar.is_empty()), "{missing:?}");
         assert!(error.to_string().contains("or push a workspace"), "{error}");
     }
 }

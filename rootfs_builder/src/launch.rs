@@ -72,10 +72,7 @@ impl LaunchNode {
             name: self.name.clone(),
             argv: self.argv.clone(),
             environment: self.environment.clone(),
-            directory: self
-                .directory
-                .clone()
-                .unwrap_or_else(|| ros_home.to_owned()),
+            directory: self.directory.clone().unwrap_or_else(|| ros_home.to_owned()),
             respawn: self.respawn,
             respawn_delay: self.respawn_delay,
             required: self.required,
@@ -116,36 +113,14 @@ pub(crate) struct LaunchAnswer {
 #[derive(Debug, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 enum PlanRefusal {
-    Launch {
-        file: String,
-        words: String,
-    },
-    NotFound {
-        what: String,
-        name: String,
-        known: Vec<String>,
-    },
-    Nothing {
-        executables: Vec<String>,
-        launch_files: Vec<String>,
-    },
-    Setup {
-        file: String,
-        status: i32,
-    },
-    NoLaunch {
-        module: String,
-    },
-    Python {
-        made_for: String,
-        there: String,
-    },
-    NoContainer {
-        plugin: String,
-    },
-    Component {
-        words: String,
-    },
+    Launch { file: String, words: String },
+    NotFound { what: String, name: String, known: Vec<String> },
+    Nothing { executables: Vec<String>, launch_files: Vec<String> },
+    Setup { file: String, status: i32 },
+    NoLaunch { module: String },
+    Python { made_for: String, there: String },
+    NoContainer { plugin: String },
+    Component { words: String },
 }
 
 #[derive(Debug, Deserialize)]
@@ -161,14 +136,8 @@ fn plan_scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
         Version::Ros1 => vec![("launch_plan.py", include_str!("inside/launch_plan.py"))],
         Version::Ros2 => vec![
             ("ros2_plan.py", include_str!("inside/ros2_plan.py")),
-            (
-                "ros2_launch_plan.py",
-                include_str!("inside/ros2_launch_plan.py"),
-            ),
-            (
-                "ros2_components.py",
-                include_str!("inside/ros2_components.py"),
-            ),
+            ("ros2_launch_plan.py", include_str!("inside/ros2_launch_plan.py")),
+            ("ros2_components.py", include_str!("inside/ros2_components.py")),
         ],
     }
 }
@@ -207,11 +176,7 @@ pub(crate) async fn query_plan(
     // The container's root is an unprivileged user on the host; nobody else can access the parent directories.
     set_mode(&out, 0o777)?;
     layers.push(tools);
-    for (name, value) in [
-        ("HOME", "/tmp"),
-        ("ROS_LOG_DIR", "/tmp"),
-        ("PYTHONDONTWRITEBYTECODE", "1"),
-    ] {
+    for (name, value) in [("HOME", "/tmp"), ("ROS_LOG_DIR", "/tmp"), ("PYTHONDONTWRITEBYTECODE", "1")] {
         environment.insert(name.to_owned(), value.to_owned());
     }
     let finished = shop
@@ -236,16 +201,9 @@ pub(crate) async fn query_plan(
             |_| {},
         )
         .await?;
-    let text = if finished.success() {
-        blocking::spawn(move || plan::read_plan(&out)).await??
-    } else {
-        None
-    };
+    let text = if finished.success() { blocking::spawn(move || plan::read_plan(&out)).await?? } else { None };
     let Some(text) = text else {
-        return Err(Error::Inside {
-            what: "resolving what to run",
-            last_lines: finished.last_output(),
-        });
+        return Err(Error::Inside { what: "resolving what to run", last_lines: finished.last_output() });
     };
     let answer = privilege::run_as_reader(|| parse_reply(&text, ros))?;
     plan::check_plan(&answer)?;
@@ -260,54 +218,34 @@ pub(crate) fn check_composition(
     let Some(container) = components.keys().next() else {
         return Ok(());
     };
-    let missing = composition::SERVICES
-        .into_iter()
-        .find(|name| !definitions.contains_key(*name));
+    let missing = composition::SERVICES.into_iter().find(|name| !definitions.contains_key(*name));
     match missing {
         None => Ok(()),
-        Some(what) => Err(Error::NoComposition {
-            container: container.clone(),
-            what: what.to_owned(),
-        }),
+        Some(what) => Err(Error::NoComposition { container: container.clone(), what: what.to_owned() }),
     }
 }
 
 /// Formats names for a message.
 pub(crate) fn join_names(names: &[String]) -> String {
-    if names.is_empty() {
-        "none".to_owned()
-    } else {
-        names.join(", ")
-    }
+    if names.is_empty() { "none".to_owned() } else { names.join(", ") }
 }
 
 fn parse_reply(text: &[u8], ros: Version) -> Result<LaunchAnswer, Error> {
     match serde_json::from_slice::<PlanReply>(text) {
         Ok(PlanReply::Planned(answer)) => Ok(answer),
         Ok(PlanReply::Refused { error }) => Err(match error {
-            PlanRefusal::Launch { file, words } => Error::Launch {
-                program: launch_program(ros),
-                file,
-                words,
-            },
+            PlanRefusal::Launch { file, words } => Error::Launch { program: launch_program(ros), file, words },
             PlanRefusal::NoLaunch { module } => Error::NoLaunch { module, with: None },
             PlanRefusal::Python { made_for, there } => Error::OtherPython { made_for, there },
             PlanRefusal::NoContainer { plugin } => Error::NoContainer { plugin },
             PlanRefusal::Component { words } => Error::BadComponent { words },
             PlanRefusal::NotFound { what, name, known } => Error::NotInPackage {
-                what: if what == "executable" {
-                    "executable"
-                } else {
-                    "launch file"
-                },
+                what: if what == "executable" { "executable" } else { "launch file" },
                 name,
                 known: join_names(&known),
                 elsewhere: String::new(),
             },
-            PlanRefusal::Nothing {
-                executables,
-                launch_files,
-            } => Error::NothingToRun {
+            PlanRefusal::Nothing { executables, launch_files } => Error::NothingToRun {
                 executables: join_names(&executables),
                 launch_files: join_names(&launch_files),
                 more: "",
@@ -317,10 +255,7 @@ fn parse_reply(text: &[u8], ros: Version) -> Result<LaunchAnswer, Error> {
                 last_lines: format!("{file} ended with status {status}"),
             },
         }),
-        Err(error) => Err(Error::Inside {
-            what: "resolving what to run",
-            last_lines: error.to_string(),
-        }),
+        Err(error) => Err(Error::Inside { what: "resolving what to run", last_lines: error.to_string() }),
     }
 }
 
@@ -342,40 +277,23 @@ mod tests {
             "parameters":{"/a/k":[1,2.5,"x",true]},"environment":{},"warnings":[],"executables":[],"launch_files":[]}"#;
         let answer = parse_reply(text, Version::Ros1).expect("a plan");
         let spec = answer.nodes[0].to_node_spec("/root/.ros");
-        assert_eq!(
-            (spec.directory.as_str(), spec.respawn, spec.respawn_delay),
-            ("/root/.ros", true, 1.5)
-        );
-        let ParamValue::List(values) = &answer.parameters["/a/k"] else {
-            panic!("a list")
-        };
+        assert_eq!((spec.directory.as_str(), spec.respawn, spec.respawn_delay), ("/root/.ros", true, 1.5));
+        let ParamValue::List(values) = &answer.parameters["/a/k"] else { panic!("a list") };
         assert_eq!(values[1], ParamValue::Double(2.5));
     }
 
     #[test]
     fn refusals_keep_roslaunchs_words_and_name_what_there_is() {
-        let launch = br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
-        let text = parse_reply(launch, Version::Ros1)
-            .expect_err("refused")
-            .to_string();
-        assert_eq!(
-            text,
-            "roslaunch cannot load /x.launch: requires the 'manager' arg to be set"
-        );
-        let node =
-            br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
-        let text = parse_reply(node, Version::Ros1)
-            .expect_err("refused")
-            .to_string();
+        let launch =
+            br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
+        let text = parse_reply(launch, Version::Ros1).expect_err("refused").to_string();
+        assert_eq!(text, "roslaunch cannot load /x.launch: requires the 'manager' arg to be set");
+        let node = br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
+        let text = parse_reply(node, Version::Ros1).expect_err("refused").to_string();
         assert_eq!(text, "no executable \"y\" in the package; available: a, b");
         let nothing = br#"{"error":{"kind":"nothing","executables":["a","b"],"launch_files":[]}}"#;
-        let text = parse_reply(nothing, Version::Ros1)
-            .expect_err("refused")
-            .to_string();
-        assert!(
-            text.contains("executables: a, b; launch files: none"),
-            "{text}"
-        );
+        let text = parse_reply(nothing, Version::Ros1).expect_err("refused").to_string();
+        assert!(text.contains("executables: a, b; launch files: none"), "{text}");
     }
 
     #[test]
@@ -385,21 +303,10 @@ mod tests {
             error.to_string()
         };
         let text = refused(br#"{"error":{"kind":"no_launch","module":"launch"}}"#);
-        assert!(
-            text.contains("no Python package launch") && text.contains("--node"),
-            "{text}"
-        );
-        let text =
-            refused(br#"{"error":{"kind":"python","made_for":"python3.12","there":"python3.11"}}"#);
-        assert!(
-            text.contains("built for python3.12, but the base has python3.11"),
-            "{text}"
-        );
-        let launch =
-            br#"{"error":{"kind":"launch","file":"/x.launch.py","words":"no such argument"}}"#;
-        assert_eq!(
-            refused(launch),
-            "ros2 launch cannot load /x.launch.py: no such argument"
-        );
+        assert!(text.contains("no Python package launch") && text.contains("--node"), "{text}");
+        let text = refused(br#"{"error":{"kind":"python","made_for":"python3.12","there":"python3.11"}}"#);
+        assert!(text.contains("built for python3.12, but the base has python3.11"), "{text}");
+        let launch = br#"{"error":{"kind":"launch","file":"/x.launch.py","words":"no such argument"}}"#;
+        assert_eq!(refused(launch), "ros2 launch cannot load /x.launch.py: no such argument");
     }
 }

@@ -15,10 +15,7 @@ pub(crate) struct LineSender {
 /// Creates a queue.
 pub(crate) fn channel() -> (LineSender, mpsc::Receiver<String>) {
     let (sender, receiver) = mpsc::channel(AHEAD);
-    let lines = LineSender {
-        sender,
-        left_out: 0,
-    };
+    let lines = LineSender { sender, left_out: 0 };
     (lines, receiver)
 }
 

@@ -56,9 +56,7 @@ pub(crate) fn overlay_tree(tree: &Path, target: &Path) -> Result<(), Error> {
         set_mode(path, about.mode() & 0o7777)?;
         let time = about.modified().io_context("reading", path)?;
         let opened = fs::File::open(path).io_context("opening", path)?;
-        opened
-            .set_modified(time)
-            .io_context("changing the time of", path)?;
+        opened.set_modified(time).io_context("changing the time of", path)?;
     }
     Ok(())
 }
@@ -69,36 +67,24 @@ fn link(from: &Path, to: &Path) -> Result<(), Error> {
     }
     let about = from.metadata().io_context("reading", from)?;
     fs::copy(from, to).io_context("copying", from)?;
-    std::os::unix::fs::lchown(to, Some(about.uid()), Some(about.gid()))
-        .io_context("changing the owner of", to)?;
+    std::os::unix::fs::lchown(to, Some(about.uid()), Some(about.gid())).io_context("changing the owner of", to)?;
     set_mode(to, about.mode() & 0o7777)?;
     let time = about.modified().io_context("reading", from)?;
-    let opened = fs::File::options()
-        .write(true)
-        .open(to)
-        .io_context("opening", to)?;
-    opened
-        .set_modified(time)
-        .io_context("changing the time of", to)
+    let opened = fs::File::options().write(true).open(to).io_context("opening", to)?;
+    opened.set_modified(time).io_context("changing the time of", to)
 }
 
 fn remove(path: &Path) -> Result<(), Error> {
     let directory = path.symlink_metadata().is_ok_and(|about| about.is_dir());
-    if directory {
-        Ok(foreign::remove(path)?)
-    } else {
-        fs::remove_file(path).io_context("removing", path)
-    }
+    if directory { Ok(foreign::remove(path)?) } else { fs::remove_file(path).io_context("removing", path) }
 }
 
 /// Returns whether a directory hides the lower layers.
 fn is_opaque(path: &Path) -> bool {
-    ["trusted.overlay.opaque", "user.overlay.opaque"]
-        .iter()
-        .any(|name| {
-            let mut value = [0; 1];
-            matches!(rustix::fs::getxattr(path, *name, &mut value[..]), Ok(1)) && value == *b"y"
-        })
+    ["trusted.overlay.opaque", "user.overlay.opaque"].iter().any(|name| {
+        let mut value = [0; 1];
+        matches!(rustix::fs::getxattr(path, *name, &mut value[..]), Ok(1)) && value == *b"y"
+    })
 }
 
 #[cfg(test)]
@@ -113,28 +99,17 @@ mod tests {
     }
 
     fn opaque(path: &Path) {
-        let set =
-            |name: &str| rustix::fs::setxattr(path, name, b"y", rustix::fs::XattrFlags::empty());
-        set("trusted.overlay.opaque")
-            .or_else(|_| set("user.overlay.opaque"))
-            .expect("marked");
+        let set = |name: &str| rustix::fs::setxattr(path, name, b"y", rustix::fs::XattrFlags::empty());
+        set("trusted.overlay.opaque").or_else(|_| set("user.overlay.opaque")).expect("marked");
     }
 
     #[test]
     fn the_last_one_counts_and_deletions_delete() {
         let place = tempfile::tempdir().expect("a directory");
-        let (one, two, all) = (
-            place.path().join("1"),
-            place.path().join("2"),
-            place.path().join("all"),
-        );
-        for (path, text) in [
-            ("a/same", "1"),
-            ("a/gone", "1"),
-            ("a/was_directory/x", "1"),
-            ("a/was_file", "1"),
-            ("new_again/old", "1"),
-        ] {
+        let (one, two, all) = (place.path().join("1"), place.path().join("2"), place.path().join("all"));
+        for (path, text) in
+            [("a/same", "1"), ("a/gone", "1"), ("a/was_directory/x", "1"), ("a/was_file", "1"), ("new_again/old", "1")]
+        {
             write(&one, path, text);
         }
         write(&two, "a/same", "2");
@@ -162,10 +137,7 @@ mod tests {
         assert_eq!(read("a/link").as_deref(), Some("2"));
         assert_eq!(read("a/was_file/inner").as_deref(), Some("2"));
         assert_eq!(read("a/was_directory").as_deref(), Some("2"));
-        assert_eq!(
-            (read("new_again/old"), read("new_again/new").as_deref()),
-            (None, Some("2"))
-        );
+        assert_eq!((read("new_again/old"), read("new_again/new").as_deref()), (None, Some("2")));
         assert_eq!(read("a/gone").is_some(), mark.is_err());
         let mode = |path: &str| all.join(path).metadata().expect("there").mode() & 0o777;
         assert_eq!((mode("a/same"), mode("new_again")), (0o755, 0o500));

@@ -29,54 +29,28 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, E
         vec![name.to_owned()]
     } else if archive.candidates.contains(name) {
         debs.insert(name.to_owned());
-        archive
-            .contents
-            .ros_packages_in(name)
-            .into_iter()
-            .map(str::to_owned)
-            .collect()
+        archive.contents.ros_packages_in(name).into_iter().map(str::to_owned).collect()
     } else {
         Vec::new()
     };
     if packages.is_empty() && archive.candidates.contains(name) {
-        return Err(Error::NotRos {
-            name: name.to_owned(),
-        });
+        return Err(Error::NotRos { name: name.to_owned() });
     }
     if packages.is_empty() {
         let similar = archive.similar(name);
-        let hint = if similar.is_empty() {
-            String::new()
-        } else {
-            format!(" (available: {})", similar.join(", "))
-        };
-        return Err(Error::UnknownPackage {
-            name: name.to_owned(),
-            suite: build.base.suite.clone(),
-            hint,
-        });
+        let hint = if similar.is_empty() { String::new() } else { format!(" (available: {})", similar.join(", ")) };
+        return Err(Error::UnknownPackage { name: name.to_owned(), suite: build.base.suite.clone(), hint });
     }
     roots.extend(packages.iter().cloned());
-    build
-        .progress
-        .step(&format!("looking up the dependencies of {name}"))
-        .await;
+    build.progress.step(&format!("looking up the dependencies of {name}")).await;
     let wanted = gather_wanted(build, &roots, true).await?;
     debs.extend(wanted.install);
     debs.extend(mapped);
     let versions = packages.iter();
     let versions = versions.map(|package| (package.clone(), archive_version(build, package)));
     let versions = versions.collect();
-    let dependencies = build
-        .add_packages("dependencies", &build.base_diff_ids(), &debs, wanted.extras)
-        .await?;
-    Ok(BuildParts {
-        packages,
-        versions,
-        dependencies,
-        package: LayerSet::default(),
-        prefix: None,
-    })
+    let dependencies = build.add_packages("dependencies", &build.base_diff_ids(), &debs, wanted.extras).await?;
+    Ok(BuildParts { packages, versions, dependencies, package: LayerSet::default(), prefix: None })
 }
 
 /// Builds on ROS 2, whose archive has a Debian package with all dependencies for each ROS package.
@@ -85,19 +59,10 @@ async fn build_ros2(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> 
     let (_, mut debs) = build.extra_packages().await?;
     let version = build.archive.candidates.get(&deb);
     debs.insert(deb);
-    debs.extend(keys::mapped_packages(
-        &build.archive,
-        &build.base,
-        &build.request.map,
-    )?);
-    let dependencies = build
-        .add_packages("dependencies", &build.base_diff_ids(), &debs, Vec::new())
-        .await?;
+    debs.extend(keys::mapped_packages(&build.archive, &build.base, &build.request.map)?);
+    let dependencies = build.add_packages("dependencies", &build.base_diff_ids(), &debs, Vec::new()).await?;
     Ok(BuildParts {
-        versions: BTreeMap::from([(
-            package.clone(),
-            version.map_or_else(String::new, |deb| deb.version),
-        )]),
+        versions: BTreeMap::from([(package.clone(), version.map_or_else(String::new, |deb| deb.version))]),
         packages: vec![package],
         dependencies,
         package: LayerSet::default(),
@@ -157,15 +122,8 @@ pub(crate) async fn gather_wanted(
     let note: GatherNote = match build.shop.layers.read_note(&key) {
         Some(note) => note,
         None => {
-            let found = gather::gather_packages(
-                &build.archive,
-                &build.base,
-                roots,
-                python,
-                &programs,
-                build.progress,
-            )
-            .await?;
+            let found =
+                gather::gather_packages(&build.archive, &build.base, roots, python, &programs, build.progress).await?;
             let note = GatherNote {
                 install: found.install,
                 extras: found.extras,
@@ -188,12 +146,7 @@ pub(crate) async fn gather_wanted(
             build.progress.warn(text).await;
         }
     }
-    Ok(GatheredPackages {
-        install: note.install,
-        extras: note.extras,
-        warnings: note.warnings,
-        unknown: note.unknown,
-    })
+    Ok(GatheredPackages { install: note.install, extras: note.extras, warnings: note.warnings, unknown: note.unknown })
 }
 
 /// Returns the programs of the archive's packages that a push runs, as far as known in advance.
@@ -212,12 +165,8 @@ fn selected_programs(request: &PushRequest) -> SelectedPrograms {
 /// Returns the version of the Debian package that contains a ROS package's programs or its package.xml.
 fn archive_version(build: &Build<'_>, package: &str) -> String {
     let carriers = build.archive.contents.ros_package(package);
-    let deb = carriers
-        .keys()
-        .find(|deb| !deb.ends_with("-dev"))
-        .or(carriers.keys().next());
-    deb.and_then(|deb| build.archive.candidates.get(deb))
-        .map_or_else(String::new, |deb| deb.version)
+    let deb = carriers.keys().find(|deb| !deb.ends_with("-dev")).or(carriers.keys().next());
+    deb.and_then(|deb| build.archive.candidates.get(deb)).map_or_else(String::new, |deb| deb.version)
 }
 
 #[cfg(test)]
@@ -247,20 +196,15 @@ mod tests {
         let base = crate::base::load(&images, "noble-jazzy").expect("valid");
         for name in ["demo_nodes_py", "demo-nodes-py", "ros-jazzy-demo-nodes-py"] {
             let found = find_in_archive(&archive, &base, name);
-            let expected = ArchivePackage {
-                package: "demo_nodes_py".to_owned(),
-                deb: "ros-jazzy-demo-nodes-py".to_owned(),
-            };
+            let expected =
+                ArchivePackage { package: "demo_nodes_py".to_owned(), deb: "ros-jazzy-demo-nodes-py".to_owned() };
             assert_eq!(found.expect("it is there"), expected, "{name}");
         }
         // Of another distribution, without ROS packages, and unknown.
         for name in ["turtlesim", "ros-humble-turtlesim", "python3-six", "frob"] {
             let refused = find_in_archive(&archive, &base, name).expect_err("it is not there");
             let refused = refused.to_string();
-            assert!(
-                refused.contains(name) && refused.contains("noble-jazzy"),
-                "{refused}"
-            );
+            assert!(refused.contains(name) && refused.contains("noble-jazzy"), "{refused}");
         }
     }
 }

@@ -52,8 +52,7 @@ pub(crate) fn check_plan(answer: &LaunchAnswer) -> Result<(), Error> {
             return refused(format!("two nodes are named {}", node.name));
         }
     }
-    if let Some(problem) = find_components_problem(&answer.components, &|name| seen.contains(name))
-    {
+    if let Some(problem) = find_components_problem(&answer.components, &|name| seen.contains(name)) {
         return refused(problem);
     }
     if let Some(problem) = find_environment_problem(&answer.environment) {
@@ -76,10 +75,7 @@ fn find_node_problem(node: &LaunchNode) -> Option<String> {
         return Some("does not have a valid ROS node name".into());
     }
     if !names::is_package(&node.package) {
-        return Some(format!(
-            "has the package {:?}, which is not a valid package name",
-            node.package
-        ));
+        return Some(format!("has the package {:?}, which is not a valid package name", node.package));
     }
     if !node.executable.split('/').all(names::is_executable) {
         return Some(format!(
@@ -92,9 +88,7 @@ fn find_node_problem(node: &LaunchNode) -> Option<String> {
     }
     let words = node.argv.iter().map(String::len).sum::<usize>();
     if words > MAX_WORDS {
-        return Some(format!(
-            "has {words} bytes of arguments; the limit is {MAX_WORDS}"
-        ));
+        return Some(format!("has {words} bytes of arguments; the limit is {MAX_WORDS}"));
     }
     if node.argv.iter().any(|word| word.contains('\0')) {
         return Some("has an argument with a NUL byte".into());
@@ -102,18 +96,12 @@ fn find_node_problem(node: &LaunchNode) -> Option<String> {
     if let Some(directory) = &node.directory
         && (!directory.starts_with('/') || directory.contains('\0') || directory.len() > 4095)
     {
-        return Some(format!(
-            "runs in {directory:?}, which is not an absolute path"
-        ));
+        return Some(format!("runs in {directory:?}, which is not an absolute path"));
     }
     if !(0.0..=MAX_DELAY).contains(&node.respawn_delay) {
-        return Some(format!(
-            "has a respawn_delay of {} s; the range is 0 to {MAX_DELAY}",
-            node.respawn_delay
-        ));
+        return Some(format!("has a respawn_delay of {} s; the range is 0 to {MAX_DELAY}", node.respawn_delay));
     }
-    find_environment_problem(&node.environment)
-        .map(|problem| format!("has an environment where {problem}"))
+    find_environment_problem(&node.environment).map(|problem| format!("has an environment where {problem}"))
 }
 
 /// Returns the first problem of the components; `is_node` tells whether a name is that of a node.
@@ -123,15 +111,11 @@ pub fn find_components_problem(
 ) -> Option<String> {
     let loaded = all.values().map(Vec::len).sum::<usize>();
     if loaded > MAX_NODES {
-        return Some(format!(
-            "it loads {loaded} nodes into others; the limit is {MAX_NODES}"
-        ));
+        return Some(format!("it loads {loaded} nodes into others; the limit is {MAX_NODES}"));
     }
     all.iter().find_map(|(container, components)| {
         if !is_node(container) {
-            return Some(format!(
-                "it loads nodes into {container:?}, which it does not start"
-            ));
+            return Some(format!("it loads nodes into {container:?}, which it does not start"));
         }
         let problem = components.iter().find_map(find_component_problem)?;
         Some(format!("a component of {container} {problem}"))
@@ -140,16 +124,10 @@ pub fn find_components_problem(
 
 fn find_component_problem(component: &Component) -> Option<String> {
     if !names::is_package(&component.package) {
-        return Some(format!(
-            "is of package {:?}, which is not a valid package name",
-            component.package
-        ));
+        return Some(format!("is of package {:?}, which is not a valid package name", component.package));
     }
     if !names::is_class(&component.plugin) {
-        return Some(format!(
-            "is {:?}, which is not a valid class name",
-            component.plugin
-        ));
+        return Some(format!("is {:?}, which is not a valid class name", component.plugin));
     }
     let name = component.full_name();
     if name.is_some_and(|name| !names::is_graph_name(&name)) {
@@ -162,14 +140,9 @@ fn find_component_problem(component: &Component) -> Option<String> {
 }
 
 fn find_environment_problem(environment: &BTreeMap<String, String>) -> Option<String> {
-    let size: usize = environment
-        .iter()
-        .map(|(name, value)| name.len() + value.len() + 2)
-        .sum();
+    let size: usize = environment.iter().map(|(name, value)| name.len() + value.len() + 2).sum();
     if size > MAX_WORDS {
-        return Some(format!(
-            "the environment has {size} bytes; the limit is {MAX_WORDS}"
-        ));
+        return Some(format!("the environment has {size} bytes; the limit is {MAX_WORDS}"));
     }
     environment.iter().find_map(|(name, value)| {
         if name.is_empty() || name.contains(['=', '\0']) {
@@ -203,19 +176,14 @@ mod tests {
     }
 
     fn answer(nodes: Vec<LaunchNode>) -> LaunchAnswer {
-        LaunchAnswer {
-            nodes,
-            ..LaunchAnswer::default()
-        }
+        LaunchAnswer { nodes, ..LaunchAnswer::default() }
     }
 
     #[test]
     fn what_the_script_makes_is_accepted() {
         let mut good = answer(vec![node()]);
-        good.parameters
-            .insert("/camera/1st".into(), ros::bus::ParamValue::Bool(true));
-        good.environment
-            .insert("CMAKE_PREFIX_PATH".into(), "/opt/x:/usr".into());
+        good.parameters.insert("/camera/1st".into(), ros::bus::ParamValue::Bool(true));
+        good.environment.insert("CMAKE_PREFIX_PATH".into(), "/opt/x:/usr".into());
         check_plan(&good).expect("a plan");
     }
 
@@ -235,28 +203,21 @@ mod tests {
         for (words, change) in changes {
             let mut bad = node();
             change(&mut bad);
-            let text = check_plan(&answer(vec![node(), bad]))
-                .expect_err(words)
-                .to_string();
+            let text = check_plan(&answer(vec![node(), bad])).expect_err(words).to_string();
             assert!(text.contains(words), "{text}");
         }
         let twice = check_plan(&answer(vec![node(), node()])).expect_err("twice");
         assert!(twice.to_string().contains("two nodes"), "{twice}");
         let mut many = answer(Vec::new());
         for number in 0..=MAX_NODES {
-            many.nodes.push(LaunchNode {
-                name: format!("/n{number}"),
-                ..node()
-            });
+            many.nodes.push(LaunchNode { name: format!("/n{number}"), ..node() });
         }
         assert!(check_plan(&many).is_err());
         let mut environment = answer(vec![node()]);
         environment.environment.insert("A=B".into(), String::new());
         assert!(check_plan(&environment).is_err());
         let mut parameter = answer(vec![node()]);
-        parameter
-            .parameters
-            .insert("relative".into(), ros::bus::ParamValue::Bool(true));
+        parameter.parameters.insert("relative".into(), ros::bus::ParamValue::Bool(true));
         assert!(check_plan(&parameter).is_err());
     }
 
@@ -284,9 +245,7 @@ mod tests {
         for (words, change) in changes {
             let mut bad = component.clone();
             change(&mut bad);
-            let text = check_plan(&loading("/a", vec![bad]))
-                .expect_err(words)
-                .to_string();
+            let text = check_plan(&loading("/a", vec![bad])).expect_err(words).to_string();
             assert!(text.contains(words), "{text}");
         }
         let nowhere = check_plan(&loading("/b", vec![component.clone()])).expect_err("nowhere");

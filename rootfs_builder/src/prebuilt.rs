@@ -24,27 +24,14 @@ const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/v
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<BuildParts, Error> {
     let packages = pushed::sort_by_importance(&space.packages);
     let prefix = choose_prefix(&space, &build.base.build.prefix, &packages)?;
-    let (own, asked) = (
-        pushed::names(&space.packages),
-        pushed::required_keys(&space.packages),
-    );
+    let (own, asked) = (pushed::names(&space.packages), pushed::required_keys(&space.packages));
     // It is compiled already: its build dependencies do not matter.
-    let asked = RequiredKeys {
-        build: BTreeMap::new(),
-        ..asked
-    };
+    let asked = RequiredKeys { build: BTreeMap::new(), ..asked };
     let there = IndexedPackages {
         build: pushed::build_tools(&asked),
         run: build.indexed_packages(&build.base_diff_ids()).await?,
     };
-    let resolved = keys::resolve_keys(
-        &build.archive,
-        &build.base,
-        &build.request.map,
-        &own,
-        &asked,
-        &there,
-    )?;
+    let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
         build.progress.warn(warning.as_str()).await;
     }
@@ -63,11 +50,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
 
 /// Chooses the prefix: the original one, if it is visible. An install space without a prefix works anywhere; scripts of
 /// ROS 2 can be relocated.
-fn choose_prefix(
-    space: &InstallSpace,
-    otherwise: &Path,
-    packages: &[String],
-) -> Result<PathBuf, Error> {
+fn choose_prefix(space: &InstallSpace, otherwise: &Path, packages: &[String]) -> Result<PathBuf, Error> {
     let Some(prefix) = &space.prefix else {
         return Ok(otherwise.to_owned());
     };
@@ -76,26 +59,19 @@ fn choose_prefix(
     match space.layout {
         _ if is_usable && !is_hidden => Ok(prefix.clone()),
         Layout::Merged | Layout::Isolated => Ok(otherwise.to_owned()),
-        Layout::Catkin => Err(Error::Prefix {
-            prefix: prefix.clone(),
-            package: packages.first().cloned().unwrap_or_default(),
-        }),
+        Layout::Catkin => {
+            Err(Error::Prefix { prefix: prefix.clone(), package: packages.first().cloned().unwrap_or_default() })
+        }
     }
 }
 
-async fn pack_space(
-    build: &Build<'_>,
-    space: &InstallSpace,
-    prefix: &Path,
-) -> Result<LayerSet, Error> {
+async fn pack_space(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<LayerSet, Error> {
     let root = &space.root;
     let root = root.canonicalize().io_context("opening", root)?;
     let hashed = root.clone();
     let content = crate::blocking::spawn(move || key::hash_tree(&hashed)).await??;
-    let key = Key::new("prebuilt")
-        .input("content", content)
-        .input("prefix", prefix.as_os_str().as_encoded_bytes())
-        .finish();
+    let key =
+        Key::new("prebuilt").input("content", content).input("prefix", prefix.as_os_str().as_encoded_bytes()).finish();
     let shop = &build.shop;
     let turn = shop.lock_key(&key).await;
     if let Some(entry) = shop.get_cached(&key).await?
@@ -109,10 +85,7 @@ async fn pack_space(
     let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
     fs::create_dir_all(&parent).io_context("making", &parent)?;
-    for directory in parent
-        .ancestors()
-        .take_while(|directory| directory.starts_with(&tree))
-    {
+    for directory in parent.ancestors().take_while(|directory| directory.starts_with(&tree)) {
         set_mode(directory, 0o755)?;
     }
     // The pushed tree belongs to this build, so moving it is cheap.
@@ -127,10 +100,7 @@ async fn pack_space(
         directory,
         turn,
     };
-    Ok(LayerSet::single(
-        shop.pack(packing, |_| Ok(())).await?,
-        false,
-    ))
+    Ok(LayerSet::single(shop.pack(packing, |_| Ok(())).await?, false))
 }
 
 #[cfg(test)]
@@ -141,12 +111,8 @@ mod tests {
     fn a_space_is_where_it_was_built_for_if_that_can_be_seen() {
         let otherwise = Path::new("/opt/cloudroid/install");
         let placed = |layout, prefix: Option<&str>| {
-            let space = InstallSpace {
-                root: PathBuf::new(),
-                layout,
-                prefix: prefix.map(PathBuf::from),
-                packages: Vec::new(),
-            };
+            let space =
+                InstallSpace { root: PathBuf::new(), layout, prefix: prefix.map(PathBuf::from), packages: Vec::new() };
             choose_prefix(&space, otherwise, &["p".to_owned()])
         };
         for layout in [Layout::Catkin, Layout::Merged, Layout::Isolated] {
@@ -155,9 +121,7 @@ mod tests {
             assert_eq!(placed(layout, None).expect("anywhere"), otherwise);
         }
         for hidden in ["/root/ws/install", "/tmp/x", "/"] {
-            let text = placed(Layout::Catkin, Some(hidden))
-                .expect_err("cannot be seen")
-                .to_string();
+            let text = placed(Layout::Catkin, Some(hidden)).expect_err("cannot be seen").to_string();
             assert!(text.contains("-DCMAKE_INSTALL_PREFIX=/opt/p"), "{text}");
             for layout in [Layout::Merged, Layout::Isolated] {
                 assert_eq!(placed(layout, Some(hidden)).expect("elsewhere"), otherwise);

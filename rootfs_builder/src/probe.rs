@@ -232,10 +232,7 @@ async fn observe(
     options: &ProbeOptions,
     unfed: &Mutex<Option<ProbeResult>>,
 ) -> Result<ProbeResult, ProbeError> {
-    let options = &ProbeOptions {
-        ros: bus.version(),
-        ..options.clone()
-    };
+    let options = &ProbeOptions { ros: bus.version(), ..options.clone() };
     let mut watch = bus.graph();
     let moved = settle::wait_until_registered(&mut watch, options).await?;
     tracing::debug!(?moved, "probe: all nodes are registered");
@@ -264,17 +261,11 @@ async fn observe(
         heard: OutputRecord::default(),
     };
     if !settle::wait_until_still(&mut look.watch, options).await? {
-        look.warnings.push(format!(
-            "topics kept changing for {:?}, so some may be missing",
-            options.restless
-        ));
+        look.warnings.push(format!("topics kept changing for {:?}, so some may be missing", options.restless));
     }
     tracing::debug!("probe: nothing changes");
     look.subscribe_outputs().await?;
-    tracing::debug!(
-        outputs = look.tried.len(),
-        "probe: all outputs are listened to"
-    );
+    tracing::debug!(outputs = look.tried.len(), "probe: all outputs are listened to");
     let mut bare = look.describe(&feed).await?;
     bare.moved = moved;
     tracing::debug!("probe: described as it is without a robot");
@@ -286,10 +277,7 @@ async fn observe(
         let Some(settle) = feed.give_inputs(&look.graph()).await else {
             break;
         };
-        let options = ProbeOptions {
-            settle,
-            ..options.clone()
-        };
+        let options = ProbeOptions { settle, ..options.clone() };
         tracing::debug!(?settle, "probe: something is given");
         settle::wait_until_still(&mut look.watch, &options).await?;
         let changed = settle::graph_shape(&look.graph()) != before;
@@ -306,9 +294,7 @@ async fn observe(
         *unfed.lock() = Some(found.clone());
     }
     look.read_messages();
-    found.watched = look
-        .heard
-        .observed_answers(|stamp| feed.input_with_stamp(stamp));
+    found.watched = look.heard.observed_answers(|stamp| feed.input_with_stamp(stamp));
     incomplete::add_warnings(&mut found, options, &mut feed);
     found.warnings.extend(idle);
     found.warnings.splice(..0, look.warnings);
@@ -322,19 +308,12 @@ async fn load_components(
     registry: &Registry,
     options: &ProbeOptions,
 ) -> Result<Vec<String>, ProbeError> {
-    let loading = options
-        .components
-        .iter()
-        .map(|(name, components)| async move {
-            let no_definition = |problem| ProbeError::NoDefinition {
-                what: format!("container {name}"),
-                problem,
-            };
-            let container =
-                ComponentContainer::new(Arc::clone(bus), registry, name).map_err(no_definition)?;
-            let loaded = container.load_all(components, options.patience).await;
-            loaded.map_err(ProbeError::from)
-        });
+    let loading = options.components.iter().map(|(name, components)| async move {
+        let no_definition = |problem| ProbeError::NoDefinition { what: format!("container {name}"), problem };
+        let container = ComponentContainer::new(Arc::clone(bus), registry, name).map_err(no_definition)?;
+        let loaded = container.load_all(components, options.patience).await;
+        loaded.map_err(ProbeError::from)
+    });
     let loaded = futures_util::future::try_join_all(loading).await?;
     let names = loaded.into_iter().flatten();
     // Other implementations of containers may not return the names.
@@ -396,17 +375,11 @@ impl ProbeRun<'_> {
             }
             let asked = Instant::now();
             for topic in &new {
-                match self
-                    .bus
-                    .subscribe(topic, WireType::any(), QosProfile::keep_last(KEPT))
-                    .await
-                {
+                match self.bus.subscribe(topic, WireType::any(), QosProfile::keep_last(KEPT)).await {
                     Ok(subscription) => {
                         self.subscriptions.insert(topic.clone(), subscription);
                     }
-                    Err(error) => self
-                        .warnings
-                        .push(format!("{topic} cannot be subscribed to: {error}")),
+                    Err(error) => self.warnings.push(format!("{topic} cannot be subscribed to: {error}")),
                 }
             }
             // A publisher that answers this has processed the connection; its reaction takes about as long as the
@@ -415,10 +388,7 @@ impl ProbeRun<'_> {
                 let _ = self.bus.topic_type(topic).await;
             }
             let settle = (asked.elapsed() * 2).clamp(self.options.settle, self.options.restless);
-            let options = ProbeOptions {
-                settle,
-                ..self.options.clone()
-            };
+            let options = ProbeOptions { settle, ..self.options.clone() };
             settle::wait_until_still(&mut self.watch, &options).await?;
         }
     }
@@ -448,23 +418,16 @@ impl ProbeRun<'_> {
 
 /// Returns the topics that the package publishes.
 fn outputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    topics_where(graph, |topic| {
-        topic.publishers.iter().any(|node| node != own)
-    })
+    topics_where(graph, |topic| topic.publishers.iter().any(|node| node != own))
 }
 
 /// Returns the topics that the package subscribes to.
 fn inputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    topics_where(graph, |topic| {
-        topic.subscribers.iter().any(|node| node != own)
-    })
+    topics_where(graph, |topic| topic.subscribers.iter().any(|node| node != own))
 }
 
 fn topics_where(graph: &Graph, pick: impl Fn(&TopicNodes) -> bool) -> BTreeSet<String> {
-    let topics = graph
-        .topics
-        .iter()
-        .filter(|(name, topic)| !plumbing::is_builtin_topic(graph, name) && pick(topic));
+    let topics = graph.topics.iter().filter(|(name, topic)| !plumbing::is_builtin_topic(graph, name) && pick(topic));
     topics.map(|(name, _)| name.clone()).collect()
 }
 

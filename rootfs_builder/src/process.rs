@@ -30,11 +30,7 @@ impl LastLines {
 
     /// Returns the lines, joined by newlines.
     pub(crate) fn text(&self) -> String {
-        self.0
-            .iter()
-            .map(String::as_str)
-            .collect::<Vec<_>>()
-            .join("\n")
+        self.0.iter().map(String::as_str).collect::<Vec<_>>().join("\n")
     }
 }
 
@@ -133,11 +129,7 @@ impl ProcessExit {
         if self.status.success() {
             return Ok(());
         }
-        Err(exit_error(
-            program,
-            &self.status.to_string(),
-            self.tail.text(),
-        ))
+        Err(exit_error(program, &self.status.to_string(), self.tail.text()))
     }
 }
 
@@ -148,9 +140,7 @@ async fn run_to_end(
 ) -> Result<ProcessExit, Error> {
     let program = command.as_std().get_program().to_owned();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
-    let mut child = command
-        .spawn()
-        .map_err(|error| spawn_error(&program, package, error))?;
+    let mut child = command.spawn().map_err(|error| spawn_error(&program, package, error))?;
     let id = child.id().and_then(|id| i32::try_from(id).ok());
     let mut group = ProcessGroup(id.map(Pid::from_raw));
     // If it is a pipe, it stays open until the program has ended; `wait` alone would close it.
@@ -170,10 +160,7 @@ async fn run_to_end(
             on_line(stream, &line);
         }
     }
-    let status = child
-        .wait()
-        .await
-        .map_err(|error| spawn_error(&program, package, error))?;
+    let status = child.wait().await.map_err(|error| spawn_error(&program, package, error))?;
     group.0 = None;
     Ok(ProcessExit { status, tail })
 }
@@ -207,11 +194,7 @@ fn exit_error(program: &OsStr, status: &str, last_lines: String) -> Error {
             what: format!("running {}", program.to_string_lossy()),
         };
     }
-    Error::Program {
-        program: program.to_string_lossy().into_owned(),
-        status: status.to_owned(),
-        last_lines,
-    }
+    Error::Program { program: program.to_string_lossy().into_owned(), status: status.to_owned(), last_lines }
 }
 
 fn spawn_error(program: &OsStr, package: &'static str, error: std::io::Error) -> Error {
@@ -241,10 +224,7 @@ struct StreamLines<R> {
 
 impl<R: AsyncRead + AsyncBufReadExt + Unpin> StreamLines<R> {
     fn new(reader: Option<R>) -> Self {
-        Self {
-            reader,
-            buffer: Vec::new(),
-        }
+        Self { reader, buffer: Vec::new() }
     }
 
     fn is_open(&self) -> bool {
@@ -261,9 +241,7 @@ impl<R: AsyncRead + AsyncBufReadExt + Unpin> StreamLines<R> {
         if self.buffer.is_empty() {
             return None;
         }
-        let line = String::from_utf8_lossy(&self.buffer)
-            .trim_end_matches(['\n', '\r'])
-            .to_owned();
+        let line = String::from_utf8_lossy(&self.buffer).trim_end_matches(['\n', '\r']).to_owned();
         self.buffer.clear();
         Some(line)
     }
@@ -285,18 +263,13 @@ mod tests {
     #[tokio::test]
     async fn lines_of_both_streams_come_and_the_last_are_kept() {
         let mut seen = Vec::new();
-        let error = run(shell("echo a; echo b >&2; exit 3"), "dash", |_, line| {
-            seen.push(line.to_owned())
-        })
-        .await
-        .expect_err("status 3");
+        let error = run(shell("echo a; echo b >&2; exit 3"), "dash", |_, line| seen.push(line.to_owned()))
+            .await
+            .expect_err("status 3");
         seen.sort();
         assert_eq!(seen, ["a", "b"]);
         let text = error.to_string();
-        assert!(
-            text.contains("sh failed (exit status: 3)") && text.contains('b'),
-            "{text}"
-        );
+        assert!(text.contains("sh failed (exit status: 3)") && text.contains('b'), "{text}");
     }
 
     #[tokio::test]
@@ -315,11 +288,7 @@ mod tests {
         });
         open.await.expect("the grandchild runs");
         running.abort();
-        assert_eq!(
-            reading.await.expect("no panic"),
-            0,
-            "the other end is closed"
-        );
+        assert_eq!(reading.await.expect("no panic"), 0, "the other end is closed");
     }
 
     /// Starts a script that mounts; its last command opens `pipe` for writing.
@@ -417,12 +386,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_full_disk_is_seen_in_a_programs_words() {
-        let error = output(
-            shell("echo 'x: No space left on device' >&2; exit 1"),
-            "dash",
-        )
-        .await
-        .expect_err("failed");
+        let error = output(shell("echo 'x: No space left on device' >&2; exit 1"), "dash").await.expect_err("failed");
         assert!(matches!(error, Error::DiskFull { .. }), "{error}");
     }
 }

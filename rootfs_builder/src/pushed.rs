@@ -48,20 +48,11 @@ pub(crate) fn required_keys(packages: &[Package]) -> RequiredKeys {
     let mut asked = RequiredKeys::default();
     for external in workspace::external_dependencies(packages) {
         let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
-        if needs(&[
-            Kind::Buildtool,
-            Kind::BuildtoolExport,
-            Kind::Build,
-            Kind::BuildExport,
-        ]) {
-            asked
-                .build
-                .insert(external.name.clone(), external.needed_by.clone());
+        if needs(&[Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport]) {
+            asked.build.insert(external.name.clone(), external.needed_by.clone());
         }
         if needs(&[Kind::Exec]) {
-            asked
-                .run
-                .insert(external.name.clone(), external.needed_by.clone());
+            asked.run.insert(external.name.clone(), external.needed_by.clone());
         }
     }
     asked
@@ -69,10 +60,7 @@ pub(crate) fn required_keys(packages: &[Package]) -> RequiredKeys {
 
 /// Returns the names of packages.
 pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
-    packages
-        .iter()
-        .map(|package| package.manifest.name.clone())
-        .collect()
+    packages.iter().map(|package| package.manifest.name.clone()).collect()
 }
 
 /// Sorts the names of packages by importance: first those that no other one needs; of several, the last in build order.
@@ -81,21 +69,11 @@ pub(crate) fn sort_by_importance(packages: &[Package]) -> Vec<String> {
         .iter()
         .rev()
         .filter(|package| !package.manifest.metapackage)
-        .chain(
-            packages
-                .iter()
-                .filter(|package| package.manifest.metapackage),
-        )
+        .chain(packages.iter().filter(|package| package.manifest.metapackage))
         .map(|package| package.manifest.name.clone())
         .collect();
     let needed = |name: &String| {
-        packages.iter().any(|package| {
-            package
-                .manifest
-                .dependencies
-                .iter()
-                .any(|need| need.name == *name)
-        })
+        packages.iter().any(|package| package.manifest.dependencies.iter().any(|need| need.name == *name))
     };
     // A stable sort keeps the order among equals.
     names.sort_by_key(needed);
@@ -113,14 +91,12 @@ pub(crate) fn main_package(packages: &[String], nodes: &[LaunchNode]) -> String 
 /// Returns the versions of packages, by name.
 pub(crate) fn versions(packages: &[Package]) -> BTreeMap<String, String> {
     let all = packages.iter().map(|package| &package.manifest);
-    all.map(|of| (of.name.clone(), of.version.clone()))
-        .collect()
+    all.map(|of| (of.name.clone(), of.version.clone())).collect()
 }
 
 /// Returns build tools that installed packages declare as `<depend>`, which are not needed at run time.
 pub(crate) fn build_tools(asked: &RequiredKeys) -> BTreeSet<String> {
-    let is_tool =
-        |name: &&String| name.starts_with("ament_cmake") || *name == "rosidl_default_generators";
+    let is_tool = |name: &&String| name.starts_with("ament_cmake") || *name == "rosidl_default_generators";
     asked.run.keys().filter(is_tool).cloned().collect()
 }
 
@@ -129,13 +105,8 @@ pub(crate) fn build_tools(asked: &RequiredKeys) -> BTreeSet<String> {
 pub(crate) fn has_python(root: &Path) -> bool {
     let generated = |path: &Path| {
         let parent = path.parent().and_then(Path::file_name).unwrap_or_default();
-        let setup = path
-            .file_name()
-            .is_some_and(|name| name == "setup.py" || name == "_setup_util.py");
-        setup
-            || ["msg", "srv", "cfg", "test", "tests"]
-                .iter()
-                .any(|name| parent == *name)
+        let setup = path.file_name().is_some_and(|name| name == "setup.py" || name == "_setup_util.py");
+        setup || ["msg", "srv", "cfg", "test", "tests"].iter().any(|name| parent == *name)
     };
     let runs = |entry: &foreign::WalkEntry<'_>| {
         let extension = entry.path.extension().unwrap_or_default();
@@ -143,17 +114,9 @@ pub(crate) fn has_python(root: &Path) -> bool {
             return entry.stat.st_size > 0;
         }
         let mut start = [0; 64];
-        let read = entry
-            .open()
-            .map(|mut file| file.read(&mut start).unwrap_or(0))
-            .unwrap_or(0);
-        let first = start[..read]
-            .split(|byte| *byte == b'\n')
-            .next()
-            .unwrap_or_default();
-        extension != "cfg"
-            && first.starts_with(b"#!")
-            && first.windows(6).any(|word| word == b"python")
+        let read = entry.open().map(|mut file| file.read(&mut start).unwrap_or(0)).unwrap_or(0);
+        let first = start[..read].split(|byte| *byte == b'\n').next().unwrap_or_default();
+        extension != "cfg" && first.starts_with(b"#!") && first.windows(6).any(|word| word == b"python")
     };
     let mut found = false;
     // Unreadable files are reported by those who need them.
@@ -189,10 +152,7 @@ mod tests {
     #[test]
     fn the_package_that_nobody_needs_is_the_one_meant() {
         let (_root, pushed) = workspace(&[
-            (
-                "app",
-                "<depend>aa_msgs</depend><exec_depend>python3-numpy</exec_depend>",
-            ),
+            ("app", "<depend>aa_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
             ("aa_msgs", "<depend>std_msgs</depend>"),
         ]);
         assert_eq!(sort_by_importance(pushed.packages()), ["app", "aa_msgs"]);
@@ -216,10 +176,7 @@ mod tests {
             required: false,
             named: true,
         };
-        assert_eq!(
-            main_package(&packages, &[node("driver"), node("app")]),
-            "app"
-        );
+        assert_eq!(main_package(&packages, &[node("driver"), node("app")]), "app");
         assert_eq!(main_package(&packages, &[node("of_debian")]), "tools");
         assert_eq!(main_package(&[], &[node("app")]), "");
     }
@@ -238,24 +195,12 @@ mod tests {
     #[test]
     fn needs_are_sorted_by_when_they_matter() {
         let (_root, pushed) = workspace(&[
-            (
-                "app",
-                "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>",
-            ),
-            (
-                "app_msgs",
-                "<build_depend>message_generation</build_depend><depend>std_msgs</depend>",
-            ),
+            ("app", "<depend>app_msgs</depend><exec_depend>python3-numpy</exec_depend>"),
+            ("app_msgs", "<build_depend>message_generation</build_depend><depend>std_msgs</depend>"),
         ]);
         let asked = required_keys(pushed.packages());
-        assert_eq!(
-            asked.build.keys().collect::<Vec<_>>(),
-            ["message_generation", "std_msgs"]
-        );
-        assert_eq!(
-            asked.run.keys().collect::<Vec<_>>(),
-            ["python3-numpy", "std_msgs"]
-        );
+        assert_eq!(asked.build.keys().collect::<Vec<_>>(), ["message_generation", "std_msgs"]);
+        assert_eq!(asked.run.keys().collect::<Vec<_>>(), ["python3-numpy", "std_msgs"]);
         assert!(asked.run["std_msgs"].contains("app_msgs"));
     }
 
@@ -271,9 +216,7 @@ mod tests {
         .expect("written");
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let error = inspect_pushed(root.path(), &base)
-            .expect_err("ROS 2")
-            .to_string();
+        let error = inspect_pushed(root.path(), &base).expect_err("ROS 2").to_string();
         assert!(error.contains("build type ament_cmake"), "{error}");
     }
 

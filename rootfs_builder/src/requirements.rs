@@ -38,19 +38,13 @@ impl Requirements {
             if whole.is_empty() || whole.starts_with('#') {
                 continue;
             }
-            let at = |problem| RequirementsError {
-                line: index + 1,
-                problem,
-            };
+            let at = |problem| RequirementsError { line: index + 1, problem };
             let (name, one) = PinnedPackage::parse(&whole).map_err(at)?;
             if pinned.insert(name.clone(), one).is_some() {
                 return Err(at(RequirementProblem::Repeated(name)));
             }
         }
-        Ok(Self {
-            text: text.to_owned(),
-            pinned,
-        })
+        Ok(Self { text: text.to_owned(), pinned })
     }
 
     /// Returns the text, for pip.
@@ -123,9 +117,7 @@ impl PinnedPackage {
 fn parse_wheel_name(file: &str) -> Option<(String, &str)> {
     let parts: Vec<&str> = file.strip_suffix(".whl")?.split('-').collect();
     match *parts {
-        [name, version, _, _, _] | [name, version, _, _, _, _] => {
-            Some((normalize_name(name), version))
-        }
+        [name, version, _, _, _] | [name, version, _, _, _, _] => Some((normalize_name(name), version)),
         _ => None,
     }
 }
@@ -147,11 +139,7 @@ mod tests {
 
     #[test]
     fn files_are_known_by_name_version_and_content() {
-        let text = format!(
-            "# a comment\n\n{}{}",
-            line("ros-std-msgs==5.3.6", b"one"),
-            line("PyYAML==6.0.3", b"two")
-        );
+        let text = format!("# a comment\n\n{}{}", line("ros-std-msgs==5.3.6", b"one"), line("PyYAML==6.0.3", b"two"));
         let asked = Requirements::parse(&text).expect("valid");
         assert_eq!(asked.len(), 2);
         let file = "ros_std_msgs-5.3.6-cp311-cp311-manylinux_2_28_x86_64.whl";
@@ -170,10 +158,7 @@ mod tests {
     fn the_key_is_of_what_is_asked_for() {
         let (one, two) = (line("a==1", b"x"), line("b==1", b"y"));
         let key = |text: &str| Requirements::parse(text).expect("valid").key();
-        assert_eq!(
-            key(&format!("{one}{two}")),
-            key(&format!("# z\n{two}{one}"))
-        );
+        assert_eq!(key(&format!("{one}{two}")), key(&format!("# z\n{two}{one}")));
         assert_ne!(key(&one), key(&two));
         assert_ne!(key(&one), key(&line("a==2", b"x")));
         assert_ne!(key(&one), key(&line("a==1", b"y")));
@@ -183,27 +168,18 @@ mod tests {
     fn addresses_and_what_is_not_pinned_are_refused_with_their_line() {
         let good = line("a==1", b"x");
         for (bad, words) in [
-            (
-                "--index-url https://example.invalid/simple",
-                "NAME==VERSION",
-            ),
+            ("--index-url https://example.invalid/simple", "NAME==VERSION"),
             ("a @ https://example.invalid/a.whl", "NAME==VERSION"),
             ("b>=1", "NAME==VERSION"),
             ("b==1", "has no --hash"),
             ("b==1 --hash=md5:abc", "--hash=sha256"),
             ("b==1 ; python_version > '3'", "--hash=sha256"),
             ("-r other.txt", "NAME==VERSION"),
-            (
-                "a==2 --hash=sha256:0000000000000000000000000000000000000000000000000000000000000000",
-                "twice",
-            ),
+            ("a==2 --hash=sha256:0000000000000000000000000000000000000000000000000000000000000000", "twice"),
         ] {
             let text = format!("{good}{bad}\n");
             let problem = Requirements::parse(&text).expect_err(bad).to_string();
-            assert!(
-                problem.starts_with("line 3: ") && problem.contains(words),
-                "{bad}: {problem}"
-            );
+            assert!(problem.starts_with("line 3: ") && problem.contains(words), "{bad}: {problem}");
         }
     }
 }

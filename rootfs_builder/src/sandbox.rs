@@ -75,11 +75,7 @@ impl RunResult {
         } else {
             return text;
         };
-        if text.is_empty() {
-            about
-        } else {
-            format!("{text}\n{about}")
-        }
+        if text.is_empty() { about } else { format!("{text}\n{about}") }
     }
 }
 
@@ -97,14 +93,7 @@ impl BuildSite {
         fs::create_dir_all(&directory).io_context("making", &directory)?;
         // Files that are readable in the container must not be readable for others on the host.
         crate::modes::set_mode(&directory, 0o700)?;
-        Ok(Self {
-            id: id.to_owned(),
-            directory,
-            sandbox,
-            limits,
-            removals,
-            running: Arc::default(),
-        })
+        Ok(Self { id: id.to_owned(), directory, sandbox, limits, removals, running: Arc::default() })
     }
 
     /// Creates a directory below the build's own.
@@ -128,11 +117,7 @@ impl BuildSite {
     }
 
     /// Runs a program to its end; each line of its output is passed to `on_line`.
-    pub(crate) async fn run(
-        &self,
-        run: SandboxRun,
-        mut on_line: impl FnMut(&str),
-    ) -> Result<RunResult, Error> {
+    pub(crate) async fn run(&self, run: SandboxRun, mut on_line: impl FnMut(&str)) -> Result<RunResult, Error> {
         let spec = ContainerSpec {
             id: format!("{}-{}", self.id, run.name),
             layers: run.layers,
@@ -158,34 +143,17 @@ impl BuildSite {
         let (result, finished) = oneshot::channel();
         // Held by this future only: when it is dropped, the task below notices and ends the container.
         let (_alive, cancelled) = oneshot::channel::<()>();
-        let task = tokio::spawn(run_to_end(
-            self.sandbox.clone(),
-            spec,
-            run.name,
-            line,
-            cancelled,
-            result,
-        ));
-        self.running
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(task);
+        let task = tokio::spawn(run_to_end(self.sandbox.clone(), spec, run.name, line, cancelled, result));
+        self.running.lock().unwrap_or_else(PoisonError::into_inner).push(task);
         let mut tail = LastLines::default();
         while let Some(line) = lines.recv().await {
             tail.push(&line);
             on_line(&line);
         }
         match finished.await {
-            Ok(Ok((exit, uid_offset))) => Ok(RunResult {
-                exit,
-                uid_offset,
-                tail,
-            }),
+            Ok(Ok((exit, uid_offset))) => Ok(RunResult { exit, uid_offset, tail }),
             Ok(Err(error)) => Err(error.into()),
-            Err(_) => Err(Error::Inside {
-                what: "the sandbox",
-                last_lines: tail.text(),
-            }),
+            Err(_) => Err(Error::Inside { what: "the sandbox", last_lines: tail.text() }),
         }
     }
 }
@@ -201,10 +169,7 @@ async fn run_to_end(
     result: oneshot::Sender<Outcome>,
 ) {
     // The start is not interrupted: a half-started container has no handle to end it by.
-    let SandboxContainer {
-        servant,
-        uid_offset,
-    } = match sandbox.start_sandbox(spec).await {
+    let SandboxContainer { servant, uid_offset } = match sandbox.start_sandbox(spec).await {
         Ok(sandboxed) => sandboxed,
         Err(error) => {
             let _ = result.send(Err(error));
@@ -243,12 +208,8 @@ pub(crate) fn default_limits() -> Limits {
 
 impl Drop for BuildSite {
     fn drop(&mut self) {
-        let running =
-            std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));
-        let (id, directory) = (
-            std::mem::take(&mut self.id),
-            std::mem::take(&mut self.directory),
-        );
+        let running = std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));
+        let (id, directory) = (std::mem::take(&mut self.id), std::mem::take(&mut self.directory));
         self.removals.start(id, running, directory);
     }
 }

@@ -36,18 +36,11 @@ pub(crate) fn seal(root: &Path) -> Result<(), Error> {
 /// Sets all times to the same value, and permissions that depend on "executable" only. Files generated during the build
 /// get later times, so that tools which compare times treat them as newer.
 fn normalize_metadata(root: &Path) -> Result<(), Error> {
-    let moment = Timespec {
-        tv_sec: EPOCH as i64,
-        tv_nsec: 0,
-    };
-    let times = Timestamps {
-        last_access: moment,
-        last_modification: moment,
-    };
+    let moment = Timespec { tv_sec: EPOCH as i64, tv_nsec: 0 };
+    let times = Timestamps { last_access: moment, last_modification: moment };
     foreign::walk(root, |entry| {
         let (parent, name) = entry.parent_and_name();
-        let failed =
-            |error: rustix::io::Errno| Error::io("sealing", entry.display_path(), error.into());
+        let failed = |error: rustix::io::Errno| Error::io("sealing", entry.display_path(), error.into());
         let mode = entry.stat.st_mode;
         match entry.kind() {
             FileType::Symlink => {}
@@ -56,13 +49,7 @@ fn normalize_metadata(root: &Path) -> Result<(), Error> {
                 let wanted = if runs { 0o755 } else { 0o644 };
                 if mode & 0o7777 != wanted {
                     // On a link this would change its target; it is not a link, and nobody else changes this tree.
-                    rustix::fs::chmodat(
-                        parent,
-                        name,
-                        Mode::from_raw_mode(wanted),
-                        AtFlags::empty(),
-                    )
-                    .map_err(failed)?;
+                    rustix::fs::chmodat(parent, name, Mode::from_raw_mode(wanted), AtFlags::empty()).map_err(failed)?;
                 }
             }
         }
@@ -95,12 +82,7 @@ mod tests {
                 FileType::Symlink => format!("{:?}", entry.read_link().expect("a link")),
                 _ => String::new(),
             };
-            all.push(format!(
-                "{} {:o} {} {content}",
-                entry.path.display(),
-                entry.stat.st_mode,
-                entry.stat.st_mtime
-            ));
+            all.push(format!("{} {:o} {} {content}", entry.path.display(), entry.stat.st_mode, entry.stat.st_mtime));
             Ok::<_, foreign::Error>(Visit::Into)
         })
         .expect("walked");
@@ -119,9 +101,7 @@ mod tests {
         let file = inside("src/p/CMakeLists.txt");
         fs::set_permissions(&file, fs::Permissions::from_mode(0o606)).expect("set");
         let opened = fs::File::options().write(true).open(&file).expect("opened");
-        opened
-            .set_modified(std::time::UNIX_EPOCH)
-            .expect("another time");
+        opened.set_modified(std::time::UNIX_EPOCH).expect("another time");
         for root in [clean.path(), poisoned.path()] {
             seal(root).expect("sealed");
         }
@@ -138,10 +118,7 @@ mod tests {
         // Not sealed here: whatever is not removed is part of the key anyway.
         fs::create_dir(other.path().join(".git")).expect("made");
         fs::write(other.path().join(".git/config"), "x").expect("written");
-        assert_ne!(
-            key::hash_sources(clean.path()).expect("hashed"),
-            key::hash_sources(other.path()).expect("hashed")
-        );
+        assert_ne!(key::hash_sources(clean.path()).expect("hashed"), key::hash_sources(other.path()).expect("hashed"));
     }
 
     #[test]

@@ -25,10 +25,7 @@ use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
 
 /// Compiles and packs the workspace.
 pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<BuildParts, Error> {
-    let (own, asked) = (
-        pushed::names(&workspace.packages),
-        pushed::required_keys(&workspace.packages),
-    );
+    let (own, asked) = (pushed::names(&workspace.packages), pushed::required_keys(&workspace.packages));
     let (packages, versions, python) = (
         pushed::sort_by_importance(&workspace.packages),
         pushed::versions(&workspace.packages),
@@ -39,14 +36,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
         build: build.indexed_packages(&tools).await?,
         run: build.indexed_packages(&build.base_diff_ids()).await?,
     };
-    let resolved = keys::resolve_keys(
-        &build.archive,
-        &build.base,
-        &build.request.map,
-        &own,
-        &asked,
-        &there,
-    )?;
+    let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
         build.progress.warn(warning.as_str()).await;
     }
@@ -54,37 +44,21 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
     let workspace = check_interfaces(build, workspace, &below).await?;
     let package = units::compile_workspace(build, workspace, below)
         .await
-        .map_err(|error| {
-            advice::add_advice(
-                error,
-                advice::AdviceIndex::for_base(&build.archive, &build.base),
-            )
-        })?;
+        .map_err(|error| advice::add_advice(error, advice::AdviceIndex::for_base(&build.archive, &build.base)))?;
     let needed = needed_libraries(build, &package).await?;
     let dependencies = dependencies(build, &resolved, &needed, python).await?;
-    Ok(BuildParts {
-        packages,
-        versions,
-        dependencies,
-        package,
-        prefix: Some(build.base.build.prefix.clone()),
-    })
+    Ok(BuildParts { packages, versions, dependencies, package, prefix: Some(build.base.build.prefix.clone()) })
 }
 
 /// Returns the layers of base and toolchain.
 async fn toolchain(build: &Build<'_>) -> Result<Vec<Digest>, Error> {
     let mut below = build.base_diff_ids();
     let toolchain = build.base.build.packages.iter().cloned().collect();
-    let toolchain = build
-        .add_packages("toolchain", &below, &toolchain, Vec::new())
-        .await?;
+    let toolchain = build.add_packages("toolchain", &below, &toolchain, Vec::new()).await?;
     below.extend(toolchain.diff_ids());
     let tools = wheels::add_build_wheels(&build.shop, &build.base, &below, build.progress).await?;
     below.extend(tools.diff_ids());
-    build
-        .shop
-        .layers
-        .write_note(&keep_note_key(&build.base.name), &below)?;
+    build.shop.layers.write_note(&keep_note_key(&build.base.name), &below)?;
     Ok(below)
 }
 
@@ -96,32 +70,21 @@ async fn build_dependencies(
 ) -> Result<Vec<Digest>, Error> {
     // Packages added by the deployer may be missing in package.xml for compiling as well as for running.
     let (ros, mut wanted) = build.extra_packages().await?;
-    wanted.extend(
-        ros.iter()
-            .flat_map(|name| build.archive.build_packages(name)),
-    );
+    wanted.extend(ros.iter().flat_map(|name| build.archive.build_packages(name)));
     wanted.extend(resolved.build.iter().cloned());
-    let more = build
-        .add_packages("build-dependencies", &below, &wanted, Vec::new())
-        .await?;
+    let more = build.add_packages("build-dependencies", &below, &wanted, Vec::new()).await?;
     below.extend(more.diff_ids());
     Ok(below)
 }
 
 /// Validates the interface files of ROS 2 packages before anything is compiled.
-async fn check_interfaces(
-    build: &Build<'_>,
-    workspace: Workspace,
-    below: &[Digest],
-) -> Result<Workspace, Error> {
+async fn check_interfaces(build: &Build<'_>, workspace: Workspace, below: &[Digest]) -> Result<Workspace, Error> {
     if build.base.ros == Version::Ros1 {
         return Ok(workspace);
     }
     let trees = build.shop.extract_layers(below).await?;
-    let shares: Vec<String> = indexed::install_prefixes(&build.base)
-        .iter()
-        .map(|prefix| format!("{prefix}/share"))
-        .collect();
+    let shares: Vec<String> =
+        indexed::install_prefixes(&build.base).iter().map(|prefix| format!("{prefix}/share")).collect();
     crate::blocking::spawn_reader(move || {
         let known = package::definitions::read(&trees, &shares)?;
         package::interfaces::check(&workspace, &known)?;
@@ -131,10 +94,7 @@ async fn check_interfaces(
 }
 
 /// Returns the libraries that a package layer needs from elsewhere.
-pub(crate) async fn needed_libraries(
-    build: &Build<'_>,
-    package: &LayerSet,
-) -> Result<BTreeSet<String>, Error> {
+pub(crate) async fn needed_libraries(build: &Build<'_>, package: &LayerSet) -> Result<BTreeSet<String>, Error> {
     let layers: Vec<Digest> = package.diff_ids().collect();
     let trees = build.shop.extract_layers(&layers).await?;
     crate::blocking::spawn_reader(move || {
@@ -168,19 +128,14 @@ pub(crate) async fn dependencies(
     libraries.retain(|name| !has_library(&trees, &own, name));
     let (found, missing) = build.archive.libraries(&libraries);
     debs.extend(found.into_values());
-    let made = build
-        .add_packages("dependencies", &below, &debs, wanted.extras)
-        .await?;
+    let made = build.add_packages("dependencies", &below, &debs, wanted.extras).await?;
     let all: Vec<Digest> = below.into_iter().chain(made.diff_ids()).collect();
     let trees = build.shop.extract_layers(&all).await?;
     for name in missing {
         // Not in the index, but perhaps in an image: a link created by a package's script.
-        if !has_library(&trees, &system_library_directories(), &name)
-            && !has_library(&trees, &own, &name)
-        {
-            let text = format!(
-                "no package holds the library {name}, which the package needs; a node may fail to start"
-            );
+        if !has_library(&trees, &system_library_directories(), &name) && !has_library(&trees, &own, &name) {
+            let text =
+                format!("no package holds the library {name}, which the package needs; a node may fail to start");
             build.progress.warn(text).await;
         }
     }
@@ -190,19 +145,9 @@ pub(crate) async fn dependencies(
 /// Returns the library directories of a distribution.
 fn system_library_directories() -> [String; 5] {
     let triplet = crate::contents::triplet();
-    [
-        format!("usr/lib/{triplet}"),
-        "usr/lib".into(),
-        format!("lib/{triplet}"),
-        "lib64".into(),
-        "lib".into(),
-    ]
+    [format!("usr/lib/{triplet}"), "usr/lib".into(), format!("lib/{triplet}"), "lib64".into(), "lib".into()]
 }
 
 fn has_library(trees: &[PathBuf], places: &[String], name: &str) -> bool {
-    trees.iter().any(|tree| {
-        places
-            .iter()
-            .any(|place| tree.join(place).join(name).symlink_metadata().is_ok())
-    })
+    trees.iter().any(|tree| places.iter().any(|place| tree.join(place).join(name).symlink_metadata().is_ok()))
 }

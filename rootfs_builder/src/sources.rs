@@ -10,20 +10,12 @@ use crate::error::{Error, IoContext};
 use crate::process;
 
 /// Returns the sources.list for a base.
-pub(crate) async fn source_lines(
-    sources: &Sources,
-    base: &Base,
-    scratch: &Path,
-) -> Result<String, Error> {
+pub(crate) async fn source_lines(sources: &Sources, base: &Base, scratch: &Path) -> Result<String, Error> {
     if let Some(lines) = sources.0.get(&base.name) {
         return Ok(lines.join("\n") + "\n");
     }
     let own = host_sources(Path::new("/etc/apt"), &base.suite)?;
-    if own.is_empty() {
-        mmdebstrap_default_sources(&base.suite, scratch).await
-    } else {
-        Ok(own)
-    }
+    if own.is_empty() { mmdebstrap_default_sources(&base.suite, scratch).await } else { Ok(own) }
 }
 
 /// Returns the host's apt sources of this release (and its updates and security), as one-line entries. Empty if the
@@ -31,12 +23,8 @@ pub(crate) async fn source_lines(
 fn host_sources(etc: &Path, suite: &str) -> Result<String, Error> {
     let mut files = vec![etc.join("sources.list")];
     let parts = etc.join("sources.list.d");
-    let mut more: Vec<PathBuf> = fs::read_dir(&parts)
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.path())
-        .collect();
+    let mut more: Vec<PathBuf> =
+        fs::read_dir(&parts).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
     more.sort();
     files.extend(more);
     let mut lines = Vec::new();
@@ -44,35 +32,19 @@ fn host_sources(etc: &Path, suite: &str) -> Result<String, Error> {
         let of_kind = |kind: &str| file.extension().is_some_and(|extension| extension == kind);
         if of_kind("sources") {
             let text = fs::read_to_string(file).io_context("reading", file)?;
-            lines.extend(
-                text.split("\n\n")
-                    .flat_map(|stanza| stanza_lines(stanza, suite)),
-            );
+            lines.extend(text.split("\n\n").flat_map(|stanza| stanza_lines(stanza, suite)));
         } else if of_kind("list") {
             let text = fs::read_to_string(file).io_context("reading", file)?;
-            lines.extend(
-                text.lines()
-                    .filter(|line| is_entry_of_suite(line, suite))
-                    .map(|line| line.trim().to_owned()),
-            );
+            lines.extend(text.lines().filter(|line| is_entry_of_suite(line, suite)).map(|line| line.trim().to_owned()));
         }
     }
     // Updates alone are not sufficient: the release itself must be included.
-    let release = lines
-        .iter()
-        .any(|line| line.split_whitespace().any(|word| word == suite));
-    Ok(if release {
-        lines.join("\n") + "\n"
-    } else {
-        String::new()
-    })
+    let release = lines.iter().any(|line| line.split_whitespace().any(|word| word == suite));
+    Ok(if release { lines.join("\n") + "\n" } else { String::new() })
 }
 
 fn is_suite_word(word: &str, suite: &str) -> bool {
-    word == suite
-        || word
-            .strip_prefix(suite)
-            .is_some_and(|rest| rest.starts_with(['-', '/']))
+    word == suite || word.strip_prefix(suite).is_some_and(|rest| rest.starts_with(['-', '/']))
 }
 
 /// Returns whether an entry `deb [options] URI SUITE COMPONENT…` is of this release.
@@ -85,9 +57,7 @@ fn is_entry_of_suite(line: &str, suite: &str) -> bool {
         Some(options) => options.split_once(']').map_or("", |(_, rest)| rest),
         None => rest,
     };
-    rest.split_whitespace()
-        .nth(1)
-        .is_some_and(|word| is_suite_word(word, suite))
+    rest.split_whitespace().nth(1).is_some_and(|word| is_suite_word(word, suite))
 }
 
 /// Converts a deb822 stanza to one-line entries (sources.list(5)).
@@ -96,20 +66,10 @@ fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
         let mut lines = stanza
             .lines()
             .filter(|line| !line.starts_with('#'))
-            .skip_while(|line| {
-                !line
-                    .split_once(':')
-                    .is_some_and(|(key, _)| key.trim().eq_ignore_ascii_case(name))
-            });
-        let first = lines
-            .next()
-            .and_then(|line| line.split_once(':'))
-            .map_or("", |(_, value)| value.trim());
+            .skip_while(|line| !line.split_once(':').is_some_and(|(key, _)| key.trim().eq_ignore_ascii_case(name)));
+        let first = lines.next().and_then(|line| line.split_once(':')).map_or("", |(_, value)| value.trim());
         let more = lines.take_while(|line| line.starts_with([' ', '\t']));
-        std::iter::once(first)
-            .chain(more)
-            .collect::<Vec<_>>()
-            .join(" ")
+        std::iter::once(first).chain(more).collect::<Vec<_>>().join(" ")
     };
     let enabled = !field("Enabled").trim().eq_ignore_ascii_case("no");
     if !enabled || !field("Types").split_whitespace().any(|kind| kind == "deb") {
@@ -119,39 +79,19 @@ fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
     let signed_by = field("Signed-By");
     // A key may also be embedded in the file; one-line entries cannot express that.
     if signed_by.trim_start().starts_with('/') {
-        options.push(format!(
-            "signed-by={}",
-            signed_by.split_whitespace().collect::<Vec<_>>().join(",")
-        ));
+        options.push(format!("signed-by={}", signed_by.split_whitespace().collect::<Vec<_>>().join(",")));
     }
     let architectures = field("Architectures");
     if !architectures.trim().is_empty() {
-        options.push(format!(
-            "arch={}",
-            architectures
-                .split_whitespace()
-                .collect::<Vec<_>>()
-                .join(",")
-        ));
+        options.push(format!("arch={}", architectures.split_whitespace().collect::<Vec<_>>().join(",")));
     }
-    let options = if options.is_empty() {
-        String::new()
-    } else {
-        format!("[{}] ", options.join(" "))
-    };
+    let options = if options.is_empty() { String::new() } else { format!("[{}] ", options.join(" ")) };
     let (uris, suites, components) = (field("URIs"), field("Suites"), field("Components"));
     let components = components.split_whitespace().collect::<Vec<_>>().join(" ");
     let mut lines = Vec::new();
     for uri in uris.split_whitespace() {
-        for word in suites
-            .split_whitespace()
-            .filter(|word| is_suite_word(word, suite))
-        {
-            lines.push(
-                format!("deb {options}{uri} {word} {components}")
-                    .trim_end()
-                    .to_owned(),
-            );
+        for word in suites.split_whitespace().filter(|word| is_suite_word(word, suite)) {
+            lines.push(format!("deb {options}{uri} {word} {components}").trim_end().to_owned());
         }
     }
     lines
@@ -162,8 +102,7 @@ async fn mmdebstrap_default_sources(suite: &str, scratch: &Path) -> Result<Strin
     let target = tempfile::tempdir_in(scratch).io_context("creating a directory in", scratch)?;
     let list = target.path().join("sources.list");
     let mut ask = process::command("mmdebstrap");
-    ask.env("LIST", &list)
-        .args(["--mode=root", "--variant=custom", "--format=directory"]);
+    ask.env("LIST", &list).args(["--mode=root", "--variant=custom", "--format=directory"]);
     ask.arg("--setup-hook=cat \"$1/etc/apt/sources.list\" > \"$LIST\"; exit 1");
     ask.arg(suite).arg(target.path().join("root"));
     let result = process::run_in_namespaces(ask, "mmdebstrap", |_, _| {}).await;
@@ -201,11 +140,7 @@ mod tests {
              deb [arch=amd64 signed-by=/k] http://example.invalid/sec bookworm-security main\n",
         )
         .expect("written");
-        fs::write(
-            parts.join("gone.list.disabled"),
-            "deb http://example.invalid bookworm main\n",
-        )
-        .expect("written");
+        fs::write(parts.join("gone.list.disabled"), "deb http://example.invalid bookworm main\n").expect("written");
         let lines = host_sources(etc.path(), "bookworm").expect("read");
         assert_eq!(
             lines,

@@ -37,11 +37,7 @@ pub(crate) fn split(
             let is_late = match relations.get(name) {
                 None => true,
                 Some(about) => {
-                    of_ros(&about.source)
-                        || about
-                            .needs
-                            .iter()
-                            .any(|need| late_names.contains(need.as_str()))
+                    of_ros(&about.source) || about.needs.iter().any(|need| late_names.contains(need.as_str()))
                 }
             };
             if is_late {
@@ -56,10 +52,7 @@ pub(crate) fn split(
             break;
         }
     }
-    let (last, first): (Vec<Deb>, Vec<Deb>) = debs
-        .iter()
-        .cloned()
-        .partition(|deb| late.contains(deb.name.as_str()));
+    let (last, first): (Vec<Deb>, Vec<Deb>) = debs.iter().cloned().partition(|deb| late.contains(deb.name.as_str()));
     if !is_worth_splitting(debs.len()) || first.len() < FEW || last.is_empty() {
         (Vec::new(), debs.to_vec())
     } else {
@@ -72,11 +65,7 @@ mod tests {
     use super::*;
 
     fn deb(name: &str) -> Deb {
-        Deb {
-            name: name.to_owned(),
-            version: "1".into(),
-            architecture: "amd64".into(),
-        }
+        Deb { name: name.to_owned(), version: "1".into(), architecture: "amd64".into() }
     }
 
     /// Parses lines of `NAME SOURCE NEEDS… / PROVIDES…`.
@@ -86,10 +75,7 @@ mod tests {
         for line in lines {
             let (words, provides) = line.split_once('/').unwrap_or((line, ""));
             let mut words = words.split_whitespace().map(str::to_owned);
-            let (name, source) = (
-                words.next().expect("a name"),
-                words.next().expect("a source"),
-            );
+            let (name, source) = (words.next().expect("a name"), words.next().expect("a source"));
             debs.push(deb(&name));
             relations.insert(
                 name,
@@ -108,16 +94,8 @@ mod tests {
         debs.iter().map(|deb| deb.name.as_str()).collect()
     }
 
-    const LIBRARIES: [&str; 8] = [
-        "liba0 a",
-        "liba1 a liba0",
-        "liba2 a liba1",
-        "liba3 a",
-        "liba4 a",
-        "liba5 a",
-        "liba6 a",
-        "liba7 a",
-    ];
+    const LIBRARIES: [&str; 8] =
+        ["liba0 a", "liba1 a liba0", "liba2 a liba1", "liba3 a", "liba4 a", "liba5 a", "liba6 a", "liba7 a"];
 
     #[test]
     fn libraries_come_first_and_the_cut_is_closed() {
@@ -132,17 +110,10 @@ mod tests {
         let (debs, relations) = parse_packages(&lines);
         let (first, last) = split(&debs, &relations, |source| source.starts_with("ros-"));
         assert_eq!(first.len(), 8);
-        assert_eq!(
-            names(&last),
-            ["libcv-bridge1d", "tool", "plugin", "ros-image-proc"]
-        );
+        assert_eq!(names(&last), ["libcv-bridge1d", "tool", "plugin", "ros-image-proc"]);
         for deb in &first {
             let needs = &relations[&deb.name].needs;
-            assert!(
-                needs
-                    .iter()
-                    .all(|need| names(&first).contains(&need.as_str()))
-            );
+            assert!(needs.iter().all(|need| names(&first).contains(&need.as_str())));
         }
     }
 

@@ -17,20 +17,15 @@ pub(crate) struct InstallStep {
 
 /// Divides `debs`, given in the order of unpacking, into steps. The last one has nothing to configure, since all
 /// packages are configured then.
-pub(crate) fn plan_steps(
-    debs: &[Deb],
-    relations: &BTreeMap<String, Relations>,
-) -> Vec<InstallStep> {
+pub(crate) fn plan_steps(debs: &[Deb], relations: &BTreeMap<String, Relations>) -> Vec<InstallStep> {
     let mut steps = vec![InstallStep::default()];
     // Packages that are unpacked and perhaps not configured, by each of their names.
     let mut waiting: BTreeMap<&str, &str> = BTreeMap::new();
     for deb in debs {
         let about = relations.get(&deb.name);
         let before = about.into_iter().flat_map(|about| &about.before);
-        let needed: BTreeSet<String> = before
-            .filter_map(|name| waiting.get(name.as_str()))
-            .map(|&name| name.to_owned())
-            .collect();
+        let needed: BTreeSet<String> =
+            before.filter_map(|name| waiting.get(name.as_str())).map(|&name| name.to_owned()).collect();
         if !needed.is_empty() {
             waiting.retain(|_, name| !needed.contains(*name));
             if let Some(last) = steps.last_mut() {
@@ -56,9 +51,8 @@ pub(crate) fn script_files(steps: &[InstallStep], files: &[String]) -> BTreeMap<
     for (number, step) in steps.iter().enumerate() {
         let (now, later) = rest.split_at(step.unpack.min(rest.len()));
         rest = later;
-        let lines = |lines: &mut dyn Iterator<Item = &String>| -> String {
-            lines.map(|line| format!("{line}\n")).collect()
-        };
+        let lines =
+            |lines: &mut dyn Iterator<Item = &String>| -> String { lines.map(|line| format!("{line}\n")).collect() };
         written.insert(format!("{number:04}.unpack"), lines(&mut now.iter()));
         let configure = lines(&mut step.configure.iter());
         written.insert(format!("{number:04}.configure"), configure);
@@ -75,21 +69,13 @@ mod tests {
     use super::*;
 
     fn deb(name: &str) -> Deb {
-        Deb {
-            name: name.to_owned(),
-            version: "1".into(),
-            architecture: "all".into(),
-        }
+        Deb { name: name.to_owned(), version: "1".into(), architecture: "all".into() }
     }
 
     fn relations(all: &[(&str, &[&str], &[&str])]) -> BTreeMap<String, Relations> {
         let names = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
         let about = |&(name, before, provides): &(&str, &[&str], &[&str])| {
-            let about = Relations {
-                before: names(before),
-                provides: names(provides),
-                ..Relations::default()
-            };
+            let about = Relations { before: names(before), provides: names(provides), ..Relations::default() };
             (name.to_owned(), about)
         };
         all.iter().map(about).collect()
@@ -104,11 +90,7 @@ mod tests {
         };
         assert_eq!(plan_steps(&debs, &relations(&[])), [step(4, &[])]);
         // Installed packages need no step, and packages are configured only once.
-        let all = relations(&[
-            ("b", &[], &["virtual"]),
-            ("c", &["virtual", "libc6"], &[]),
-            ("d", &["b"], &[]),
-        ]);
+        let all = relations(&[("b", &[], &["virtual"]), ("c", &["virtual", "libc6"], &[]), ("d", &["b"], &[])]);
         assert_eq!(plan_steps(&debs, &all), [step(2, &["b"]), step(2, &[])]);
     }
 
@@ -148,12 +130,9 @@ mod tests {
         for (name, text) in script_files(&plan_steps(&debs, &all), &files) {
             fs::write(given.join("steps").join(name), text).expect("written");
         }
-        let script = include_str!("inside/install.sh")
-            .replace("/cloudroid/", &format!("{}/", given.display()));
+        let script = include_str!("inside/install.sh").replace("/cloudroid/", &format!("{}/", given.display()));
         let mut run = Command::new("/bin/sh");
-        run.args(["-c", &script])
-            .env("DPKG_ROOT", &root)
-            .env("DPKG_FORCE", "not-root");
+        run.args(["-c", &script]).env("DPKG_ROOT", &root).env("DPKG_FORCE", "not-root");
         let said = run.output().expect("run");
         assert!(said.status.success(), "{said:?}");
         let status = fs::read_to_string(root.join("var/lib/dpkg/status")).expect("there");

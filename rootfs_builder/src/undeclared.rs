@@ -18,19 +18,10 @@ const LIBRARIES: &str = "usr/lib";
 
 /// Returns advice for each missing module. `trees` are extracted layers, lowest first. Unreadable files are ignored.
 /// Blocking.
-pub(crate) fn missing_module_advice(
-    trees: &[PathBuf],
-    inventory: &Inventory,
-    known: AdviceIndex<'_>,
-) -> Vec<String> {
-    let trees: Vec<Tree> = trees
-        .iter()
-        .filter_map(|tree| Tree::open(tree).ok())
-        .collect();
+pub(crate) fn missing_module_advice(trees: &[PathBuf], inventory: &Inventory, known: AdviceIndex<'_>) -> Vec<String> {
+    let trees: Vec<Tree> = trees.iter().filter_map(|tree| Tree::open(tree).ok()).collect();
     let shared = inventory.prefixes.iter();
-    let mut shared: Vec<PathBuf> = shared
-        .map(|prefix| relative_to_root(prefix).join(MODULES))
-        .collect();
+    let mut shared: Vec<PathBuf> = shared.map(|prefix| relative_to_root(prefix).join(MODULES)).collect();
     shared.extend(trees.iter().flat_map(standard_library));
     let mut told = BTreeSet::new();
     for (name, path) in &inventory.programs {
@@ -68,17 +59,13 @@ fn standard_library(tree: &Tree) -> Vec<PathBuf> {
     };
     let names = libraries.names().unwrap_or_default().into_iter();
     let of_python = names.filter(|name| name.to_string_lossy().starts_with("python3."));
-    of_python
-        .map(|name| Path::new(LIBRARIES).join(name))
-        .collect()
+    of_python.map(|name| Path::new(LIBRARIES).join(name)).collect()
 }
 
 fn has_module(tree: &Tree, place: &Path, module: &str) -> bool {
     // A link points to something, and a directory without `__init__.py` is a Python package as well.
-    !matches!(
-        tree.open_directory(place.join(module)),
-        Ok(DirectoryLookup::Nothing)
-    ) || tree.has_file(place.join(format!("{module}.py")))
+    !matches!(tree.open_directory(place.join(module)), Ok(DirectoryLookup::Nothing))
+        || tree.has_file(place.join(format!("{module}.py")))
         || has_extension(tree, place, module)
 }
 
@@ -90,9 +77,7 @@ fn has_extension(tree: &Tree, place: &Path, module: &str) -> bool {
     let start = format!("{module}.");
     let is_library = |name: &str| name.starts_with(&start) && name.ends_with(".so");
     let names = directory.names().unwrap_or_default();
-    names
-        .iter()
-        .any(|name| name.to_str().is_some_and(is_library))
+    names.iter().any(|name| name.to_str().is_some_and(is_library))
 }
 
 #[cfg(test)]
@@ -109,10 +94,7 @@ mod tests {
                        import own.part, nobodys\ntry:\n    import scipy\nexcept ImportError:\n    pass\n";
         for (path, text) in [
             ("low/usr/lib/python3/dist-packages/rospy/__init__.py", ""),
-            (
-                "low/usr/lib/python3/dist-packages/yaml.cpython-311-x86_64-linux-gnu.so",
-                "",
-            ),
+            ("low/usr/lib/python3/dist-packages/yaml.cpython-311-x86_64-linux-gnu.so", ""),
             ("low/usr/lib/python3.11/os.py", ""),
             ("high/opt/x/lib/python3/dist-packages/own/part.py", ""),
             ("high/opt/x/lib/p/near.py", ""),
@@ -123,13 +105,9 @@ mod tests {
             std::fs::create_dir_all(path.parent().expect("below")).expect("made");
             std::fs::write(path, text).expect("written");
         }
-        let names = [
-            "rospy", "numpy", "cv2", "yaml", "near", "own", "scipy", "os",
-        ];
-        let text: String = names
-            .iter()
-            .map(|name| format!("{shared}/{name}/__init__.py python/python3-{name}\n"))
-            .collect();
+        let names = ["rospy", "numpy", "cv2", "yaml", "near", "own", "scipy", "os"];
+        let text: String =
+            names.iter().map(|name| format!("{shared}/{name}/__init__.py python/python3-{name}\n")).collect();
         let lists = [list(root.path(), "c.gz", &text)];
         let contents = Contents::open(root.path(), &lists).expect("read");
         let programs = ["run", "compiled", "gone"];
@@ -141,9 +119,7 @@ mod tests {
         };
         let trees = ["low", "high"].map(|layer| root.path().join(layer));
         let told = |name: &str| {
-            format!(
-                "run imports the Python module {name}, which the image lacks: push with `--with python3-{name}`"
-            )
+            format!("run imports the Python module {name}, which the image lacks: push with `--with python3-{name}`")
         };
         assert_eq!(
             missing_module_advice(&trees, &inventory, AdviceIndex::for_ros1(&contents)),

@@ -32,13 +32,7 @@ use crate::modes::set_mode;
 use crate::workshop::PackJob;
 
 /// Kinds of dependencies that make another package of the workspace visible.
-const NEEDS: [Kind; 5] = [
-    Kind::Buildtool,
-    Kind::BuildtoolExport,
-    Kind::Build,
-    Kind::BuildExport,
-    Kind::Exec,
-];
+const NEEDS: [Kind; 5] = [Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport, Kind::Exec];
 
 /// Maximum number of install spaces mounted separately in a container; more are merged into one directory, since the
 /// kernel mounts at most 500 layers.
@@ -81,12 +75,7 @@ enum SourceVisibility {
 
 impl WorkspaceUnits {
     /// Reads the sources of a workspace. `place` is an empty directory of this build. Blocking.
-    fn read(
-        workspace: &Workspace,
-        build_key: String,
-        below: &[Digest],
-        place: &Path,
-    ) -> Result<Self, Error> {
+    fn read(workspace: &Workspace, build_key: String, below: &[Digest], place: &Path) -> Result<Self, Error> {
         let packages = &workspace.packages;
         let root = workspace.root.clone();
         compile::make_readable(&root)?;
@@ -122,20 +111,18 @@ impl WorkspaceUnits {
     /// Returns the key of a package; `keys` are those of all earlier packages.
     fn key(&self, index: usize, sight: SourceVisibility, keys: &[String]) -> String {
         let unit = &self.units[index];
-        let key = Key::new("unit").input("ground", &self.ground).input(
-            "unit",
-            format!("{} {} {}", unit.name, unit.path.display(), unit.build_type),
-        );
+        let key = Key::new("unit")
+            .input("ground", &self.ground)
+            .input("unit", format!("{} {} {}", unit.name, unit.path.display(), unit.build_type));
         match sight {
             SourceVisibility::Named => key
                 .input("sees", "named")
                 .input("sources", &self.sources[index])
                 .input("rest", &self.rest_hash)
                 .inputs("needs", self.needs[index].iter().map(|&need| &keys[need])),
-            SourceVisibility::All => key
-                .input("sees", "all")
-                .input("sources", &self.all)
-                .inputs("needs", &keys[..index]),
+            SourceVisibility::All => {
+                key.input("sees", "all").input("sources", &self.all).inputs("needs", &keys[..index])
+            }
         }
         .finish()
     }
@@ -160,8 +147,7 @@ impl WorkspaceUnits {
         };
         said.lines().any(|line| {
             hidden.iter().any(|name| line.contains(name))
-                || ABSENT.iter().any(|words| line.contains(words))
-                    && (!hidden.is_empty() || elsewhere(line))
+                || ABSENT.iter().any(|words| line.contains(words)) && (!hidden.is_empty() || elsewhere(line))
         })
     }
 
@@ -198,9 +184,7 @@ fn resolve_needs(packages: &[Package]) -> Vec<Vec<usize>> {
         let named = package.manifest.needs(&NEEDS);
         let mut found = BTreeSet::new();
         for (earlier, other) in packages[..index].iter().enumerate() {
-            if named.contains(other.manifest.name.as_str())
-                || package.manifest.needs_group_of(&other.manifest)
-            {
+            if named.contains(other.manifest.name.as_str()) || package.manifest.needs_group_of(&other.manifest) {
                 found.insert(earlier);
                 found.extend(&all[earlier]);
             }
@@ -253,14 +237,7 @@ pub(crate) async fn compile_workspace(
         Arc::new(crate::blocking::spawn(read).await??)
     };
     let count = units.units.len();
-    let mut making = WorkspaceBuild {
-        build,
-        units,
-        below,
-        place,
-        keys: Vec::new(),
-        diff_ids: Vec::new(),
-    };
+    let mut making = WorkspaceBuild { build, units, below, place, keys: Vec::new(), diff_ids: Vec::new() };
     let missing = making.find_missing().await?;
     if missing.is_empty()
         && let Some(diff_id) = cached_layer(build, &making.whole_key()).await?
@@ -282,9 +259,7 @@ pub(crate) async fn compile_workspace(
 /// Returns the cached layer of a key.
 async fn cached_layer(build: &Build<'_>, key: &str) -> Result<Option<Digest>, Error> {
     let entry = build.shop.get_cached(key).await?;
-    Ok(entry
-        .and_then(|entry| entry.layer)
-        .map(|layer| layer.diff_id))
+    Ok(entry.and_then(|entry| entry.layer).map(|layer| layer.diff_id))
 }
 
 /// State of compiling a workspace.
@@ -344,10 +319,7 @@ impl WorkspaceBuild<'_> {
             Version::Ros1 => "configuring",
             Version::Ros2 => "looking at",
         };
-        build
-            .progress
-            .step(&format!("{doing} {} packages", missing.len()))
-            .await;
+        build.progress.step(&format!("{doing} {} packages", missing.len())).await;
         let there: Vec<usize> = (0..self.keys.len()).collect();
         let place = |need: &usize| missing.iter().position(|index| index == need);
         let order = CompileOrder {
@@ -363,9 +335,7 @@ impl WorkspaceBuild<'_> {
                 .collect(),
             workspace: &self.units.units,
         };
-        let directory = compile::run_task(&build.shop, Task::Check, &order, log, build.progress)
-            .await?
-            .directory;
+        let directory = compile::run_task(&build.shop, Task::Check, &order, log, build.progress).await?.directory;
         crate::blocking::spawn(move || Ok(foreign::remove(&directory)?)).await?
     }
 
@@ -385,9 +355,7 @@ impl WorkspaceBuild<'_> {
         let needs = self.units.needs[index].clone();
         let (key, made, turn) = match self.compile_unit(index, &needs, &view, log).await {
             Ok(made) => (named, made, turn),
-            Err(Error::BuildFailed { .. })
-                if self.units.misses_something(index, &log.text_since(begun)) =>
-            {
+            Err(Error::BuildFailed { .. }) if self.units.misses_something(index, &log.text_since(begun)) => {
                 drop(turn);
                 let key = self.units.key(index, SourceVisibility::All, &self.keys);
                 let turn = build.shop.lock_key(&key).await;
@@ -449,12 +417,7 @@ impl WorkspaceBuild<'_> {
             let whole = shop.site.fresh_directory("spaces")?;
             set_mode(&whole, 0o755)?;
             let into = whole.clone();
-            crate::blocking::spawn(move || {
-                spaces
-                    .iter()
-                    .try_for_each(|space| overlay_tree(space, &into))
-            })
-            .await??;
+            crate::blocking::spawn(move || spaces.iter().try_for_each(|space| overlay_tree(space, &into))).await??;
             trees.push(whole);
         }
         Ok(trees)
@@ -478,8 +441,7 @@ impl WorkspaceBuild<'_> {
         fs::create_dir(&tree).io_context("making", &tree)?;
         let diff_ids: Vec<Digest> = self.diff_ids.iter().copied().flatten().collect();
         let (trees, into) = (shop.extract_layers(&diff_ids).await?, tree.clone());
-        crate::blocking::spawn(move || trees.iter().try_for_each(|tree| overlay_tree(tree, &into)))
-            .await??;
+        crate::blocking::spawn(move || trees.iter().try_for_each(|tree| overlay_tree(tree, &into))).await??;
         let made_from = self.units.units.iter().map(|unit| unit.name.clone());
         let packing = PackJob {
             key,

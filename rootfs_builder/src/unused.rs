@@ -37,16 +37,11 @@ pub(crate) fn mark_used(path: &Path) {
 /// Removes files that have not been used for long, once a day. Blocking.
 pub(crate) fn sweep(cache: &Path) {
     let looked = cache.join(LOOKED);
-    let lately = fs::metadata(&looked)
-        .and_then(|about| about.modified())
-        .is_ok_and(|time| age(time) < LOOKED_EVERY);
+    let lately = fs::metadata(&looked).and_then(|about| about.modified()).is_ok_and(|time| age(time) < LOOKED_EVERY);
     if lately || fs::write(&looked, "").is_err() {
         return;
     }
-    for file in cache_files(cache)
-        .iter()
-        .filter(|file| age(file.used) > KEEP)
-    {
+    for file in cache_files(cache).iter().filter(|file| age(file.used) > KEEP) {
         // A file that came into use meanwhile is built again. Directories are kept, since a file may be about to be
         // created in them.
         let _ = fs::remove_file(&file.path);
@@ -70,11 +65,7 @@ pub(crate) fn shrink(cache: &Path, most: u64) {
             total -= file.bytes;
         }
     }
-    tracing::info!(
-        "removed {} MB of the cache {}; its limit is {most} bytes",
-        (before - total) >> 20,
-        cache.display()
-    );
+    tracing::info!("removed {} MB of the cache {}; its limit is {most} bytes", (before - total) >> 20, cache.display());
 }
 
 /// A file that may be removed.
@@ -101,15 +92,9 @@ fn cache_files(cache: &Path) -> Vec<CachedFile> {
     let cached = |path: PathBuf| {
         let about = fs::symlink_metadata(&path).ok()?;
         about.is_file().then_some(())?;
-        Some(CachedFile {
-            used: about.modified().ok()?,
-            bytes: about.blocks() * 512,
-            path,
-        })
+        Some(CachedFile { used: about.modified().ok()?, bytes: about.blocks() * 512, path })
     };
-    let files = directories
-        .iter()
-        .flat_map(|directory| list_directory(directory));
+    let files = directories.iter().flat_map(|directory| list_directory(directory));
     files.filter_map(cached).collect()
 }
 

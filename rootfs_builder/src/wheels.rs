@@ -33,12 +33,7 @@ pub(crate) async fn add_runtime_wheels(
 ) -> Result<LayerSet, Error> {
     if let Some(wheels) = &base.wheels {
         let below: Vec<Digest> = made.diff_ids().collect();
-        let part = WheelSet {
-            name: "base",
-            wheels,
-            wanted: &base.required.runtime,
-            files: Some(&wheels.files),
-        };
+        let part = WheelSet { name: "base", wheels, wanted: &base.required.runtime, files: Some(&wheels.files) };
         let more = wheel_layer(shop, base, &part, &below, progress).await?;
         made.layers.extend(more.layers);
     }
@@ -55,12 +50,7 @@ pub(crate) async fn add_build_wheels(
     let Some(wheels) = &base.wheels else {
         return Ok(LayerSet::default());
     };
-    let part = WheelSet {
-        name: "toolchain",
-        wheels,
-        wanted: &base.required.build,
-        files: None,
-    };
+    let part = WheelSet { name: "toolchain", wheels, wanted: &base.required.build, files: None };
     wheel_layer(shop, base, &part, below, progress).await
 }
 
@@ -82,21 +72,13 @@ async fn wheel_layer(
     below: &[Digest],
     progress: &Progress,
 ) -> Result<LayerSet, Error> {
-    let WheelSet {
-        name,
-        wheels,
-        wanted,
-        ..
-    } = *part;
+    let WheelSet { name, wheels, wanted, .. } = *part;
     if wanted.len() == 0 {
         return Ok(LayerSet::default());
     }
     let key = Key::new("wheels")
         .input("script", INSTALL)
-        .input(
-            "strip",
-            serde_json::to_string(&base.strip).unwrap_or_default(),
-        )
+        .input("strip", serde_json::to_string(&base.strip).unwrap_or_default())
         .input("wheels", serde_json::to_string(wheels).unwrap_or_default())
         .input("requirements", wanted.key())
         .inputs("below", below.iter().map(Digest::to_string))
@@ -116,10 +98,7 @@ async fn wheel_layer(
         options,
         turn,
     };
-    Ok(LayerSet::single(
-        shop.pack(packing, |_| Ok(())).await?,
-        false,
-    ))
+    Ok(LayerSet::single(shop.pack(packing, |_| Ok(())).await?, false))
 }
 
 /// Returns the wheels, from the cache or downloaded now, sorted by name.
@@ -152,9 +131,7 @@ async fn download_wheels(
     }
     cached_wheels(&place, wanted)
         .await?
-        .ok_or_else(|| Error::Wheels {
-            words: "pip's downloads do not match the requirements".to_owned(),
-        })
+        .ok_or_else(|| Error::Wheels { words: "pip's downloads do not match the requirements".to_owned() })
 }
 
 /// Returns the files of a directory, if they satisfy all requirements.
@@ -183,12 +160,7 @@ async fn cached_wheels(place: &Path, wanted: &Requirements) -> Result<Option<Vec
 }
 
 /// Downloads wheels with the host's pip, from its configured source.
-async fn fetch_wheels(
-    place: &Path,
-    wheels: &Wheels,
-    wanted: &Requirements,
-    progress: &Progress,
-) -> Result<(), Error> {
+async fn fetch_wheels(place: &Path, wheels: &Wheels, wanted: &Requirements, progress: &Progress) -> Result<(), Error> {
     let total = wanted.len() as u64;
     let title = format!("downloading {total} Python packages");
     progress.step(&title).await;
@@ -200,11 +172,7 @@ async fn fetch_wheels(
         .args(["--only-binary", ":all:", "--implementation", "cp"])
         .args(["--python-version", &wheels.python])
         .args(wheels.abis().flat_map(|abi| ["--abi".to_owned(), abi]))
-        .args(
-            wheels
-                .platforms(std::env::consts::ARCH)
-                .flat_map(|platform| ["--platform".to_owned(), platform]),
-        )
+        .args(wheels.platforms(std::env::consts::ARCH).flat_map(|platform| ["--platform".to_owned(), platform]))
         .arg("--dest")
         .arg(place.join("files"))
         .arg("--requirement")
@@ -218,24 +186,16 @@ async fn fetch_wheels(
     })
     .await;
     match result {
-        Err(Error::Program { last_lines, .. }) => Err(Error::Wheels {
-            words: pip_errors(&last_lines),
-        }),
+        Err(Error::Program { last_lines, .. }) => Err(Error::Wheels { words: pip_errors(&last_lines) }),
         result => result,
     }
 }
 
 /// Extracts the error messages from the output of pip.
 fn pip_errors(lines: &str) -> String {
-    let errors = lines
-        .lines()
-        .filter_map(|line| line.strip_prefix("ERROR: "));
+    let errors = lines.lines().filter_map(|line| line.strip_prefix("ERROR: "));
     let errors: Vec<&str> = errors.collect();
-    if errors.is_empty() {
-        lines.to_owned()
-    } else {
-        errors.join("; ")
-    }
+    if errors.is_empty() { lines.to_owned() } else { errors.join("; ") }
 }
 
 /// Installs wheels in a container on top of `below`; returns the container's upper directory, in a separate directory,
@@ -253,11 +213,7 @@ async fn install_wheels(
     let title = format!("installing {total} Python packages of the {name}");
     progress.step(&title).await;
     let directory = shop.site.fresh_directory("wheels")?;
-    let (tools, given, upper) = (
-        directory.join("tools"),
-        directory.join("given"),
-        directory.join("upper"),
-    );
+    let (tools, given, upper) = (directory.join("tools"), directory.join("given"), directory.join("upper"));
     for path in [&given, &upper] {
         fs::create_dir(path).io_context("making", path)?;
     }
@@ -306,15 +262,9 @@ async fn install_wheels(
                     opened: None,
                 }],
                 environment: environment.into(),
-                argv: [
-                    "/usr/bin/python3",
-                    "-I",
-                    "/cloudroid/wheels.py",
-                    "/cloudroid/job.json",
-                    "/cloudroid/wheels",
-                ]
-                .map(str::to_owned)
-                .into(),
+                argv: ["/usr/bin/python3", "-I", "/cloudroid/wheels.py", "/cloudroid/job.json", "/cloudroid/wheels"]
+                    .map(str::to_owned)
+                    .into(),
             },
             |line| {
                 if line.starts_with("::wheel ") {
@@ -325,16 +275,9 @@ async fn install_wheels(
         )
         .await?;
     if !finished.success() {
-        return Err(Error::Inside {
-            what: "installing Python packages",
-            last_lines: finished.last_output(),
-        });
+        return Err(Error::Inside { what: "installing Python packages", last_lines: finished.last_output() });
     }
-    let options = TreeOptions {
-        uid_offset: finished.uid_offset,
-        overlay_upper: true,
-        ..tree_options(base)
-    };
+    let options = TreeOptions { uid_offset: finished.uid_offset, overlay_upper: true, ..tree_options(base) };
     Ok((upper, options))
 }
 

@@ -56,14 +56,7 @@ impl BuildContext {
         push: PushLabel,
         progress: Progress,
     ) -> Self {
-        Self {
-            site,
-            layers,
-            turns,
-            push,
-            progress,
-            packing: Mutex::default(),
-        }
+        Self { site, layers, turns, push, progress, packing: Mutex::default() }
     }
 
     /// Waits for the lock on a key of a layer or a note; reports when another push holds it.
@@ -80,36 +73,21 @@ impl BuildContext {
     ) -> Result<Digest, Error> {
         let store = self.layers.store().clone();
         let (tree, options) = (packing.tree.clone(), packing.options.clone());
-        let (diff_id, bytes) =
-            crate::blocking::spawn(move || store.stage_tree(&tree, &options)).await??;
+        let (diff_id, bytes) = crate::blocking::spawn(move || store.stage_tree(&tree, &options)).await??;
         let layers = self.layers.clone();
         let archive = crate::blocking::spawn(move || -> Result<_, Error> {
-            let layer = layers
-                .store()
-                .layer_from_tree(&packing.tree, &packing.options)?;
+            let layer = layers.store().layer_from_tree(&packing.tree, &packing.options)?;
             if layer.diff_id != diff_id {
-                return Err(image::Error::Damaged {
-                    path: packing.tree,
-                    expected: diff_id,
-                    found: layer.diff_id,
-                }
-                .into());
+                return Err(
+                    image::Error::Damaged { path: packing.tree, expected: diff_id, found: layer.diff_id }.into()
+                );
             }
-            layers.insert(
-                &packing.key,
-                &LayerEntry {
-                    layer: Some(layer),
-                    made_from: packing.made_from,
-                },
-            )?;
+            layers.insert(&packing.key, &LayerEntry { layer: Some(layer), made_from: packing.made_from })?;
             record(bytes)?;
             drop(packing.turn);
             Ok(foreign::remove(&packing.directory)?)
         });
-        self.packing
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(archive);
+        self.packing.lock().unwrap_or_else(PoisonError::into_inner).push(archive);
         Ok(diff_id)
     }
 
@@ -121,8 +99,7 @@ impl BuildContext {
 
     /// Waits until all packed layers are complete and in the cache.
     pub(crate) async fn wait_until_packed(&self) -> Result<(), Error> {
-        let packing =
-            std::mem::take(&mut *self.packing.lock().unwrap_or_else(PoisonError::into_inner));
+        let packing = std::mem::take(&mut *self.packing.lock().unwrap_or_else(PoisonError::into_inner));
         let mut result = Ok(());
         for archive in packing {
             let done = archive.await.unwrap_or_else(|error| Err(error.into()));
@@ -146,13 +123,7 @@ impl BuildContext {
     /// Extracts layers and returns their trees.
     pub(crate) async fn extract_layers(&self, layers: &[Digest]) -> Result<Vec<PathBuf>, Error> {
         let (store, layers) = (self.layers.store().clone(), layers.to_vec());
-        crate::blocking::spawn(move || {
-            layers
-                .iter()
-                .map(|layer| Ok(store.ensure_extracted(layer)?))
-                .collect()
-        })
-        .await?
+        crate::blocking::spawn(move || layers.iter().map(|layer| Ok(store.ensure_extracted(layer)?)).collect()).await?
     }
 }
 
@@ -178,12 +149,7 @@ struct KeyLock {
 
 impl KeyLocks {
     /// Waits for a lock, which is released when the guard is dropped. `progress` receives the name of the lock holder.
-    async fn lock(
-        &self,
-        key: &str,
-        push: &PushLabel,
-        progress: &Progress,
-    ) -> tokio::sync::OwnedMutexGuard<()> {
+    async fn lock(&self, key: &str, push: &PushLabel, progress: &Progress) -> tokio::sync::OwnedMutexGuard<()> {
         let turn = {
             let mut all = lock_unpoisoned(&self.0);
             // The guard of a lock holds only the inner mutex.
@@ -217,10 +183,7 @@ mod tests {
     use super::*;
 
     fn push(name: &str) -> PushLabel {
-        PushLabel {
-            id: format!("push-{name}"),
-            name: name.to_owned(),
-        }
+        PushLabel { id: format!("push-{name}"), name: name.to_owned() }
     }
 
     #[tokio::test]
@@ -233,9 +196,7 @@ mod tests {
         let _other = turns.lock("b", &field, &progress).await;
         let (again, by, telling) = (turns.clone(), field.clone(), progress.clone());
         let waiting = tokio::spawn(async move { again.lock("a", &by, &telling).await });
-        let waits = BuildEvent::Waits {
-            push: "lab".to_owned(),
-        };
+        let waits = BuildEvent::Waits { push: "lab".to_owned() };
         assert_eq!(told.recv().await, Some(waits));
         assert!(!waiting.is_finished());
         drop(first);
@@ -251,9 +212,6 @@ mod tests {
         drop(turns.lock("c", &lab, &progress).await);
         drop(turns.lock("d", &lab, &progress).await);
         let kept: Vec<String> = lock_unpoisoned(&turns.0).keys().cloned().collect();
-        assert!(
-            kept.contains(&"b".to_owned()) && !kept.contains(&"c".to_owned()),
-            "{kept:?}"
-        );
+        assert!(kept.contains(&"b".to_owned()) && !kept.contains(&"c".to_owned()), "{kept:?}");
     }
 }

@@ -28,14 +28,8 @@ pub(super) fn prepare() -> Result<(), String> {
     })?;
     for place in claim::find_abandoned(&std::env::temp_dir(), world::PREFIX) {
         match claim::remove_abandoned(&place) {
-            Ok(()) => println!(
-                "removed {}, which a run that was killed had left",
-                place.display()
-            ),
-            Err(error) => println!(
-                "{} stays, which a run that was killed had left: {error:#}",
-                place.display()
-            ),
+            Ok(()) => println!("removed {}, which a run that was killed had left", place.display()),
+            Err(error) => println!("{} stays, which a run that was killed had left: {error:#}", place.display()),
         }
     }
     for name in cable::remove_abandoned() {
@@ -63,8 +57,11 @@ fn check_cgroups() -> Result<(), String> {
         is_there = true;
         let child = parent.join(format!("cloudroid-check-{}", std::process::id()));
         std::fs::create_dir(&child).map_err(|error| {
-            format!("cgroups cannot be made below {} ({error}), and servants have limits: run the stories where root \
-                may make them", parent.display())
+            format!(
+                "cgroups cannot be made below {} ({error}), and servants have limits: run the stories where root \
+                may make them",
+                parent.display()
+            )
         })?;
         let _ = std::fs::remove_dir(child);
     }
@@ -72,7 +69,8 @@ fn check_cgroups() -> Result<(), String> {
         return Ok(());
     }
     Err("no cgroups with limits are mounted below /sys/fs/cgroup, and servants have limits: mount them, or run the \
-        stories elsewhere".to_owned())
+        stories elsewhere"
+        .to_owned())
 }
 
 fn check_room(place: &Path) -> Result<(), String> {
@@ -92,36 +90,25 @@ fn check_room(place: &Path) -> Result<(), String> {
 fn check_overlay(place: &Path) -> Result<(), String> {
     let trial = place.join("overlay");
     let names = ["lower", "upper", "work", "root"];
-    let made = names
-        .iter()
-        .try_for_each(|name| std::fs::create_dir_all(trial.join(name)));
+    let made = names.iter().try_for_each(|name| std::fs::create_dir_all(trial.join(name)));
     made.map_err(|error| format!("{}: {error}", trial.display()))?;
     let at = |name: &str| trial.join(name).display().to_string();
-    let options = format!(
-        "lowerdir={},upperdir={},workdir={}",
-        at("lower"),
-        at("upper"),
-        at("work")
-    );
+    let options = format!("lowerdir={},upperdir={},workdir={}", at("lower"), at("upper"), at("work"));
     // Some file systems only fail when something is renamed or removed.
-    let used = mount(
-        Some("overlay"),
-        trial.join("root").as_path(),
-        Some("overlay"),
-        MsFlags::empty(),
-        Some(options.as_str()),
-    )
-    .map_err(std::io::Error::from)
-    .and_then(|()| {
-        let used = std::fs::write(trial.join("root/file"), "")
-            .and_then(|()| std::fs::remove_file(trial.join("root/file")));
-        umount(&trial.join("root"))
+    let used =
+        mount(Some("overlay"), trial.join("root").as_path(), Some("overlay"), MsFlags::empty(), Some(options.as_str()))
             .map_err(std::io::Error::from)
-            .and(used)
-    });
+            .and_then(|()| {
+                let used = std::fs::write(trial.join("root/file"), "")
+                    .and_then(|()| std::fs::remove_file(trial.join("root/file")));
+                umount(&trial.join("root")).map_err(std::io::Error::from).and(used)
+            });
     let _ = std::fs::remove_dir_all(&trial);
     used.map_err(|error| {
-        format!("the file system of {} cannot hold the upper directories of overlays ({error}), which servants are \
-            made of: name another place by TMPDIR", place.display())
+        format!(
+            "the file system of {} cannot hold the upper directories of overlays ({error}), which servants are \
+            made of: name another place by TMPDIR",
+            place.display()
+        )
     })
 }

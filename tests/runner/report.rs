@@ -74,12 +74,7 @@ impl RunReport {
         longest.sort_by_key(|outcome| std::cmp::Reverse(outcome.took));
         println!("== the longest stories, in seconds, and how long of that they waited for a core");
         for outcome in longest.iter().take(LONGEST) {
-            println!(
-                "{:8.1} {:7.1}  {}",
-                outcome.took.as_secs_f64(),
-                outcome.waited.as_secs_f64(),
-                outcome.name
-            );
+            println!("{:8.1} {:7.1}  {}", outcome.took.as_secs_f64(), outcome.waited.as_secs_f64(), outcome.name);
         }
         let all: Duration = self.told.iter().map(|outcome| outcome.took).sum();
         println!(
@@ -98,26 +93,15 @@ impl RunReport {
             println!("more than {MOST_FLAKY} stories failed and then passed: the run has failed");
         }
         for (name, reason) in &self.failed {
-            println!(
-                "== failed: {name}\n{}\nkept below {}",
-                shorten(reason),
-                evidence_directory(name, 1).display()
-            );
+            println!("== failed: {name}\n{}\nkept below {}", shorten(reason), evidence_directory(name, 1).display());
         }
         for thing in &self.left {
             println!("left behind: {thing}");
         }
         if self.not_told > 0 {
-            println!(
-                "{} stories were not told after the first failure",
-                self.not_told
-            );
+            println!("{} stories were not told after the first failure", self.not_told);
         }
-        println!(
-            "{} passed, {} failed",
-            self.told.len() - self.failed.len(),
-            self.failed.len()
-        );
+        println!("{} passed, {} failed", self.told.len() - self.failed.len(), self.failed.len());
     }
 }
 
@@ -127,16 +111,10 @@ fn shorten(reason: &str) -> String {
 
 /// Adds a line to the list of flaky stories that need to be fixed.
 fn note_flaky(name: &str, reason: &str) {
-    let time = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default()
-        .as_secs();
+    let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
     let line = json!({"time": time, "story": name, "reason": shorten(reason)});
     let path = binaries::target().join("flaky.json");
-    let file = std::fs::File::options()
-        .create(true)
-        .append(true)
-        .open(path);
+    let file = std::fs::File::options().create(true).append(true).open(path);
     if let Err(error) = file.and_then(|mut file| writeln!(file, "{line}")) {
         eprintln!("target/flaky.json: {error}");
     }

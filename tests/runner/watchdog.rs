@@ -46,10 +46,7 @@ impl Watchdog {
 
     /// Records that a story has started.
     pub(super) fn begin(&self, story: &'static str) {
-        let watched = WatchedStory {
-            since: Instant::now(),
-            named: 0,
-        };
+        let watched = WatchedStory { since: Instant::now(), named: 0 };
         self.state.lock().stories.insert(story, watched);
     }
 
@@ -68,9 +65,7 @@ impl Drop for Watchdog {
 
 impl WatchdogState {
     fn lock(&self) -> std::sync::MutexGuard<'_, RunningStories> {
-        self.under_way
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
+        self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn watch(&self, limit: Duration) {

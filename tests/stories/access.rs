@@ -20,23 +20,15 @@ pub fn daemon(name: &str) -> anyhow::Result<Daemon> {
 
 /// Creates a token and returns its secret.
 pub fn create_token(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
-    let made = daemon
-        .deployer()
-        .run_json(&[&["token", "create"], arguments].concat())?;
+    let made = daemon.deployer().run_json(&[&["token", "create"], arguments].concat())?;
     let secret = made["secret"].as_str().context("a secret")?;
     Ok(secret.to_owned())
 }
 
 /// Runs a command over TCP with a token.
-pub fn run_with_token(
-    daemon: &Daemon,
-    token: &str,
-    arguments: &[&str],
-) -> anyhow::Result<CommandOutcome> {
+pub fn run_with_token(daemon: &Daemon, token: &str, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let server = format!("http://{}", daemon.address);
-    let deployer = Deployer {
-        home: daemon.deployer().home,
-    };
+    let deployer = Deployer { home: daemon.deployer().home };
     deployer.run(&[&["--server", &server, "--token", token], arguments].concat())
 }
 
@@ -56,17 +48,9 @@ impl AccessRow {
 
     /// Returns the path with parameters filled in from this story.
     fn request_path(&self, servant: &str, recording: &str) -> String {
-        let name = if self.path.contains("/robots/") {
-            "r1"
-        } else {
-            "adder_py"
-        };
+        let name = if self.path.contains("/robots/") { "r1" } else { "adder_py" };
         let of_servants = ["/servants/", "/foxglove/"];
-        let id = if of_servants.iter().any(|part| self.path.contains(part)) {
-            servant
-        } else {
-            "x"
-        };
+        let id = if of_servants.iter().any(|part| self.path.contains(part)) { servant } else { "x" };
         self.path
             .replace("{name}", name)
             .replace("{id}", id)
@@ -82,13 +66,9 @@ impl AccessRow {
         match (&*self.method, &*self.path) {
             ("ANY", _) => "GET",
             // The first takes long, the others never end.
-            (
-                _,
-                "/stubs/{file}"
-                | "/api/v1/stream"
-                | "/api/v1/events/follow"
-                | "/api/v1/servants/{id}/topics",
-            ) => "HEAD",
+            (_, "/stubs/{file}" | "/api/v1/stream" | "/api/v1/events/follow" | "/api/v1/servants/{id}/topics") => {
+                "HEAD"
+            }
             (method, _) => method,
         }
     }
@@ -104,15 +84,11 @@ impl AccessRow {
 
 /// Parses the matrix of the document, which a unit test compares with the portal's table.
 fn read_matrix() -> anyhow::Result<Vec<AccessRow>> {
-    let (_, matrix) = MATRIX
-        .split_once("| method | address |")
-        .context("the matrix")?;
+    let (_, matrix) = MATRIX.split_once("| method | address |").context("the matrix")?;
     let mut lines = matrix.lines().take_while(|line| !line.is_empty());
     let cells = |line: &str| -> Vec<String> {
         let cells = line.trim().trim_matches('|').split('|');
-        cells
-            .map(|cell| cell.trim().trim_matches('`').to_owned())
-            .collect()
+        cells.map(|cell| cell.trim().trim_matches('`').to_owned()).collect()
     };
     let columns = cells(lines.next().context("its head")?);
     let rows: Vec<AccessRow> = lines
@@ -163,37 +139,23 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
             continue;
         }
         let (status, body) = asks(row, &row.request_path("x", "1"), None)?;
-        ensure!(
-            (status != 403) == allowed && status != 401,
-            "local {} {}: {status} {body}",
-            row.method,
-            row.path
-        );
+        ensure!((status != 403) == allowed && status != 401, "local {} {}: {status} {body}", row.method, row.path);
         walked += 1;
     }
     // For each role, one principal whose scope includes the service, and one whose scope does not.
     let scoped = |name: &str, more: &[&str]| -> anyhow::Result<(String, String)> {
         let made = |name: &str, service: &str, robot: &str| {
             let given = [&[name, "--service", service], more].concat();
-            let given: Vec<&str> = given
-                .into_iter()
-                .map(|word| if word == "ROBOT" { robot } else { word })
-                .collect();
+            let given: Vec<&str> = given.into_iter().map(|word| if word == "ROBOT" { robot } else { word }).collect();
             create_token(&daemon, &given)
         };
-        Ok((
-            made(name, "adder*", "r1")?,
-            made(&format!("other-{name}"), "other*", "r2")?,
-        ))
+        Ok((made(name, "adder*", "r1")?, made(&format!("other-{name}"), "other*", "r2")?))
     };
     let (alice, bob) = scoped("deployer", &["--role", "deployer"])?;
     let (rover, other) = scoped("robot", &["--role", "robot", "--robot", "ROBOT"])?;
     let (eve, oscar) = scoped("viewer", &["--role", "viewer"])?;
-    let mut principals = vec![
-        ("deployer", alice.clone(), bob),
-        ("robot", rover.clone(), other),
-        ("viewer", eve.clone(), oscar),
-    ];
+    let mut principals =
+        vec![("deployer", alice.clone(), bob), ("robot", rover.clone(), other), ("viewer", eve.clone(), oscar)];
     for role in ["admin", "operator"] {
         let one = create_token(&daemon, &[role, "--role", role])?;
         principals.push((role, one.clone(), one));
@@ -206,18 +168,13 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
     })?;
     let servant = servant["id"].as_str().context("an id")?.to_owned();
     let recording = support::wait_until("a recording", || {
-        let taken = daemon
-            .deployer()
-            .run(&["--format", "json", "recordings", "take", &servant])?;
+        let taken = daemon.deployer().run(&["--format", "json", "recordings", "take", &servant])?;
         let taken: Result<serde_json::Value, _> = serde_json::from_str(&taken.stdout);
         let number = taken.map(|taken| taken[0]["number"].to_string());
         Ok(number.map_err(|error| error.to_string()))
     })?;
     let revoked = create_token(&daemon, &["over", "--role", "admin"])?;
-    daemon
-        .deployer()
-        .run(&["token", "revoke", "over"])?
-        .expect_success()?;
+    daemon.deployer().run(&["token", "revoke", "over"])?.expect_success()?;
     let expired = expired_token(&daemon)?;
     for row in &rows {
         let address = row.request_path(&servant, &recording);
@@ -225,10 +182,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
             let cell = row.cell(role)?;
             // Routes that name their service in the query or the body check it later; these requests name none.
             let named_later = matches!(&*row.path, "/api/v1/push" | "/api/v1/servants");
-            for (whose, token, allowed) in [
-                ("own", own, cell != "-"),
-                ("another's", foreign, cell == "yes"),
-            ] {
+            for (whose, token, allowed) in [("own", own, cell != "-"), ("another's", foreign, cell == "yes")] {
                 if row.is_of_robots() {
                     // Permitted connections are covered by the other stories.
                     if !allowed {
@@ -236,10 +190,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
                         let Err(refusal) = Robot::try_connect(&daemon.url(&path)) else {
                             anyhow::bail!("{role} ({whose}) connected to {address}");
                         };
-                        ensure!(
-                            refusal.status == 403,
-                            "{role} ({whose}) {address}: {refusal}"
-                        );
+                        ensure!(refusal.status == 403, "{role} ({whose}) {address}: {refusal}");
                     }
                     continue;
                 }
@@ -261,16 +212,8 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         }
         let (status, body) = asks(row, &address, None)?;
         let open = row.cell("no token")? == "yes";
-        ensure!(
-            (status != 401) == open,
-            "{} {address}: {status} {body}",
-            row.method
-        );
-        for (token, words) in [
-            (&*revoked, "was revoked"),
-            (&*expired, "has expired"),
-            ("guess", "not known"),
-        ] {
+        ensure!((status != 401) == open, "{} {address}: {status} {body}", row.method);
+        for (token, words) in [(&*revoked, "was revoked"), (&*expired, "has expired"), ("guess", "not known")] {
             let (status, body) = asks(row, &address, Some(token))?;
             // Repeated guesses are slowed down after a while.
             let slowed = token == "guess" && status == 429;
@@ -315,8 +258,7 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
         ("/api/v1/events?limit=1&limit=2", "duplicate field `limit`"),
     ] {
         let (status, body) = daemon.request("GET", path, &[("Authorization", &bearer)])?;
-        let problem: serde_json::Value =
-            serde_json::from_str(&body).with_context(|| format!("{path}: {body}"))?;
+        let problem: serde_json::Value = serde_json::from_str(&body).with_context(|| format!("{path}: {body}"))?;
         let detail = problem["detail"].as_str().unwrap_or_default();
         ensure!(
             status == 400 && detail.contains("the query cannot be read") && detail.contains(words),
@@ -325,63 +267,30 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
     }
     for (typed, words) in [
         (&["policy", "rm", "9999"][..], "no rule \"9999\""),
-        (
-            &["policy", "allow", "role:fool", "call:/x"],
-            "unknown role \"fool\"",
-        ),
-        (
-            &["policy", "allow", "rover", "fly:/x"],
-            "\"fly:/x\" is not a grant",
-        ),
+        (&["policy", "allow", "role:fool", "call:/x"], "unknown role \"fool\""),
+        (&["policy", "allow", "rover", "fly:/x"], "\"fly:/x\" is not a grant"),
         (&["policy", "allow", "rover", "call:[/x"], "is not a grant"),
-        (
-            &["token", "revoke", "nobody"],
-            "there is no valid token \"nobody\"",
-        ),
-        (
-            &["token", "rotate", "nobody"],
-            "there is no valid token \"nobody\"",
-        ),
-        (
-            &["token", "create", "a b", "--role", "viewer"],
-            "is not a valid name",
-        ),
+        (&["token", "revoke", "nobody"], "there is no valid token \"nobody\""),
+        (&["token", "rotate", "nobody"], "there is no valid token \"nobody\""),
+        (&["token", "create", "a b", "--role", "viewer"], "is not a valid name"),
         (&["token", "create", "r", "--role", "robot"], "--service"),
         (&["token", "create", "k", "--role", "king"], "king"),
-        (
-            &[
-                "token",
-                "create",
-                "chief",
-                "--role",
-                "viewer",
-                "--service",
-                "*",
-            ],
-            "chief",
-        ),
+        (&["token", "create", "chief", "--role", "viewer", "--service", "*"], "chief"),
     ] {
         daemon.deployer().run(typed)?.expect_failure(&[words])?;
     }
     let rules = daemon.deployer().run_json(&["policy", "list"])?;
-    ensure!(
-        rules.as_array().is_some_and(|rules| rules.len() == 2),
-        "{rules}"
-    );
+    ensure!(rules.as_array().is_some_and(|rules| rules.len() == 2), "{rules}");
     Ok(())
 }
 
 pub fn a_deployer_changes_its_own_services_alone() -> Verdict {
     let daemon = daemon("owners")?;
-    let alice = create_token(
-        &daemon,
-        &["alice", "--role", "deployer", "--service", "adder*"],
-    )?;
+    let alice = create_token(&daemon, &["alice", "--role", "deployer", "--service", "adder*"])?;
     let bob = create_token(&daemon, &["bob", "--role", "deployer", "--service", "*"])?;
     push_adder(&daemon, &alice, &[])?.expect_success()?;
     // If only the name is given, the owner is found out when the package is built.
-    push_adder(&daemon, &bob, &[])?
-        .expect_failure(&["bob (deployer) may not deploy service adder_py"])?;
+    push_adder(&daemon, &bob, &[])?.expect_failure(&["bob (deployer) may not deploy service adder_py"])?;
     push_adder(&daemon, &alice, &["--name", "other"])?
         .expect_failure(&["alice (deployer) may not deploy service other"])?;
     run_with_token(&daemon, &bob, &["rm", "adder_py"])?.expect_failure(&["may not deploy"])?;
@@ -395,29 +304,17 @@ pub fn a_deployer_changes_its_own_services_alone() -> Verdict {
 pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
     let daemon = daemon("policies")?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let robot = ["--role", "robot", "--service", "adder_py", "--robot"];
     let rover = create_token(&daemon, &[&["rover"], &robot[..], &["r1"]].concat())?;
     let other = create_token(&daemon, &[&["other"], &robot[..], &["r2"]].concat())?;
     // A token cannot be used for another robot, and a robot without a name gets that of its token.
     let refused = Robot::try_connect(&daemon.url(&format!("adder_py?robot=r1&token={other}")));
-    let Err(refusal) = refused else {
-        anyhow::bail!("one robot was let in as another")
-    };
-    ensure!(
-        refusal.status == 403 && refusal.body.contains("as robot r1"),
-        "{refusal}"
-    );
+    let Err(refusal) = refused else { anyhow::bail!("one robot was let in as another") };
+    ensure!(refusal.status == 403 && refusal.body.contains("as robot r1"), "{refusal}");
     let class = Robot::try_connect(&daemon.url(&format!("adder_py?class=gold&token={rover}")));
-    let Err(refusal) = class else {
-        anyhow::bail!("a class was given to who may not have it")
-    };
-    ensure!(
-        refusal.status == 403 && refusal.body.contains("class gold"),
-        "{refusal}"
-    );
+    let Err(refusal) = class else { anyhow::bail!("a class was given to who may not have it") };
+    ensure!(refusal.status == 403 && refusal.body.contains("class gold"), "{refusal}");
     let mut at_work = daemon.robot(&format!("adder_py?token={rover}"))?;
     let mut beside = daemon.robot("adder_py?robot=r2")?;
     beside.send(json!({"op": "auth", "mac": other}))?;
@@ -426,35 +323,18 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
     }
     daemon.servant_of("adder_py", "r1")?;
     at_work.send(json!({"op": "subscribe", "topic": "/rosout", "type": "rosgraph_msgs/Log"}))?;
-    deployer
-        .run(&[
-            "policy",
-            "allow",
-            "rover",
-            "call:/nothing",
-            "--service",
-            "adder_*",
-        ])?
-        .expect_success()?;
+    deployer.run(&["policy", "allow", "rover", "call:/nothing", "--service", "adder_*"])?.expect_success()?;
     at_work.wait_for_status("subscribe:/rosout is no longer granted to this client")?;
     let refused = at_work.call("/add_two", json!({"a": 1, "b": 2}))?;
     let reason = refused["values"].as_str().unwrap_or_default();
-    ensure!(
-        refused["result"] == false && reason.contains("call:/add_two is not granted"),
-        "{refused}"
-    );
+    ensure!(refused["result"] == false && reason.contains("call:/add_two is not granted"), "{refused}");
     let services = at_work.call("/rosapi/services", json!({}))?.to_string();
     ensure!(!services.contains("/add_two"), "{services}");
     ensure!(beside.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
     // The connection of a revoked token ends; the other one continues.
-    deployer
-        .run(&["token", "revoke", "rover"])?
-        .expect_success()?;
+    deployer.run(&["token", "revoke", "rover"])?.expect_success()?;
     let close = at_work.wait_for_close()?;
-    ensure!(
-        u16::from(close.code) == 1008 && close.reason.contains("revoked"),
-        "{close:?}"
-    );
+    ensure!(u16::from(close.code) == 1008 && close.reason.contains("revoked"), "{close:?}");
     let Err(refusal) = Robot::try_connect(&daemon.url(&format!("adder_py?token={rover}"))) else {
         anyhow::bail!("a revoked token let a robot in")
     };
@@ -466,9 +346,7 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
 pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
     let daemon = daemon("locals")?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=r1")?;
     ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     ensure!(daemon.get("/api/v1/services")?.0 == 200 && daemon.get("/metrics")?.0 == 200);
@@ -480,33 +358,22 @@ pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
         ("POST", "/api/v1/tokens"),
     ] {
         let (status, body) = daemon.request(method, path, &[])?;
-        ensure!(
-            status == 403 && body.contains("local (viewer, robot) may not"),
-            "{method} {path}: {status} {body}"
-        );
+        ensure!(status == 403 && body.contains("local (viewer, robot) may not"), "{method} {path}: {status} {body}");
     }
     // From the first token on everyone needs one, and a client without a token is disconnected.
     create_token(&daemon, &["root2", "--role", "admin"])?;
     let close = robot.wait_for_close()?;
     ensure!(u16::from(close.code) == 1008, "{close:?}");
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
-    deployer
-        .run(&["token", "revoke", "root2"])?
-        .expect_success()?;
-    ensure!(
-        daemon.get("/api/v1/services")?.0 == 401,
-        "the door does not open again"
-    );
+    deployer.run(&["token", "revoke", "root2"])?.expect_success()?;
+    ensure!(daemon.get("/api/v1/services")?.0 == 401, "the door does not open again");
     deployer.run(&["services"])?.expect_success()?;
     Ok(())
 }
 
 pub fn what_was_begun_with_a_token_ends_with_it() -> Verdict {
     let daemon = daemon("access-revoked")?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let secret = create_token(&daemon, &["watcher", "--role", "operator"])?;
     // Nobody uses the service, so it would wait for an hour.
     let mut going = Command::new(support::binaries::path("cloudroidctl"))
@@ -520,13 +387,8 @@ pub fn what_was_begun_with_a_token_ends_with_it() -> Verdict {
     let first = BufReader::new(said).lines().next();
     let first = first.context("it said nothing")??;
     ensure!(first.contains("waiting for a robot"), "{first}");
-    daemon
-        .deployer()
-        .run(&["token", "revoke", "watcher"])?
-        .expect_success()?;
-    let ended = support::wait_until("its end", || {
-        Ok(going.try_wait()?.ok_or_else(|| "it goes on".to_owned()))
-    });
+    daemon.deployer().run(&["token", "revoke", "watcher"])?.expect_success()?;
+    let ended = support::wait_until("its end", || Ok(going.try_wait()?.ok_or_else(|| "it goes on".to_owned())));
     let _ = going.kill();
     let _ = going.wait();
     ensure!(!ended?.success(), "nothing was compared");

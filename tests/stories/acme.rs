@@ -45,26 +45,18 @@ fn wait_for_event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result
 pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     let directory = AcmeDirectory::new()?;
     let elsewhere = free_port()?;
-    let setup = world().setup("named").config(&format!(
-        "{TOKENS}{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n",
-        directory.section(NAME)
-    ));
+    let setup = world()
+        .setup("named")
+        .config(&format!("{TOKENS}{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n", directory.section(NAME)));
     let daemon = setup.start()?;
     // No ACME server is running yet; meanwhile the daemon uses its self-signed certificate.
     wait_for_event(
         &daemon,
         "certificate-not-renewed",
-        &[
-            &directory.url(),
-            NAME,
-            "cannot be reached",
-            "next attempt in",
-        ],
+        &[&directory.url(), NAME, "cannot be reached", "next attempt in"],
     )?;
     ensure!(
-        curl(&daemon, &daemon.home.join("tls/own.pem"))?
-            .output()
-            .contains("no alternative certificate subject name"),
+        curl(&daemon, &daemon.home.join("tls/own.pem"))?.output().contains("no alternative certificate subject name"),
         "its own is for other names"
     );
     // A server that does not find this machine under the name.
@@ -72,11 +64,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     wait_for_event(
         &daemon,
         "certificate-not-renewed",
-        &[
-            "could not verify the names",
-            NAME,
-            &format!("port 443 to port {elsewhere}"),
-        ],
+        &["could not verify the names", NAME, &format!("port 443 to port {elsewhere}")],
     )?;
     drop(lost);
     // A server that does, at the port that it is given. The account with the previous server is not valid here.
@@ -99,9 +87,7 @@ pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
     drop(lasting);
     // Certificate and key are stored for a daemon that starts while no server is available.
     for file in ["acme.pem", "acme-account.json"] {
-        let mode = std::fs::metadata(daemon.home.join("tls").join(file))?
-            .permissions()
-            .mode();
+        let mode = std::fs::metadata(daemon.home.join("tls").join(file))?.permissions().mode();
         ensure!(mode & 0o777 == 0o600, "{file}: {mode:o}");
     }
     daemon.stop()?;
@@ -115,10 +101,7 @@ pub fn who_comes_for_something_else_is_answered_no_challenge() -> Verdict {
     let elsewhere = free_port()?;
     let daemon = world()
         .setup("unchallenged")
-        .config(&format!(
-            "{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n",
-            directory.section(NAME)
-        ))
+        .config(&format!("{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n", directory.section(NAME)))
         .start()?;
     let asks = |port: u16, protocol: &str| {
         run(Command::new("openssl")
@@ -145,26 +128,15 @@ pub fn who_comes_for_something_else_is_answered_no_challenge() -> Verdict {
 
 pub fn what_cannot_be_asked_for_is_said_at_the_start() -> Verdict {
     for (own, section, words) in [
-        (
-            "disagreeing",
-            "names = [\"robots.lab.example\"]",
-            "accept_terms = true",
-        ),
-        (
-            "wild",
-            "names = [\"*.lab.example\"]\naccept_terms = true",
-            "wildcards",
-        ),
+        ("disagreeing", "names = [\"robots.lab.example\"]", "accept_terms = true"),
+        ("wild", "names = [\"*.lab.example\"]\naccept_terms = true", "wildcards"),
         (
             "displaced",
             "names = [\"robots.lab.example\"]\naccept_terms = true\nchallenge_listen = \"192.0.2.1:443\"",
             "challenge_listen in [tls.acme]",
         ),
     ] {
-        let refused = world()
-            .setup(own)
-            .config(&format!("[tls.acme]\n{section}\n"))
-            .expect_refusal()?;
+        let refused = world().setup(own).config(&format!("[tls.acme]\n{section}\n")).expect_refusal()?;
         ensure!(refused.contains(words), "{words}: {refused}");
     }
     Ok(())

@@ -18,14 +18,8 @@ use crate::access::{create_token, daemon, push_adder, run_with_token};
 
 /// Returns the records of the audit log.
 fn audit_records(daemon: &Daemon) -> anyhow::Result<Vec<Value>> {
-    let told = daemon
-        .deployer()
-        .run(&["--format", "json", "audit", "-n", "1000"])?
-        .expect_success()?;
-    told.stdout
-        .lines()
-        .map(|line| Ok(serde_json::from_str(line)?))
-        .collect()
+    let told = daemon.deployer().run(&["--format", "json", "audit", "-n", "1000"])?.expect_success()?;
+    told.stdout.lines().map(|line| Ok(serde_json::from_str(line)?)).collect()
 }
 
 fn find_record<'a>(records: &'a [Value], wanted: &[(&str, Value)]) -> anyhow::Result<&'a Value> {
@@ -45,11 +39,7 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
         .spawn()?;
     let followed = BufReader::new(follower.stdout.take().context("piped")?).lines();
     let (sender, lines) = std::sync::mpsc::channel();
-    std::thread::spawn(move || {
-        followed
-            .map_while(Result::ok)
-            .try_for_each(|line| sender.send(line))
-    });
+    std::thread::spawn(move || followed.map_while(Result::ok).try_for_each(|line| sender.send(line)));
     let hears = |word: &str| -> Verdict {
         loop {
             let line = patience::receive(&lines).with_context(|| format!("{word} was not told"))?;
@@ -64,15 +54,9 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     ensure!(status == 403, "{status}");
     hears("evil.example")?;
     let scope = ["--service", "adder*"];
-    let alice = create_token(
-        &daemon,
-        &[&["alice", "--role", "deployer"], &scope[..]].concat(),
-    )?;
+    let alice = create_token(&daemon, &[&["alice", "--role", "deployer"], &scope[..]].concat())?;
     hears("token alice: ")?;
-    let eve = create_token(
-        &daemon,
-        &[&["eve", "--role", "viewer"], &scope[..]].concat(),
-    )?;
+    let eve = create_token(&daemon, &[&["eve", "--role", "viewer"], &scope[..]].concat())?;
     push_adder(&daemon, &alice, &[])?.expect_success()?;
     hears("published")?;
     for _ in 0..3 {
@@ -84,16 +68,12 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     hears("connected by rosbridge")?;
     drop(robot);
     let deployer = daemon.deployer();
-    deployer
-        .run(&["policy", "allow", "rover", "call:/x"])?
-        .expect_success()?;
+    deployer.run(&["policy", "allow", "rover", "call:/x"])?.expect_success()?;
     let mut robot = daemon.robot(&format!("adder_py?token={rover}"))?;
     robot.send(json!({"op": "subscribe", "topic": "/cmd_vel", "type": "std_msgs/String"}))?;
     hears("was refused subscribe:/cmd_vel")?;
     drop(robot);
-    deployer
-        .run(&["token", "revoke", "eve"])?
-        .expect_success()?;
+    deployer.run(&["token", "revoke", "eve"])?.expect_success()?;
     hears("token eve")?;
     let records = audit_records(&daemon)?;
     let root = json!("root (admin)");
@@ -101,52 +81,23 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
         &records,
         &[
             ("who", root.clone()),
-            (
-                "object",
-                json!(r#"token alice: {"name":"alice","role":"deployer","services":["adder*"]}"#),
-            ),
+            ("object", json!(r#"token alice: {"name":"alice","role":"deployer","services":["adder*"]}"#)),
         ],
     )?;
-    ensure!(
-        made["from"] == "user 0" && made["action"] == "administer",
-        "{made}"
-    );
-    let pushed = find_record(
-        &records,
-        &[
-            ("who", json!("alice (deployer)")),
-            ("object", json!("service adder_py")),
-        ],
-    )?;
+    ensure!(made["from"] == "user 0" && made["action"] == "administer", "{made}");
+    let pushed = find_record(&records, &[("who", json!("alice (deployer)")), ("object", json!("service adder_py"))])?;
     let from = pushed["from"].as_str().unwrap_or_default();
-    ensure!(
-        from.starts_with("127.0.0.1:") && pushed["status"] == 200,
-        "{pushed}"
-    );
+    ensure!(from.starts_with("127.0.0.1:") && pushed["status"] == 200, "{pushed}");
     // Repeated refusals are recorded once.
     let refused = [("who", json!("eve (viewer)")), ("status", json!(403))];
     let refused = find_record(&records, &refused)?;
-    ensure!(
-        refused["did"] == "DELETE /api/v1/services/adder_py",
-        "{refused}"
-    );
-    let often = records
-        .iter()
-        .filter(|record| record["who"] == "eve (viewer)");
+    ensure!(refused["did"] == "DELETE /api/v1/services/adder_py", "{refused}");
+    let often = records.iter().filter(|record| record["who"] == "eve (viewer)");
     ensure!(often.count() == 1, "{records:#?}");
-    let connected = [
-        ("who", json!("rover (robot)")),
-        ("action", json!("connect")),
-    ];
+    let connected = [("who", json!("rover (robot)")), ("action", json!("connect"))];
     let connected = find_record(&records, &connected)?;
-    ensure!(
-        connected["object"] == "service adder_py as robot r1",
-        "{connected}"
-    );
-    find_record(
-        &records,
-        &[("who", root), ("object", json!("rover at *: call:/x"))],
-    )?;
+    ensure!(connected["object"] == "service adder_py as robot r1", "{connected}");
+    find_record(&records, &[("who", root), ("object", json!("rover at *: call:/x"))])?;
     // Users who may not read the log learn nothing, and the log survives a restart.
     run_with_token(&daemon, &alice, &["audit"])?.expect_failure(&["may not administer"])?;
     follower.kill()?;
@@ -160,25 +111,16 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
 }
 
 pub fn who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded() -> Verdict {
-    let daemon = world()
-        .setup("audited-refusals")
-        .config("trusted_proxies = [\"127.0.0.1\"]\n")
-        .start()?;
+    let daemon = world().setup("audited-refusals").config("trusted_proxies = [\"127.0.0.1\"]\n").start()?;
     let scope = ["--role", "robot", "--service", "*", "--robot"];
-    let robot =
-        |name: &str, robot: &str| create_token(&daemon, &[&[name], &scope[..], &[robot]].concat());
+    let robot = |name: &str, robot: &str| create_token(&daemon, &[&[name], &scope[..], &[robot]].concat());
     let (_, taker) = (robot("rover", "r1")?, robot("taker", "r2")?);
     let chief = create_token(&daemon, &["chief", "--role", "operator"])?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     // One is refused because of its scope, the other because the name belongs to another principal.
     for token in [&taker, &chief] {
         let url = daemon.url(&format!("adder_py?robot=r1&token={token}"));
-        let Err(refusal) = Robot::try_connect(&url) else {
-            anyhow::bail!("another's robot was taken over")
-        };
+        let Err(refusal) = Robot::try_connect(&url) else { anyhow::bail!("another's robot was taken over") };
         ensure!(refusal.status == 403, "{refusal}");
     }
     // Also over a connection that may authenticate later.
@@ -212,11 +154,7 @@ pub fn who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded() ->
     let records = support::wait_until("all of them", || {
         let records = audit_records(&daemon)?;
         let enough = records.iter().filter(|one| one["status"] == 403).count() >= 9;
-        Ok(if enough {
-            Ok(records)
-        } else {
-            Err(format!("{records:#?}"))
-        })
+        Ok(if enough { Ok(records) } else { Err(format!("{records:#?}")) })
     })?;
     for who in ["taker (robot)", "chief (operator)"] {
         let refused = [
@@ -245,22 +183,14 @@ pub fn who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded() ->
         let record = find_record(&records, &[("did", json!(did))])?;
         let told = record["from"].as_str().unwrap_or_default();
         ensure!(told.starts_with(from), "{record}");
-        let who = if number < 7 {
-            "eve (viewer)"
-        } else {
-            "a client without a token"
-        };
+        let who = if number < 7 { "eve (viewer)" } else { "a client without a token" };
         ensure!(record["who"] == who, "{record}");
     }
     Ok(())
 }
 
 /// Finds files below a directory that contain one of the texts, except in images.
-fn find_files_with(
-    directory: &Path,
-    texts: &[(String, String)],
-    found: &mut Vec<String>,
-) -> Verdict {
+fn find_files_with(directory: &Path, texts: &[(String, String)], found: &mut Vec<String>) -> Verdict {
     for entry in std::fs::read_dir(directory)? {
         let path = entry?.path();
         let about = path.symlink_metadata()?;
@@ -300,24 +230,12 @@ pub fn no_secret_is_in_any_log() -> Verdict {
     let rotated = deployer.run_json(&["token", "rotate", "rover"])?;
     let rover = rotated["secret"].as_str().context("a secret")?.to_owned();
     let gone = create_token(&daemon, &["gone", "--role", "admin"])?;
-    said += &deployer
-        .run(&["token", "revoke", "gone"])?
-        .expect_success()?
-        .output();
+    said += &deployer.run(&["token", "revoke", "gone"])?.expect_success()?.output();
     // Before the guesses, after which this token would have to wait.
-    said += &run_with_token(&daemon, configured, &["services"])?
-        .expect_success()?
-        .output();
-    for path in [
-        "/metrics",
-        "/api/v1/events?limit=1000",
-        "/api/v1/tokens",
-        "/api/v1/policy",
-    ] {
+    said += &run_with_token(&daemon, configured, &["services"])?.expect_success()?.output();
+    for path in ["/metrics", "/api/v1/events?limit=1000", "/api/v1/tokens", "/api/v1/policy"] {
         let bearer = format!("Bearer {configured}");
-        said += &daemon
-            .request("GET", path, &[("Authorization", &bearer)])?
-            .1;
+        said += &daemon.request("GET", path, &[("Authorization", &bearer)])?.1;
     }
     // Every way to show a token, valid or not.
     let guess = "guessedatrandom".to_owned();
@@ -331,9 +249,7 @@ pub fn no_secret_is_in_any_log() -> Verdict {
     ] {
         let bearer = format!("Bearer {secret}");
         for path in ["/api/v1/services", "/api/v1/tokens"] {
-            said += &daemon
-                .request("GET", path, &[("Authorization", &bearer)])?
-                .1;
+            said += &daemon.request("GET", path, &[("Authorization", &bearer)])?.1;
         }
         said += &daemon.get(&format!("/api/v1/services?token={secret}"))?.1;
         let url = daemon.url(&format!("adder_py?resume={resume}&token={secret}"));
@@ -358,14 +274,9 @@ pub fn no_secret_is_in_any_log() -> Verdict {
         secrets.push((name.to_owned(), secret.clone()));
     }
     secrets.push(("the resume token".to_owned(), resume));
-    for words in [
-        &["token", "list"][..],
-        &["events"],
-        &["audit", "-n", "1000"],
-        &["status"],
-        &["servants"],
-        &["doctor"],
-    ] {
+    for words in
+        [&["token", "list"][..], &["events"], &["audit", "-n", "1000"], &["status"], &["servants"], &["doctor"]]
+    {
         said += &deployer.run(words)?.output();
     }
     for (name, secret) in &secrets {
@@ -410,45 +321,28 @@ fn request_as(socket: &Path, uid: u32, groups: &[u32]) -> anyhow::Result<String>
         stream.read_to_string(&mut answer)?;
         Ok(answer)
     };
-    std::thread::scope(|scope| scope.spawn(asks).join())
-        .map_err(|_| anyhow::anyhow!("the thread ended badly"))?
+    std::thread::scope(|scope| scope.spawn(asks).join()).map_err(|_| anyhow::anyhow!("the thread ended badly"))?
 }
 
 pub fn members_of_a_group_are_admins_at_a_socket_of_theirs() -> Verdict {
     // Other users cannot enter a home, but this directory.
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-members-")
-        .tempdir()?;
-    std::fs::set_permissions(
-        place.path(),
-        std::os::unix::fs::PermissionsExt::from_mode(0o755),
-    )?;
+    let place = tempfile::Builder::new().prefix("cloudroid-members-").tempdir()?;
+    std::fs::set_permissions(place.path(), std::os::unix::fs::PermissionsExt::from_mode(0o755))?;
     let (member, group) = (61_001, 61_002);
     let socket = place.path().join("below/daemon.sock");
-    let daemon = world()
-        .setup("members")
-        .config(&format!(
-            "admin_group = \"{group}\"\nadmin_socket = {socket:?}\n"
-        ))
-        .start()?;
+    let daemon =
+        world().setup("members").config(&format!("admin_group = \"{group}\"\nadmin_socket = {socket:?}\n")).start()?;
     // By a supplementary group, and by the primary group.
     for (uid, groups) in [(member, &[group][..]), (group, &[]), (0, &[])] {
         let answer = request_as(&socket, uid, groups)?;
-        ensure!(
-            answer.starts_with("HTTP/1.1 200"),
-            "{uid} {groups:?}: {answer}"
-        );
+        ensure!(answer.starts_with("HTTP/1.1 200"), "{uid} {groups:?}: {answer}");
     }
     // The file's permissions keep others out; with open permissions the peer credentials do.
-    ensure!(
-        request_as(&socket, member, &[]).is_err(),
-        "let in without the group"
-    );
+    ensure!(request_as(&socket, member, &[]).is_err(), "let in without the group");
     std::fs::set_permissions(&socket, std::os::unix::fs::PermissionsExt::from_mode(0o666))?;
     let answer = request_as(&socket, member, &[member])?;
     ensure!(
-        answer.starts_with("HTTP/1.1 403")
-            && answer.contains("user 61001 may not use the daemon's socket"),
+        answer.starts_with("HTTP/1.1 403") && answer.contains("user 61001 may not use the daemon's socket"),
         "{answer}"
     );
     // The user of the portal's threads is refused as well.
@@ -456,10 +350,7 @@ pub fn members_of_a_group_are_admins_at_a_socket_of_theirs() -> Verdict {
     ensure!(answer.starts_with("HTTP/1.1 403"), "{answer}");
     // None of them may use the daemon's own socket.
     let own = daemon.deployer().home.join("run/daemon.sock");
-    ensure!(
-        request_as(&own, member, &[group]).is_err(),
-        "let into the home"
-    );
+    ensure!(request_as(&own, member, &[group]).is_err(), "let into the home");
     daemon.stop()?;
     ensure!(!socket.exists(), "the socket is left");
     Ok(())
@@ -485,12 +376,7 @@ pub fn whoever_guesses_is_slowed_and_counted() -> Verdict {
     };
     ensure!(guesses > 10, "slowed after {guesses}");
     let problem: Value = serde_json::from_str(&body)?;
-    ensure!(
-        problem["retry_after"]
-            .as_u64()
-            .is_some_and(|after| after > 0),
-        "{body}"
-    );
+    ensure!(problem["retry_after"].as_u64().is_some_and(|after| after > 0), "{body}");
     // Valid tokens of the database are not slowed down.
     ensure!(shows(&rover)?.0 == 200);
     let (_, metrics) = {
@@ -501,9 +387,6 @@ pub fn whoever_guesses_is_slowed_and_counted() -> Verdict {
         .lines()
         .find_map(|line| line.strip_prefix("cloudroid_refused_tokens_total{why=\"unknown\"} "))
         .context("a count")?;
-    ensure!(
-        counted.parse::<u64>()? == guesses - 1,
-        "{counted} of {guesses}"
-    );
+    ensure!(counted.parse::<u64>()? == guesses - 1, "{counted} of {guesses}");
     Ok(())
 }

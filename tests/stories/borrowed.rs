@@ -63,18 +63,13 @@ pub fn services_elsewhere_and_modules_of_plain_packages_are_found() -> Verdict {
         ("src/plain/matcher.h", "#define MATCH 2\n".to_owned()),
         ("src/asker/package.xml", manifest("asker", &needs)),
         ("src/asker/CMakeLists.txt", asker.to_owned()),
-        (
-            "src/asker/services/Ask.srv",
-            "int64 question\n---\nint64 answer\n".to_owned(),
-        ),
+        ("src/asker/services/Ask.srv", "int64 question\n---\nint64 answer\n".to_owned()),
         ("src/asker/asker.cpp", program.to_owned()),
     ];
     write_files(place.path(), &files)?;
     let push = ["push", path_str(place.path()), "--name", "asker"];
     daemon.deployer().run(&push)?.expect_success()?;
-    let answer = daemon
-        .robot("asker")?
-        .call("/ask", json!({"question": 40}))?;
+    let answer = daemon.robot("asker")?.call("/ask", json!({"question": 40}))?;
     ensure!(answer["values"]["answer"] == 42, "{answer}");
     Ok(())
 }
@@ -90,10 +85,7 @@ pub fn all_that_a_package_forgot_is_named_at_once() -> Verdict {
                  find_package(no_such_package REQUIRED)\ncatkin_package()\n";
     write_files(
         place.path(),
-        &[
-            ("package.xml", manifest("forgetful", OF_CATKIN)),
-            ("CMakeLists.txt", build.to_owned()),
-        ],
+        &[("package.xml", manifest("forgetful", OF_CATKIN)), ("CMakeLists.txt", build.to_owned())],
     )?;
     let push = ["push", path_str(place.path()), "--node", "any"];
     let outcome = daemon.deployer().run(&push)?.expect_failure(&[
@@ -127,10 +119,7 @@ pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
     )?;
     let push = ["push", path_str(place.path())];
     let missing = "the Python module scipy is missing: push with `--with python3-scipy`";
-    daemon
-        .deployer()
-        .run(&push)?
-        .expect_failure(&["exited with status 1", missing])?;
+    daemon.deployer().run(&push)?.expect_failure(&["exited with status 1", missing])?;
     Ok(())
 }
 
@@ -159,9 +148,6 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     let events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
     let titles = events.filter_map(|event| Some(event["title"].as_str()?.to_owned()));
     let titles: Vec<String> = titles.collect();
-    ensure!(
-        titles.iter().all(|title| !title.contains("compil")),
-        "{titles:?}"
-    );
+    ensure!(titles.iter().all(|title| !title.contains("compil")), "{titles:?}");
     Ok(())
 }

@@ -49,17 +49,12 @@ fn write_package(below: &Path, name: &str, program: &str) -> anyhow::Result<Path
 /// Returns the names of running or abandoned builds.
 fn list_builds(daemon: &Daemon) -> anyhow::Result<Vec<String>> {
     let directory = daemon.home.join("build");
-    let names = std::fs::read_dir(directory)?
-        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
+    let names = std::fs::read_dir(directory)?.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
     names.collect()
 }
 
 /// Waits for a condition while a push runs; on a busy machine a push takes a while to start.
-fn wait_during_push<T>(
-    push: &JoinHandle<T>,
-    what: &str,
-    mut is: impl FnMut() -> anyhow::Result<bool>,
-) -> Verdict {
+fn wait_during_push<T>(push: &JoinHandle<T>, what: &str, mut is: impl FnMut() -> anyhow::Result<bool>) -> Verdict {
     while !is()? {
         ensure!(!push.is_finished(), "the push ended without {what}");
         std::thread::sleep(LOOK_EVERY);
@@ -68,43 +63,24 @@ fn wait_during_push<T>(
 }
 
 pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Verdict {
-    let daemon = world()
-        .setup("bounds")
-        .config("[push]\ndisk = \"8G\"\n")
-        .start()?;
+    let daemon = world().setup("bounds").config("[push]\ndisk = \"8G\"\n").start()?;
     let place = world().directory("bounds-packages")?;
     let endless = "import time\nopen('hole', 'w').truncate(1 << 40)\nwhile True: time.sleep(1)\n";
     let deep = "import os, time\nfor _ in range(15000):\n    os.mkdir('d')\n    os.chdir('d')\nwhile True: \
         time.sleep(1)\n";
     let brief = "import os\nfor _ in range(15000):\n    os.mkdir('d')\n    os.chdir('d')\n";
-    for (name, program, words) in [
-        ("takes_the_disk", endless, &["8G", "raise disk"][..]),
-        ("nests_for_ever", deep, &["directories deep"]),
-    ] {
+    for (name, program, words) in
+        [("takes_the_disk", endless, &["8G", "raise disk"][..]), ("nests_for_ever", deep, &["directories deep"])]
+    {
         let package = write_package(place.path(), name, program)?;
-        daemon
-            .deployer()
-            .run(&["push", path_str(&package)])?
-            .expect_failure(words)?;
-        ensure!(
-            list_builds(&daemon)?.is_empty(),
-            "{:?}",
-            list_builds(&daemon)?
-        );
+        daemon.deployer().run(&["push", path_str(&package)])?.expect_failure(words)?;
+        ensure!(list_builds(&daemon)?.is_empty(), "{:?}", list_builds(&daemon)?);
     }
     // Faster than the monitor's interval, and removed completely: the daemon is still running to report the end.
     let package = write_package(place.path(), "nests_and_goes_on", brief)?;
     let outcome = daemon.deployer().run(&["push", path_str(&package)])?;
-    ensure!(
-        !outcome.output().contains("aborted the push"),
-        "{}",
-        outcome.output()
-    );
-    ensure!(
-        list_builds(&daemon)?.is_empty(),
-        "{:?}",
-        list_builds(&daemon)?
-    );
+    ensure!(!outcome.output().contains("aborted the push"), "{}", outcome.output());
+    ensure!(list_builds(&daemon)?.is_empty(), "{:?}", list_builds(&daemon)?);
     daemon.get_json("/api/v1/status")?;
     Ok(())
 }
@@ -112,14 +88,9 @@ pub fn a_build_that_takes_too_much_is_ended_and_leaves_nothing() -> Verdict {
 /// Writes a package whose node never registers, so that its push waits.
 fn write_waiting_package(below: &Path) -> anyhow::Result<PathBuf> {
     let place = write_package(below, "never_there", "print('built')\n")?;
-    std::fs::write(
-        place.join("waits.py"),
-        "#!/usr/bin/env python3\nimport time\ntime.sleep(86400)\n",
-    )?;
+    std::fs::write(place.join("waits.py"), "#!/usr/bin/env python3\nimport time\ntime.sleep(86400)\n")?;
     let mut list = std::fs::read_to_string(place.join("CMakeLists.txt"))?;
-    list.push_str(
-        "catkin_install_python(PROGRAMS waits.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n",
-    );
+    list.push_str("catkin_install_python(PROGRAMS waits.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n");
     std::fs::write(place.join("CMakeLists.txt"), list)?;
     Ok(place)
 }
@@ -130,27 +101,12 @@ pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
     let sleeper = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
     // During the build, and while the node is examined.
     for (name, package, node, words) in [
-        (
-            "alice",
-            write_package(place.path(), "sleeps_on", sleeper)?,
-            "x",
-            "it sleeps",
-        ),
-        (
-            "bob",
-            write_waiting_package(place.path())?,
-            "waits.py",
-            "starting it once",
-        ),
+        ("alice", write_package(place.path(), "sleeps_on", sleeper)?, "x", "it sleeps"),
+        ("bob", write_waiting_package(place.path())?, "waits.py", "starting it once"),
     ] {
         let secret = create_token(&daemon, &[name, "--role", "deployer", "--service", "*"])?;
         let mut push = Command::new(binaries::path("cloudroidctl"))
-            .args([
-                "--server",
-                &format!("http://{}", daemon.address),
-                "--token",
-                &secret,
-            ])
+            .args(["--server", &format!("http://{}", daemon.address), "--token", &secret])
             .args(["push", path_str(&package), "--node", node])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
@@ -163,10 +119,7 @@ pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
             said.push_str(&line);
             said.push('\n');
             if line.contains(words) {
-                daemon
-                    .deployer()
-                    .run(&["token", "revoke", name])?
-                    .expect_success()?;
+                daemon.deployer().run(&["token", "revoke", name])?.expect_success()?;
             }
         }
         said += &std::fs::read_to_string(place.path().join(name))?;
@@ -175,11 +128,7 @@ pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
         // Nothing is left of the build, and nothing was published.
         support::wait_until("the build's end", || {
             let builds = list_builds(&daemon)?;
-            Ok(if builds.is_empty() {
-                Ok(())
-            } else {
-                Err(format!("{builds:?}"))
-            })
+            Ok(if builds.is_empty() { Ok(()) } else { Err(format!("{builds:?}")) })
         })?;
         ensure!(daemon.api("/api/v1/services")? == json!([]));
     }
@@ -196,15 +145,9 @@ pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Verdict {
     let logs = home.join("logs");
     wait_during_push(&push, "its build", || {
         let mut logs = std::fs::read_dir(&logs).into_iter().flatten().flatten();
-        Ok(logs.any(|log| {
-            std::fs::read_to_string(log.path()).is_ok_and(|text| text.contains("it sleeps"))
-        }))
+        Ok(logs.any(|log| std::fs::read_to_string(log.path()).is_ok_and(|text| text.contains("it sleeps"))))
     })?;
-    ensure!(
-        list_builds(&daemon)?.len() == 1,
-        "{:?}",
-        list_builds(&daemon)?
-    );
+    ensure!(list_builds(&daemon)?.len() == 1, "{:?}", list_builds(&daemon)?);
     ensure!(daemon.stop()?.success(), "it ended as asked");
     let Ok(outcome) = push.join() else {
         bail!("the deployer panicked");
@@ -220,10 +163,7 @@ pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Verdict {
 pub fn a_second_signal_ends_the_daemon_at_once() -> Verdict {
     let setup = world().setup("impatient");
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .push(GREETER.0, GREETER.1)?
-        .expect_success()?;
+    daemon.deployer().push(GREETER.0, GREETER.1)?.expect_success()?;
     let mut robot = daemon.robot("greeter_cpp?robot=stuck")?;
     robot.call("/rosapi/get_time", json!({}))?;
     let servant = daemon.servant_of("greeter_cpp", "stuck")?;
@@ -256,38 +196,22 @@ fn parent_of_process(pid: i32) -> anyhow::Result<i32> {
 
 pub fn a_probe_waits_for_room_like_any_servant() -> Verdict {
     // Capacity for one servant with the default limits.
-    let daemon = world()
-        .setup("probe-room")
-        .config("[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n")
-        .start()?;
-    daemon
-        .deployer()
-        .push(GREETER.0, GREETER.1)?
-        .expect_success()?;
+    let daemon =
+        world().setup("probe-room").config("[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n").start()?;
+    daemon.deployer().push(GREETER.0, GREETER.1)?.expect_success()?;
     let mut robot = daemon.robot("greeter_cpp?robot=first")?;
     robot.call("/rosapi/get_time", json!({}))?;
     let deployer = daemon.deployer();
-    let second = std::thread::spawn(move || {
-        deployer.push(GREETER.0, &[GREETER.1, &["--name", "second"]].concat())
-    });
+    let second = std::thread::spawn(move || deployer.push(GREETER.0, &[GREETER.1, &["--name", "second"]].concat()));
     wait_during_push(&second, "waiting for free capacity", || {
         Ok(daemon.get_json("/api/v1/status")?["capacity"]["waiting"] == 1)
     })?;
     robot.leave()?;
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     let Ok(outcome) = second.join() else {
         bail!("the deployer panicked");
     };
     let outcome = outcome?.expect_success()?;
-    ensure!(
-        outcome
-            .output()
-            .contains("waiting for free capacity to start it"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(outcome.output().contains("waiting for free capacity to start it"), "{}", outcome.output());
     Ok(())
 }

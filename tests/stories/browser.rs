@@ -58,23 +58,10 @@ pub struct ChromiumBrowser(Child);
 
 impl ChromiumBrowser {
     /// Opens a page, with further command-line arguments.
-    pub fn open(
-        url: &str,
-        profile: &std::path::Path,
-        more: &[&str],
-    ) -> anyhow::Result<ChromiumBrowser> {
+    pub fn open(url: &str, profile: &std::path::Path, more: &[&str]) -> anyhow::Result<ChromiumBrowser> {
         let child = Command::new("chromium")
-            .args([
-                "--headless",
-                "--no-sandbox",
-                "--disable-gpu",
-                "--disable-dev-shm-usage",
-            ])
-            .args([
-                "--no-first-run",
-                "--disable-background-networking",
-                "--disable-component-update",
-            ])
+            .args(["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"])
+            .args(["--no-first-run", "--disable-background-networking", "--disable-component-update"])
             .arg(format!("--user-data-dir={}", profile.display()))
             .args(more)
             .arg(url)
@@ -156,15 +143,7 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
     let admin = create_token(&daemon, &["admin", "--role", "admin"])?;
     push_adder(&daemon, &admin, &[])?.expect_success()?;
     let robot = |name: &str, service: &str| {
-        let words = [
-            name,
-            "--role",
-            "robot",
-            "--robot",
-            name,
-            "--service",
-            service,
-        ];
+        let words = [name, "--role", "robot", "--robot", name, "--service", service];
         create_token(&daemon, &words)
     };
     let (page, other) = (robot("page", "adder_py")?, robot("other", "other_*")?);
@@ -190,10 +169,7 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
         ensure!(said["own"][way] == 42, "{way}: {said}");
         for whose in ["another's", "unknown"] {
             let came = &said[whose][way];
-            ensure!(
-                came == "refused" || came == "closed",
-                "{whose} {way}: {said}"
-            );
+            ensure!(came == "refused" || came == "closed", "{whose} {way}: {said}");
         }
     }
     Ok(())

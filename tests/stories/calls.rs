@@ -129,11 +129,7 @@ fn expect_success(answer: anyhow::Result<(bool, String)>) -> anyhow::Result<Stri
 }
 
 /// Starts a call of std_srvs/Trigger without waiting.
-fn begin_call(
-    site: &Site,
-    app: &Arc<dyn Bus>,
-    service: &'static str,
-) -> JoinHandle<Result<Bytes, BusError>> {
+fn begin_call(site: &Site, app: &Arc<dyn Bus>, service: &'static str) -> JoinHandle<Result<Bytes, BusError>> {
     begin_call_with_timeout(site, app, service, patience())
 }
 
@@ -146,25 +142,17 @@ fn begin_call_with_timeout(
 ) -> JoinHandle<Result<Bytes, BusError>> {
     let app = Arc::clone(app);
     let request = trigger_request(site.system.version());
-    site.runtime
-        .spawn(async move { app.call(service, request, time).await })
+    site.runtime.spawn(async move { app.call(service, request, time).await })
 }
 
 /// Waits for the response to a call.
-fn finish_call(
-    site: &Site,
-    call: JoinHandle<Result<Bytes, BusError>>,
-) -> anyhow::Result<(bool, String)> {
+fn finish_call(site: &Site, call: JoinHandle<Result<Bytes, BusError>>) -> anyhow::Result<(bool, String)> {
     let answer = site.runtime.block_on(call)??;
     twins::parse_trigger_response(site.system.version(), &answer)
 }
 
 /// Repeats a call until it fails with a message that contains `words`; other failures must be among `may`.
-fn wait_for_failure(
-    ask: impl Fn() -> anyhow::Result<String>,
-    words: &str,
-    may: &[&str],
-) -> anyhow::Result<()> {
+fn wait_for_failure(ask: impl Fn() -> anyhow::Result<String>, words: &str, may: &[&str]) -> anyhow::Result<()> {
     let deadline = Deadline::begin();
     loop {
         if let Err(error) = ask() {
@@ -179,10 +167,7 @@ fn wait_for_failure(
 }
 
 /// Repeats a call until it succeeds; failures must be among `may`.
-fn wait_for_success(
-    ask: impl Fn() -> anyhow::Result<String>,
-    may: &[&str],
-) -> anyhow::Result<String> {
+fn wait_for_success(ask: impl Fn() -> anyhow::Result<String>, may: &[&str]) -> anyhow::Result<String> {
     let deadline = Deadline::begin();
     loop {
         match ask() {
@@ -204,9 +189,7 @@ fn start_stub(
     argv: &[&str],
     ahead: i64,
 ) -> anyhow::Result<NodeProcess> {
-    let toml = format!(
-        "server = \"ws://{server}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n"
-    );
+    let toml = format!("server = \"ws://{server}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n");
     let ahead = ahead.to_string();
     let environment = [("CLOUDROID_TEST_CLOCK_SHIFT", ahead.as_str())];
     site.start_stub_with_environment(&environment, &toml, service, node, argv)
@@ -216,23 +199,13 @@ fn with_log<T>(outcome: anyhow::Result<T>, stub: &NodeProcess) -> anyhow::Result
     outcome.with_context(|| format!("the stub said:\n{}", stub.output()))
 }
 
-fn wait_until_served(
-    site: &Site,
-    app: &Arc<dyn Bus>,
-    service: &str,
-    stub: &NodeProcess,
-) -> anyhow::Result<()> {
+fn wait_until_served(site: &Site, app: &Arc<dyn Bus>, service: &str, stub: &NodeProcess) -> anyhow::Result<()> {
     let there = site.wait_for_graph(app, service, |graph| graph.services.contains_key(service));
     with_log(there.map(drop), stub)
 }
 
 /// Waits until a service has been looked up at the robot's Master in vain.
-fn wait_until_sought(
-    site: &Site,
-    app: &Arc<dyn Bus>,
-    service: &str,
-    stub: &NodeProcess,
-) -> anyhow::Result<()> {
+fn wait_until_sought(site: &Site, app: &Arc<dyn Bus>, service: &str, stub: &NodeProcess) -> anyhow::Result<()> {
     let sought = site.wait_for_graph(app, service, |graph| graph.sought.contains_key(service));
     with_log(sought.map(drop), stub)
 }
@@ -261,10 +234,7 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
     let ask = || expect_success(call_trigger(&site, &app, "/crossing/ask"));
     // No server exists: the same error as with the original.
     let error = format!("{:#}", ask().err().context("nobody is there")?);
-    ensure!(
-        error.contains("/robot/secret") && error.contains("unavailable"),
-        "{error}"
-    );
+    ensure!(error.contains("/robot/secret") && error.contains("unavailable"), "{error}");
     // Waits for a server that starts later.
     let waits = begin_call(&site, &app, "/crossing/wait");
     if ros == RosVersion::One {
@@ -309,13 +279,7 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
     with_log(wait_for_failure(ask, "unavailable", &gone), &stub)?;
     let another = site.join("/another")?;
     let wrong = std_srvs_type(ros, "Empty", "---\n")?;
-    let serving = serve(
-        &site,
-        &another,
-        "/robot/secret",
-        wrong,
-        TriggerService::new(ros, "?"),
-    )?;
+    let serving = serve(&site, &another, "/robot/secret", wrong, TriggerService::new(ros, "?"))?;
     // For a client of ROS 2 a service with another type does not exist.
     let another_type = match ros {
         RosVersion::One => "md5sum",
@@ -326,13 +290,7 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
     drop(serving);
     let secret = TriggerService::new(ros, "43");
     let _serving = serve_trigger(&site, &another, "/robot/secret", secret)?;
-    let may = [
-        "unavailable",
-        "md5sum",
-        "any more",
-        "no answer",
-        "does not serve",
-    ];
+    let may = ["unavailable", "md5sum", "any more", "no answer", "does not serve"];
     let told = with_log(wait_for_success(ask, &may), &stub)?;
     ensure!(told == "the robot says 43", "{told:?}");
     Ok(())
@@ -361,9 +319,7 @@ impl ServiceHandler for RobotScale {
             [part(at / SECOND), part(at % SECOND)].concat()
         };
         let moments = [time(now), time(now - 5)].concat();
-        Ok([&2_u32.to_le_bytes()[..], &moments, &request]
-            .concat()
-            .into())
+        Ok([&2_u32.to_le_bytes()[..], &moments, &request].concat().into())
     }
 }
 
@@ -372,19 +328,11 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     // The push has detected that the node waits for a service.
     let service = daemon.get_json("/api/v1/services/caller_cpp")?;
     let needs = service["interface"]["needs"].to_string();
-    ensure!(
-        needs == r#"[{"name":"/awaited","nodes":["/caller"]}]"#,
-        "{needs}"
-    );
+    ensure!(needs == r#"[{"name":"/awaited","nodes":["/caller"]}]"#, "{needs}");
     let ros = RosVersion::One;
     let site = Site::new()?;
     let app = site.join("/app")?;
-    let argv = [
-        "__name:=caller",
-        "__ns:=/arm",
-        "secret:=/vault/secret",
-        "scale:=kitchen_scale",
-    ];
+    let argv = ["__name:=caller", "__ns:=/arm", "secret:=/vault/secret", "scale:=kitchen_scale"];
     let stub = start_stub(&site, &daemon.address, THE_CALLER, "calls-cpp", &argv, HOUR)?;
     wait_until_served(&site, &app, "/arm/caller/once", &stub)?;
     // The node waits for a service that starts later.
@@ -400,12 +348,7 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     let kept = || with_log(call_trigger(&site, &app, "/arm/caller/kept"), &stub);
     ensure!(once()? == (false, "it failed".into()));
     wait_until_sought(&site, &app, "/vault/secret", &stub)?;
-    let serving = serve_trigger(
-        &site,
-        &robot,
-        "/vault/secret",
-        TriggerService::new(ros, "42"),
-    )?;
+    let serving = serve_trigger(&site, &robot, "/vault/secret", TriggerService::new(ros, "42"))?;
     let first = loop {
         let told = once()?;
         if told.0 {
@@ -420,12 +363,7 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     let gone = |graph: &ros::bus::Graph| !graph.services.contains_key("/vault/secret");
     site.wait_for_graph(&app, "its end", gone)?;
     while kept()?.0 {}
-    let _serving = serve_trigger(
-        &site,
-        &robot,
-        "/vault/secret",
-        TriggerService::new(ros, "43"),
-    )?;
+    let _serving = serve_trigger(&site, &robot, "/vault/secret", TriggerService::new(ros, "43"))?;
     let again = loop {
         let told = kept()?;
         if told.0 {
@@ -439,13 +377,8 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
         "caller_cpp/srv/Measure",
         "Header header\nuint8[] data\n---\ntime[] moments\nHeader header\nuint8[] data\n",
     )?;
-    let measure = ServiceType::new(
-        "caller_cpp/Measure",
-        registry.service("caller_cpp/Measure")?.md5.clone(),
-    );
-    let scale = Arc::new(RobotScale {
-        ahead: HOUR * SECOND,
-    });
+    let measure = ServiceType::new("caller_cpp/Measure", registry.service("caller_cpp/Measure")?.md5.clone());
+    let scale = Arc::new(RobotScale { ahead: HOUR * SECOND });
     let _scale = serve(&site, &robot, "/arm/kitchen_scale", measure, scale)?;
     let measured = with_log(call_trigger(&site, &app, "/arm/caller/measure"), &stub)?;
     ensure!(measured == (true, String::new()), "{measured:?}");
@@ -469,10 +402,7 @@ pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link(ros: RosVersio
     let setup = world().setup(&twin.robot_name("calls-cut"));
     let daemon = setup.start()?;
     let pushed = service.package.context("a package")?;
-    daemon
-        .deployer()
-        .push(pushed, service.arguments)?
-        .expect_success()?;
+    daemon.deployer().push(pushed, service.arguments)?.expect_success()?;
     let cutter = Cutter::new(&daemon.address, 0, 1, 0)?;
     let site = Site::with_ros(ros)?;
     let app = site.join("/app")?;

@@ -30,10 +30,7 @@ impl Comparison {
             .stdout(Stdio::piped())
             .spawn()?;
         let stdout = ctl.stdout.take().context("its standard output")?;
-        let mut comparing = Comparison {
-            ctl,
-            lines: BufReader::new(stdout).lines(),
-        };
+        let mut comparing = Comparison { ctl, lines: BufReader::new(stdout).lines() };
         while let Some(line) = comparing.lines.next() {
             let event: Value = serde_json::from_str(&line?)?;
             let title = event["title"].as_str().unwrap_or_default();
@@ -41,10 +38,7 @@ impl Comparison {
                 return Ok(comparing);
             }
         }
-        bail!(
-            "{arguments:?} ended before it compared: {}",
-            comparing.ctl.wait()?
-        )
+        bail!("{arguments:?} ended before it compared: {}", comparing.ctl.wait()?)
     }
 
     /// Waits for the end and returns the result.
@@ -100,9 +94,7 @@ fn connect_listener(daemon: &Daemon, name: &str) -> anyhow::Result<Robot> {
     support::wait_until("its subscription", || {
         robot.call("/add_two", json!({"a": 1, "b": 1}))?;
         let hears_nothing = robot.has_not_heard(|value| value["topic"] == "/sums")?;
-        Ok((!hears_nothing)
-            .then_some(())
-            .ok_or_else(|| "it hears nothing yet".to_owned()))
+        Ok((!hears_nothing).then_some(()).ok_or_else(|| "it hears nothing yet".to_owned()))
     })?;
     robot.call("/add_two", json!({"a": 1, "b": -1}))?;
     while robot.next_message_on("/sums")?["data"] != "0" {}
@@ -133,23 +125,14 @@ pub fn a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it() 
     expect_sums(&mut robot, 5)?;
     let found = comparing.finish()?;
     ensure!(found["verdict"] == "different", "{found:#}");
-    ensure!(
-        found["robot"] == "r1" && found["revision"] == 1 && found["candidate"] == 2,
-        "{found:#}"
-    );
+    ensure!(found["robot"] == "r1" && found["revision"] == 1 && found["candidate"] == 2, "{found:#}");
     let (service, topic) = (find_row(&found, "/add_two")?, find_row(&found, "/sums")?);
-    for (row, field, present, candidate) in [
-        (&service, "sum", "2", "102"),
-        (&topic, "data", "\"2\"", "\"102\""),
-    ] {
+    for (row, field, present, candidate) in [(&service, "sum", "2", "102"), (&topic, "data", "\"2\"", "\"102\"")] {
         let expected = json!([
             {"field": field, "answers": 5, "present": present, "candidate": candidate}
         ]);
         ensure!(row["fields"] == expected, "{found:#}");
-        ensure!(
-            row["different"] == 5 && row["missing"] == 0 && row["surplus"] == 0,
-            "{found:#}"
-        );
+        ensure!(row["different"] == 5 && row["missing"] == 0 && row["surplus"] == 0, "{found:#}");
         for times in ["present", "candidate"] {
             ensure!(row[times]["p50"].as_f64() > Some(0.0), "{found:#}");
         }
@@ -169,10 +152,7 @@ pub fn a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it() 
     let found = comparing.finish()?;
     let refused = &find_row(&found, "/add_two")?["fields"][0];
     let words = refused["candidate"].as_str().unwrap_or_default();
-    ensure!(
-        refused["field"] == "" && words.starts_with("failed: "),
-        "{found:#}"
-    );
+    ensure!(refused["field"] == "" && words.starts_with("failed: "), "{found:#}");
     wait_until_none_left(&daemon, "adder_py")?;
 
     let nothing = robot.has_not_heard(|value| {
@@ -183,17 +163,11 @@ pub fn a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it() 
     let refusals: [(&[&str], &str); 3] = [
         (&["9"], "adder_py has no revision 9"),
         (&["1"], "robot r1 already uses revision 1 of adder_py"),
-        (
-            &["2", "--robot", "nobody", "--seconds", "0.3"],
-            "robot nobody did not use adder_py within 0.3 s",
-        ),
+        (&["2", "--robot", "nobody", "--seconds", "0.3"], "robot nobody did not use adder_py within 0.3 s"),
     ];
     for (arguments, words) in refusals {
         let arguments = [&["shadow", "adder_py"], arguments].concat();
-        daemon
-            .deployer()
-            .run(&arguments)?
-            .expect_failure(&[words])?;
+        daemon.deployer().run(&arguments)?.expect_failure(&[words])?;
     }
     Ok(())
 }
@@ -201,10 +175,7 @@ pub fn a_candidate_that_adds_otherwise_is_told_and_its_robot_hears_none_of_it() 
 pub fn what_a_robot_says_is_said_to_a_candidate_too() -> Verdict {
     let daemon = world().setup("candidates-topics").start()?;
     let arguments = ["--node", "teller.py"];
-    daemon
-        .deployer()
-        .push("teller_py", &arguments)?
-        .expect_success()?;
+    daemon.deployer().push("teller_py", &arguments)?.expect_success()?;
     let mut robot = daemon.robot("teller_py?robot=talker")?;
     robot.send(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
     robot.subscribe("/teller/said")?;
@@ -218,16 +189,11 @@ pub fn what_a_robot_says_is_said_to_a_candidate_too() -> Verdict {
         Ok(())
     };
     let before = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "before"}});
-    robot.send_until(&before, "what the node says", |message| {
-        message["topic"] == "/teller/said"
-    })?;
+    robot.send_until(&before, "what the node says", |message| message["topic"] == "/teller/said")?;
     robot.send(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "heard"}}))?;
     while robot.next_message_on("/teller/said")?["data"] != "heard" {}
     let changed = [&arguments[..], &["--param", "word=another"]].concat();
-    daemon
-        .deployer()
-        .push("teller_py", &changed)?
-        .expect_success()?;
+    daemon.deployer().push("teller_py", &changed)?.expect_success()?;
     let arguments = ["teller_py", "2", "--requests", "6", "--bound", "1000"];
     let comparing = Comparison::start(&daemon, &arguments)?;
     for number in 0..6 {
@@ -235,20 +201,14 @@ pub fn what_a_robot_says_is_said_to_a_candidate_too() -> Verdict {
     }
     let found = comparing.finish()?;
     // The message published at startup is latched, and compared as well.
-    let (said, told) = (
-        find_row(&found, "/teller/said")?,
-        find_row(&found, "/teller/told")?,
-    );
+    let (said, told) = (find_row(&found, "/teller/said")?, find_row(&found, "/teller/told")?);
     ensure!(said["equal"] == 6, "{found:#}");
     ensure!(said["present"]["p50"].as_f64() > Some(0.0), "{found:#}");
     ensure!(said["candidate"]["p50"].as_f64() > Some(0.0), "{found:#}");
     ensure!(told["different"] == 1, "{found:#}");
     let words = told["fields"][0].to_string();
     ensure!(words.contains("data"), "{found:#}");
-    ensure!(
-        found["verdict"] == "different" && found["given"] == 6,
-        "{found:#}"
-    );
+    ensure!(found["verdict"] == "different" && found["given"] == 6, "{found:#}");
     wait_until_none_left(&daemon, "teller_py")
 }
 
@@ -289,26 +249,16 @@ fn compare_calls_and_goals(home: &str, more: &[&str]) -> Verdict {
     // The response contains the name of the container.
     ensure!(work["fields"][0]["field"] == "where", "{found:#}");
     ensure!(work["different"] == 2, "{found:#}");
-    ensure!(
-        count["kind"] == "action" && count["equal"] == 1,
-        "{found:#}"
-    );
-    ensure!(
-        count["candidate"]["p50"].as_f64() > Some(200.0),
-        "{found:#}"
-    );
-    let once = robot.has_not_heard(|value| {
-        value["op"] == "action_result" || value["op"] == "service_response"
-    })?;
+    ensure!(count["kind"] == "action" && count["equal"] == 1, "{found:#}");
+    ensure!(count["candidate"]["p50"].as_f64() > Some(200.0), "{found:#}");
+    let once = robot.has_not_heard(|value| value["op"] == "action_result" || value["op"] == "service_response")?;
     ensure!(once, "it was answered twice");
     wait_until_none_left(&daemon, "sharer_cpp")
 }
 
 pub fn a_candidate_gives_way_to_a_robot_and_what_was_compared_is_told() -> Verdict {
-    let daemon = world()
-        .setup("candidates-room")
-        .config("[capacity]\ncpus = 2.0\n[servant]\nwarm_pool = 0\n")
-        .start()?;
+    let daemon =
+        world().setup("candidates-room").config("[capacity]\ncpus = 2.0\n[servant]\nwarm_pool = 0\n").start()?;
     push(&daemon, &["--cpus", "1"])?;
     let mut first = connect_listener(&daemon, "first")?;
     expect_sums(&mut first, 1)?;
@@ -335,23 +285,10 @@ pub fn a_stubs_node_is_started_in_a_candidate_as_it_is_on_its_robot() -> Verdict
     push(&daemon, &[])?;
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let argv = [
-        "__name:=sum",
-        "/add_two:=/robot/add",
-        "/sums:=/robot/sums",
-        "_offset:=7",
-    ];
-    let stub = site.start_stub(
-        &daemon,
-        ("adder_py", "adder_py", "adder.py"),
-        "linked",
-        &argv,
-    )?;
+    let argv = ["__name:=sum", "/add_two:=/robot/add", "/sums:=/robot/sums", "_offset:=7"];
+    let stub = site.start_stub(&daemon, ("adder_py", "adder_py", "adder.py"), "linked", &argv)?;
     let said = || format!("the stub said:\n{}", stub.output());
-    site.wait_for_graph(&app, "the service", |graph| {
-        graph.services.contains_key("/robot/add")
-    })
-    .with_context(said)?;
+    site.wait_for_graph(&app, "the service", |graph| graph.services.contains_key("/robot/add")).with_context(said)?;
     let mut sums = site.subscribe(&app, "/robot/sums")?;
     let mut sum = 7i64;
     let mut asks = || -> anyhow::Result<String> {
@@ -383,18 +320,13 @@ pub fn a_stubs_node_is_started_in_a_candidate_as_it_is_on_its_robot() -> Verdict
         adds().with_context(said)?;
     }
     let found = comparing.finish()?;
-    ensure!(
-        found["verdict"] == "equal" && found["given"] == 5,
-        "{found:#}"
-    );
+    ensure!(found["verdict"] == "equal" && found["given"] == 5, "{found:#}");
     for name in ["/robot/add", "/robot/sums"] {
         // The last answer may still be in flight after all requests have been passed on.
         let owed = found["not_compared"].as_array().context("what was not")?;
         let owed = owed.iter().filter(|one| one["what"] == name);
         let owed: u64 = owed.filter_map(|one| one["count"].as_u64()).sum();
-        let equal = find_row(&found, name)?["equal"]
-            .as_u64()
-            .unwrap_or_default();
+        let equal = find_row(&found, name)?["equal"].as_u64().unwrap_or_default();
         ensure!(equal + owed == 5 && owed <= 1, "{found:#}");
     }
     wait_until_none_left(&daemon, "adder_py")

@@ -35,11 +35,8 @@ pub fn clients_with_tokens_find_nothing_missing() -> Verdict {
     let package = package_path(FIXTURE)?;
     let push = [&["push", package.as_str()], FIXTURE.arguments].concat();
     daemon.deployer().run(&push)?.expect_success()?;
-    for (command, name) in [
-        (roslibpy(ROSLIBPY), "roslibpy"),
-        (roslib(ROSLIB), "roslib"),
-        (roslibrust(), "roslibrust"),
-    ] {
+    for (command, name) in [(roslibpy(ROSLIBPY), "roslibpy"), (roslib(ROSLIB), "roslib"), (roslibrust(), "roslibrust")]
+    {
         let scope = ["--role", "robot", "--service", FIXTURE.name, "--robot"];
         let token = create_token(&daemon, &[&[name], &scope[..], &[name]].concat())?;
         let path = format!("{}?token={token}", FIXTURE.name);
@@ -55,11 +52,7 @@ pub fn what_a_node_that_is_well_prints_is_in_its_log_at_once() -> Verdict {
     let id = id.as_str().context("an id")?;
     support::wait_until("a line of ROS_INFO", || {
         let log = daemon.deployer().run(&["logs", id])?.expect_success()?;
-        Ok(if log.stdout.contains("the fixture is ready") {
-            Ok(())
-        } else {
-            Err(log.output())
-        })
+        Ok(if log.stdout.contains("the fixture is ready") { Ok(()) } else { Err(log.output()) })
     })
 }
 

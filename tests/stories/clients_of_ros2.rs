@@ -40,8 +40,7 @@ fn run_while_publishing(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Ve
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         let crying = scope.spawn(|| {
-            let says =
-                |topic: &str, msg: &Value| json!({"op": "publish", "topic": topic, "msg": msg});
+            let says = |topic: &str, msg: &Value| json!({"op": "publish", "topic": topic, "msg": msg});
             while !over.load(Ordering::Relaxed) {
                 robot.send(says("/name", &json!({"data": "rover"})))?;
                 robot.send(says("/square", &square))?;
@@ -58,16 +57,13 @@ fn run_while_publishing(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Ve
 
 /// Checks that nodes and clients with incompatible quality of service are told so, with that of both sides.
 fn expect_differences_reported(robot: &mut Robot) -> Verdict {
-    robot.send(
-        json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String",
-        "qos": {"reliability": "best_effort"}}),
-    )?;
+    robot.send(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String",
+        "qos": {"reliability": "best_effort"}}))?;
     let told = robot.wait_for_status("no messages pass between /herald and this client")?;
     let told = told["msg"].as_str().context("words")?;
     ensure!(
-        told.contains(
-            "reliability: the publisher offers best_effort, the subscriber asks for reliable"
-        ) && told.contains("(publisher: best_effort, volatile; subscriber: reliable, volatile)"),
+        told.contains("reliability: the publisher offers best_effort, the subscriber asks for reliable")
+            && told.contains("(publisher: best_effort, volatile; subscriber: reliable, volatile)"),
         "{told}"
     );
     robot.send(json!({"op": "unadvertise", "topic": "/name"}))
@@ -94,18 +90,14 @@ fn check_recording(daemon: &Daemon, servant: &str, robot: &mut Robot) -> Verdict
     ensure!(read["topics"] == topics, "{read}");
     ensure!(read["messages"] == summary["messages"], "{read} {summary}");
     let names = recordings::topic_texts(&read, "/name")?;
-    ensure!(
-        names.len() > 10 && names.iter().all(|name| name == "rover"),
-        "{names:?}"
-    );
+    ensure!(names.len() > 10 && names.iter().all(|name| name == "rover"), "{names:?}");
 
     // Replayed to the servant of another robot, whose node answers.
     let mut other = daemon.robot(&robot_address(daemon, "other")?)?;
     other.subscribe("/greeting")?;
     let name = json!({"op": "publish", "topic": "/name", "type": "std_msgs/msg/String", "msg": {"data": "other"}});
-    let is_greeted = |text: &'static str| {
-        move |told: &Value| told["topic"] == "/greeting" && told["msg"]["text"] == text
-    };
+    let is_greeted =
+        |text: &'static str| move |told: &Value| told["topic"] == "/greeting" && told["msg"]["text"] == text;
     other.send_until(&name, "a greeting", is_greeted("Hello, other"))?;
     let to = daemon.servant_of(HERALD.name, "other")?;
     let to = to["id"].as_str().context("an id")?.to_owned();
@@ -117,10 +109,7 @@ fn check_recording(daemon: &Daemon, servant: &str, robot: &mut Robot) -> Verdict
 
 pub fn they_find_nothing_missing() -> Verdict {
     let daemon = daemon("clients-2")?;
-    daemon
-        .deployer()
-        .push("herald_ros2", HERALD.arguments)?
-        .expect_success()?;
+    daemon.deployer().push("herald_ros2", HERALD.arguments)?.expect_success()?;
     for (command, robot) in [
         (clients::roslibpy("ros2_with_roslibpy.py"), "roslibpy"),
         (clients::roslib("ros2_with_roslib.mjs"), "roslib"),

@@ -25,21 +25,14 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
         deployer.push("adder_py", &push)?.expect_success()?;
     }
     let ends = |outcome: CommandOutcome, status: i32, words: &str| -> Verdict {
-        ensure!(
-            outcome.status == status && outcome.output().contains(words),
-            "{status} was to be: {outcome:#?}"
-        );
+        ensure!(outcome.status == status && outcome.output().contains(words), "{status} was to be: {outcome:#?}");
         Ok(())
     };
     ends(types(&["services"])?, 0, "adder_py")?;
     ends(types(&["push"])?, 2, "Usage")?;
     ends(types(&["rollback", "nothing"])?, 5, "available: adder_py")?;
     ends(types(&["explain", "nobody"])?, 5, "nobody")?;
-    ends(
-        run_with_token(&daemon, &viewer, &["rm", "adder_py"])?,
-        4,
-        "error",
-    )?;
+    ends(run_with_token(&daemon, &viewer, &["rm", "adder_py"])?, 4, "error")?;
     ends(run_with_token(&daemon, "wrong", &["status"])?, 4, "token")?;
     let changed = deployer.run_json(&["diff", "adder_py", "1", "2"])?;
     let differences = changed["differences"].as_array().context("differences")?;
@@ -47,22 +40,14 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
     ensure!(differences.contains(&offset), "{changed:#}");
     let back = types(&["diff", "adder_py", "2", "1"])?.expect_success()?;
     ensure!(back.stdout.contains("REVISION 2"), "{back:#?}");
-    ends(
-        types(&["diff", "adder_py", "1", "7"])?,
-        5,
-        "available: 2, 1",
-    )?;
+    ends(types(&["diff", "adder_py", "1", "7"])?, 5, "available: 2, 1")?;
     ends(types(&["diff", "adder_py"])?, 5, "no revision before 1")?;
     // The canary has no robots yet, so no decision is made.
     let wait = ["rollout", "adder_py", "--wait=1s"];
     ends(types(&wait)?, 8, "adder_py is at canary")?;
     let abort = ["rollout", "adder_py", "--wait=30s", "abort"];
     ends(types(&abort)?, 1, "was not promoted: aborted")?;
-    ends(
-        types(&["rollout", "adder_py", "promote"])?,
-        6,
-        "not a canary",
-    )?;
+    ends(types(&["rollout", "adder_py", "promote"])?, 6, "not a canary")?;
     let start = ["rollout", "adder_py", "--wait", "start", "2"];
     ends(types(&start)?, 0, "promoted")?;
     // A reader that closes the pipe early is not an error.
@@ -109,9 +94,7 @@ impl EventFollower {
         let (told, lines) = channel();
         std::thread::spawn(move || {
             let lines = BufReader::new(out).lines();
-            lines
-                .map_while(Result::ok)
-                .all(|line| told.send(line).is_ok())
+            lines.map_while(Result::ok).all(|line| told.send(line).is_ok())
         });
         Ok(EventFollower { child, lines })
     }
@@ -141,23 +124,13 @@ impl Drop for EventFollower {
 pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
     let daemon = world().setup("by-name").start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let types = |words: &[&str]| deployer.run(words);
     let never = types(&["fit", "adder_py", "--cpus", "4000"])?.expect_success()?;
-    ensure!(
-        never
-            .stdout
-            .contains("it would always be refused: a servant of 4000 cores"),
-        "{}",
-        never.output()
-    );
+    ensure!(never.stdout.contains("it would always be refused: a servant of 4000 cores"), "{}", never.output());
     types(&["stop", "adder_py"])?.expect_failure(&["adder_py"])?;
     let one = daemon.robot("adder_py?robot=one")?;
-    daemon.wait_for_event("a ready servant", |event| {
-        event["kind"] == "servant-ready" && event["robot"] == "one"
-    })?;
+    daemon.wait_for_event("a ready servant", |event| event["kind"] == "servant-ready" && event["robot"] == "one")?;
     types(&["set", "adder_py", "--cpus", "0.5"])?.expect_success()?;
     let servant = daemon.servant_of("adder_py", "one")?;
     ensure!(servant["limits"]["cpus"] == 0.5, "{servant:#}");
@@ -170,11 +143,7 @@ pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
     // A servant that is named twice is stopped once.
     let id = id.as_str().context("an id")?;
     let stopped = types(&["stop", id, id])?.expect_success()?;
-    ensure!(
-        stopped.stdout.matches(id).count() == 1,
-        "{}",
-        stopped.output()
-    );
+    ensure!(stopped.stdout.matches(id).count() == 1, "{}", stopped.output());
     let stopped = types(&["stop", "adder_py"])?.expect_success()?;
     let id = servant["id"].as_str().context("an id")?;
     ensure!(stopped.stdout.contains(id), "{}", stopped.output());
@@ -188,25 +157,17 @@ pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verd
     let mut all = EventFollower::begin(&daemon, &["-n", "1000"])?;
     let mut some = EventFollower::begin(&daemon, &["--kind", "removed"])?;
     let push = ["--node", "adder.py"];
-    daemon
-        .deployer()
-        .push("adder_py", &push)?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &push)?.expect_success()?;
     let mut numbers = all.wait_for_event("published")?;
     daemon.kill()?;
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .run(&["rm", "adder_py"])?
-        .expect_success()?;
+    daemon.deployer().run(&["rm", "adder_py"])?.expect_success()?;
     numbers.extend(all.wait_for_event("removed")?);
     let kept = daemon.deployer().run_json(&["events", "-n", "1000"])?;
     let kept = kept.as_array().context("events")?;
     let removed = kept.iter().position(|event| event["kind"] == "removed");
-    let expected: Vec<i64> = kept[..=removed.context("it is removed")?]
-        .iter()
-        .filter_map(|event| event["id"].as_i64())
-        .collect();
+    let expected: Vec<i64> =
+        kept[..=removed.context("it is removed")?].iter().filter_map(|event| event["id"].as_i64()).collect();
     ensure!(numbers == expected, "{numbers:?}, kept are {expected:?}");
     // A filter by kind applies to followed events as well.
     let last = expected.last().copied().context("one")?;
@@ -239,11 +200,9 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
         bash.args(["-c", completes]).arg(&file).args(words);
         Ok(run(&mut bash)?.expect_success()?.stdout)
     };
-    for (words, expected) in [
-        (&["roll"][..], "rollback rollout"),
-        (&["push", "--can"], "--canary"),
-        (&["rollout", "s", "pro"], "promote"),
-    ] {
+    for (words, expected) in
+        [(&["roll"][..], "rollback rollout"), (&["push", "--can"], "--canary"), (&["rollout", "s", "pro"], "promote")]
+    {
         let found = completed(words)?;
         ensure!(found.trim() == expected, "{words:?}: {found}");
     }
@@ -260,20 +219,14 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     let verbs = help.split_once("Commands:").context("verbs")?.1;
     let verbs = verbs.split_once("Options:").context("options")?.0;
     let mut count = 0;
-    for verb in verbs
-        .lines()
-        .filter_map(|line| line.split_whitespace().next())
-        .filter(|verb| *verb != "help")
-    {
+    for verb in verbs.lines().filter_map(|line| line.split_whitespace().next()).filter(|verb| *verb != "help") {
         let text = page(&format!("cloudroidctl-{verb}.1")).context(verb.to_owned())?;
         ensure!(text.contains(".SH NAME"), "{verb}: {text}");
         count += 1;
     }
     ensure!(count > 25, "{verbs}");
     let nowhere = format!("{directory}/cloudroidctl.1/below");
-    deployer
-        .run(&["man", &nowhere])?
-        .expect_failure(&["cannot write the manual pages to"])?;
+    deployer.run(&["man", &nowhere])?.expect_failure(&["cannot write the manual pages to"])?;
     Ok(())
 }
 
@@ -326,9 +279,6 @@ pub fn top_shows_who_uses_the_machine() -> Verdict {
     let ended = terminal.wait()?;
     let all = reader.join().map_err(|_| anyhow::anyhow!("the reader"))??;
     ensure!(ended.success(), "{ended}: {all}");
-    ensure!(
-        all.contains("\u{1b}[?1049l"),
-        "the terminal is left as it was not: {all}"
-    );
+    ensure!(all.contains("\u{1b}[?1049l"), "the terminal is left as it was not: {all}");
     Ok(())
 }

@@ -16,18 +16,12 @@ fn run_architecture(architecture: &str, emulator: &str) -> Verdict {
     let stub = site.start_emulated(emulator, &overlay, "teller_py", "teller.py", &[])?;
     let mut said = site.subscribe(&app, "/teller/said")?;
     let say = site.advertise_strings(&app, "/teller/say", false)?;
-    site.wait_for_subscribers(&*say, 1)
-        .with_context(|| stub.output())?;
-    site.wait_for_publishers(&said, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*say, 1).with_context(|| stub.output())?;
+    site.wait_for_publishers(&said, 1).with_context(|| stub.output())?;
     say.publish(string(architecture));
-    let heard = site
-        .next_message(&mut said)
-        .with_context(|| stub.output())?;
+    let heard = site.next_message(&mut said).with_context(|| stub.output())?;
     ensure!(heard.bytes == string(architecture), "{heard:?}");
-    let graph = site.wait_for_graph(&app, "the loggers", |graph| {
-        graph.services.contains_key("/teller/get_loggers")
-    })?;
+    let graph = site.wait_for_graph(&app, "the loggers", |graph| graph.services.contains_key("/teller/get_loggers"))?;
     ensure!(registrations(&graph, "/teller").len() >= 5, "{graph:#?}");
     Ok(())
 }

@@ -6,8 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use ros::bus::{
-    GlobalParameters, ParamValue, Publisher, QosProfile, RosVersion, SerializedMessage,
-    Subscription, WireType,
+    GlobalParameters, ParamValue, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, WireType,
 };
 use ros::ros1::Ros1Bus;
 use ros::schema::{MessageType, Registry};
@@ -33,28 +32,13 @@ pub fn message_types() -> anyhow::Result<Registry> {
 pub fn message_types_for(ros: RosVersion) -> anyhow::Result<Registry> {
     let registry = Registry::for_version(ros);
     for (key, text) in [
-        (
-            "geometry_msgs/PointStamped",
-            "std_msgs/Header header\nPoint point",
-        ),
+        ("geometry_msgs/PointStamped", "std_msgs/Header header\nPoint point"),
         ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z"),
-        (
-            "tf2_msgs/TFMessage",
-            "geometry_msgs/TransformStamped[] transforms",
-        ),
-        (
-            "geometry_msgs/TransformStamped",
-            "std_msgs/Header header\nstring child_frame_id\nTransform transform",
-        ),
-        (
-            "geometry_msgs/Transform",
-            "Vector3 translation\nQuaternion rotation",
-        ),
+        ("tf2_msgs/TFMessage", "geometry_msgs/TransformStamped[] transforms"),
+        ("geometry_msgs/TransformStamped", "std_msgs/Header header\nstring child_frame_id\nTransform transform"),
+        ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation"),
         ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z"),
-        (
-            "geometry_msgs/Quaternion",
-            "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-        ),
+        ("geometry_msgs/Quaternion", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w"),
         (
             "sensor_msgs/Image",
             "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 \
@@ -65,24 +49,14 @@ pub fn message_types_for(ros: RosVersion) -> anyhow::Result<Registry> {
     }
     let (time, action, text) = match ros {
         RosVersion::One => ("time", "actionlib/action/Test", ["int32"; 3]),
-        RosVersion::Two => (
-            "builtin_interfaces/Time",
-            "test_msgs/action/Fibonacci",
-            ["int32", "int32[]", "int32[]"],
-        ),
+        RosVersion::Two => ("builtin_interfaces/Time", "test_msgs/action/Fibonacci", ["int32", "int32[]", "int32[]"]),
     };
-    registry.insert(
-        &type_name(ros, "rosgraph_msgs/Clock"),
-        &format!("{time} clock"),
-    )?;
+    registry.insert(&type_name(ros, "rosgraph_msgs/Clock"), &format!("{time} clock"))?;
     let names = match ros {
         RosVersion::One => ["goal", "result", "feedback"],
         RosVersion::Two => ["order", "sequence", "sequence"],
     };
-    let parts = text
-        .iter()
-        .zip(names)
-        .map(|(of, name)| format!("{of} {name}\n"));
+    let parts = text.iter().zip(names).map(|(of, name)| format!("{of} {name}\n"));
     registry.insert(action, &parts.collect::<Vec<_>>().join("---\n"))?;
     Ok(registry)
 }
@@ -133,8 +107,7 @@ impl MessageBytes {
     /// Appends a time; `at` is in nanoseconds since 1970.
     pub fn time(self, at: i64) -> Self {
         let part = |part: i64| u32::try_from(part).unwrap_or(0);
-        self.word(part(at / 1_000_000_000))
-            .word(part(at % 1_000_000_000))
+        self.word(part(at / 1_000_000_000)).word(part(at % 1_000_000_000))
     }
 
     pub fn zeros(mut self, count: usize) -> Self {
@@ -178,13 +151,7 @@ pub fn argv(ros: RosVersion) -> &'static [&'static str] {
 }
 
 /// Starts a stub of the crossing node, whose clock is `ahead` seconds ahead of the machine's.
-pub fn crossing(
-    site: &Site,
-    server: &str,
-    robot: &str,
-    ahead: i64,
-    settings: &str,
-) -> anyhow::Result<NodeProcess> {
+pub fn crossing(site: &Site, server: &str, robot: &str, ahead: i64, settings: &str) -> anyhow::Result<NodeProcess> {
     let argv = argv(site.system.version());
     crossing_with(site, (server, robot), ahead, settings, argv)
 }
@@ -211,8 +178,7 @@ pub fn wait_until_ready(site: &Site, app: &(impl HasBus + ?Sized)) -> anyhow::Re
     site.wait_for_graph(app, "the node", |graph| match site.system.version() {
         RosVersion::One => {
             let result = graph.topics.get(&format!("{NODE}/act/result"));
-            let publishes =
-                result.is_some_and(|ends| ends.publishers.iter().any(|node| node == NODE));
+            let publishes = result.is_some_and(|ends| ends.publishers.iter().any(|node| node == NODE));
             publishes && graph.services.contains_key(&format!("{NODE}/ask"))
         }
         RosVersion::Two => graph.ends.get(NODE).is_some_and(|ends| {
@@ -241,31 +207,19 @@ pub fn wait_for_answer(
 }
 
 /// Publishes until a message is returned unchanged; other messages may precede it.
-fn wait_for_echo(
-    site: &Site,
-    points: &dyn Publisher,
-    subscription: &mut Subscription,
-    sent: &Bytes,
-) -> Verdict {
+fn wait_for_echo(site: &Site, points: &dyn Publisher, subscription: &mut Subscription, sent: &Bytes) -> Verdict {
     let ask = || {
         points.publish(sent.clone());
         Ok(())
     };
-    site.ask_until(subscription, ask, |came| Ok(is_same(&came.bytes, sent)))
-        .map(drop)
+    site.ask_until(subscription, ask, |came| Ok(is_same(&came.bytes, sent))).map(drop)
 }
 
 /// Subscribes, and waits until the node's stub is connected.
-pub fn subscribe(
-    site: &Site,
-    app: &(impl HasBus + ?Sized),
-    topic: &str,
-) -> anyhow::Result<Subscription> {
+pub fn subscribe(site: &Site, app: &(impl HasBus + ?Sized), topic: &str) -> anyhow::Result<Subscription> {
     let mut subscription = site.subscribe(app, topic)?;
     let connected = site.runtime.block_on(async {
-        let connected = subscription
-            .matched
-            .wait_for(|now| now.connected_count() > 0);
+        let connected = subscription.matched.wait_for(|now| now.connected_count() > 0);
         wait_for(connected).await.is_ok()
     });
     ensure!(connected, "nobody publishes {topic}");
@@ -290,22 +244,13 @@ pub fn stamps_mean_the_same_where_clocks_differ(ros: RosVersion) -> Verdict {
         if understood {
             let answer = with_log(wait_for_answer(&site, say, &mut seen), &stub)?;
             // The stamp at the beginning is the one that the robot sent.
-            ensure!(
-                is_same(&answer.bytes, &sent),
-                "{answer:?} is not {sent:?}\n{}",
-                stub.output()
-            );
+            ensure!(is_same(&answer.bytes, &sent), "{answer:?} is not {sent:?}\n{}", stub.output());
         } else {
             let answer = with_log(wait_for_answer(&site, say, &mut refused), &stub)?;
             let answer = string_text(ros, &answer.bytes, 0)?;
             // It is an hour ahead, less the latency of the message.
-            let age = answer
-                .split_whitespace()
-                .find_map(|word| word.parse::<f64>().ok());
-            ensure!(
-                age.is_some_and(|age| (-3600.5..-3000.0).contains(&age)),
-                "{answer}"
-            );
+            let age = answer.split_whitespace().find_map(|word| word.parse::<f64>().ok());
+            ensure!(age.is_some_and(|age| (-3600.5..-3000.0).contains(&age)), "{answer}");
         }
     }
     Ok(())
@@ -356,10 +301,7 @@ pub fn simulated_time_is_the_robot_s(ros: RosVersion) -> Verdict {
     // A node of ROS 2 can be switched while it runs.
     if let Ok(parameters) = app.node_parameters() {
         for is_simulated in [false, true] {
-            let change = (
-                "use_sim_time".to_owned(),
-                Some(ParamValue::Bool(is_simulated)),
-            );
+            let change = ("use_sim_time".to_owned(), Some(ParamValue::Bool(is_simulated)));
             let set = site.runtime.block_on(parameters.set(NODE, vec![change]))?;
             ensure!(set == [Ok(())], "{set:?}");
             let sent = if is_simulated {
@@ -436,10 +378,7 @@ pub fn explain_names_a_clock_and_a_queue(ros: RosVersion) -> Verdict {
             points.publish(point_message(ros, *at));
         }
         let last = point_message(ros, *sent.last().context("some")?);
-        while !is_same(
-            &with_log(site.next_message(&mut worked), &stub)?.bytes,
-            &last,
-        ) {}
+        while !is_same(&with_log(site.next_message(&mut worked), &stub)?.bytes, &last) {}
     }
     let path = format!("/api/v1/robots/{robot}/explain");
     let explained = daemon.wait_for(&path, "a queue and a clock among the causes", |explained| {
@@ -473,24 +412,16 @@ pub fn settings_are_changed_through_dynamic_reconfigure() -> Verdict {
         &["__name:=people", "_debug_view:=false"],
     )?;
     let there = site.wait_for_graph(&app, "the service", |graph| {
-        graph.services.contains_key("/people/set_parameters")
-            && graph.topics.contains_key("/people/parameter_updates")
+        graph.services.contains_key("/people/set_parameters") && graph.topics.contains_key("/people/parameter_updates")
     });
     with_log(there, &stub)?;
     let mut updates = site.subscribe(&app, "/people/parameter_updates")?;
     // The current settings are latched.
     with_log(site.next_message(&mut updates), &stub)?;
     // dynamic_reconfigure/Config: bools · ints { name, value } · strs · doubles · groups
-    let config = MessageBytes::default()
-        .word(0)
-        .word(1)
-        .text("padding")
-        .word(16);
+    let config = MessageBytes::default().word(0).word(1).text("padding").word(16);
     let request = config.word(0).word(0).word(0).0;
-    let response = with_log(
-        site.call_service(&app, "/people/set_parameters", &request),
-        &stub,
-    )?;
+    let response = with_log(site.call_service(&app, "/people/set_parameters", &request), &stub)?;
     let padding = MessageBytes::default().text("padding").word(16).0;
     let holds = |bytes: &[u8]| bytes.windows(padding.len()).any(|part| part == padding);
     ensure!(holds(&response), "{response:?}");
@@ -514,9 +445,7 @@ fn image_bytes(number: u32) -> Vec<u8> {
             pixels.extend([shade, shade / 2 + (column * row % 3) as u8, 200 - shade / 2]);
         }
     }
-    let head = MessageBytes::default()
-        .word(0)
-        .time(1_700_000_000_000_000_000 + i64::from(number));
+    let head = MessageBytes::default().word(0).time(1_700_000_000_000_000_000 + i64::from(number));
     let mut picture = head.text("camera").word(SIZE.1).word(SIZE.0).text("rgb8");
     picture = picture.zeros(1).word(SIZE.0 * 3).word(SIZE.0 * SIZE.1 * 3);
     picture.0.extend(pixels);
@@ -553,19 +482,14 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
         let settled = |carried: &[(u64, u64)]| {
             let last = &carried[carried.len().saturating_sub(SETTLED)..];
             let is = |bytes: u64| {
-                if smaller {
-                    bytes < size / 2
-                } else {
-                    bytes >= size
-                }
+                if smaller { bytes < size / 2 } else { bytes >= size }
             };
             last.len() == SETTLED && last.iter().all(|(up, down)| is(*up) && is(*down))
         };
         let deadline = Deadline::begin();
         let mut number = 0;
         while number < TRIED || !settled(&carried) {
-            deadline
-                .check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
+            deadline.check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
             number += 1;
             let before = cable.transferred_bytes()?;
             let sent = image_bytes(number);

@@ -38,9 +38,7 @@ fn reported_drops(daemon: &Daemon, robot: &str, topic: &str) -> anyhow::Result<u
 
 /// Returns the resources of a process: descriptors, threads, resident memory in kB.
 fn process_resources(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
-    let count = |what: &str| -> anyhow::Result<usize> {
-        Ok(std::fs::read_dir(format!("/proc/{pid}/{what}"))?.count())
-    };
+    let count = |what: &str| -> anyhow::Result<usize> { Ok(std::fs::read_dir(format!("/proc/{pid}/{what}"))?.count()) };
     let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
     let resident = status
         .lines()
@@ -49,14 +47,9 @@ fn process_resources(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
     Ok((count("fd")?, count("task")?, resident.context("VmRSS")?))
 }
 
-pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
-    ros: RosVersion,
-) -> Verdict {
+pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(ros: RosVersion) -> Verdict {
     // A thousand cuts: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
-    let cuts = std::env::var("CLOUDROID_CUTS")
-        .ok()
-        .and_then(|cuts| cuts.parse().ok())
-        .unwrap_or(60);
+    let cuts = std::env::var("CLOUDROID_CUTS").ok().and_then(|cuts| cuts.parse().ok()).unwrap_or(60);
     let (adder, greeter) = (Twin::adder(ros), Twin::greeter(ros));
     // A separate daemon, because its resources are measured.
     let daemon = world().setup(&adder.robot_name("cuts")).start()?;
@@ -71,26 +64,15 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
     let server = cutter.server.to_string();
     let site = Site::with_ros(ros)?;
     let app = site.join("/app")?;
-    let (adds, greets) = (
-        adder.robot_name("cut-adder"),
-        greeter.robot_name("cut-greeter"),
-    );
+    let (adds, greets) = (adder.robot_name("cut-adder"), greeter.robot_name("cut-greeter"));
     let argv = adder.argv("adder", &[]);
     let adder = adder.stub(&site, (&server, &adds), "", &argv)?;
     let argv = greeter.argv("greeter", &[("~name", "/who")]);
     let greeter = greeter.stub(&site, (&server, &greets), "", &argv)?;
-    let said = || {
-        format!(
-            "the adder's:\n{}\nthe greeter's:\n{}",
-            adder.output(),
-            greeter.output()
-        )
-    };
-    let is_there = |graph: &Graph| {
-        graph.services.contains_key("/add_two") && graph.services.contains_key("/greeter/count")
-    };
-    site.wait_for_graph(&app, "both", is_there)
-        .with_context(said)?;
+    let said = || format!("the adder's:\n{}\nthe greeter's:\n{}", adder.output(), greeter.output());
+    let is_there =
+        |graph: &Graph| graph.services.contains_key("/add_two") && graph.services.contains_key("/greeter/count");
+    site.wait_for_graph(&app, "both", is_there).with_context(said)?;
     let names = site.advertise_strings(&app, "/who", false)?;
     site.wait_for_subscribers(&*names, 1)?;
     let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
@@ -98,12 +80,8 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
     let mut sums = site.subscribe(&app, "/sums")?;
     // From here on messages of both outputs arrive.
     let next = Arc::new(AtomicI64::new(1));
-    let ask = || {
-        site.call_service(&app, "/add_two", &sum_request(ros, 0))
-            .map(drop)
-    };
-    site.ask_until(&mut sums, ask, |_| Ok(true))
-        .with_context(said)?;
+    let ask = || site.call_service(&app, "/add_two", &sum_request(ros, 0)).map(drop);
+    site.ask_until(&mut sums, ask, |_| Ok(true)).with_context(said)?;
     names.publish(string_in(WireFormat::for_version(ros), "0"));
     site.next_message(&mut greetings).with_context(said)?;
     let before = [
@@ -121,10 +99,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
             let call = async || {
                 while !over() {
                     let number = next.fetch_add(1, Ordering::Relaxed);
-                    match app
-                        .call("/add_two", sum_request(ros, number), patience())
-                        .await
-                    {
+                    match app.call("/add_two", sum_request(ros, number), patience()).await {
                         Ok(response) => {
                             let response = parse_sum(ros, &response)?;
                             ensure!(response == number, "{response} is not {number}");
@@ -151,16 +126,10 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                     count += 1;
                     names.publish(string_in(WireFormat::for_version(ros), &count.to_string()));
                     let greeting = wait_for(greetings.messages.recv()).await;
-                    let greeting = greeting
-                        .ok()
-                        .flatten()
-                        .with_context(|| format!("name {count} was lost"))?;
+                    let greeting = greeting.ok().flatten().with_context(|| format!("name {count} was lost"))?;
                     let text = format!("hi {count}");
                     ensure!(
-                        greeting
-                            .bytes
-                            .windows(text.len())
-                            .any(|part| part == text.as_bytes()),
+                        greeting.bytes.windows(text.len()).any(|part| part == text.as_bytes()),
                         "not the answer to {count}, or one twice: {greeting:?}"
                     );
                 }
@@ -174,21 +143,15 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                     if over() && done.load(Ordering::Relaxed) == CALLERS {
                         let number = next.fetch_add(1, Ordering::Relaxed);
                         fence.get_or_insert(number);
-                        app.call("/add_two", sum_request(ros, number), patience())
-                            .await?;
+                        app.call("/add_two", sum_request(ros, number), patience()).await?;
                     }
                     let pause = scale(PAUSE);
-                    while let Ok(Some(told)) =
-                        tokio::time::timeout(pause, sums.messages.recv()).await
-                    {
+                    while let Ok(Some(told)) = tokio::time::timeout(pause, sums.messages.recv()).await {
                         let number: i64 = string_text(ros, &told.bytes, 0)?.parse()?;
                         if fence.is_some_and(|fence| number >= fence) {
                             return anyhow::Ok(executed);
                         }
-                        ensure!(
-                            number == 0 || executed.insert(number),
-                            "{number} was added twice"
-                        );
+                        ensure!(number == 0 || executed.insert(number), "{number} was added twice");
                     }
                 }
             };
@@ -211,37 +174,23 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
         "{cuts} cuts: {answered} calls answered, {failed} failed with a reason, {executed} executed, {greeted} names \
          greeted; descriptors, threads, kB before {before:?}, after {after:?}"
     );
-    ensure!(
-        answered > 0 && greeted > 0,
-        "{answered} answers, {greeted} greetings"
-    );
+    ensure!(answered > 0 && greeted > 0, "{answered} answers, {greeted} greetings");
     // Each answered call has also published its sum: it was received once, or is reported as dropped.
-    let all_known = support::wait_until(
-        "each answered call's sum, heard or told as dropped",
-        || {
-            let here = sums.dropped.get();
-            let dropped = here + reported_drops(&daemon, &adds, "/sums")?;
-            let known = executed as u64 + dropped;
-            let told = format!(
-                "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as \
+    let all_known = support::wait_until("each answered call's sum, heard or told as dropped", || {
+        let here = sums.dropped.get();
+        let dropped = here + reported_drops(&daemon, &adds, "/sums")?;
+        let known = executed as u64 + dropped;
+        let told = format!(
+            "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as \
                     dropped"
-            );
-            let all = (u64::from(answered)..=u64::from(answered + failed)).contains(&known);
-            Ok(if all { Ok(told) } else { Err(told) })
-        },
-    );
+        );
+        let all = (u64::from(answered)..=u64::from(answered + failed)).contains(&known);
+        Ok(if all { Ok(told) } else { Err(told) })
+    });
     println!("{}", all_known.with_context(said)?);
-    for ((fds, threads, memory), (fds_after, threads_after, memory_after)) in
-        before.iter().zip(&after)
-    {
-        ensure!(
-            fds_after <= &(fds + 8) && threads_after <= &(threads + 8),
-            "they grow: {before:?}, {after:?}"
-        );
-        ensure!(
-            *memory_after < memory + 12_000,
-            "memory grows: {before:?}, {after:?}"
-        );
+    for ((fds, threads, memory), (fds_after, threads_after, memory_after)) in before.iter().zip(&after) {
+        ensure!(fds_after <= &(fds + 8) && threads_after <= &(threads + 8), "they grow: {before:?}, {after:?}");
+        ensure!(*memory_after < memory + 12_000, "memory grows: {before:?}, {after:?}");
     }
     // The same nodes in the same servants.
     let servants = daemon.deployer().run_json(&["servants"])?;
@@ -249,11 +198,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
         .as_array()
         .context("a list")?
         .iter()
-        .filter(|servant| {
-            servant["robot"]
-                .as_str()
-                .is_some_and(|robot| robot.starts_with("cut-"))
-        });
+        .filter(|servant| servant["robot"].as_str().is_some_and(|robot| robot.starts_with("cut-")));
     ensure!(ours.count() == 2, "{servants:#}");
     drop((adder, greeter));
     daemon.deployer().run(&["stop", "--all"])?;

@@ -64,9 +64,7 @@ impl ApiScene {
     /// Creates two working robots, and everything else that operations refer to by name.
     fn new(daemon: Daemon, place: &Path) -> anyhow::Result<(ApiScene, [Robot; 2])> {
         let deployer = daemon.deployer();
-        deployer
-            .push("adder_py", ADDER.arguments)?
-            .expect_success()?;
+        deployer.push("adder_py", ADDER.arguments)?.expect_success()?;
         let admin = create_token(&daemon, &["chief", "--role", "admin"])?;
         let connect = |name: &str| -> anyhow::Result<(Robot, String)> {
             let path = format!("adder_py?robot={name}&token={admin}");
@@ -112,12 +110,8 @@ impl ApiScene {
         let person = json!({"name": "person", "password": PASSWORD, "role": "operator"});
         let bearer = format!("Bearer {}", self.admin);
         let headers = [("Authorization", bearer.as_str())];
-        let (status, _, body) = self.daemon.request_with_body(
-            "POST",
-            "/api/v1/accounts",
-            &headers,
-            &person.to_string(),
-        )?;
+        let (status, _, body) =
+            self.daemon.request_with_body("POST", "/api/v1/accounts", &headers, &person.to_string())?;
         ensure!(status == 200, "{status} {body}");
         Ok(())
     }
@@ -128,12 +122,7 @@ impl ApiScene {
     }
 
     /// Runs Schemathesis with this token; returns the number of operations that it called.
-    fn run_schemathesis(
-        &self,
-        bearer: &str,
-        last: bool,
-        arguments: &[&str],
-    ) -> anyhow::Result<usize> {
+    fn run_schemathesis(&self, bearer: &str, last: bool, arguments: &[&str]) -> anyhow::Result<usize> {
         let given = json!({
             "names": self.names, "spare": self.spare, "person": "person", "password": PASSWORD, "last": last,
             "answers": path_str(&self.answers_path()),
@@ -145,10 +134,7 @@ impl ApiScene {
             .env("SCHEMATHESIS_HOOKS", "hooks")
             .env("DESCRIBED", given.to_string())
             .args(["--no-color", "run"])
-            .arg(format!(
-                "http://{}/api/v1/openapi.json",
-                self.daemon.address
-            ))
+            .arg(format!("http://{}/api/v1/openapi.json", self.daemon.address))
             .args(["--header", &format!("Authorization: Bearer {bearer}")])
             .args(["--checks", CHECKS, "--phases", "examples,coverage,fuzzing"])
             .args(["--seed", "1", "--continue-on-failure"])
@@ -156,9 +142,7 @@ impl ApiScene {
             .args(["--generation-database", "none", "--warnings", "off"])
             .args(arguments);
         let said = run(&mut schemathesis)?.expect_success()?.stdout;
-        let tested = said
-            .lines()
-            .find_map(|line| line.trim().strip_prefix("Tested: "));
+        let tested = said.lines().find_map(|line| line.trim().strip_prefix("Tested: "));
         Ok(tested.context("a count")?.trim().parse()?)
     }
 
@@ -229,8 +213,7 @@ impl ApiScene {
         self.check_streams()?;
         for id in LAST {
             let arguments = ["--max-examples", "4", "--include-operation-id", id];
-            self.run_schemathesis(&self.admin, true, &arguments)
-                .context(*id)?;
+            self.run_schemathesis(&self.admin, true, &arguments).context(*id)?;
         }
         Ok(())
     }
@@ -266,10 +249,8 @@ fn documented_statuses(daemon: &Daemon) -> anyhow::Result<BTreeMap<String, BTree
     let document = daemon.api("/api/v1/openapi.json")?;
     let mut described = BTreeMap::new();
     let paths = document["paths"].as_object().context("paths")?;
-    for operation in paths
-        .values()
-        .flat_map(|item| item.as_object().into_iter().flatten())
-        .map(|(_, operation)| operation)
+    for operation in
+        paths.values().flat_map(|item| item.as_object().into_iter().flatten()).map(|(_, operation)| operation)
     {
         let id = operation["operationId"].as_str().context("an id")?;
         let statuses = operation["responses"].as_object().context("responses")?;

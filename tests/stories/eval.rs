@@ -68,9 +68,7 @@ with rosbag.Bag("/root/end.bag", "w") as bag:
     for number in range(12):
         bag.write("/end", Int32(1), rospy.Time(1000, number * 50000000))
 "#;
-        machine
-            .run_script("sh", &format!("python3 - << 'END'\n{records}END"))?
-            .expect_success()?;
+        machine.run_script("sh", &format!("python3 - << 'END'\n{records}END"))?.expect_success()?;
         Ok(RobotRecordings { machine })
     }
 
@@ -80,10 +78,7 @@ with rosbag.Bag("/root/end.bag", "w") as bag:
 }
 
 fn json_number(value: &Value, path: &str) -> anyhow::Result<f64> {
-    value
-        .pointer(path)
-        .and_then(Value::as_f64)
-        .with_context(|| format!("{path} of {value:#}"))
+    value.pointer(path).and_then(Value::as_f64).with_context(|| format!("{path} of {value:#}"))
 }
 
 fn evaluate(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Value> {
@@ -94,9 +89,7 @@ fn evaluate(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Value
 pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     // A separate daemon, because the cores for the evaluation are not available to the robots of other stories. The
     // recording alone needs nearly all memory of a client's budget.
-    let setup = world()
-        .setup("evaluated")
-        .config("[memory]\nclient = \"5M\"\n");
+    let setup = world().setup("evaluated").config("[memory]\nclient = \"5M\"\n");
     let daemon = setup.start()?;
     // Robots may request less memory than the native run has.
     let pushed = [&["push", "--max-memory", "512M"], PEOPLE.arguments].concat();
@@ -105,32 +98,14 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     let place = world().directory("evaluation")?;
     let plot = place.path().join("plot.svg");
     let plot = ["--plot", path_str(&plot)];
-    let words = [
-        "--requests",
-        "12",
-        "--cpus",
-        "1",
-        "--network",
-        "20",
-        "--yes",
-    ];
-    let found = evaluate(
-        &daemon,
-        &recordings.path("people"),
-        &[&words[..], &plot].concat(),
-    )?;
+    let words = ["--requests", "12", "--cpus", "1", "--network", "20", "--yes"];
+    let found = evaluate(&daemon, &recordings.path("people"), &[&words[..], &plot].concat())?;
     wait_until_none_left(&daemon, PEOPLE.name)?;
     for side in ["native", "outsourced"] {
         ensure!(found[side]["answered"] == 12, "{side}: {found:#}");
-        ensure!(
-            found[side]["times"].as_array().map(Vec::len) == Some(12),
-            "{side}: {found:#}"
-        );
+        ensure!(found[side]["times"].as_array().map(Vec::len) == Some(12), "{side}: {found:#}");
     }
-    ensure!(
-        found["native"]["cpus"] == 0.25 && found["outsourced"]["cpus"] == 1.0,
-        "{found:#}"
-    );
+    ensure!(found["native"]["cpus"] == 0.25 && found["outsourced"]["cpus"] == 1.0, "{found:#}");
     ensure!(found["native"]["memory_limit"] == 1u64 << 30, "{found:#}");
     // A quarter of a core takes longer than a whole one because of the limit.
     let held_up = |side: &str| json_number(&found, &format!("/{side}/phases/held_up"));
@@ -139,39 +114,24 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     let verdict = found["verdict"].as_str().unwrap_or_default();
     ensure!(verdict.starts_with("worth it: outsourced"), "{verdict}");
     // Half of the network's delay in each direction; the measured times are within the total.
-    ensure!(
-        json_number(&found, "/outsourced/phases/up")? == 10.0,
-        "{found:#}"
-    );
+    ensure!(json_number(&found, "/outsourced/phases/up")? == 10.0, "{found:#}");
     let part = |name: &str| json_number(&found, &format!("/outsourced/phases/{name}"));
     let median = json_number(&found, "/outsourced/rrt/p50")?;
     // Of only two runs some parts may be missing.
     if !found["outsourced"]["phases"]["transport"].is_null() {
         let parts = part("up")? + part("transport")? + part("compute")? + part("down")?;
-        ensure!(
-            (parts - median).abs() < 1e-6,
-            "{parts} is not {median}: {found:#}"
-        );
+        ensure!((parts - median).abs() < 1e-6, "{parts} is not {median}: {found:#}");
     }
     ensure!(found["native"]["phases"]["up"].is_null(), "{found:#}");
     ensure!(found["sla"]["network_added"] == 20.0, "{found:#}");
     // The image was sent unencoded.
-    ensure!(
-        json_number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0,
-        "{found:#}"
-    );
-    let (desire, p95) = (
-        json_number(&found, "/sla/desire")?,
-        json_number(&found, "/outsourced/rrt/p95")?,
-    );
+    ensure!(json_number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0, "{found:#}");
+    let (desire, p95) = (json_number(&found, "/sla/desire")?, json_number(&found, "/outsourced/rrt/p95")?);
     ensure!((p95..p95 * 1.1).contains(&(desire * 1000.0)), "{found:#}");
     let rows = daemon.deployer().run_json(&["sla", "list", PEOPLE.name])?;
     ensure!(rows.as_array().map(Vec::len) == Some(1), "{rows:#}");
     ensure!(rows[0]["value"] == found["sla"]["desire"], "{rows:#}");
-    ensure!(
-        found["sla"]["written"] == true && found["sla"]["row"]["id"] == rows[0]["id"],
-        "{found:#}"
-    );
+    ensure!(found["sla"]["written"] == true && found["sla"]["row"]["id"] == rows[0]["id"], "{found:#}");
     let drawn = std::fs::read_to_string(plot[1])?;
     for class in ["class=\"native\"", "class=\"outsourced\""] {
         ensure!(drawn.contains(class), "{class}: {drawn}");
@@ -187,45 +147,25 @@ fn evaluate_large_pictures(daemon: &Daemon, recordings: &RobotRecordings, plot: 
     let words = ["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"];
     let more = ["--requests", "10", "--cpus", "1", "--robot-cpus", "0.5"];
     let yes = ["--yes", "--plot", plot];
-    let outcome = daemon
-        .deployer()
-        .run(&[&words[..], &more, &yes].concat())?
-        .expect_success()?;
+    let outcome = daemon.deployer().run(&[&words[..], &more, &yes].concat())?.expect_success()?;
     for words in ["10 of 10", "request: ", " 1.3M, answer: /", "THROTTLED MS"] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     // A row with the same desired time replaces the first one.
     let rows = daemon.deployer().run_json(&["sla", "list", PEOPLE.name])?;
     if rows.as_array().is_some_and(|rows| rows.len() > 1) {
         let words = "already had entries for the same number of cores (";
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     wait_until_none_left(daemon, PEOPLE.name)
 }
 
 /// Checks that too little memory is a result, and that robots still get servants afterwards.
-fn evaluate_with_little_memory(
-    daemon: &Daemon,
-    recordings: &RobotRecordings,
-    plot: &str,
-) -> Verdict {
+fn evaluate_with_little_memory(daemon: &Daemon, recordings: &RobotRecordings, plot: &str) -> Verdict {
     let words = ["--requests", "12", "--robot-memory", "24M", "--plot", plot];
     let found = evaluate(daemon, &recordings.path("people"), &words)?;
-    let told = found["native"]["out_of_memory"]
-        .as_str()
-        .unwrap_or_default();
-    ensure!(
-        told.contains("needs more than 24M of memory: the kernel killed it"),
-        "{found:#}"
-    );
+    let told = found["native"]["out_of_memory"].as_str().unwrap_or_default();
+    ensure!(told.contains("needs more than 24M of memory: the kernel killed it"), "{found:#}");
     let verdict = found["verdict"].as_str().unwrap_or_default();
     ensure!(verdict.starts_with("only outsourced: "), "{verdict}");
     ensure!(found["sla"]["has_local"] == false, "{found:#}");
@@ -240,31 +180,16 @@ fn evaluate_with_little_memory(
     let bag = recordings.path("people");
     let shown = daemon
         .deployer()
-        .run(
-            &[
-                &["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"],
-                &words[..],
-            ]
-            .concat(),
-        )?
+        .run(&[&["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"], &words[..]].concat())?
         .expect_success()?;
-    for words in [
-        "out of memory",
-        "answer: /",
-        "local = \"none\"",
-        "nothing was written; --yes",
-    ] {
+    for words in ["out of memory", "answer: /", "local = \"none\"", "nothing was written; --yes"] {
         ensure!(shown.stdout.contains(words), "{words}: {}", shown.output());
     }
     Ok(())
 }
 
 /// Checks an evaluation over TCP with a token of the role that may calibrate, at the recording's own rate.
-fn deployers_evaluate_what_is_theirs(
-    daemon: &Daemon,
-    recordings: &RobotRecordings,
-    plot: &str,
-) -> Verdict {
+fn deployers_evaluate_what_is_theirs(daemon: &Daemon, recordings: &RobotRecordings, plot: &str) -> Verdict {
     let named = ["theirs", "--role", "deployer", "--service", TELLER.name];
     let token = access::create_token(daemon, &named)?;
     let package = binaries::package("teller_py");
@@ -274,25 +199,13 @@ fn deployers_evaluate_what_is_theirs(
     let words = ["eval", TELLER.name, "--requests", "10", "--plot", plot];
     let words = [&words[..], &["--bag", path_str(&bag)]].concat();
     let outcome = access::run_with_token(daemon, &token, &words)?.expect_success()?;
-    for words in [
-        "10 of 10",
-        "/chatter of the recording was sent to /teller/say",
-        "without a codec",
-    ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+    for words in ["10 of 10", "/chatter of the recording was sent to /teller/say", "without a codec"] {
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     // It may be faster without a network, and then nothing is suggested.
     let suggested = "in stub.toml (desire is p95 of 10 outsourced requests";
     let is_suggested = outcome.stdout.contains(suggested);
-    ensure!(
-        is_suggested != outcome.stdout.contains("it is faster on the robot"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(is_suggested != outcome.stdout.contains("it is faster on the robot"), "{}", outcome.output());
     wait_until_none_left(daemon, TELLER.name)
 }
 
@@ -300,23 +213,13 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
     let daemon = world().setup("unevaluated").start()?;
     for service in [ADDER, TELLER] {
         let package = service.package.context("a package")?;
-        daemon
-            .deployer()
-            .push(package, service.arguments)?
-            .expect_success()?;
+        daemon.deployer().push(package, service.arguments)?.expect_success()?;
     }
     let recordings = RobotRecordings::new()?;
     let place = world().directory("unevaluated")?;
     let plot = place.path().join("plot.svg");
     let refused = |service: &str, bag: &Path, more: &[&str], saying: &[&str]| {
-        let words = [
-            "eval",
-            service,
-            "--bag",
-            path_str(bag),
-            "--plot",
-            path_str(&plot),
-        ];
+        let words = ["eval", service, "--bag", path_str(bag), "--plot", path_str(&plot)];
         let outcome = daemon.deployer().run(&[&words, more].concat())?;
         outcome.expect_failure(saying)
     };
@@ -325,42 +228,18 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
     refused(TELLER.name, &nowhere, &[], &["cannot read", "nowhere.bag"])?;
     let text = place.path().join("text.bag");
     std::fs::write(&text, "no recording")?;
-    refused(
-        TELLER.name,
-        &text,
-        &[],
-        &["text.bag cannot be replayed", "not a rosbag file"],
-    )?;
+    refused(TELLER.name, &text, &[], &["text.bag cannot be replayed", "not a rosbag file"])?;
     let empty = place.path().join("empty.bag");
     std::fs::write(&empty, "")?;
     refused(TELLER.name, &empty, &[], &["the file is empty"])?;
     let other = recordings.path("other");
-    refused(
-        TELLER.name,
-        &other,
-        &[],
-        &["/teller/say is std_msgs/Float64 there"],
-    )?;
+    refused(TELLER.name, &other, &[], &["/teller/say is std_msgs/Float64 there"])?;
     let output = ["--output", "/nothing"];
-    refused(
-        TELLER.name,
-        &words,
-        &output,
-        &["has no output /nothing; its outputs are: "],
-    )?;
+    refused(TELLER.name, &words, &output, &["has no output /nothing; its outputs are: "])?;
     let people = recordings.path("people");
-    let saying = [
-        "(it has /camera)",
-        "its inputs are: ",
-        "/teller/say (std_msgs/String)",
-    ];
+    let saying = ["(it has /camera)", "its inputs are: ", "/teller/say (std_msgs/String)"];
     refused(TELLER.name, &people, &[], &saying)?;
-    let saying = [
-        "unheard_of",
-        "available: ",
-        TELLER.name,
-        "cloudroidctl push",
-    ];
+    let saying = ["unheard_of", "available: ", TELLER.name, "cloudroidctl push"];
     refused("unheard_of", &words, &[], &saying)?;
     expect_directory_name_errors(&daemon, place.path(), &people)?;
     let directory = binaries::package("teller_py");
@@ -368,19 +247,9 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
     refused(path_str(&directory), &words, &[], &saying)?;
     let saying = ["/add_two", "a recording has topic messages only", "explain"];
     refused(ADDER.name, &words, &[], &saying)?;
-    refused(
-        TELLER.name,
-        &words,
-        &["--robot-cpus", "0"],
-        &["--robot-cpus", "expected 0.01 to 4096"],
-    )?;
+    refused(TELLER.name, &words, &["--robot-cpus", "0"], &["--robot-cpus", "expected 0.01 to 4096"])?;
     refused(TELLER.name, &words, &["--robot-memory", "64T"], &["64T"])?;
-    refused(
-        TELLER.name,
-        &words,
-        &["--cpus", "4000"],
-        &["--cpus 4000 can never be measured", "4000 cores"],
-    )?;
+    refused(TELLER.name, &words, &["--cpus", "4000"], &["--cpus 4000 can never be measured", "4000 cores"])?;
     // Its node exits at the first request.
     let saying = [TELLER.name, "exited with status 0"];
     refused(TELLER.name, &recordings.path("end"), &[], &saying)?;
@@ -390,10 +259,7 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
 
 /// Checks errors for services with the names of directories in the working directory.
 fn expect_directory_name_errors(daemon: &Daemon, place: &Path, bag: &Path) -> Verdict {
-    for (name, saying) in [
-        (TELLER.name, "(it has /camera)"),
-        ("unheard_of", "unheard_of is a directory here"),
-    ] {
+    for (name, saying) in [(TELLER.name, "(it has /camera)"), ("unheard_of", "unheard_of is a directory here")] {
         std::fs::create_dir(place.join(name))?;
         let outcome = run(Command::new(binaries::path("cloudroidctl"))
             .current_dir(place)
@@ -419,20 +285,13 @@ fn expect_interruptible(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
         .spawn()?;
     let seen = support::wait_until("a servant that is measured", || {
         let found = crate::calibration::measured_servants(daemon, TELLER.name)?;
-        Ok(found
-            .iter()
-            .any(|servant| servant["phase"] == "ready")
-            .then_some(())
-            .ok_or_else(|| "none".to_owned()))
+        Ok(found.iter().any(|servant| servant["phase"] == "ready").then_some(()).ok_or_else(|| "none".to_owned()))
     });
     kill(Pid::from_raw(i32::try_from(going.id())?), Signal::SIGINT)?;
     let outcome = going.wait_with_output()?;
     seen?;
     let said = String::from_utf8_lossy(&outcome.stderr);
-    ensure!(
-        outcome.status.code() == Some(1) && said.contains("cancelled; nothing was written"),
-        "{said}"
-    );
+    ensure!(outcome.status.code() == Some(1) && said.contains("cancelled; nothing was written"), "{said}");
     ensure!(!plot.exists(), "it drew what was not measured");
     wait_until_none_left(daemon, TELLER.name)
 }

@@ -17,13 +17,7 @@ use support::world::world;
 
 /// Generous, because these machines are slow and the network is worse.
 const T_MAX: f64 = 5.0;
-const SLOW: NetworkImpairment = NetworkImpairment {
-    rate: 100_000,
-    delay: 15_000,
-    jitter: 0,
-    loss: 0.0,
-    limit: 10_000,
-};
+const SLOW: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 15_000, jitter: 0, loss: 0.0, limit: 10_000 };
 /// Polling interval for the stub's log.
 const MOMENT: Duration = Duration::from_millis(50);
 const SILENT: NetworkImpairment = NetworkImpairment { loss: 1.0, ..SLOW };
@@ -64,16 +58,7 @@ impl FailoverScene {
         let stub = start(&site, &daemon, &cable)?;
         let camera = PeopleCamera::new(&site, 10);
         let camera = camera.with_context(|| format!("the stub said:\n{}", stub.output()))?;
-        Ok(Self {
-            camera,
-            stub,
-            site,
-            cable,
-            daemon,
-            robot: robot.to_owned(),
-            answers: BTreeMap::new(),
-            sent: 0,
-        })
+        Ok(Self { camera, stub, site, cable, daemon, robot: robot.to_owned(), answers: BTreeMap::new(), sent: 0 })
     }
 
     /// Publishes an image; returns its number.
@@ -90,10 +75,7 @@ impl FailoverScene {
             let message = self.site.next_message(&mut self.camera.found);
             let message = message.with_context(|| {
                 let said = self.stub.output();
-                format!(
-                    "picture {number} of {}: {:?}\n{said}",
-                    self.sent, self.answers
-                )
+                format!("picture {number} of {}: {:?}\n{said}", self.sent, self.answers)
             })?;
             self.record_answer(&message)?;
         }
@@ -125,10 +107,7 @@ impl FailoverScene {
 
     /// Records the next answer, if one arrives within a moment.
     fn receive_answer(&mut self) -> Verdict {
-        if let Some(answer) = self
-            .site
-            .next_message_within(&mut self.camera.found, MOMENT)?
-        {
+        if let Some(answer) = self.site.next_message_within(&mut self.camera.found, MOMENT)? {
             self.record_answer(&answer)?;
         }
         Ok(())
@@ -172,13 +151,9 @@ impl FailoverScene {
     /// Waits until `explain` lists this cause.
     fn wait_for_cause(&self, words: &str) -> Verdict {
         let what = format!("an explanation that names {words:?}");
-        self.daemon
-            .wait_for(&self.explain_path(), &what, |explained| {
-                explained["causes"]
-                    .to_string()
-                    .contains(words)
-                    .then_some(())
-            })
+        self.daemon.wait_for(&self.explain_path(), &what, |explained| {
+            explained["causes"].to_string().contains(words).then_some(())
+        })
     }
 
     /// Waits until the last events about this robot's local original are of these kinds.
@@ -191,11 +166,7 @@ impl FailoverScene {
                 .filter_map(|event| event["kind"].as_str())
                 .filter(|kind| kind.starts_with("local-") || kind.starts_with("cloud-"))
                 .collect();
-            Ok(if told.ends_with(kinds) {
-                Ok(())
-            } else {
-                Err(format!("{told:?}"))
-            })
+            Ok(if told.ends_with(kinds) { Ok(()) } else { Err(format!("{told:?}")) })
         })
     }
 
@@ -215,10 +186,9 @@ impl FailoverScene {
     /// Waits until `explain` reports this value for the link.
     fn wait_for_link_value(&self, key: &str, value: f64) -> Verdict {
         let what = format!("a link whose {key} is {value}");
-        self.daemon
-            .wait_for(&self.explain_path(), &what, |explained| {
-                (explained["servants"][0]["links"][0][key] == value).then_some(())
-            })
+        self.daemon.wait_for(&self.explain_path(), &what, |explained| {
+            (explained["servants"][0]["links"][0][key] == value).then_some(())
+        })
     }
 
     /// Returns the API path that explains this robot.
@@ -233,18 +203,13 @@ impl FailoverScene {
 
 pub fn a_slow_network_costs_few_requests(ros: RosVersion) -> Verdict {
     // Slow starts of the servant should not matter here.
-    let more =
-        format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0");
+    let more = format!("local = \"cold\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0");
     let mut scene = FailoverScene::new(ros, "failover-slow", &more)?;
     for _ in 0..3 {
         let number = scene.publish_picture();
         scene.wait_for_answer(number)?;
     }
-    ensure!(
-        scene.count_in_log("local original is started") == 0,
-        "{}",
-        scene.stub.output()
-    );
+    ensure!(scene.count_in_log("local original is started") == 0, "{}", scene.stub.output());
     for _ in 0..2 {
         let answers = "the local original answers, too";
         let times = scene.count_in_log(answers) + 1;
@@ -267,12 +232,7 @@ pub fn a_slow_network_costs_few_requests(ros: RosVersion) -> Verdict {
     let last = scene.publish_picture();
     scene.wait_for_answer(last)?;
     let once: BTreeMap<u32, usize> = (1..=last).map(|number| (number, 1)).collect();
-    ensure!(
-        scene.answers == once,
-        "{:?}\n{}",
-        scene.answers,
-        scene.stub.output()
-    );
+    ensure!(scene.answers == once, "{:?}\n{}", scene.answers, scene.stub.output());
     Ok(())
 }
 
@@ -285,9 +245,7 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
     let arguments = [&stateful, detector.arguments].concat();
     match detector.package {
         Some(package) => daemon.deployer().push(package, &arguments)?,
-        None => daemon
-            .deployer()
-            .run(&[&["push"], &arguments[..]].concat())?,
+        None => daemon.deployer().run(&[&["push"], &arguments[..]].concat())?,
     }
     .expect_success()?;
     // Late answers should not matter here: a busy machine must not cause a handover.
@@ -300,10 +258,7 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
     let number = scene.publish_picture();
     scene.wait_for_answer(number)?;
     // Before the link was up for the first time the local original may have answered as well.
-    let (over, back) = (
-        "the local original answers, too why=LinkDown",
-        "the cloud answers alone why=LinkUp",
-    );
+    let (over, back) = ("the local original answers, too why=LinkDown", "the cloud answers alone why=LinkUp");
     let before = scene.count_in_log(over);
     scene.wait_for_log(back, before)?;
     for round in 1..=2 {
@@ -322,17 +277,12 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
     let both = ["local-takes-over", "local-hands-back"];
     scene.wait_for_events(&both.repeat(before + 2))?;
     // The history shows when and why this happened.
-    let history = scene
-        .daemon
-        .api(&format!("/api/v1/history/servants?robot={robot}"))?;
+    let history = scene.daemon.api(&format!("/api/v1/history/servants?robot={robot}"))?;
     let periods = history[0]["local"].as_array().context("periods")?;
     ensure!(periods.len() == before + 2, "{history:#}");
     for period in periods {
         let (began, ended) = (period["began"].as_u64(), period["ended"].as_u64());
-        ensure!(
-            began < ended && period["node"] == "/people_detect",
-            "{history:#}"
-        );
+        ensure!(began < ended && period["node"] == "/people_detect", "{history:#}");
         let why = period["why"].as_str().context("why")?;
         ensure!(why.ends_with("the link is down"), "{history:#}");
     }
@@ -351,11 +301,7 @@ pub fn a_lost_link_hands_over_and_back(ros: RosVersion) -> Verdict {
     ensure!(listed.stdout.contains(lost), "{}", listed.stdout);
     scene.wait_for_cause("the cloud takes over without having received")?;
     scene.wait_for_diagnostics(&mut diagnostics, "lost at the last hand-over")?;
-    ensure!(
-        scene.answers.values().all(|times| *times == 1),
-        "{:?}",
-        scene.answers
-    );
+    ensure!(scene.answers.values().all(|times| *times == 1), "{:?}", scene.answers);
     Ok(())
 }
 
@@ -393,9 +339,7 @@ pub fn frames_that_stay_away_stop_the_robot_and_wake_its_original(ros: RosVersio
 
 pub fn outputs_that_become_too_old_wake_the_original(ros: RosVersion) -> Verdict {
     let desired = T_MAX / 2.0;
-    let more = format!(
-        "local = \"cold\"\nage = {T_MAX:?}\ndesired_age = {desired:?}\nfallback_after = 300.0"
-    );
+    let more = format!("local = \"cold\"\nage = {T_MAX:?}\ndesired_age = {desired:?}\nfallback_after = 300.0");
     let mut scene = FailoverScene::new(ros, "failover-age", &more)?;
     scene.wait_for_link_value("age", T_MAX * 1e3)?;
     scene.wait_for_link_value("desired_age", desired * 1e3)?;
@@ -414,36 +358,22 @@ pub fn outputs_that_become_too_old_wake_the_original(ros: RosVersion) -> Verdict
 }
 
 pub fn a_first_sign_has_the_original_ready_before_it_is_needed(ros: RosVersion) -> Verdict {
-    let more = format!(
-        "local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0"
-    );
+    let more = format!("local = \"first-sign\"\ndesire = {T_MAX:?}\nmax = {T_MAX:?}\nfallback_after = 300.0");
     let mut scene = FailoverScene::new(ros, "failover-sign", &more)?;
     let number = scene.publish_picture();
     scene.wait_for_answer(number)?;
     let started = "the local original is started why=FirstSign";
-    ensure!(
-        scene.count_in_log("is started") == 0,
-        "{}",
-        scene.stub.output()
-    );
+    ensure!(scene.count_in_log("is started") == 0, "{}", scene.stub.output());
     // After one late request it is started, and gets no requests yet.
     scene.cable.degrade(SLOW)?;
     let late = scene.publish_picture();
     scene.wait_for_log(started, 1)?;
     scene.cable.restore()?;
     scene.wait_for_answer(late)?;
-    ensure!(
-        scene.count_in_log("answers, too") == 0,
-        "{}",
-        scene.stub.output()
-    );
+    ensure!(scene.count_in_log("answers, too") == 0, "{}", scene.stub.output());
     // After a long time without problems it is not needed any more.
     scene.publish_until_log("the local original is stopped", 1)?;
-    ensure!(
-        scene.count_in_log("answers, too") == 0,
-        "{}",
-        scene.stub.output()
-    );
+    ensure!(scene.count_in_log("answers, too") == 0, "{}", scene.stub.output());
     // Two late requests: the first starts it, after the second it answers.
     scene.cable.degrade(SLOW)?;
     scene.publish_picture();
@@ -473,9 +403,7 @@ pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
     let number = scene.publish_picture();
     scene.wait_for_answer(number)?;
     // The node needs much longer for an image than the interval between two.
-    let servant = scene
-        .daemon
-        .servant_of(people::service(ros).name, &scene.robot)?;
+    let servant = scene.daemon.servant_of(people::service(ros).name, &scene.robot)?;
     let id = servant["id"].as_str().context("an id")?;
     let cores = match ros {
         RosVersion::One => "0.3",
@@ -491,14 +419,8 @@ pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
         let picture = picture_of(ros, scene.sent, SIZE, &pixels);
         scene.camera.image.publish(picture);
         next += pause;
-        while let Some(left) = next
-            .checked_duration_since(Instant::now())
-            .filter(|left| !left.is_zero())
-        {
-            if let Some(answer) = scene
-                .site
-                .next_message_within(&mut scene.camera.found, left)?
-            {
+        while let Some(left) = next.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
+            if let Some(answer) = scene.site.next_message_within(&mut scene.camera.found, left)? {
                 scene.record_answer(&answer)?;
             }
         }
@@ -506,10 +428,7 @@ pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
     // The newest image is always answered.
     scene.wait_for_answer(scene.sent)?;
     let answered = scene.answers.len();
-    ensure!(
-        answered < pictures as usize / 2,
-        "it answers {answered} of {pictures}: no story of a slow node"
-    );
+    ensure!(answered < pictures as usize / 2, "it answers {answered} of {pictures}: no story of a slow node");
     let stopped = scene.site.next_message_within(&mut commands, MOMENT)?;
     ensure!(stopped.is_none(), "{stopped:?}\n{}", scene.stub.output());
     scene.wait_for_link_value("late", 0.0)
@@ -525,19 +444,14 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
     }
     // The report contains where the time was spent.
     let path = format!("/api/v1/robots/{}/explain", scene.robot);
-    let link = scene
-        .daemon
-        .wait_for(&path, "three requests", |explained| {
-            let link = &explained["servants"][0]["links"][0];
-            let phases = link["phases"].as_array().map_or(0, Vec::len);
-            (link["requests"] == 3 && phases == 6).then(|| link.clone())
-        })?;
+    let link = scene.daemon.wait_for(&path, "three requests", |explained| {
+        let link = &explained["servants"][0]["links"][0];
+        let phases = link["phases"].as_array().map_or(0, Vec::len);
+        (link["requests"] == 3 && phases == 6).then(|| link.clone())
+    })?;
     ensure!(link["max"] == T_MAX * 1e3, "the SLA is known: {link:#}");
     let (_, metrics) = scene.daemon.request("GET", "/metrics", &[])?;
-    for family in [
-        "cloudroid_request_seconds",
-        "cloudroid_request_phase_seconds",
-    ] {
+    for family in ["cloudroid_request_seconds", "cloudroid_request_phase_seconds"] {
         let counted = metrics.lines().any(|line| {
             let count = line.rsplit(' ').next().and_then(|count| count.parse().ok());
             let of = format!("{family}_count{{service=\"{service}\"");
@@ -552,20 +466,9 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
     );
     let (package, argv): (_, &[&str]) = match ros {
         RosVersion::One => ("opencv_apps", &["__name:=astray", "image:=/nowhere"]),
-        RosVersion::Two => (
-            "seer_ros2",
-            &[
-                "--ros-args",
-                "-r",
-                "__node:=astray",
-                "-r",
-                "image:=/nowhere",
-            ],
-        ),
+        RosVersion::Two => ("seer_ros2", &["--ros-args", "-r", "__node:=astray", "-r", "image:=/nowhere"]),
     };
-    let _astray = scene
-        .site
-        .start_stub_with_config(&toml, package, "people_detect", argv)?;
+    let _astray = scene.site.start_stub_with_config(&toml, package, "people_detect", argv)?;
     let _listener = scene.site.subscribe(&scene.camera.node, "/astray/found")?;
     scene.wait_for_cause("/nowhere, which no node on the robot publishes")?;
     // Less of a core than the node needs.
@@ -575,16 +478,10 @@ pub fn explain_says_why(ros: RosVersion) -> Verdict {
     scene.daemon.deployer().run(&less)?.expect_success()?;
     // Each image takes 50 ms of a whole core.
     let deadline = Deadline::begin();
-    while !scene.explain()?["causes"]
-        .to_string()
-        .contains("throttled by its CPU limit")
-    {
+    while !scene.explain()?["causes"].to_string().contains("throttled by its CPU limit") {
         scene.sent += 1;
         let large = [0; 640 * 480 * 3];
-        scene
-            .camera
-            .image
-            .publish(picture_of(ros, scene.sent, (640, 480), &large));
+        scene.camera.image.publish(picture_of(ros, scene.sent, (640, 480), &large));
         deadline.check(|| format!("{:#}", scene.explain().unwrap_or_default()))?;
     }
     // More at once than the link can carry: all but the newest are dropped.

@@ -21,25 +21,11 @@ use support::world::{LOCALISER, LOCALISER_TWO, StoryService, world};
 /// Duration of a link failure that is over before the original would take over: not a time limit, and so not scaled
 /// with the load.
 const BLIP: Duration = Duration::from_millis(50);
-const SILENT: NetworkImpairment = NetworkImpairment {
-    rate: 100_000,
-    delay: 1,
-    jitter: 0,
-    loss: 1.0,
-    limit: 1000,
-};
+const SILENT: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 1, jitter: 0, loss: 1.0, limit: 1000 };
 
 /// Map of a hall with an interior wall: `#` is a wall.
-const HALL: [&str; 8] = [
-    "##########",
-    "#........#",
-    "#........#",
-    "#....#####",
-    "#........#",
-    "#........#",
-    "#........#",
-    "##########",
-];
+const HALL: [&str; 8] =
+    ["##########", "#........#", "#........#", "#....#####", "#........#", "#........#", "#........#", "##########"];
 const RESOLUTION: f32 = 0.5;
 
 /// A robot with a map server and a laser, and a subscriber to its position.
@@ -116,15 +102,7 @@ impl MapRobot {
         let laser = people::type_of(ros, "sensor_msgs/LaserScan", SCAN)?;
         let scan = advertise(&*node, "/scan", false, laser)?;
         let poses = site.subscribe_latched(&node, "/localiser/pose")?;
-        Ok(Self {
-            poses,
-            scan,
-            _map: map_publisher,
-            _server: server,
-            node,
-            site,
-            sent: 0,
-        })
+        Ok(Self { poses, scan, _map: map_publisher, _server: server, node, site, sent: 0 })
     }
 
     /// Publishes a scan from a cell.
@@ -134,12 +112,7 @@ impl MapRobot {
     }
 
     /// Starts a stub with its original, as installed on a robot.
-    fn start_stub(
-        &self,
-        daemon: &Daemon,
-        robot: &str,
-        server: &str,
-    ) -> anyhow::Result<NodeProcess> {
+    fn start_stub(&self, daemon: &Daemon, robot: &str, server: &str) -> anyhow::Result<NodeProcess> {
         self.start_stub_with_config(daemon, robot, server, "")
     }
 
@@ -155,9 +128,7 @@ impl MapRobot {
         let service = of.service.name;
         let overlay = self.site.install_stub(daemon, service, settings)?;
         let original = (of.package, of.executable);
-        let workspace: PathBuf = self
-            .site
-            .install_original(daemon, service, original, of.program)?;
+        let workspace: PathBuf = self.site.install_original(daemon, service, original, of.program)?;
         let prefixes = format!("{}:{}", overlay.display(), workspace.display());
         let server = format!("ws://{server}");
         let variables = [
@@ -166,13 +137,7 @@ impl MapRobot {
             ("CLOUDROID_ROBOT", robot),
             ("NO_COLOR", "1"),
         ];
-        self.site.start_installed_with_environment(
-            &variables,
-            &overlay,
-            of.package,
-            of.executable,
-            of.argv,
-        )
+        self.site.start_installed_with_environment(&variables, &overlay, of.package, of.executable, of.argv)
     }
 
     /// Publishes scans from a cell until one is answered, and checks the answer.
@@ -195,9 +160,7 @@ impl MapRobot {
             Ok([number(0)?, number(8)?] == wanted)
         };
         let found = self.site.ask_until(&mut self.poses, ask, is_there);
-        found
-            .map(drop)
-            .with_context(|| format!("{cell:?} should be found:\n{}", stub.output()))
+        found.map(drop).with_context(|| format!("{cell:?} should be found:\n{}", stub.output()))
     }
 }
 
@@ -219,50 +182,28 @@ fn wait_for_message_with(site: &Site, subscription: &mut Subscription, words: &s
     }
 }
 
-pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back(
-    ros: RosVersion,
-) -> Verdict {
+pub fn an_untouched_stub_finds_its_way_when_the_cable_is_cut_and_hands_back(ros: RosVersion) -> Verdict {
     let daemon = world().daemon_with(localiser(ros).service)?;
     let cable = Cable::new(&daemon.address)?;
     let mut robot = MapRobot::new(ros)?;
-    let stub = robot.start_stub(
-        &daemon,
-        &robot_name("fallback-cut", ros),
-        &cable.server.to_string(),
-    )?;
+    let stub = robot.start_stub(&daemon, &robot_name("fallback-cut", ros), &cable.server.to_string())?;
     wait_for_log(&stub, "linked to", 1)?;
     robot.expect_localised((2, 4), &stub)?;
     let mut diagnostics = robot.site.subscribe(&robot.node, "/diagnostics")?;
-    let (over, back) = (
-        "the local original answers, too why=LinkDown",
-        "the cloud answers alone why=LinkUp",
-    );
+    let (over, back) = ("the local original answers, too why=LinkDown", "the cloud answers alone why=LinkUp");
     // On a slow machine the original may already have taken over before the first link.
-    wait_for_message_with(
-        &robot.site,
-        &mut diagnostics,
-        "the cloud answers (no response time set",
-    )?;
+    wait_for_message_with(&robot.site, &mut diagnostics, "the cloud answers (no response time set")?;
     let before = stub.output().matches(over).count();
     for round in 1..=2 {
         cable.degrade(SILENT)?;
         wait_for_log(&stub, over, before + round)?;
         // The original's process has just started: it knows these walls from the latched map only.
         robot.expect_localised((6, 2), &stub)?;
-        wait_for_message_with(
-            &robot.site,
-            &mut diagnostics,
-            "the link is down, the local original answers",
-        )?;
+        wait_for_message_with(&robot.site, &mut diagnostics, "the link is down, the local original answers")?;
         let words = "if the original is installed on the robot, it takes over after 3.0 s";
         let name = robot_name("fallback-cut", ros);
         let path = format!("/api/v1/robots/{name}/explain");
-        daemon.wait_for(&path, words, |explained| {
-            explained["causes"]
-                .to_string()
-                .contains(words)
-                .then_some(())
-        })?;
+        daemon.wait_for(&path, words, |explained| explained["causes"].to_string().contains(words).then_some(()))?;
         let explained = daemon.deployer().run(&["explain", &name])?;
         let explained = explained.expect_success()?.stdout;
         let words = "no response time set, fallback 3.0 s after the link is lost";
@@ -295,11 +236,7 @@ pub fn a_server_that_was_never_reached_is_stood_in_for_until_it_comes(ros: RosVe
     let mut robot = MapRobot::new(ros)?;
     let way = Cutter::new(&daemon.address, 0, 1, 1)?;
     way.cut(true);
-    let stub = robot.start_stub(
-        &daemon,
-        &robot_name("fallback-never", ros),
-        &way.server.to_string(),
-    )?;
+    let stub = robot.start_stub(&daemon, &robot_name("fallback-never", ros), &way.server.to_string())?;
     wait_for_log(&stub, "no link: ", 1)?;
     robot.expect_localised((6, 6), &stub)?;
     wait_for_log(&stub, "the local original answers, too why=LinkDown", 1)?;
@@ -318,12 +255,7 @@ pub fn a_promise_holds_without_a_server_too_until_it_comes(ros: RosVersion) -> V
     // Requests cannot start before a node has registered the topics.
     let settings = "desire = 20.0\nmax = 20.0\nfallback_after = 1.0\n";
     let server = way.server.to_string();
-    let stub = robot.start_stub_with_config(
-        &daemon,
-        &robot_name("fallback-promise", ros),
-        &server,
-        settings,
-    )?;
+    let stub = robot.start_stub_with_config(&daemon, &robot_name("fallback-promise", ros), &server, settings)?;
     wait_for_log(&stub, "the local original answers, too why=LinkDown", 1)?;
     robot.expect_localised((6, 6), &stub)?;
     ensure!(!stub.output().contains("linked to"), "{}", stub.output());
@@ -345,12 +277,7 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing(ros: RosVersion) -> V
     // One late request would start the original, and nothing is late within five minutes.
     let settings = "desire = 300.0\nmax = 300.0\nfallback_after = 300.0\nthreshold = 4.0\ninitial = 5.0\ncap = 6.0\n";
     let server = way.server.to_string();
-    let stub = robot.start_stub_with_config(
-        &daemon,
-        &robot_name("fallback-blip", ros),
-        &server,
-        settings,
-    )?;
+    let stub = robot.start_stub_with_config(&daemon, &robot_name("fallback-blip", ros), &server, settings)?;
     wait_for_log(&stub, "linked to", 1)?;
     robot.site.wait_for_subscribers(&*robot.scan, 1)?;
     robot.expect_localised((2, 4), &stub)?;
@@ -381,10 +308,7 @@ pub fn a_blip_of_the_link_starts_nothing_and_loses_nothing(ros: RosVersion) -> V
     let said = stub.output();
     ensure!(said.contains("was lost"), "it was not cut: {said}");
     ensure!(!said.contains("the local original is started"), "{said}");
-    let path = format!(
-        "/api/v1/robots/{}/explain",
-        robot_name("fallback-blip", ros)
-    );
+    let path = format!("/api/v1/robots/{}/explain", robot_name("fallback-blip", ros));
     // All requests were answered; they are counted once the stub has determined which output answers which input.
     let link = daemon.wait_for(&path, "requests that are told", |explained| {
         let link = &explained["servants"][0]["links"][0];
@@ -404,10 +328,7 @@ pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone(ros: RosVersion
     let link = &explained["servants"][0]["links"][0];
     ensure!(link["fallback_after"].is_null(), "{explained:#}");
     let graph = robot.node.graph().borrow().clone();
-    ensure!(
-        !graph.nodes.contains_key("/localiser_cloudroid"),
-        "{graph:#?}"
-    );
+    ensure!(!graph.nodes.contains_key("/localiser_cloudroid"), "{graph:#?}");
     Ok(())
 }
 

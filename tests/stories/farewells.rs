@@ -40,8 +40,7 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
             RosVersion::Two => "herald",
         };
         let stub = site.start_stub_with_config(&toml, package, executable, &[])?;
-        site.wait_for_graph(&app, topic, |graph| graph.topics.contains_key(topic))
-            .with_context(|| stub.output())?;
+        site.wait_for_graph(&app, topic, |graph| graph.topics.contains_key(topic)).with_context(|| stub.output())?;
         anyhow::Ok(stub)
     };
     let mut stub = begins("frozen")?;
@@ -53,9 +52,7 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
     kill(pid, Signal::SIGCONT)?;
     ended?;
     ensure!(!is_late, "{}", stub.output());
-    site.wait_for_graph(&app, "nothing of it", |graph| {
-        !graph.topics.contains_key(topic)
-    })?;
+    site.wait_for_graph(&app, "nothing of it", |graph| !graph.topics.contains_key(topic))?;
     let mut stub = begins("killed")?;
     daemon.kill()?;
     let deadline = Deadline::begin_for(LAUNCH);

@@ -14,9 +14,7 @@ use support::patience::{Deadline, patience};
 use support::site::{NodeProcess, Site};
 use support::world::{StoryService, world};
 
-use crate::crossing::{
-    HOUR, argv, crossing, message_types_for, robot_name, service, wait_until_ready, with_log,
-};
+use crate::crossing::{HOUR, argv, crossing, message_types_for, robot_name, service, wait_until_ready, with_log};
 
 const ACTION: &str = "/crossing/act";
 
@@ -59,26 +57,15 @@ impl<'a> GoalApplication<'a> {
         };
         let _runtime = site.runtime.enter();
         let client = app.action_client(ACTION, &message_types_for(ros)?.action(action)?)?;
-        with_log(
-            site.runtime
-                .block_on(client.wait_for_server(patience()))
-                .map_err(Into::into),
-            stub,
-        )?;
-        Ok(Self {
-            client,
-            ros,
-            site,
-            stub,
-        })
+        with_log(site.runtime.block_on(client.wait_for_server(patience())).map_err(Into::into), stub)?;
+        Ok(Self { client, ros, site, stub })
     }
 
     fn send(&self, id: &str, steps: u32) -> Arc<GoalRecord> {
         let _runtime = self.site.runtime.enter();
         let goal = Arc::new(GoalRecord::default());
         let events = Arc::clone(&goal);
-        self.client
-            .send_goal(id, MessageLayout::new(self.ros).u32(steps).finish(), events);
+        self.client.send_goal(id, MessageLayout::new(self.ros).u32(steps).finish(), events);
         goal
     }
 
@@ -86,11 +73,7 @@ impl<'a> GoalApplication<'a> {
     fn wait_for_steps(&self, goal: &GoalRecord, count: usize) -> anyhow::Result<Vec<i32>> {
         let steps = support::wait_until(&format!("{count} steps"), || {
             let steps = goal.steps.lock().clone();
-            Ok(if steps.len() >= count {
-                Ok(steps)
-            } else {
-                Err(format!("{steps:?}"))
-            })
+            Ok(if steps.len() >= count { Ok(steps) } else { Err(format!("{steps:?}")) })
         });
         with_log(steps, self.stub)
     }
@@ -108,9 +91,7 @@ impl<'a> GoalApplication<'a> {
             let whole = end == (GoalOutcome::Succeeded, i32::try_from(count)?);
             let steps = goal.steps.lock().clone();
             ensure!(whole && all.starts_with(&steps), "{end:?} after {steps:?}");
-            Ok((steps == all)
-                .then_some(())
-                .ok_or_else(|| format!("{steps:?}")))
+            Ok((steps == all).then_some(()).ok_or_else(|| format!("{steps:?}")))
         })?;
         Ok(sent)
     }
@@ -151,10 +132,7 @@ pub fn an_action_is_carried_out_in_the_cloud(ros: RosVersion) -> Verdict {
             break i64::from(u32::from_le_bytes(word.try_into()?));
         }
     };
-    ensure!(
-        seconds.abs_diff(now) < HOUR.unsigned_abs() / 2,
-        "{seconds} is not about {now}"
-    );
+    ensure!(seconds.abs_diff(now) < HOUR.unsigned_abs() / 2, "{seconds} is not about {now}");
     // A goal that never ends is cancelled while it is in progress.
     let long = sender.send("long", 1_000_000);
     sender.wait_for_steps(&long, 1)?;
@@ -202,17 +180,9 @@ pub fn a_goal_is_carried_out_once_however_often_the_link_is_cut(ros: RosVersion)
 }
 
 /// A network on which nothing arrives in time.
-const LATE: NetworkImpairment = NetworkImpairment {
-    rate: 100_000,
-    delay: 15_000,
-    jitter: 0,
-    loss: 0.0,
-    limit: 10_000,
-};
+const LATE: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 15_000, jitter: 0, loss: 0.0, limit: 10_000 };
 
-pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
-    ros: RosVersion,
-) -> Verdict {
+pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(ros: RosVersion) -> Verdict {
     let (crossing, executable) = service(ros);
     let daemon = world().daemon_with(crossing)?;
     let cable = Cable::new(&daemon.address)?;
@@ -233,8 +203,7 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
         RosVersion::Two => "AMENT_PREFIX_PATH",
     };
     let environment = [(workspaces, &*workspace), ("NO_COLOR", "1")];
-    let stub =
-        site.start_stub_with_environment(&environment, &toml, name, executable, argv(ros))?;
+    let stub = site.start_stub_with_environment(&environment, &toml, name, executable, argv(ros))?;
     with_log(wait_until_ready(&site, &app), &stub)?;
     let sender = GoalApplication::new(&site, &app, &stub)?;
     // In ROS 1 results are published on a topic: two for one goal would be visible.
@@ -257,11 +226,7 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
     let [first, second] = &late;
     let end = sender.wait_for_end(first)?;
     let is_preempted = ros == RosVersion::One && end.0 == GoalOutcome::Canceled;
-    ensure!(
-        is_preempted || end == (GoalOutcome::Succeeded, 1),
-        "{end:?}\n{}",
-        stub.output()
-    );
+    ensure!(is_preempted || end == (GoalOutcome::Succeeded, 1), "{end:?}\n{}", stub.output());
     ends(second, 1)?;
     // The first side to send feedback for a goal continues to send it.
     let told = sender.send_until_all_steps("steps", 3);

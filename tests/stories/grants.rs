@@ -18,9 +18,7 @@ pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     create_models(&models)?;
     let listener = TcpListener::bind("127.0.0.1:0")?;
     let out = listener.local_addr()?.to_string();
-    let config = format!(
-        "[allow]\ndevices = [\"{kind}=*\"]\nvolumes = [{models:?}]\negress = [\"{out}\"]\n"
-    );
+    let config = format!("[allow]\ndevices = [\"{kind}=*\"]\nvolumes = [{models:?}]\negress = [\"{out}\"]\n");
     let daemon = world().setup("granted").config(&config).start()?;
     let device = format!("{kind}=zero");
     let pushed = daemon
@@ -45,9 +43,11 @@ pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
     check_grants(&mut robot, &listener)?;
     let events = daemon.deployer().run_json(&["events"])?;
-    let told = events.as_array().context("events")?.iter().any(|event| {
-        event["kind"] == "device-incomplete" && event["message"].to_string().contains(&hook)
-    });
+    let told = events
+        .as_array()
+        .context("events")?
+        .iter()
+        .any(|event| event["kind"] == "device-incomplete" && event["message"].to_string().contains(&hook));
     ensure!(told, "{events:#}");
     drop(robot);
     daemon.stop()?;
@@ -63,10 +63,7 @@ pub fn nothing_is_given_unasked_or_unallowed() -> Verdict {
     ] {
         daemon
             .deployer()
-            .push(
-                "burglar_cpp",
-                &["--name", "greedy", "--node", "burglar", flag, value],
-            )?
+            .push("burglar_cpp", &["--name", "greedy", "--node", "burglar", flag, value])?
             .expect_failure(&[kind, "not allowed", "[allow]"])?;
     }
     Ok(())

@@ -11,23 +11,15 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
     let setup = world().setup("history");
     let daemon = setup.start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=r1&rrt=100ms&max_rrt=2s")?;
     // Repeated calls, because a sample covers the ten seconds before it.
     let history = support::wait_until("a sample with response times", || {
         let sum = robot.call("/add_two", json!({"a": 2, "b": 3}))?;
         ensure!(sum["values"]["sum"] == 5, "{sum}");
         let history = daemon.api("/api/v1/history/servants?robot=r1&step=10")?;
-        let answered = history[0]["figures"]["p50"]
-            .as_array()
-            .is_some_and(|all| all.iter().any(Value::is_f64));
-        Ok(if answered {
-            Ok(history)
-        } else {
-            Err(history.to_string())
-        })
+        let answered = history[0]["figures"]["p50"].as_array().is_some_and(|all| all.iter().any(Value::is_f64));
+        Ok(if answered { Ok(history) } else { Err(history.to_string()) })
     })?;
     let one = &history[0];
     ensure!(one["service"] == "adder_py" && one["step"] == 10, "{one:#}");
@@ -37,38 +29,22 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
         let length = list.as_array().context("a list")?.len();
         ensure!(length == times.len(), "{name}: {one:#}");
     }
-    let last = |name: &str| {
-        figures[name]
-            .as_array()
-            .and_then(|all| all.last()?.as_f64())
-    };
-    ensure!(
-        last("memory") > Some(1e6) && last("desire") == Some(100.0) && last("max") == Some(2000.0),
-        "{one:#}"
-    );
+    let last = |name: &str| figures[name].as_array().and_then(|all| all.last()?.as_f64());
+    ensure!(last("memory") > Some(1e6) && last("desire") == Some(100.0) && last("max") == Some(2000.0), "{one:#}");
     let machine = daemon.api("/api/v1/history/machine?step=10")?;
     let memory = machine["figures"]["memory"].as_array().context("memory")?;
-    ensure!(
-        memory.iter().any(|one| one.as_f64() > Some(1e6)),
-        "{machine:#}"
-    );
+    ensure!(memory.iter().any(|one| one.as_f64() > Some(1e6)), "{machine:#}");
 
     // After a kill and restart the history is still available, also for a servant that has ended.
     robot.leave()?;
     daemon.kill()?;
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     ensure!(daemon.servants_of("adder_py")?.is_empty());
     let id = one["servant"].as_str().context("an id")?;
     let later = daemon.api(&format!("/api/v1/history/servants?servant={id}&step=10"))?;
     let kept = later[0]["figures"]["time"].as_array().context("times")?;
-    ensure!(
-        kept.starts_with(times) && later[0]["robot"] == "r1",
-        "{later:#}\n{one:#}"
-    );
+    ensure!(kept.starts_with(times) && later[0]["robot"] == "r1", "{later:#}\n{one:#}");
     let none = daemon.api(&format!(
         "/api/v1/history/servants?servant={id}&step=10&to={}",
         times[0].as_u64().context("a time")? - 1
@@ -96,18 +72,12 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
     // Invalid requests are refused with the name of the error.
     let admin = create_token(&daemon, &["boss", "--role", "admin"])?;
     let bearer = format!("Bearer {admin}");
-    for (asked, words) in [
-        ("step=7", "step=10"),
-        ("from=2&to=1", "from is after to"),
-        ("from=yesterday", "query"),
-        ("to=-1", "query"),
-    ] {
+    for (asked, words) in
+        [("step=7", "step=10"), ("from=2&to=1", "from is after to"), ("from=yesterday", "query"), ("to=-1", "query")]
+    {
         let path = format!("/api/v1/history/servants?{asked}");
         let (status, body) = daemon.request("GET", &path, &[("Authorization", &bearer)])?;
-        ensure!(
-            status == 400 && body.contains(words),
-            "{asked}: {status} {body}"
-        );
+        ensure!(status == 400 && body.contains(words), "{asked}: {status} {body}");
     }
     Ok(())
 }

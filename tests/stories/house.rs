@@ -19,10 +19,7 @@ pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
     let setup = world().setup("one");
     let daemon = setup.start()?;
     let said = setup.expect_refusal()?;
-    ensure!(
-        said.contains(&daemon.pid().to_string()),
-        "the first is named: {said}"
-    );
+    ensure!(said.contains(&daemon.pid().to_string()), "the first is named: {said}");
     ensure!(daemon.get("/healthz")?.0 == 200, "and is not disturbed");
     Ok(())
 }
@@ -62,11 +59,7 @@ fn expect_closed(home: &Path) -> Verdict {
 /// Restores the permissions of earlier versions.
 fn open_up(path: &Path) -> Verdict {
     let about = path.symlink_metadata()?;
-    if about.is_symlink()
-        || ["skeleton", "layers"]
-            .iter()
-            .any(|name| path.ends_with(name))
-    {
+    if about.is_symlink() || ["skeleton", "layers"].iter().any(|name| path.ends_with(name)) {
         return Ok(());
     }
     let rights = if about.is_dir() { 0o755 } else { 0o644 };
@@ -82,10 +75,7 @@ fn open_up(path: &Path) -> Verdict {
 pub fn the_state_is_closed_to_others() -> Verdict {
     let setup = world().setup("closed");
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let adds = |daemon: &Daemon| -> Verdict {
         let mut robot = daemon.robot("adder_py?robot=r1")?;
         let answer = robot.call("/add_two", json!({"a": 1, "b": 2}))?;
@@ -95,20 +85,12 @@ pub fn the_state_is_closed_to_others() -> Verdict {
     adds(&daemon)?;
     // Other users cannot lock the ranges of user ids.
     let held = Command::new("flock")
-        .args([
-            "--shared",
-            "--nonblock",
-            "/run/cloudroid/uid-ranges",
-            "true",
-        ])
+        .args(["--shared", "--nonblock", "/run/cloudroid/uid-ranges", "true"])
         .uid(65534)
         .gid(65534)
         .output()?;
     let said = String::from_utf8_lossy(&held.stderr);
-    ensure!(
-        !held.status.success() && said.contains("Permission denied"),
-        "{said}"
-    );
+    ensure!(!held.status.success() && said.contains("Permission denied"), "{said}");
     let home = daemon.home.clone();
     daemon.stop()?;
     open_up(&home)?;
@@ -119,14 +101,8 @@ pub fn the_state_is_closed_to_others() -> Verdict {
 
 pub fn a_taken_port_is_named() -> Verdict {
     let daemon = world().setup("port-owner").start()?;
-    let said = world()
-        .setup("port-wanter")
-        .listen(&daemon.address)
-        .expect_refusal()?;
-    ensure!(
-        said.contains(&daemon.address) && said.contains("--listen"),
-        "{said}"
-    );
+    let said = world().setup("port-wanter").listen(&daemon.address).expect_refusal()?;
+    ensure!(said.contains(&daemon.address) && said.contains("--listen"), "{said}");
     Ok(())
 }
 
@@ -139,10 +115,7 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing(ros: RosVersion) -> Verdict {
     world().daemon_with(service)?;
     let home = world().home(&format!("demo{}", ros.number()));
     let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
-    let binaries = binaries::path("cloudroidd")
-        .parent()
-        .map(ToOwned::to_owned)
-        .unwrap_or_default();
+    let binaries = binaries::path("cloudroidd").parent().map(ToOwned::to_owned).unwrap_or_default();
     let outcome = run(Command::new(binaries::checkout().join("demo/demo"))
         .env("BIN", binaries)
         .env("CHECK", "1")
@@ -160,22 +133,10 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing(ros: RosVersion) -> Verdict {
 pub fn doctor_names_each_need() -> Verdict {
     let daemon = world().ensure_shared()?;
     let outcome = daemon.deployer().run(&["doctor"])?;
-    for need in [
-        "root",
-        "overlay",
-        "idmap",
-        "user namespace",
-        "seccomp",
-        "landlock",
-        "cgroup",
-        "mmdebstrap",
-        "cloudroid-init",
-    ] {
-        ensure!(
-            outcome.output().to_lowercase().contains(need),
-            "{need} in:\n{}",
-            outcome.output()
-        );
+    for need in
+        ["root", "overlay", "idmap", "user namespace", "seccomp", "landlock", "cgroup", "mmdebstrap", "cloudroid-init"]
+    {
+        ensure!(outcome.output().to_lowercase().contains(need), "{need} in:\n{}", outcome.output());
     }
     let answer: Value = daemon.deployer().run_json(&["doctor"])?;
     ensure!(answer.to_string().contains("mmdebstrap"), "{answer}");
@@ -183,33 +144,17 @@ pub fn doctor_names_each_need() -> Verdict {
 }
 
 pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Verdict {
-    let daemon = world()
-        .setup("grace")
-        .config("[servant]\ngrace = \"1s\"\n")
-        .start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    let daemon = world().setup("grace").config("[servant]\ngrace = \"1s\"\n").start()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=guest")?;
     robot.call("/add_two", json!({"a": 1, "b": 1}))?;
-    let id = daemon.servant_of("adder_py", "guest")?["id"]
-        .as_str()
-        .unwrap_or_default()
-        .to_owned();
+    let id = daemon.servant_of("adder_py", "guest")?["id"].as_str().unwrap_or_default().to_owned();
     robot.leave()?;
     support::wait_until("the servant's end", || {
         let left = daemon.servants_of("adder_py")?;
-        Ok(if left.is_empty() {
-            Ok(())
-        } else {
-            Err(format!("{left:#?}"))
-        })
+        Ok(if left.is_empty() { Ok(()) } else { Err(format!("{left:#?}")) })
     })?;
-    ensure!(
-        leftovers::cgroups(std::slice::from_ref(&id)).is_empty(),
-        "{id} left a cgroup"
-    );
+    ensure!(leftovers::cgroups(std::slice::from_ref(&id)).is_empty(), "{id} left a cgroup");
     // A robot that returns later gets a new servant.
     let mut robot = daemon.robot("adder_py?robot=guest")?;
     robot.call("/add_two", json!({"a": 1, "b": 1}))?;

@@ -9,19 +9,12 @@ use support::patience::scale_seconds;
 use support::world::world;
 
 pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
-    let setup = world()
-        .setup("hung")
-        .config("[servant]\nhung = \"restart\"\nhung_after = 2\nwarm_nodes = 1\n");
+    let setup = world().setup("hung").config("[servant]\nhung = \"restart\"\nhung_after = 2\nwarm_nodes = 1\n");
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     support::wait_until("a container whose node runs", || {
         let status = daemon.api("/api/v1/status")?;
-        Ok((status["warm_nodes"] == 1)
-            .then_some(())
-            .ok_or_else(|| status.to_string()))
+        Ok((status["warm_nodes"] == 1).then_some(()).ok_or_else(|| status.to_string()))
     })?;
     // A node counts as hanging after twice this time: long enough that it does not count so before it is stopped, and
     // that the bridge meanwhile finds that it cannot connect.
@@ -52,9 +45,7 @@ pub fn a_node_that_answers_no_more_is_told_and_started_again() -> Verdict {
     daemon.wait_for_event("its new start", |event| event["kind"] == "node-failed")?;
     support::wait_until("an answer", || {
         let answer = robot.call("/add_two", sum.clone())?;
-        Ok((answer["values"]["sum"] == 2)
-            .then_some(())
-            .ok_or_else(|| answer.to_string()))
+        Ok((answer["values"]["sum"] == 2).then_some(()).ok_or_else(|| answer.to_string()))
     })?;
     ensure!(daemon.servant_of("adder_py", "one")?["id"] == servant["id"]);
     Ok(())

@@ -13,72 +13,35 @@ use crate::access::create_token;
 pub fn skopeo_and_umoci_read_the_store() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let store = daemon.home.join("images");
-    let inspected = run(Command::new("skopeo")
-        .arg("inspect")
-        .arg(format!("oci:{}:adder_py", store.display())))?;
+    let inspected = run(Command::new("skopeo").arg("inspect").arg(format!("oci:{}:adder_py", store.display())))?;
     let inspected: Value = serde_json::from_str(&inspected.expect_success()?.stdout)?;
-    ensure!(
-        inspected["Layers"]
-            .as_array()
-            .is_some_and(|layers| layers.len() >= 2),
-        "{inspected}"
-    );
-    ensure!(
-        inspected["Architecture"] == "amd64" && inspected["Os"] == "linux",
-        "{inspected}"
-    );
+    ensure!(inspected["Layers"].as_array().is_some_and(|layers| layers.len() >= 2), "{inspected}");
+    ensure!(inspected["Architecture"] == "amd64" && inspected["Os"] == "linux", "{inspected}");
     let place = tempfile::tempdir()?;
     let bundle = place.path().join("bundle");
-    run(Command::new("umoci")
-        .args([
-            "unpack",
-            "--image",
-            &format!("{}:adder_py", store.display()),
-        ])
-        .arg(&bundle))?
-    .expect_success()?;
-    ensure!(
-        bundle
-            .join("rootfs/usr/bin/python3")
-            .symlink_metadata()
-            .is_ok(),
-        "the base is there"
-    );
+    run(Command::new("umoci").args(["unpack", "--image", &format!("{}:adder_py", store.display())]).arg(&bundle))?
+        .expect_success()?;
+    ensure!(bundle.join("rootfs/usr/bin/python3").symlink_metadata().is_ok(), "the base is there");
     // The registry API serves the same image.
     let (status, manifest) = daemon.get("/v2/adder_py/manifests/latest")?;
     ensure!(status == 200, "{status} {manifest}");
     let manifest: Value = serde_json::from_str(&manifest)?;
-    let served: Vec<_> = manifest["layers"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .map(|layer| &layer["digest"])
-        .collect();
-    let stored: Vec<_> = inspected["Layers"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .collect();
+    let served: Vec<_> = manifest["layers"].as_array().into_iter().flatten().map(|layer| &layer["digest"]).collect();
+    let stored: Vec<_> = inspected["Layers"].as_array().into_iter().flatten().collect();
     ensure!(served == stored, "{served:?} against {stored:?}");
     // The command line exports the same image to a file.
     let file = place.path().join("adder.tar").display().to_string();
     let deployer = daemon.deployer();
-    deployer
-        .run(&["export", "adder_py", "-o", &file])?
-        .expect_success()?;
+    deployer.run(&["export", "adder_py", "-o", &file])?.expect_success()?;
     let archive = format!("oci-archive:{file}");
     let exported = run(Command::new("skopeo").args(["inspect", &archive]))?;
     let exported: Value = serde_json::from_str(&exported.expect_success()?.stdout)?;
     for key in ["Digest", "Layers"] {
-        ensure!(
-            exported[key] == inspected[key],
-            "{exported}, not {inspected}"
-        );
+        ensure!(exported[key] == inspected[key], "{exported}, not {inspected}");
     }
     let copied = format!("dir:{}", place.path().join("copied").display());
     // Reads every blob and compares its digest.
-    run(Command::new("skopeo").args(["--insecure-policy", "copy", &archive, &copied]))?
-        .expect_success()?;
+    run(Command::new("skopeo").args(["--insecure-policy", "copy", &archive, &copied]))?.expect_success()?;
     // A missing image is reported by the exit status, and no file is written.
     let nowhere = place.path().join("nowhere.tar").display().to_string();
     for missing in [&["adder_py", "--revision", "9"][..], &["nobody"]] {
@@ -114,9 +77,7 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     let place = tempfile::tempdir()?;
     let at = |name: &str| place.path().join(name).display().to_string();
     let file = at("sevens.oci.tar");
-    one.deployer()
-        .run(&["export", "sevens", "-o", &file])?
-        .expect_success()?;
+    one.deployer().run(&["export", "sevens", "-o", &file])?.expect_success()?;
     let before = one.get_json("/api/v1/services/sevens")?;
     let rows = one.get_json("/api/v1/services/sevens/sla")?;
     one.stop()?;
@@ -124,21 +85,9 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     let other = world().setup("importing").start()?;
     let types = |words: &[&str]| other.deployer().run(words);
     let said = types(&["import", &file])?.expect_success()?;
-    ensure!(
-        said.output().contains("measured on another machine"),
-        "{}",
-        said.output()
-    );
+    ensure!(said.output().contains("measured on another machine"), "{}", said.output());
     let after = other.get_json("/api/v1/services/sevens")?;
-    for key in [
-        "image",
-        "package",
-        "limits",
-        "interface",
-        "nodes",
-        "topics",
-        "services",
-    ] {
+    for key in ["image", "package", "limits", "interface", "nodes", "topics", "services"] {
         ensure!(after[key] == before[key], "{key}: {after}, not {before}");
     }
     let source = after["revisions"][0]["source"].as_str().unwrap_or_default();
@@ -157,11 +106,7 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     // Imported again it becomes another revision, or a service with another name; rows of the existing service are
     // kept.
     let again = types(&["import", &file])?.expect_success()?;
-    ensure!(
-        again.output().contains("keeps its existing SLA table"),
-        "{}",
-        again.output()
-    );
+    ensure!(again.output().contains("keeps its existing SLA table"), "{}", again.output());
     types(&["import", &file, "--name", "sevens_too"])?.expect_success()?;
     adds("sevens_too")?;
 
@@ -174,25 +119,12 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     std::fs::write(at("changed.tar"), changed)?;
     let image = format!("oci:{}:sevens", other.home.join("images").display());
     let plain = format!("oci-archive:{}:plain", at("plain.tar"));
-    run(Command::new("skopeo").args(["--insecure-policy", "copy", &image, &plain]))?
-        .expect_success()?;
+    run(Command::new("skopeo").args(["--insecure-policy", "copy", &image, &plain]))?.expect_success()?;
     let rows: [(&[&str], &[&str]); 4] = [
-        (
-            &["push", &file, "--cpus", "2"],
-            &["includes its start commands"],
-        ),
-        (
-            &["import", &at("torn.tar"), "--name", "torn"],
-            &["truncated", "copy the whole file"],
-        ),
-        (
-            &["import", &at("changed.tar"), "--name", "changed"],
-            &["has the content of", "export the service again"],
-        ),
-        (
-            &["import", &at("plain.tar"), "--name", "plain"],
-            &["is not an exported service", "next:"],
-        ),
+        (&["push", &file, "--cpus", "2"], &["includes its start commands"]),
+        (&["import", &at("torn.tar"), "--name", "torn"], &["truncated", "copy the whole file"]),
+        (&["import", &at("changed.tar"), "--name", "changed"], &["has the content of", "export the service again"]),
+        (&["import", &at("plain.tar"), "--name", "plain"], &["is not an exported service", "next:"]),
     ];
     for (words, expected) in rows {
         types(words)?.expect_failure(expected)?;
@@ -205,15 +137,9 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     let eve = create_token(&other, &["eve", "--role", "viewer", "--service", "sevens*"])?;
     let server = format!("http://{}", other.address);
     let hers = at("hers.tar");
-    let typed = [
-        "--server", &server, "--token", &eve, "export", "sevens", "-o", &hers,
-    ];
+    let typed = ["--server", &server, "--token", &eve, "export", "sevens", "-o", &hers];
     let said = types(&typed)?.expect_success()?;
-    ensure!(
-        said.output().contains("only the image is exported"),
-        "{}",
-        said.output()
-    );
+    ensure!(said.output().contains("only the image is exported"), "{}", said.output());
     let typed = ["--server", &server, "--token", &admin, "import", &hers];
     types(&typed)?.expect_failure(&["is not an exported service"])?;
     other.stop()?;
@@ -224,36 +150,21 @@ pub fn what_nobody_refers_to_is_collected() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let deployer = daemon.deployer();
     deployer
-        .push(
-            "adder_py",
-            &[
-                "--name", "fleeting", "--node", "adder.py", "--param", "offset=7",
-            ],
-        )?
+        .push("adder_py", &["--name", "fleeting", "--node", "adder.py", "--param", "offset=7"])?
         .expect_success()?;
-    let image = daemon.get_json("/api/v1/services/fleeting")?["image"]
-        .as_str()
-        .unwrap_or_default()
-        .to_owned();
-    let blob = daemon
-        .home
-        .join("images/blobs/sha256")
-        .join(image.trim_start_matches("sha256:"));
+    let image = daemon.get_json("/api/v1/services/fleeting")?["image"].as_str().unwrap_or_default().to_owned();
+    let blob = daemon.home.join("images/blobs/sha256").join(image.trim_start_matches("sha256:"));
     ensure!(blob.exists(), "{}", blob.display());
-    let shared = run(Command::new("skopeo").args([
-        "inspect",
-        &format!("oci:{}:adder_py", daemon.home.join("images").display()),
-    ]))?;
+    let shared = run(
+        Command::new("skopeo").args(["inspect", &format!("oci:{}:adder_py", daemon.home.join("images").display())])
+    )?;
     shared.expect_success()?;
     deployer.run(&["rm", "fleeting"])?.expect_success()?;
     ensure!(
         !blob.exists() || daemon.get_json("/api/v1/services/adder_py")?["image"] == image.as_str(),
         "the image of a removed service is collected"
     );
-    run(Command::new("skopeo").args([
-        "inspect",
-        &format!("oci:{}:adder_py", daemon.home.join("images").display()),
-    ]))?
-    .expect_success()?;
+    run(Command::new("skopeo").args(["inspect", &format!("oci:{}:adder_py", daemon.home.join("images").display())]))?
+        .expect_success()?;
     Ok(())
 }

@@ -40,33 +40,13 @@ impl InsideScene {
     fn start(setup: &DaemonSetup) -> anyhow::Result<InsideScene> {
         let daemon = setup.start()?;
         let admin = create_token(&daemon, &["chief", "--role", "admin"])?;
-        daemon
-            .deployer()
-            .push("sights_py", SIGHTS)?
-            .expect_success()?;
-        let own = create_token(
-            &daemon,
-            &[
-                "rover",
-                "--role",
-                "robot",
-                "--robot",
-                "rover",
-                "--service",
-                "sights_py",
-            ],
-        )?;
+        daemon.deployer().push("sights_py", SIGHTS)?.expect_success()?;
+        let own = create_token(&daemon, &["rover", "--role", "robot", "--robot", "rover", "--service", "sights_py"])?;
         let mut rover = daemon.robot(&format!("sights_py?token={own}"))?;
         rover.call("/rosapi/get_time", json!({}))?;
         let servant = daemon.servant_of("sights_py", "rover")?;
         let servant = servant["id"].as_str().context("an id")?.to_owned();
-        Ok(InsideScene {
-            daemon,
-            admin,
-            rover,
-            token: own,
-            servant,
-        })
+        Ok(InsideScene { daemon, admin, rover, token: own, servant })
     }
 
     pub fn viewer_token(&self, name: &str, services: &str) -> anyhow::Result<String> {
@@ -79,45 +59,32 @@ impl InsideScene {
     }
 
     fn connect_viewer(&self, token: &str) -> Result<Robot, ConnectionRefusal> {
-        let url = self
-            .daemon
-            .url(&format!("{}?token={token}", self.inside_path()));
+        let url = self.daemon.url(&format!("{}?token={token}", self.inside_path()));
         Robot::try_connect(&url)
     }
 
     pub fn servant(&self) -> anyhow::Result<Value> {
-        self.daemon
-            .api(&format!("/api/v1/servants/{}", self.servant))
+        self.daemon.api(&format!("/api/v1/servants/{}", self.servant))
     }
 
     pub fn wait_for_audit(&self, who: &str, did: &str) -> Verdict {
         support::wait_until(&format!("a record that {who} {did}"), || {
             let typed = ["--format", "json", "audit", "-n", "1000"];
             let log = self.daemon.deployer().run(&typed)?.expect_success()?.stdout;
-            let found = log
-                .lines()
-                .filter_map(|line| serde_json::from_str::<Value>(line).ok())
-                .any(|record| {
-                    let (name, what) = (record["who"].as_str(), record["did"].as_str());
-                    name.is_some_and(|name| name.starts_with(who)) && what == Some(did)
-                });
+            let found = log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()).any(|record| {
+                let (name, what) = (record["who"].as_str(), record["did"].as_str());
+                name.is_some_and(|name| name.starts_with(who)) && what == Some(did)
+            });
             Ok(found.then_some(()).ok_or(log))
         })
     }
 }
 
-pub fn expect_refused(
-    connection: Result<Robot, ConnectionRefusal>,
-    status: u16,
-    words: &str,
-) -> Verdict {
+pub fn expect_refused(connection: Result<Robot, ConnectionRefusal>, status: u16, words: &str) -> Verdict {
     match connection {
         Ok(_) => bail!("let in, and not refused with {status} {words}"),
         Err(refusal) => {
-            ensure!(
-                refusal.status == status && refusal.body.contains(words),
-                "{status} {words}: {refusal}"
-            );
+            ensure!(refusal.status == status && refusal.body.contains(words), "{status} {words}: {refusal}");
             Ok(())
         }
     }
@@ -139,12 +106,7 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     let mut eve = scene.connect_viewer(&eve_token)?;
     // A viewer sees and receives all topics, including the robot's own.
     let topics = eve.call("/rosapi/topics", json!({}))?;
-    ensure!(
-        topics["values"]["topics"]
-            .to_string()
-            .contains("/sights/scan"),
-        "{topics}"
-    );
+    ensure!(topics["values"]["topics"].to_string().contains("/sights/scan"), "{topics}");
     for topic in ["/sights/said", "/sights/say"] {
         eve.subscribe(topic)?;
         eve.wait_for_subscriber(topic)?;
@@ -156,9 +118,7 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
         json!({"op": "publish", "topic": "/sights/say", "type": "std_msgs/String",
         "msg": {"data": words}})
     };
-    scene
-        .rover
-        .send(json!({"op": "advertise", "topic": "/sights/say", "type": "std_msgs/String"}))?;
+    scene.rover.send(json!({"op": "advertise", "topic": "/sights/say", "type": "std_msgs/String"}))?;
     // She receives messages once her node is connected, for which the robot does not wait; the node's own messages
     // arrive even later.
     support::wait_until("what the robot sends and its node says, inside", || {
@@ -174,7 +134,8 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     ensure!(eve.next_message_on("/sights/said")?["data"] == "by rover");
     // Images are sent in binary on request.
     let mut pictures = scene.connect_viewer(&eve_token)?;
-    pictures.send(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor", "throttle_rate": 200,
+    pictures
+        .send(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor", "throttle_rate": 200,
         "queue_length": 1}))?;
     wait_for_picture(&mut pictures)?;
     pictures.leave()?;
@@ -183,10 +144,7 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     eve.wait_for_status("publish:/sights/say is not granted")?;
     for (service, arguments) in [
         ("/sights/ping", json!({})),
-        (
-            "/rosapi/set_param",
-            json!({"name": "/sights/gain", "value": "9"}),
-        ),
+        ("/rosapi/set_param", json!({"name": "/sights/gain", "value": "9"})),
         ("/rosapi/get_param", json!({"name": "/sights/gain"})),
         ("/rosapi/delete_param", json!({"name": "/sights/gain"})),
     ] {
@@ -196,15 +154,11 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
             "{service}: {answer}"
         );
     }
-    eve.send(
-        json!({"op": "send_action_goal", "id": "g", "action": "/sights/count",
-        "action_type": "actionlib/TestAction", "args": {"goal": 1}}),
-    )?;
+    eve.send(json!({"op": "send_action_goal", "id": "g", "action": "/sights/count",
+        "action_type": "actionlib/TestAction", "args": {"goal": 1}}))?;
     let goal = eve.wait_for("the goal's end", |said| said["op"] == "action_result")?;
     ensure!(goal["result"] == false, "{goal}");
-    eve.send(
-        json!({"op": "advertise_service", "service": "/sights/other", "type": "std_srvs/Trigger"}),
-    )?;
+    eve.send(json!({"op": "advertise_service", "service": "/sights/other", "type": "std_srvs/Trigger"}))?;
     eve.wait_for_status("advertise:/sights/other is not granted")?;
     scene.wait_for_audit("eve", "looks inside")?;
     scene.wait_for_audit("eve", "was refused publish:/sights/say")?;
@@ -214,10 +168,7 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     let mut olga = scene.connect_viewer(&olga)?;
     let answer = olga.call("/sights/ping", json!({}))?;
     ensure!(answer["values"]["message"] == "pong", "{answer}");
-    olga.call(
-        "/rosapi/set_param",
-        json!({"name": "/sights/gain", "value": "9"}),
-    )?;
+    olga.call("/rosapi/set_param", json!({"name": "/sights/gain", "value": "9"}))?;
     let gain = olga.call("/rosapi/get_param", json!({"name": "/sights/gain"}))?;
     ensure!(gain["values"]["value"] == "9", "{gain}");
     scene.rover.subscribe("/sights/said")?;
@@ -225,17 +176,11 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     // The node treats it like any other publication, and its robot gets the answer once both are connected.
     support::wait_until("what olga sends, at the robot", || {
         olga.send(say("by olga"))?;
-        let unheard = scene
-            .rover
-            .has_not_heard(|said| said["msg"]["data"] == "by olga")?;
-        Ok((!unheard)
-            .then_some(())
-            .ok_or_else(|| "not heard".to_owned()))
+        let unheard = scene.rover.has_not_heard(|said| said["msg"]["data"] == "by olga")?;
+        Ok((!unheard).then_some(()).ok_or_else(|| "not heard".to_owned()))
     })?;
-    olga.send(
-        json!({"op": "send_action_goal", "id": "g", "action": "/sights/count",
-        "action_type": "actionlib/TestAction", "args": {"goal": 10}}),
-    )?;
+    olga.send(json!({"op": "send_action_goal", "id": "g", "action": "/sights/count",
+        "action_type": "actionlib/TestAction", "args": {"goal": 10}}))?;
     let goal = olga.wait_for("the goal's end", |said| said["op"] == "action_result")?;
     ensure!(goal["result"] == true, "{goal}");
     scene.wait_for_audit("olga", "inside: call:/sights/ping")?;
@@ -253,41 +198,20 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     scene.rover.subscribe("/client_count")?;
     ensure!(scene.rover.next_message_on("/client_count")?["data"] == 1);
     let events = scene.daemon.api("/api/v1/events?limit=10000")?;
-    ensure!(
-        !events.to_string().contains("duplicate-robot"),
-        "{events:#}"
-    );
+    ensure!(!events.to_string().contains("duplicate-robot"), "{events:#}");
 
     // A rule restricts a viewer's subscriptions immediately.
-    let rule = [
-        "policy",
-        "allow",
-        "eve",
-        "subscribe:/sights/map",
-        "--service",
-        "*",
-    ];
+    let rule = ["policy", "allow", "eve", "subscribe:/sights/map", "--service", "*"];
     scene.daemon.deployer().run(&rule)?.expect_success()?;
     eve.wait_for_status("/sights/said")?;
     eve.send(json!({"op": "subscribe", "id": "again", "topic": "/sights/said"}))?;
     eve.wait_for_status("subscribe:/sights/said is not granted")?;
     // Connections end with their token.
-    scene
-        .daemon
-        .deployer()
-        .run(&["token", "revoke", "eve"])?
-        .expect_success()?;
+    scene.daemon.deployer().run(&["token", "revoke", "eve"])?.expect_success()?;
     let close = eve.wait_for_close()?;
-    ensure!(
-        u16::from(close.code) == 1008 && close.reason.contains("revoked"),
-        "{close:?}"
-    );
+    ensure!(u16::from(close.code) == 1008 && close.reason.contains("revoked"), "{close:?}");
     // Connections end with the servant.
-    scene
-        .daemon
-        .deployer()
-        .run(&["stop", &scene.servant])?
-        .expect_success()?;
+    scene.daemon.deployer().run(&["stop", &scene.servant])?.expect_success()?;
     let close = olga.wait_for_close()?;
     ensure!(u16::from(close.code) == 1012, "{close:?}");
     expect_refused(scene.connect_viewer(&scene.admin), 404, "servant")?;
@@ -299,15 +223,7 @@ pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
     let scene = InsideScene::new("inside-bounds", "[servant]\ngrace = \"1s\"\n")?;
     let eve = scene.viewer_token("eve", "sights*")?;
     let stranger = scene.viewer_token("stranger", "other*")?;
-    let other = [
-        "other",
-        "--role",
-        "robot",
-        "--robot",
-        "other",
-        "--service",
-        "sights_py",
-    ];
+    let other = ["other", "--role", "robot", "--robot", "other", "--service", "sights_py"];
     let other = create_token(&scene.daemon, &other)?;
     expect_refused(scene.connect_viewer(&stranger), 403, "may not see servant")?;
     expect_refused(scene.connect_viewer(&other), 403, "may not see")?;
@@ -315,20 +231,11 @@ pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
     let bare = Robot::try_connect(&scene.daemon.url(&scene.inside_path()));
     expect_refused(bare, 401, "token")?;
     let elsewhere = format!("api/v1/servants/nothing/inside?token={eve}");
-    expect_refused(
-        Robot::try_connect(&scene.daemon.url(&elsewhere)),
-        403,
-        "may not see",
-    )?;
+    expect_refused(Robot::try_connect(&scene.daemon.url(&elsewhere)), 403, "may not see")?;
     let bearer = format!("Bearer {eve}");
     let path = format!("/{}", scene.inside_path());
-    let (status, body) = scene
-        .daemon
-        .request("GET", &path, &[("Authorization", &bearer)])?;
-    ensure!(
-        status == 400 && body.contains("not a WebSocket handshake"),
-        "{status} {body}"
-    );
+    let (status, body) = scene.daemon.request("GET", &path, &[("Authorization", &bearer)])?;
+    ensure!(status == 400 && body.contains("not a WebSocket handshake"), "{status} {body}");
 
     // With a session, only from the page's own origin.
     let made = ["create", "vera", "--role", "viewer", "--service", "sights*"];
@@ -348,20 +255,11 @@ pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
     hers.call("/rosapi/topics", json!({}))?;
 
     // The number of connections of a principal is limited; a closed one makes room.
-    let mut many: Vec<Robot> = (0..4)
-        .map(|_| scene.connect_viewer(&eve))
-        .collect::<Result<_, _>>()?;
-    expect_refused(
-        scene.connect_viewer(&eve),
-        429,
-        "too many connections look into",
-    )?;
+    let mut many: Vec<Robot> = (0..4).map(|_| scene.connect_viewer(&eve)).collect::<Result<_, _>>()?;
+    expect_refused(scene.connect_viewer(&eve), 429, "too many connections look into")?;
     many.pop().context("one")?.leave()?;
     support::wait_until("room for one more", || {
-        Ok(scene
-            .connect_viewer(&eve)
-            .map(|one| many.push(one))
-            .map_err(|refusal| refusal.to_string()))
+        Ok(scene.connect_viewer(&eve).map(|one| many.push(one)).map_err(|refusal| refusal.to_string()))
     })?;
     // The robot leaves: viewers do not keep its servant alive.
     let InsideScene { daemon, rover, .. } = scene;
@@ -373,10 +271,7 @@ pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
     }
     support::wait_until("the servant's end", || {
         let left = daemon.servants_of("sights_py")?;
-        Ok(left
-            .is_empty()
-            .then_some(())
-            .ok_or_else(|| format!("{left:#?}")))
+        Ok(left.is_empty().then_some(()).ok_or_else(|| format!("{left:#?}")))
     })?;
     daemon.stop()?;
     Ok(())
@@ -385,9 +280,7 @@ pub fn looking_inside_keeps_no_servant_and_is_bounded() -> Verdict {
 pub fn who_looks_slowly_costs_its_robot_nothing() -> Verdict {
     let mut scene = InsideScene::new("inside-slow", "")?;
     let eve = scene.viewer_token("eve", "*")?;
-    let url = scene
-        .daemon
-        .url(&format!("{}?token={eve}", scene.inside_path()));
+    let url = scene.daemon.url(&format!("{}?token={eve}", scene.inside_path()));
     // She requests thirty images per second and reads none of them.
     let mut slow = Robot::connect_with_small_buffer(&url, &[])?;
     slow.send(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "cbor"}))?;
@@ -401,9 +294,7 @@ pub fn who_looks_slowly_costs_its_robot_nothing() -> Verdict {
     };
     support::wait_until("the first answer", || {
         scene.rover.send(said("first"))?;
-        let unheard = scene
-            .rover
-            .has_not_heard(|heard| heard["topic"] == "/sights/said")?;
+        let unheard = scene.rover.has_not_heard(|heard| heard["topic"] == "/sights/said")?;
         Ok((!unheard).then_some(()).ok_or_else(|| "none".to_owned()))
     })?;
     for number in 0..100 {
@@ -442,11 +333,7 @@ impl TopicCounting {
             .spawn()?;
         let out = BufReader::new(child.stdout.take().context("piped")?);
         let (told, lines) = mpsc::channel();
-        thread::spawn(move || {
-            out.lines()
-                .map_while(Result::ok)
-                .try_for_each(|line| told.send(line))
-        });
+        thread::spawn(move || out.lines().map_while(Result::ok).try_for_each(|line| told.send(line)));
         Ok(TopicCounting { child, lines })
     }
 
@@ -485,12 +372,10 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
     let mut scene = InsideScene::start(&setup)?;
     // A line per second, until the client leaves.
     let counting = TopicCounting::start(&scene, None)?;
-    let flows = |topics: &[Value], name: &str| {
-        find_topic(topics, name).is_some_and(|one| one["rate"].as_f64() > Some(0.0))
-    };
-    let topics = counting.wait_for_topics(|topics| {
-        flows(topics, "/sights/scan") && flows(topics, "/sights/image/rgb8")
-    })?;
+    let flows =
+        |topics: &[Value], name: &str| find_topic(topics, name).is_some_and(|one| one["rate"].as_f64() > Some(0.0));
+    let topics =
+        counting.wait_for_topics(|topics| flows(topics, "/sights/scan") && flows(topics, "/sights/image/rgb8"))?;
     drop(counting);
     let found = find_topic(&topics, "/sights/scan").zip(find_topic(&topics, "/sights/image/rgb8"));
     let (scan, picture) = found.context("scans and pictures that are counted")?;
@@ -498,53 +383,27 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
     let number = |of: &Value, key: &str| of[key].as_f64().unwrap_or_default();
     // The size of a message follows from bandwidth and rate.
     let each = number(&picture, "bandwidth") / number(&picture, "rate");
-    ensure!(
-        each > 640.0 * 480.0 * 3.0 && each < 640.0 * 480.0 * 3.1,
-        "{picture}"
-    );
+    ensure!(each > 640.0 * 480.0 * 3.0 && each < 640.0 * 480.0 * 3.1, "{picture}");
     // Scans have a stamp, images here do not.
     let latency = scan["latency"].as_f64().context("a latency")?;
     ensure!((0.0..30.0).contains(&latency), "{scan}");
     ensure!(picture.get("latency").is_none(), "{picture}");
     // Counting stops once the client has left.
     support::wait_until("the place of who counted", || {
-        let graph = scene.rover.call(
-            "/rosapi/subscribers",
-            json!({"topic": "/sights/image/rgb8"}),
-        )?;
-        let left = graph["values"]["subscribers"]
-            .as_array()
-            .map_or(0, Vec::len);
+        let graph = scene.rover.call("/rosapi/subscribers", json!({"topic": "/sights/image/rgb8"}))?;
+        let left = graph["values"]["subscribers"].as_array().map_or(0, Vec::len);
         Ok((left == 0).then_some(()).ok_or_else(|| graph.to_string()))
     })?;
 
     // A viewer sees the topics that a rule permits, and a robot sees its own servant only.
     let eve = scene.viewer_token("eve", "sights*")?;
-    let rule = [
-        "policy",
-        "allow",
-        "eve",
-        "subscribe:/sights/map",
-        "--service",
-        "*",
-    ];
+    let rule = ["policy", "allow", "eve", "subscribe:/sights/map", "--service", "*"];
     scene.daemon.deployer().run(&rule)?.expect_success()?;
     let counting = TopicCounting::start(&scene, Some(&eve))?;
     let topics = counting.wait_for_topics(|topics| !topics.is_empty())?;
     drop(counting);
-    ensure!(
-        topics.len() == 1 && topics[0]["topic"] == "/sights/map",
-        "{topics:?}"
-    );
-    let other = [
-        "other",
-        "--role",
-        "robot",
-        "--robot",
-        "other",
-        "--service",
-        "*",
-    ];
+    ensure!(topics.len() == 1 && topics[0]["topic"] == "/sights/map", "{topics:?}");
+    let other = ["other", "--role", "robot", "--robot", "other", "--service", "*"];
     let other = create_token(&scene.daemon, &other)?;
     let server = format!("http://{}", scene.daemon.address);
     for verb in ["topics", "goals"] {
@@ -559,24 +418,17 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
         "action_type": "actionlib/TestAction", "args": {"goal": count}, "feedback": true})
     };
     let path = format!("/api/v1/servants/{}/goals", scene.servant);
-    let listed = |daemon: &Daemon| -> anyhow::Result<Vec<Value>> {
-        Ok(serde_json::from_value(daemon.api(&path)?)?)
-    };
+    let listed = |daemon: &Daemon| -> anyhow::Result<Vec<Value>> { Ok(serde_json::from_value(daemon.api(&path)?)?) };
     // The first goal may be sent before the robot's node has been discovered; of such a goal only the end is known.
     let mut early = 0;
     support::wait_until("a goal that was heard when it was sent", || {
         early += 1;
         let id = format!("early{early}");
         scene.rover.send(goal(&id, 1))?;
-        scene.rover.wait_for("its end", |said| {
-            said["op"] == "action_result" && said["id"] == id.as_str()
-        })?;
+        scene.rover.wait_for("its end", |said| said["op"] == "action_result" && said["id"] == id.as_str())?;
         let goals = listed(&scene.daemon)?;
         let known = [json!("robot rover"), json!("unknown sender")];
-        ensure!(
-            goals.iter().all(|goal| known.contains(&goal["by"])),
-            "{goals:?}"
-        );
+        ensure!(goals.iter().all(|goal| known.contains(&goal["by"])), "{goals:?}");
         let heard = goals.iter().any(|goal| goal["by"] == known[0]);
         Ok(heard.then_some(()).ok_or_else(|| format!("{goals:?}")))
     })?;
@@ -585,37 +437,23 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
             let goals = listed(&scene.daemon)?;
             let ended = goals.iter().filter(|goal| goal["ended"].is_u64()).count();
             let are = ended == count && goals.len() == count;
-            Ok(are
-                .then(|| goals.clone())
-                .ok_or_else(|| format!("{goals:?}")))
+            Ok(are.then(|| goals.clone()).ok_or_else(|| format!("{goals:?}")))
         })
     };
     all_ended(early)?;
     scene.rover.send(goal("short", 1))?;
-    scene.rover.wait_for("its end", |said| {
-        said["op"] == "action_result" && said["id"] == "short"
-    })?;
+    scene.rover.wait_for("its end", |said| said["op"] == "action_result" && said["id"] == "short")?;
     scene.rover.send(goal("long", 10_000))?;
-    scene.rover.wait_for("that it has begun", |said| {
-        said["op"] == "action_feedback" && said["id"] == "long"
-    })?;
-    scene
-        .rover
-        .send(json!({"op": "cancel_action_goal", "id": "long", "action": "/sights/count"}))?;
-    scene.rover.wait_for("its end", |said| {
-        said["op"] == "action_result" && said["id"] == "long"
-    })?;
+    scene.rover.wait_for("that it has begun", |said| said["op"] == "action_feedback" && said["id"] == "long")?;
+    scene.rover.send(json!({"op": "cancel_action_goal", "id": "long", "action": "/sights/count"}))?;
+    scene.rover.wait_for("its end", |said| said["op"] == "action_result" && said["id"] == "long")?;
     let olga = create_token(&scene.daemon, &["olga", "--role", "operator"])?;
     let mut olga = scene.connect_viewer(&olga)?;
     olga.send(goal("hers", 1))?;
     let hers = olga.wait_for("its end", |said| said["op"] == "action_result")?;
     ensure!(hers["result"] == true, "{hers}");
     let goals = all_ended(early + 3)?;
-    let told: Vec<_> = goals[..3]
-        .iter()
-        .rev()
-        .map(|goal| (goal["by"].clone(), goal["state"].clone()))
-        .collect();
+    let told: Vec<_> = goals[..3].iter().rev().map(|goal| (goal["by"].clone(), goal["state"].clone())).collect();
     ensure!(
         told == [
             (json!("robot rover"), json!("succeeded")),
@@ -625,28 +463,14 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
         "{goals:?}"
     );
     // Every end is reported, also if several occur at once.
-    for words in [
-        "robot rover succeeded",
-        "robot rover was cancelled",
-        "somebody who looks inside succeeded",
-    ] {
+    for words in ["robot rover succeeded", "robot rover was cancelled", "somebody who looks inside succeeded"] {
         scene.daemon.wait_for_event(words, |event| {
             let said = event["message"].as_str().unwrap_or_default();
-            event["kind"] == "goal-ended"
-                && said.contains(&format!("/sights/count: the goal of {words}"))
+            event["kind"] == "goal-ended" && said.contains(&format!("/sights/count: the goal of {words}"))
         })?;
     }
     // She may not see them.
-    let typed = [
-        "--server",
-        &server,
-        "--token",
-        &eve,
-        "--format",
-        "json",
-        "goals",
-        &scene.servant,
-    ];
+    let typed = ["--server", &server, "--token", &eve, "--format", "json", "goals", &scene.servant];
     let none = scene.daemon.deployer().run(&typed)?.expect_success()?;
     ensure!(none.stdout.trim() == "[]", "{}", none.output());
 
@@ -662,10 +486,7 @@ pub fn what_is_published_is_counted_and_goals_are_remembered() -> Verdict {
     drop(counting);
     // Servants left by the daemon continue; the next daemon stops them.
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     daemon.stop()?;
     Ok(())
 }

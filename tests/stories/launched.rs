@@ -114,12 +114,7 @@ pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Verdict {
     for setup in ["", ". /opt/cloudroid/setup.sh"] {
         let machine = Machine::with_stub(&*world().daemon_with(TELLER)?, "teller_py")?;
         machine.install_teller()?;
-        machine
-            .run_script(
-                "sh",
-                "sh teller_py-stub/install.sh --robot launched-contract",
-            )?
-            .expect_success()?;
+        machine.run_script("sh", "sh teller_py-stub/install.sh --robot launched-contract")?.expect_success()?;
         let script = format!("{}{CONTRACT}", prelude(free_port()?, setup));
         let outcome = machine.run_script("bash", &script)?;
         ensure!(outcome.stdout == AS_EVER, "{setup}: {}", outcome.output());
@@ -146,11 +141,7 @@ find /opt/cloudroid -name teller.py -perm /111
     // Scripts of a source package are shared as well; with two executables of the same name roslaunch would not know
     // which to start.
     let found = outcome.stdout.matches("/teller.py\n").count();
-    ensure!(
-        outcome.stdout.contains("life 1 of /usual_name in") && found == 1,
-        "{}",
-        outcome.output()
-    );
+    ensure!(outcome.stdout.contains("life 1 of /usual_name in") && found == 1, "{}", outcome.output());
     Ok(())
 }
 
@@ -223,9 +214,7 @@ pub fn a_launch_file_says_what_is_promised() -> Verdict {
     let installs = "sh teller_py-stub/install.sh --robot launched-promises";
     machine.run_script("sh", installs)?.expect_success()?;
     let port = free_port()?;
-    let promises = PROMISES
-        .replace("PORT", &port.to_string())
-        .replace("SERVER", &daemon.address);
+    let promises = PROMISES.replace("PORT", &port.to_string()).replace("SERVER", &daemon.address);
     let setup = prelude(port, ". /opt/cloudroid/setup.sh");
     let outcome = machine.run_script("bash", &format!("{setup}{promises}"))?;
     let links = outcome.stdout.lines().find(|line| line.starts_with('['));
@@ -256,11 +245,7 @@ pub fn a_launch_file_says_what_is_promised() -> Verdict {
         "parameter /front/cloudroid/max: max is given without desire; set desire, too, or remove max",
         "parameter /front/typo/cloudroid/desired is 1: unknown field",
     ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     let died = outcome.stdout.matches("exit code 1").count();
     ensure!(died == 5, "{died} died: {}", outcome.output());

@@ -35,25 +35,12 @@ pub fn nodes_of_a_servant_become_active_and_share_their_memory() -> Verdict {
     let config = format!("[allow]\nvolumes = [{post:?}]\n");
     let daemon = world().setup("lifecycle").config(&config).start()?;
     let volume = format!("{}:/post", path_str(&post));
-    let arguments = [
-        "--node",
-        "sentry",
-        "--node",
-        "eye",
-        "--node",
-        "reader",
-        "--param",
-        "drowsy=1.0",
-        "--volume",
-        &volume,
-    ];
+    let arguments =
+        ["--node", "sentry", "--node", "eye", "--node", "reader", "--param", "drowsy=1.0", "--volume", &volume];
     let pushed = daemon.deployer().push(SERVICE, &arguments)?;
     pushed.expect_success()?;
     let service = daemon.api(&format!("/api/v1/services/{SERVICE}"))?;
-    ensure!(
-        service["interface"]["lifecycle"] == json!([SENTRY]),
-        "{service:#}"
-    );
+    ensure!(service["interface"]["lifecycle"] == json!([SENTRY]), "{service:#}");
 
     let mut robot = expect_active_node(&daemon)?;
     expect_shared_memory_used(&daemon, &mut robot)?;
@@ -62,10 +49,7 @@ pub fn nodes_of_a_servant_become_active_and_share_their_memory() -> Verdict {
     expect_inactive_refused(&daemon, &arguments)?;
     std::fs::remove_file(&closed)?;
     drive_across_failover(&daemon)?;
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     daemon.stop()?;
     Ok(())
 }
@@ -149,10 +133,7 @@ fn expect_shared_memory_used(daemon: &Daemon, robot: &mut Robot) -> Verdict {
         ensure!(seen["data"] == whole, "{seen}");
     }
     let carried = loopback_bytes(nodes[0])? - before;
-    ensure!(
-        carried < SIZE,
-        "{PICTURES} pictures of {SIZE} bytes took {carried} bytes of the network"
-    );
+    ensure!(carried < SIZE, "{PICTURES} pictures of {SIZE} bytes took {carried} bytes of the network");
     let [eye, reader] = nodes.map(mapped_shared_memory);
     let (eye, reader) = (eye?, reader?);
     ensure!(!eye.is_disjoint(&reader), "{eye:?} and {reader:?}");
@@ -162,17 +143,11 @@ fn expect_shared_memory_used(daemon: &Daemon, robot: &mut Robot) -> Verdict {
         let ours = eye.union(&reader);
         let systems: BTreeSet<&String> = ours.map(|(system, _)| system).collect();
         ensure!(!theirs.is_empty(), "they share memory, too");
-        ensure!(
-            theirs.iter().all(|(system, _)| !systems.contains(system)),
-            "{theirs:?} beside {eye:?}"
-        );
+        ensure!(theirs.iter().all(|(system, _)| !systems.contains(system)), "{theirs:?} beside {eye:?}");
     }
     let device = std::fs::metadata("/dev/shm")?.dev();
     let host = format!("{:02x}:{:02x}", major(device), minor(device));
-    ensure!(
-        eye.union(&reader).all(|(system, _)| *system != host),
-        "{eye:?} is on {host}, which is this machine's"
-    );
+    ensure!(eye.union(&reader).all(|(system, _)| *system != host), "{eye:?} is on {host}, which is this machine's");
     let seen = |told: &Value| told["op"] == "publish" && told["topic"] == "/seen";
     ensure!(other.has_not_heard(seen)?, "it heard of another's pictures");
     other.leave()
@@ -260,11 +235,8 @@ fn start_stub(site: &Site, daemon: &Daemon, server: &str) -> anyhow::Result<Node
     let original = site.install_original(daemon, SERVICE, (SERVICE, "sentry"), &program)?;
     let prefixes = format!("{}:{}", overlay.display(), original.display());
     let server = format!("ws://{server}");
-    let variables = [
-        ("AMENT_PREFIX_PATH", prefixes.as_str()),
-        ("CLOUDROID_SERVER", server.as_str()),
-        ("NO_COLOR", "1"),
-    ];
+    let variables =
+        [("AMENT_PREFIX_PATH", prefixes.as_str()), ("CLOUDROID_SERVER", server.as_str()), ("NO_COLOR", "1")];
     site.start_installed_with_environment(&variables, &overlay, SERVICE, "sentry", &[])
 }
 
@@ -277,26 +249,15 @@ fn drive_across_failover(daemon: &Daemon) -> Verdict {
     driven.with_context(|| format!("the stub said:\n{}", stub.output()))
 }
 
-fn drive_node(
-    site: Site,
-    app: Arc<dyn Bus>,
-    daemon: &Daemon,
-    (way, stub): (&Cutter, &NodeProcess),
-) -> Verdict {
-    site.wait_for_graph(&app, "the node", |graph| {
-        LifecycleNode::has_lifecycle(graph, SENTRY)
-    })?;
+fn drive_node(site: Site, app: Arc<dyn Bus>, daemon: &Daemon, (way, stub): (&Cutter, &NodeProcess)) -> Verdict {
+    site.wait_for_graph(&app, "the node", |graph| LifecycleNode::has_lifecycle(graph, SENTRY))?;
     stub.wait_for_output("linked to")?;
     // The robot drives the lifecycle: the node does not activate by itself.
     let shows = |state: &str| {
         let wanted = sentry_in_state(state);
         support::wait_until(&format!("a sentry that is {state}"), || {
             let shown = lifecycle_states(daemon, "drives")?;
-            Ok(if shown == wanted {
-                Ok(())
-            } else {
-                Err(format!("{shown:#}"))
-            })
+            Ok(if shown == wanted { Ok(()) } else { Err(format!("{shown:#}")) })
         })
     };
     shows("unconfigured")?;
@@ -308,10 +269,7 @@ fn drive_node(
         noises: 0,
     };
     let (unconfigured, inactive, active) = (State::Unconfigured, State::Inactive, State::Active);
-    let configures = (
-        Transition::Configure,
-        [unconfigured, State::Configuring, inactive],
-    );
+    let configures = (Transition::Configure, [unconfigured, State::Configuring, inactive]);
     let activates = (Transition::Activate, [inactive, State::Activating, active]);
     guarded.transition_through(&[configures])?;
     shows("inactive")?;

@@ -35,34 +35,19 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     let site = Site::new()?;
     let app = site.node("/app")?;
     let run = |future| site.runtime.block_on(future);
-    run(app.set(
-        "/front/hello/style",
-        ParamValue::String("{name: robot's}".into()),
-    ))?;
-    let argv = [
-        "__name:=hello",
-        "__ns:=/front",
-        "~name:=/who",
-        "__log:=/nowhere/x.log",
-    ];
+    run(app.set("/front/hello/style", ParamValue::String("{name: robot's}".into())))?;
+    let argv = ["__name:=hello", "__ns:=/front", "~name:=/who", "__log:=/nowhere/x.log"];
     let mut stub = site.start_stub(&daemon, THE_GREETER, "linked-greeter", &argv)?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/front/hello/count")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/front/hello/count")), &stub)?;
     // An input topic, remapped; an output topic; both with the original's names and types.
     let names = site.advertise_strings(&app, "/who", false)?;
     site.wait_for_subscribers(&*names, 1)?;
     let mut greetings = site.subscribe(&app, "/front/hello/greeting")?;
     names.publish(string("robot"));
     let greeting = with_log(site.next_message(&mut greetings), &stub)?;
+    ensure!(to_text(&greeting.bytes).contains("hi robot"), "{greeting:?}");
     ensure!(
-        to_text(&greeting.bytes).contains("hi robot"),
-        "{greeting:?}"
-    );
-    ensure!(
-        greeting.wire_type.name == "greeter_cpp/Greeting"
-            && greeting.publisher.node() == "/front/hello",
+        greeting.wire_type.name == "greeter_cpp/Greeting" && greeting.publisher.node() == "/front/hello",
         "{greeting:?}"
     );
     // A late subscriber gets the latched message.
@@ -71,28 +56,17 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     ensure!(site.next_message(&mut again)?.bytes == greeting.bytes);
     // A service that uses a parameter of the robot.
     let response = site.call_service(&app, "/front/hello/count", &[0])?;
-    ensure!(
-        to_text(&response).contains("robot's") && response[0] == 1,
-        "{response:?}"
-    );
+    ensure!(to_text(&response).contains("robot's") && response[0] == 1, "{response:?}");
     // The services of the node's logger are available.
-    ensure!(
-        to_text(&site.call_service(&app, "/front/hello/get_loggers", &[])?).contains("ros.roscpp")
-    );
+    ensure!(to_text(&site.call_service(&app, "/front/hello/get_loggers", &[])?).contains("ros.roscpp"));
     // The signal with which roslaunch ends nodes.
     stub.signal(Signal::SIGINT)?;
     let status = stub.wait_for_exit()?;
     // The stub ends as the node did: successfully, or with its error.
-    let crashed = std::os::unix::process::ExitStatusExt::signal(&status).is_some()
-        && stub.output().contains("was killed by");
-    ensure!(
-        status.code() == Some(0) || crashed,
-        "{status}: {}",
-        stub.output()
-    );
-    site.wait_for_graph(&app, "an empty graph", |graph| {
-        registrations(graph, "/front/hello").is_empty()
-    })?;
+    let crashed =
+        std::os::unix::process::ExitStatusExt::signal(&status).is_some() && stub.output().contains("was killed by");
+    ensure!(status.code() == Some(0) || crashed, "{status}: {}", stub.output());
+    site.wait_for_graph(&app, "an empty graph", |graph| registrations(graph, "/front/hello").is_empty())?;
     Ok(())
 }
 
@@ -107,10 +81,7 @@ fn describe_node(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String>
         }
     }
     if let Ok(ParamValue::Map(all)) = site.runtime.block_on(watcher.get(node)) {
-        lines.extend(
-            all.iter()
-                .map(|(name, value)| format!("sets {name} to {value:?}")),
-        );
+        lines.extend(all.iter().map(|(name, value)| format!("sets {name} to {value:?}")));
     }
     lines
 }
@@ -139,18 +110,12 @@ fn describe_states(
 ) -> anyhow::Result<Vec<BTreeSet<String>>> {
     let node = "/people_detect";
     let watcher = site.node("/watcher")?;
-    let mut states = vec![wait_for_description(site, &watcher, node, |lines| {
-        arrived(0, lines)
-    })];
+    let mut states = vec![wait_for_description(site, &watcher, node, |lines| arrived(0, lines))];
     let listener = site.node("/listener")?;
     let found = site.subscribe(&listener, &format!("{node}/found"))?;
-    states.push(wait_for_description(site, &watcher, node, |lines| {
-        arrived(1, lines)
-    }));
+    states.push(wait_for_description(site, &watcher, node, |lines| arrived(1, lines)));
     drop(found);
-    states.push(wait_for_description(site, &watcher, node, |lines| {
-        arrived(2, lines)
-    }));
+    states.push(wait_for_description(site, &watcher, node, |lines| arrived(2, lines)));
     Ok(states)
 }
 
@@ -184,10 +149,7 @@ pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
     let stub = site.start_stub(&daemon, PEOPLE_DETECT, "linked-people", &argv)?;
     let linked = describe_states(&site, |state, lines| *lines == original[state]);
     let linked = with_log(linked, &stub)?;
-    for (state, (theirs, ours)) in ["idle", "busy", "left"]
-        .iter()
-        .zip(original.iter().zip(&linked))
-    {
+    for (state, (theirs, ours)) in ["idle", "busy", "left"].iter().zip(original.iter().zip(&linked)) {
         let missing: Vec<_> = theirs.difference(ours).collect();
         let extra: Vec<_> = ours.difference(theirs).collect();
         ensure!(
@@ -209,20 +171,10 @@ pub fn two_nodes_share_a_servant(ros: RosVersion) -> Verdict {
         twin.stub(&site, (&daemon.address, robot), "", &argv)
     };
     let (one, two) = (start("one")?, start("two")?);
-    with_log(
-        site.wait_for_graph(&app, "the first", has_service("/one/count")),
-        &one,
-    )?;
-    with_log(
-        site.wait_for_graph(&app, "the second", has_service("/two/count")),
-        &two,
-    )?;
+    with_log(site.wait_for_graph(&app, "the first", has_service("/one/count")), &one)?;
+    with_log(site.wait_for_graph(&app, "the second", has_service("/two/count")), &two)?;
     let servants = daemon.deployer().run_json(&["servants"])?;
-    let theirs = servants
-        .as_array()
-        .context("a list")?
-        .iter()
-        .filter(|servant| servant["robot"] == robot);
+    let theirs = servants.as_array().context("a list")?.iter().filter(|servant| servant["robot"] == robot);
     ensure!(theirs.count() == 1, "{servants:#}");
     let names = site.advertise_strings(&app, "/who", false)?;
     site.wait_for_subscribers(&*names, 2)?;
@@ -246,23 +198,12 @@ pub fn a_lost_link_is_taken_up_again() -> Verdict {
     let home = world().home("link-restarted");
     let setup = world().setup("link-restarted");
     let daemon = setup.start()?;
-    daemon
-        .deployer()
-        .push("greeter_cpp", GREETER.arguments)?
-        .expect_success()?;
+    daemon.deployer().push("greeter_cpp", GREETER.arguments)?.expect_success()?;
     let address = daemon.address.clone();
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let stub = site.start_stub(
-        &daemon,
-        THE_GREETER,
-        "linked-again",
-        &["__name:=greeter", "~name:=/who"],
-    )?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
-        &stub,
-    )?;
+    let stub = site.start_stub(&daemon, THE_GREETER, "linked-again", &["__name:=greeter", "~name:=/who"])?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/greeter/count")), &stub)?;
     let names = site.advertise_strings(&app, "/who", false)?;
     site.wait_for_subscribers(&*names, 1)?;
     let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
@@ -275,20 +216,14 @@ pub fn a_lost_link_is_taken_up_again() -> Verdict {
     ensure!(daemon.home == home);
     // A call made meanwhile is answered or fails with a reason; the next one is answered.
     if let Err(error) = site.call_service(&app, "/greeter/count", &[0]) {
-        ensure!(
-            format!("{error:#}").contains("this call was lost"),
-            "{error:#}"
-        );
+        ensure!(format!("{error:#}").contains("this call was lost"), "{error:#}");
     }
     let count = with_log(site.call_service(&app, "/greeter/count", &[0]), &stub)?;
     ensure!(count[0] == 1, "it has forgotten what it did: {count:?}");
     ensure!(registrations(&app.graph().borrow(), "/greeter") == before);
     names.publish(string("second"));
     let greeting = with_log(site.next_message(&mut greetings), &stub)?;
-    ensure!(
-        to_text(&greeting.bytes).contains("second") || to_text(&greeting.bytes).contains("first"),
-        "{greeting:?}"
-    );
+    ensure!(to_text(&greeting.bytes).contains("second") || to_text(&greeting.bytes).contains("first"), "{greeting:?}");
     drop(stub);
     daemon.deployer().run(&["stop", "--all"])?;
     daemon.stop()?;
@@ -307,59 +242,29 @@ pub fn what_a_stub_cannot_do_is_said(ros: RosVersion) -> Verdict {
         greeter.robot_name("linked-wrong")
     );
     let cases = [
-        (
-            format!("{server}service = \"nothing\""),
-            executable,
-            "nothing",
-        ),
-        (
-            format!("{server}service = \"{service}\""),
-            "no_such",
-            "not pushed with the executable no_such",
-        ),
-        (
-            format!("{server}service = \"{service}\"\ntoken_file = \"/nowhere/token\""),
-            executable,
-            "/nowhere/token",
-        ),
-        (
-            format!("{server}service = \"{service}\"\nmaximum = 3"),
-            executable,
-            "maximum",
-        ),
+        (format!("{server}service = \"nothing\""), executable, "nothing"),
+        (format!("{server}service = \"{service}\""), "no_such", "not pushed with the executable no_such"),
+        (format!("{server}service = \"{service}\"\ntoken_file = \"/nowhere/token\""), executable, "/nowhere/token"),
+        (format!("{server}service = \"{service}\"\nmaximum = 3"), executable, "maximum"),
     ];
     let argv = greeter.argv("wrong", &[]);
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
     for (toml, executable, said) in cases {
         let mut stub = site.start_stub_with_config(&toml, package, executable, &argv)?;
         let status = stub.wait_for_exit()?;
-        ensure!(
-            status.code() == Some(1) && stub.output().contains(said),
-            "{said}: {status}\n{}",
-            stub.output()
-        );
+        ensure!(status.code() == Some(1) && stub.output().contains(said), "{said}: {status}\n{}", stub.output());
     }
     // The end of a node ends its stub, with its exit status.
     let robot = &*adder.robot_name("linked-ended");
     let argv = adder.argv("adder", &[]);
     let mut stub = adder.stub(&site, (&daemon.address, robot), "", &argv)?;
     let app = site.join("/app")?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/add_two")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/add_two")), &stub)?;
     let servant = daemon.servant_of(adder.service.name, robot)?;
     let pid = servant["pids"][0].as_i64().context("its process")?;
-    nix::sys::signal::kill(
-        nix::unistd::Pid::from_raw(i32::try_from(pid)?),
-        Signal::SIGKILL,
-    )?;
+    nix::sys::signal::kill(nix::unistd::Pid::from_raw(i32::try_from(pid)?), Signal::SIGKILL)?;
     let status = stub.wait_for_exit()?;
-    ensure!(
-        std::os::unix::process::ExitStatusExt::signal(&status) == Some(9),
-        "{status}: {}",
-        stub.output()
-    );
+    ensure!(std::os::unix::process::ExitStatusExt::signal(&status) == Some(9), "{status}: {}", stub.output());
     // All its registrations disappear with it.
     site.wait_for_graph(&app, "its end", |graph| !has_service("/add_two")(graph))?;
     Ok(())
@@ -371,13 +276,8 @@ pub fn the_robot_s_master_starts_again() -> Verdict {
     let stub = site.start_stub(&daemon, THE_GREETER, "linked-master", &["__name:=greeter"])?;
     let before = {
         let app = site.node("/app")?;
-        let graph = with_log(
-            site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
-            &stub,
-        )?;
-        site.wait_for_graph(&app, "all of it", |graph| {
-            registrations(graph, "/greeter").len() == 6
-        })?;
+        let graph = with_log(site.wait_for_graph(&app, "the service", has_service("/greeter/count")), &stub)?;
+        site.wait_for_graph(&app, "all of it", |graph| registrations(graph, "/greeter").len() == 6)?;
         registrations(&app.graph().borrow(), "/greeter")
             .union(&registrations(&graph, "/greeter"))
             .cloned()
@@ -386,12 +286,7 @@ pub fn the_robot_s_master_starts_again() -> Verdict {
     site.end_master();
     site.start_master()?;
     let app = site.node("/app")?;
-    with_log(
-        site.wait_for_graph(&app, "the same graph", |graph| {
-            registrations(graph, "/greeter") == before
-        }),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the same graph", |graph| registrations(graph, "/greeter") == before), &stub)?;
     Ok(())
 }
 
@@ -408,10 +303,7 @@ pub fn a_connection_that_falls_silent_is_replaced(ros: RosVersion) -> Verdict {
     let max = scale_seconds(2);
     let settings = format!("desire = 1.0\nmax = {max}.0\n");
     let stub = twin.stub(&site, (&server, &robot), &settings, &argv)?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/greeter/count")), &stub)?;
     let names = site.advertise_strings(&app, "/who", false)?;
     let say = |name: &str| names.publish(string_in(WireFormat::for_version(ros), name));
     site.wait_for_subscribers(&*names, 1)?;
@@ -428,10 +320,7 @@ pub fn a_connection_that_falls_silent_is_replaced(ros: RosVersion) -> Verdict {
     ensure!(count == 2, "{count}");
     let said = stub.output();
     ensure!(said.contains("is silent, a new one replaces it"), "{said}");
-    ensure!(
-        !said.contains("nothing was received from the other end"),
-        "{said}"
-    );
+    ensure!(!said.contains("nothing was received from the other end"), "{said}");
     Ok(())
 }
 
@@ -477,25 +366,16 @@ pub fn who_has_just_connected_hears_what_the_node_answers(ros: RosVersion) -> Ve
     let robot = twin.robot_name("linked-newcomer");
     let argv = twin.argv("adder", &[]);
     let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/add_two")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/add_two")), &stub)?;
     for number in 1..=10_i64 {
         // Without subscribers on the robot: from now on the node in the cloud is subscribed.
         let app = site.join(&format!("/app{number}"))?;
         let mut sums = site.subscribe(&app, "/sums")?;
         site.wait_for_publishers(&sums, 1)?;
-        with_log(
-            site.call_service(&app, "/add_two", &sum_request(ros, number)),
-            &stub,
-        )?;
-        let told = with_log(site.next_message(&mut sums), &stub)
-            .with_context(|| format!("sum {number} was not heard"))?;
-        ensure!(
-            string_text(ros, &told.bytes, 0)? == number.to_string(),
-            "{told:?}"
-        );
+        with_log(site.call_service(&app, "/add_two", &sum_request(ros, number)), &stub)?;
+        let told =
+            with_log(site.next_message(&mut sums), &stub).with_context(|| format!("sum {number} was not heard"))?;
+        ensure!(string_text(ros, &told.bytes, 0)? == number.to_string(), "{told:?}");
         drop(sums);
         site.runtime.block_on(app.close());
     }

@@ -40,16 +40,9 @@ fn send_unfinished_trial(daemon: &Daemon) -> anyhow::Result<PatientStream<UnixSt
 pub fn what_is_begun_and_never_ended_costs_its_owner() -> Verdict {
     // All have to start before the first one times out.
     let late = scale_seconds(8);
-    let daemon = world()
-        .setup("memory")
-        .config(&format!(
-            "[memory]\nclient = \"8M\"\nunfinished = \"{late}s\"\n"
-        ))
-        .start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    let daemon =
+        world().setup("memory").config(&format!("[memory]\nclient = \"8M\"\nunfinished = \"{late}s\"\n")).start()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let mut polite = daemon.robot("adder_py?robot=polite")?;
     let mut answered = |sum: i64| -> Verdict {
         let answer = polite.call("/add_two", json!({"a": sum - 1, "b": 1}))?;
@@ -66,15 +59,8 @@ pub fn what_is_begun_and_never_ended_costs_its_owner() -> Verdict {
     // Two of them fit and time out; the others are refused at once.
     let closes = robots.iter_mut().map(Robot::wait_for_close);
     let closes = closes.collect::<anyhow::Result<Vec<_>>>()?;
-    let of = |code: u16| {
-        closes
-            .iter()
-            .filter(move |close| u16::from(close.code) == code)
-    };
-    ensure!(
-        of(1013).count() >= 2 && of(1013).count() + of(1008).count() == 4,
-        "{closes:?}"
-    );
+    let of = |code: u16| closes.iter().filter(move |close| u16::from(close.code) == code);
+    ensure!(of(1013).count() >= 2 && of(1013).count() + of(1008).count() == 4, "{closes:?}");
     for close in of(1013) {
         ensure!(close.reason.contains("client greedy"), "{close:?}");
     }

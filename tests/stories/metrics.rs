@@ -32,14 +32,11 @@ fn read_with_parser(format: &str, text: &str) -> anyhow::Result<Vec<Value>> {
     std::fs::write(&file, text)?;
     let mut reader = Command::new(binaries::readers().join("python"));
     reader.args(["-c", READER, format]).arg(&file);
-    Ok(serde_json::from_str(
-        &run(&mut reader)?.expect_success()?.stdout,
-    )?)
+    Ok(serde_json::from_str(&run(&mut reader)?.expect_success()?.stdout)?)
 }
 
 /// Returns name, type, meaning and labels of the documented metrics.
-fn documented_metrics()
--> BTreeMap<&'static str, (&'static str, &'static str, BTreeSet<&'static str>)> {
+fn documented_metrics() -> BTreeMap<&'static str, (&'static str, &'static str, BTreeSet<&'static str>)> {
     let rows = LIST.lines().filter_map(|line| line.strip_prefix("| `"));
     rows.filter_map(|row| {
         let cells: Vec<&str> = row.trim_end_matches(" |").split(" | ").collect();
@@ -63,43 +60,27 @@ pub fn every_metric_is_listed_and_read_by_others() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let mut robot = daemon.robot("adder_py?robot=counted")?;
     ensure!(robot.call("/add_two", json!({"a": 1, "b": 1}))?["result"] == true);
-    let open = get_metrics(
-        &daemon,
-        "application/openmetrics-text;version=1.0.0,text/plain;q=0.5",
-    )?;
+    let open = get_metrics(&daemon, "application/openmetrics-text;version=1.0.0,text/plain;q=0.5")?;
     ensure!(open.ends_with("# EOF\n"), "it may be half of an answer");
     let listed = documented_metrics();
     let families = read_with_parser("open", &open)?;
     ensure!(families.len() > 40, "{families:?}");
     for family in &families {
         let name = family["name"].as_str().context("a name")?;
-        let (kind, meaning, labels) = listed
-            .get(name)
-            .with_context(|| format!("docs/metrics.md does not list {name}"))?;
+        let (kind, meaning, labels) =
+            listed.get(name).with_context(|| format!("docs/metrics.md does not list {name}"))?;
         ensure!(family["type"] == *kind, "{family}, listed as {kind}");
-        ensure!(
-            family["help"] == *meaning,
-            "{family}, listed as {meaning:?}"
-        );
+        ensure!(family["help"] == *meaning, "{family}, listed as {meaning:?}");
         for label in family["labels"].as_array().context("labels")? {
             let label = label.as_str().context("a label")?;
             ensure!(labels.contains(label), "{name}: {label} is not listed");
         }
     }
-    let told: BTreeSet<&str> = families
-        .iter()
-        .filter_map(|family| family["name"].as_str())
-        .collect();
+    let told: BTreeSet<&str> = families.iter().filter_map(|family| family["name"].as_str()).collect();
     // Only a daemon with TLS has these.
-    let of_tls = [
-        "cloudroid_refused_handshakes",
-        "cloudroid_certificate_end_seconds",
-    ];
+    let of_tls = ["cloudroid_refused_handshakes", "cloudroid_certificate_end_seconds"];
     for name in listed.keys() {
-        ensure!(
-            told.contains(name) || of_tls.contains(name),
-            "{name} is listed, and not told"
-        );
+        ensure!(told.contains(name) || of_tls.contains(name), "{name} is listed, and not told");
     }
     let count = |families: &[Value], name: &str| {
         let found = families.iter().find(|family| family["name"] == name);
@@ -126,9 +107,7 @@ pub fn the_dashboard_asks_for_what_there_is() -> Verdict {
             for name in words.filter(|word| word.starts_with("cloudroid_")) {
                 let family = listed.iter().find(|(family, (kind, ..))| match *kind {
                     "counter" => name == format!("{family}_total"),
-                    "histogram" => ["bucket", "sum", "count"]
-                        .iter()
-                        .any(|end| name == format!("{family}_{end}")),
+                    "histogram" => ["bucket", "sum", "count"].iter().any(|end| name == format!("{family}_{end}")),
                     _ => name == **family,
                 });
                 ensure!(family.is_some(), "{query}: no metric is called {name}");

@@ -85,10 +85,7 @@ impl PackageVariants {
     fn push(&self, daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
         let place = world().directory(self.package)?;
         let original = binaries::package(self.package);
-        let copied = std::process::Command::new("cp")
-            .arg("-rT")
-            .args([&*original, place.path()])
-            .status()?;
+        let copied = std::process::Command::new("cp").arg("-rT").args([&*original, place.path()]).status()?;
         ensure!(copied.success(), "{copied}");
         let file = place.path().join(self.file);
         let mut text = std::fs::read_to_string(&file)?;
@@ -97,14 +94,7 @@ impl PackageVariants {
             text = text.replace(old, new);
         }
         std::fs::write(file, text)?;
-        let words = [
-            "push",
-            path_str(place.path()),
-            "--name",
-            self.service,
-            "--node",
-            self.executable,
-        ];
+        let words = ["push", path_str(place.path()), "--name", self.service, "--node", self.executable];
         daemon.deployer().run(&words)?.expect_success().map(drop)
     }
 }
@@ -130,9 +120,7 @@ pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs(ros: RosVer
     let start = || site.start_installed(&overlay, variants.package, variants.executable, &[]);
     let speaks = |stub: &NodeProcess| -> Verdict {
         let mut told = site.subscribe_latched(&app, variants.topic)?;
-        let told = site
-            .next_message(&mut told)
-            .with_context(|| stub.output())?;
+        let told = site.next_message(&mut told).with_context(|| stub.output())?;
         ensure!(told.wire_type.name == variants.types[0], "{told:?}");
         Ok(())
     };
@@ -157,10 +145,7 @@ pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs(ros: RosVer
     drop(second);
     stops()?;
     let [before, after] = variants.types;
-    let differs = format!(
-        "output topic {} was a {before} and is a {after}",
-        variants.topic
-    );
+    let differs = format!("output topic {} was a {before} and is a {after}", variants.topic);
     expect_refused(
         start()?,
         &[
@@ -191,10 +176,7 @@ pub fn another_version_of_the_protocol_is_named() -> Verdict {
             ],
         )?;
         let named = format!("the stub speaks {version}, this server cloudroid-link.v2");
-        ensure!(
-            status == 400 && body.contains(&named) && body.contains("install the stub again"),
-            "{status} {body}"
-        );
+        ensure!(status == 400 && body.contains(&named) && body.contains("install the stub again"), "{status} {body}");
     }
     Ok(())
 }
@@ -213,10 +195,7 @@ pub fn a_wrong_token_is_named(ros: RosVersion) -> Verdict {
         );
         site.start_stub_with_config(&toml, "any", "node", &[])
     };
-    expect_refused(
-        stub("token = \"wrong\"\n")?,
-        &["401", "token", "install.sh --token"],
-    )?;
+    expect_refused(stub("token = \"wrong\"\n")?, &["401", "token", "install.sh --token"])?;
     expect_refused(stub("")?, &["401", "token", "install.sh --token"])?;
     // With the right token it gets further.
     expect_refused(stub("token = \"open sesame\"\n")?, &["404", "any"])
@@ -264,10 +243,7 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
     };
     expect_refused(
         start("greeter")?,
-        &[
-            ") is connected as this robot and runs /greeter; give one of them another id",
-            "CLOUDROID_ROBOT",
-        ],
+        &[") is connected as this robot and runs /greeter; give one of them another id", "CLOUDROID_ROBOT"],
     )?;
     answers().context("the first goes on")?;
     // Another node of the package would share the servant: both sides and the server report it.
@@ -275,10 +251,7 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
     for stub in [&neighbour, &stub] {
         stub.wait_for_output("two machines are connected as this robot: ")?;
         let said = stub.output();
-        ensure!(
-            said.contains(" runs /other") && said.contains("CLOUDROID_ROBOT"),
-            "{said}"
-        );
+        ensure!(said.contains(" runs /other") && said.contains("CLOUDROID_ROBOT"), "{said}");
     }
     let path = format!("/api/v1/robots/{robot}/explain");
     daemon.wait_for(&path, "an event of two robots", |told| {
@@ -330,11 +303,7 @@ cat said"#
         "then restart this node",
         "\n/teller\n",
     ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words:?}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words:?}: {}", outcome.output());
     }
     Ok(())
 }
@@ -353,16 +322,13 @@ pub fn a_missing_original_is_said_once_and_the_cloud_goes_on(ros: RosVersion) ->
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
     let stub = site.start_installed(&overlay, package, executable, &argv)?;
     let names = site.advertise_strings(&app, "/who", false)?;
-    site.wait_for_subscribers(&*names, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*names, 1).with_context(|| stub.output())?;
     let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
-    site.wait_for_publishers(&greetings, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_publishers(&greetings, 1).with_context(|| stub.output())?;
     for number in 0..8 {
         let name = string_in(WireFormat::for_version(ros), &format!("robot {number}"));
         names.publish(name);
-        site.next_message(&mut greetings)
-            .with_context(|| stub.output())?;
+        site.next_message(&mut greetings).with_context(|| stub.output())?;
     }
     stub.wait_for_output("there is no local original")?;
     let said = stub.output();
@@ -388,11 +354,7 @@ fn start_installed_greeter(
         RosVersion::One => "CMAKE_PREFIX_PATH",
         RosVersion::Two => "AMENT_PREFIX_PATH",
     };
-    let variables = [
-        &[(workspaces, prefixes.as_str()), ("NO_COLOR", "1")],
-        variables,
-    ]
-    .concat();
+    let variables = [&[(workspaces, prefixes.as_str()), ("NO_COLOR", "1")], variables].concat();
     let argv = twin.argv("greeter", &[("~name", "/who")]);
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
     site.start_installed_with_environment(&variables, &overlay, package, executable, &argv)
@@ -406,10 +368,7 @@ fn wait_until_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &NodeProcess) -> Ve
     let ask = || {
         number += 1;
         let name = format!("robot {number}");
-        names.publish(string_in(
-            WireFormat::for_version(site.system.version()),
-            &name,
-        ));
+        names.publish(string_in(WireFormat::for_version(site.system.version()), &name));
         Ok(())
     };
     let greeted = site.ask_until(&mut greetings, ask, |_| Ok(true));
@@ -420,9 +379,7 @@ fn wait_until_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &NodeProcess) -> Ve
 fn find_original(stub: &NodeProcess, program: &str) -> Option<i32> {
     let path = format!("/proc/{0}/task/{0}/children", stub.pid());
     let children = std::fs::read_to_string(path).ok()?;
-    let mut children = children
-        .split_whitespace()
-        .filter_map(|pid| pid.parse().ok());
+    let mut children = children.split_whitespace().filter_map(|pid| pid.parse().ok());
     children.find(|pid| {
         let line = procfs::command_line(*pid).unwrap_or_default();
         // It may be preceded by an interpreter.
@@ -450,10 +407,7 @@ pub fn an_original_that_crashes_is_told_and_started_again(ros: RosVersion) -> Ve
     kill(Pid::from_raw(first), Signal::SIGKILL)?;
     let second = runs(first)?;
     let said = stub.output();
-    ensure!(
-        said.matches("the local original ended").count() == 1 && said.contains("signal: 9"),
-        "{said}"
-    );
+    ensure!(said.matches("the local original ended").count() == 1 && said.contains("signal: 9"), "{said}");
     wait_until_greeted(&site, &app, &stub)?;
     // The original ends if its stub is killed.
     stub.signal(Signal::SIGKILL)?;
@@ -511,11 +465,7 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
         // Its end with the launch is not a crash.
         "crashes: 1\n",
     ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words:?}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words:?}: {}", outcome.output());
     }
     Ok(())
 }

@@ -40,10 +40,7 @@ fn run_doctor(preparation: &str, names: &[&str]) -> anyhow::Result<String> {
     let questions: Vec<String> = names.iter().map(|name| format!("asks {name}")).collect();
     let script = format!("{NETWORK}{preparation}\n{}", questions.join("\n"));
     machine.write_file("/root/inside.sh", &script)?;
-    Ok(machine
-        .run_script("sh", "unshare --net bash /root/inside.sh")?
-        .expect_success()?
-        .output())
+    Ok(machine.run_script("sh", "unshare --net bash /root/inside.sh")?.expect_success()?.output())
 }
 
 pub fn a_server_is_found_in_the_hosts_file_and_by_dns() -> Verdict {

@@ -17,17 +17,11 @@ pub fn a_group_of_the_provider_is_a_role_here() -> Verdict {
     // With a provider configured a session is required, also on this machine.
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     let open = daemon.get_json("/api/v1/session")?;
-    ensure!(
-        open["needed"] == true && open["provider"]["name"] == "Lab login",
-        "{open}"
-    );
+    ensure!(open["needed"] == true && open["provider"]["name"] == "Lab login", "{open}");
     ensure!(open["provider"]["path"] == LOGIN, "{open}");
     let alice = provider.browser("alice");
     let visit = alice.sign_in()?;
-    ensure!(
-        visit.status == 200 && visit.body.contains("url=/\""),
-        "goes on by itself: {visit:?}"
-    );
+    ensure!(visit.status == 200 && visit.body.contains("url=/\""), "goes on by itself: {visit:?}");
     alice.expect_user("oidc:alice", "admin")?;
     ensure!(alice.visit("/api/v1/tokens")?.status == 200, "an admin");
     // Another user with the same name has another identity.
@@ -36,14 +30,8 @@ pub fn a_group_of_the_provider_is_a_role_here() -> Verdict {
     another.sign_in()?;
     another.expect_user("oidc:alice~2", "viewer")?;
     ensure!(another.visit("/api/v1/tokens")?.status == 403);
-    ensure!(
-        another.visit("/api/v1/services/other")?.status == 403,
-        "its scope"
-    );
-    ensure!(
-        another.visit("/api/v1/services/lab_1")?.status == 404,
-        "its scope"
-    );
+    ensure!(another.visit("/api/v1/services/other")?.status == 403, "its scope");
+    ensure!(another.visit("/api/v1/services/lab_1")?.status == 404, "its scope");
     // With several groups the most powerful role counts, with its own services.
     provider.set_user("both")?;
     let dora = provider.browser("dora");
@@ -52,45 +40,22 @@ pub fn a_group_of_the_provider_is_a_role_here() -> Verdict {
     ensure!(dora.visit("/api/v1/services/lab_1")?.status == 403);
     // Requests by cookie need the same CSRF token as those of accounts.
     let listed = daemon.deployer().run_json(&["account", "sessions"])?;
-    let names: Vec<_> = listed
-        .as_array()
-        .into_iter()
-        .flatten()
-        .map(|line| line["name"].clone())
-        .collect();
-    ensure!(
-        names == ["oidc:alice", "oidc:alice~2", "oidc:dora"],
-        "{listed}"
-    );
-    let no_csrf = alice.request(
-        &["-X", "DELETE"],
-        &format!("{}/api/v1/services/x", provider.portal()),
-    )?;
+    let names: Vec<_> = listed.as_array().into_iter().flatten().map(|line| line["name"].clone()).collect();
+    ensure!(names == ["oidc:alice", "oidc:alice~2", "oidc:dora"], "{listed}");
+    let no_csrf = alice.request(&["-X", "DELETE"], &format!("{}/api/v1/services/x", provider.portal()))?;
     no_csrf.expect_refusal(403, &["may not use a session"])?;
     ensure!(alice.send_change("DELETE", "/api/v1/services/x")?.status == 404);
     // Accounts and tokens cannot have such a name; rules can use it.
     let deployer = daemon.deployer();
     let token = ["token", "create", "oidc:alice", "--role", "admin"];
-    deployer
-        .run(&token)?
-        .expect_failure(&["is not a valid name"])?;
-    let rule = [
-        "policy",
-        "allow",
-        "oidc:dora",
-        "subscribe:/camera/**",
-        "--service",
-        "build_*",
-    ];
+    deployer.run(&token)?.expect_failure(&["is not a valid name"])?;
+    let rule = ["policy", "allow", "oidc:dora", "subscribe:/camera/**", "--service", "build_*"];
     deployer.run(&rule)?.expect_success()?;
     // Sessions survive a restart, and can be ended one by one.
     daemon.stop()?;
     let daemon = setup.start()?;
     alice.expect_user("oidc:alice", "admin")?;
-    daemon
-        .deployer()
-        .run(&["account", "logout", "oidc:alice~2"])?
-        .expect_success()?;
+    daemon.deployer().run(&["account", "logout", "oidc:alice~2"])?.expect_success()?;
     ensure!(another.is_signed_out()?);
     let mut secrets = alice.secrets()?;
     secrets.extend(dora.secrets()?);
@@ -98,39 +63,20 @@ pub fn a_group_of_the_provider_is_a_role_here() -> Verdict {
     ensure!(out.status == 204 && alice.is_signed_out()?, "{out:?}");
     dora.expect_user("oidc:dora", "deployer")?;
     // Signing in again ends the browser's previous session.
-    let before = daemon
-        .deployer()
-        .run_json(&["account", "sessions", "oidc:dora"])?;
+    let before = daemon.deployer().run_json(&["account", "sessions", "oidc:dora"])?;
     provider.set_user("both")?;
     dora.sign_in()?;
-    let after = daemon
-        .deployer()
-        .run_json(&["account", "sessions", "oidc:dora"])?;
+    let after = daemon.deployer().run_json(&["account", "sessions", "oidc:dora"])?;
     let count = |all: &Value| all.as_array().map_or(0, Vec::len);
-    ensure!(
-        (count(&before), count(&after)) == (1, 1),
-        "{before} {after}"
-    );
+    ensure!((count(&before), count(&after)) == (1, 1), "{before} {after}");
     ensure!(before[0]["id"] != after[0]["id"], "{after}");
     let audited = daemon.deployer().run(&["--format", "json", "audit"])?;
-    for words in [
-        "person oidc:alice",
-        "oidc:alice (admin)",
-        "GET /api/v1/oidc/callback",
-    ] {
-        ensure!(
-            audited.stdout.contains(words),
-            "{words}: {}",
-            audited.stdout
-        );
+    for words in ["person oidc:alice", "oidc:alice (admin)", "GET /api/v1/oidc/callback"] {
+        ensure!(audited.stdout.contains(words), "{words}: {}", audited.stdout);
     }
     secrets.push(SECRET.to_owned());
     secrets.extend(provider.secrets());
-    ensure!(
-        secrets.len() > 8,
-        "tokens were given out: {}",
-        secrets.len()
-    );
+    ensure!(secrets.len() > 8, "tokens were given out: {}", secrets.len());
     expect_no_secret(&daemon, &secrets)
 }
 
@@ -143,10 +89,7 @@ pub fn who_has_no_role_is_told_why() -> Verdict {
     visit.expect_refusal(403, &["oidc:vic signed in", bold, "[oidc]"])?;
     provider.set_user("nobody")?;
     let visit = provider.browser("nell").sign_in()?;
-    visit.expect_refusal(
-        403,
-        &["oidc:nell signed in", "gives none in the claim groups"],
-    )?;
+    visit.expect_refusal(403, &["oidc:nell signed in", "gives none in the claim groups"])?;
     provider.set_fault("denied")?;
     let visit = provider.browser("denied").sign_in()?;
     visit.expect_refusal(403, &["access_denied", "not &lt;today&gt;"])?;
@@ -158,11 +101,7 @@ pub fn who_has_no_role_is_told_why() -> Verdict {
     sam.sign_in()?;
     sam.expect_user("oidc:sam", "viewer")?;
     let audited = daemon.deployer().run(&["--format", "json", "audit"])?;
-    ensure!(
-        audited.stdout.contains("person oidc:vic"),
-        "{}",
-        audited.stdout
-    );
+    ensure!(audited.stdout.contains("person oidc:vic"), "{}", audited.stdout);
     Ok(())
 }
 
@@ -195,25 +134,15 @@ pub fn a_token_that_is_not_good_signs_nobody_in() -> Verdict {
         provider.set_fault(wrong)?;
         let browser = provider.browser(wrong);
         let visit = browser.sign_in()?;
-        let tells = provider
-            .secrets()
-            .iter()
-            .any(|secret| visit.body.contains(secret));
-        if tells
-            || visit.status != 401
-            || !visit.body.contains(words)
-            || !browser.is_signed_out()?
-        {
+        let tells = provider.secrets().iter().any(|secret| visit.body.contains(secret));
+        if tells || visit.status != 401 || !visit.body.contains(words) || !browser.is_signed_out()? {
             taken.push(format!("{wrong}: {visit:?}"));
         }
     }
     ensure!(taken.is_empty(), "{}", taken.join("\n"));
     provider.set_fault("huge-token")?;
     let visit = provider.browser("huge").sign_in()?;
-    visit.expect_refusal(
-        502,
-        &["cannot reach the identity provider", "cannot be read"],
-    )?;
+    visit.expect_refusal(502, &["cannot reach the identity provider", "cannot be read"])?;
     let none = daemon.deployer().run_json(&["account", "sessions"])?;
     ensure!(none.as_array().is_some_and(Vec::is_empty), "{none}");
     // Clock skew is tolerated, and a token may have several audiences.
@@ -236,16 +165,12 @@ pub fn a_sign_in_is_good_once_and_in_its_browser() -> Verdict {
     // Eve's browser, with a sign-in of its own in progress, is led to the response for Alice's.
     let answer = path(&alice.sign_in_until_callback()?);
     eve.sign_in_until_callback()?;
-    eve.visit(&answer)?
-        .expect_refusal(400, &["started in another browser"])?;
+    eve.visit(&answer)?.expect_refusal(400, &["started in another browser"])?;
     ensure!(eve.is_signed_out()?);
     // The response was for Alice's browser and has been used.
-    alice
-        .visit(&answer)?
-        .expect_refusal(400, &["not started here"])?;
+    alice.visit(&answer)?.expect_refusal(400, &["not started here"])?;
     let answer = path(&alice.sign_in_until_callback()?);
-    let sent =
-        |header: &str| alice.request(&["-H", header], &format!("{}{answer}", provider.portal()));
+    let sent = |header: &str| alice.request(&["-H", header], &format!("{}{answer}", provider.portal()));
     for part in ["image", "iframe"] {
         let visit = sent(&format!("Sec-Fetch-Dest: {part}"))?;
         visit.expect_refusal(403, &["not by a person"])?;
@@ -253,31 +178,19 @@ pub fn a_sign_in_is_good_once_and_in_its_browser() -> Verdict {
     // A request from within another page has not used it up.
     ensure!(alice.visit(&answer)?.status == 200);
     alice.expect_user("oidc:alice", "admin")?;
-    alice
-        .visit(&answer)?
-        .expect_refusal(400, &["not started here"])?;
+    alice.visit(&answer)?.expect_refusal(400, &["not started here"])?;
     let other = provider.browser("other-issuer");
     let answer = path(&other.sign_in_until_callback()?).replace("iss=http", "iss=https");
-    other
-        .visit(&answer)?
-        .expect_refusal(401, &["the answer comes from another issuer"])?;
+    other.visit(&answer)?.expect_refusal(401, &["the answer comes from another issuer"])?;
     let made_up = provider.browser("made-up");
     let answer = path(&made_up.sign_in_until_callback()?);
     let (before, _) = answer.split_once("code=").unwrap_or_default();
     let (_, state) = answer.split_once("&state=").unwrap_or_default();
     let answer = format!("{before}code=invented&state={state}");
-    made_up
-        .visit(&answer)?
-        .expect_refusal(401, &["rejected its own code"])?;
+    made_up.visit(&answer)?.expect_refusal(401, &["rejected its own code"])?;
     // A sign-in starts at the host name of the portal's cookies.
-    let named = alice.request(
-        &["-H", "Host: localhost:1"],
-        &format!("{}{LOGIN}", provider.portal()),
-    )?;
-    ensure!(
-        named.status == 303 && named.onward.ends_with(&format!("{LOGIN}?again=true")),
-        "{named:?}"
-    );
+    let named = alice.request(&["-H", "Host: localhost:1"], &format!("{}{LOGIN}", provider.portal()))?;
+    ensure!(named.status == 303 && named.onward.ends_with(&format!("{LOGIN}?again=true")), "{named:?}");
     let wrong = format!("{}{LOGIN}?again=true", provider.portal());
     let refused = alice.request(&["-H", "Host: localhost:1"], &wrong)?;
     refused.expect_refusal(403, &["redirect", "Host"])?;
@@ -303,17 +216,11 @@ pub fn a_provider_that_is_down_keeps_nobody_else_out() -> Verdict {
     let down = |visit: support::provider::PageVisit| {
         visit.expect_refusal(
             502,
-            &[
-                "cannot reach the identity provider",
-                &provider.issuer(),
-                "accounts and tokens still work",
-            ],
+            &["cannot reach the identity provider", &provider.issuer(), "accounts and tokens still work"],
         )
     };
     down(alice.sign_in()?)?;
-    let secret = daemon
-        .deployer()
-        .run_json(&["token", "create", "tool", "--role", "operator"])?;
+    let secret = daemon.deployer().run_json(&["token", "create", "tool", "--role", "operator"])?;
     let bearer = format!("Bearer {}", secret["secret"].as_str().unwrap_or_default());
     let asked = daemon.request("GET", "/api/v1/status", &[("Authorization", &bearer)])?;
     ensure!(asked.0 == 200, "{asked:?}");
@@ -328,11 +235,7 @@ pub fn a_provider_that_is_down_keeps_nobody_else_out() -> Verdict {
         wait_until("the provider to be asked anew", || {
             let visit = alice.sign_in()?;
             ensure!(visit.status == 502, "{wrong}: {visit:?}");
-            Ok(if visit.body.contains(words) {
-                Ok(())
-            } else {
-                Err(visit.body)
-            })
+            Ok(if visit.body.contains(words) { Ok(()) } else { Err(visit.body) })
         })?;
     }
     provider.set_user("alice")?;
@@ -385,10 +288,7 @@ pub fn sessions_end_when_the_configuration_gives_other_rights() -> Verdict {
     ensure!(sam.is_signed_out()?);
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     let (status, body) = daemon.get(LOGIN)?;
-    ensure!(
-        status == 404 && body.contains("docs/access.md"),
-        "{status} {body}"
-    );
+    ensure!(status == 404 && body.contains("docs/access.md"), "{status} {body}");
     Ok(())
 }
 
@@ -423,10 +323,7 @@ pub fn through_tls_both_cookies_are_this_hosts_alone() -> Verdict {
     for name in ["__Host-cloudroid\t", "__Host-cloudroid-oidc\t"] {
         let line = kept.lines().find(|line| line.contains(name));
         // Host prefix, whole path, secure.
-        ensure!(
-            line.is_some_and(|line| line.contains("localhost\tFALSE\t/\tTRUE\t")),
-            "{name}: {kept}"
-        );
+        ensure!(line.is_some_and(|line| line.contains("localhost\tFALSE\t/\tTRUE\t")), "{name}: {kept}");
     }
     ensure!(alice.send_change("DELETE", "/api/v1/session")?.status == 204);
     ensure!(alice.is_signed_out()?);

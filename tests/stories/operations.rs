@@ -15,9 +15,7 @@ const GRANTS: [&str; 4] = ["publish", "subscribe", "call", "advertise"];
 /// Returns the operations and the grants that they need from the document, which a unit test compares with the known
 /// operations.
 fn documented_needs() -> anyhow::Result<Vec<(String, String)>> {
-    let (_, table) = DOCUMENT
-        .split_once("| operation | needs |\n")
-        .context("the table of operations")?;
+    let (_, table) = DOCUMENT.split_once("| operation | needs |\n").context("the table of operations")?;
     let rows = table.lines().skip(1).take_while(|line| !line.is_empty());
     let cells = |row: &str| {
         let mut cells = row.trim_matches('|').split('|');
@@ -76,12 +74,7 @@ fn is_refused(robot: &mut Robot, message: Value) -> anyhow::Result<bool> {
 }
 
 /// Sends every operation on a connection of its own, so that none depends on earlier ones.
-fn try_operations(
-    daemon: &Daemon,
-    who: &str,
-    path: &str,
-    granted: &[&str],
-) -> anyhow::Result<usize> {
+fn try_operations(daemon: &Daemon, who: &str, path: &str, granted: &[&str]) -> anyhow::Result<usize> {
     let mut walked = 0;
     for (operation, needs) in documented_needs()? {
         if needs == "contents" {
@@ -89,13 +82,9 @@ fn try_operations(
         }
         let message = sample_message(&operation)?;
         let allowed = needs == "-" || granted.contains(&&*needs);
-        for (message, form) in [
-            (message.clone(), "bare"),
-            (to_fragment(&message), "fragment"),
-        ] {
+        for (message, form) in [(message.clone(), "bare"), (to_fragment(&message), "fragment")] {
             let mut robot = daemon.robot(path)?;
-            let refused = is_refused(&mut robot, message)
-                .with_context(|| format!("{who}: {operation} ({form})"))?;
+            let refused = is_refused(&mut robot, message).with_context(|| format!("{who}: {operation} ({form})"))?;
             ensure!(
                 refused != allowed,
                 "{who}: {operation} ({form}), which needs {needs}, was {}",
@@ -112,49 +101,28 @@ pub fn every_operation_is_done_where_the_table_says() -> Verdict {
     let daemon = daemon("operations")?;
     let adder = support::binaries::package("adder_py");
     let path = support::deployer::path_str(&adder);
-    daemon
-        .deployer()
-        .run(&["push", path, "--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().run(&["push", path, "--node", "adder.py"])?.expect_success()?;
     // On a machine without principals.
     let mut walked = try_operations(&daemon, "local", "adder_py?robot=r0", &GRANTS)?;
-    let alice = create_token(
-        &daemon,
-        &["alice", "--role", "deployer", "--service", "adder*"],
-    )?;
+    let alice = create_token(&daemon, &["alice", "--role", "deployer", "--service", "adder*"])?;
     push_adder(&daemon, &alice, &["--name", "adder_own"])?.expect_success()?;
     let own = format!("adder_own?robot=r3&token={alice}");
     walked += try_operations(&daemon, "a deployer", &own, &GRANTS)?;
     for role in ["admin", "operator"] {
         let token = create_token(&daemon, &[role, "--role", role])?;
-        walked += try_operations(
-            &daemon,
-            role,
-            &format!("adder_py?robot={role}&token={token}"),
-            &GRANTS,
-        )?;
+        walked += try_operations(&daemon, role, &format!("adder_py?robot={role}&token={token}"), &GRANTS)?;
     }
     let robots = ["--role", "robot", "--service", "adder_py", "--robot"];
     let named = |name: &str| create_token(&daemon, &[&[name], &robots[..], &[name]].concat());
     let rover = named("rover")?;
-    walked += try_operations(
-        &daemon,
-        "a robot",
-        &format!("adder_py?token={rover}"),
-        &GRANTS,
-    )?;
+    walked += try_operations(&daemon, "a robot", &format!("adder_py?token={rover}"), &GRANTS)?;
     // With a single grant, with all others, and with grants for other names.
     for one in GRANTS {
         let others: Vec<&str> = GRANTS.into_iter().filter(|other| *other != one).collect();
-        for (name, granted, names) in [
-            (format!("only-{one}"), vec![one], "/**"),
-            (format!("but-{one}"), others, "/**"),
-        ] {
+        for (name, granted, names) in [(format!("only-{one}"), vec![one], "/**"), (format!("but-{one}"), others, "/**")]
+        {
             let token = named(&name)?;
-            let grants: Vec<String> = granted
-                .iter()
-                .map(|grant| format!("{grant}:{names}"))
-                .collect();
+            let grants: Vec<String> = granted.iter().map(|grant| format!("{grant}:{names}")).collect();
             let mut allow = vec!["policy", "allow", &name];
             allow.extend(grants.iter().map(String::as_str));
             daemon.deployer().run(&allow)?.expect_success()?;
@@ -164,12 +132,7 @@ pub fn every_operation_is_done_where_the_table_says() -> Verdict {
     let elsewhere = named("elsewhere")?;
     let allow = ["policy", "allow", "elsewhere", "*:/other/**"];
     daemon.deployer().run(&allow)?.expect_success()?;
-    walked += try_operations(
-        &daemon,
-        "elsewhere",
-        &format!("adder_py?token={elsewhere}"),
-        &[],
-    )?;
+    walked += try_operations(&daemon, "elsewhere", &format!("adder_py?token={elsewhere}"), &[])?;
     ensure!(walked > 300, "{walked} were walked");
     Ok(())
 }
@@ -178,40 +141,18 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
     let daemon = daemon("unheard")?;
     let adder = support::binaries::package("adder_py");
     let path = support::deployer::path_str(&adder);
-    daemon
-        .deployer()
-        .run(&["push", path, "--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().run(&["push", path, "--node", "adder.py"])?.expect_success()?;
     let robot = |name: &str, robot: &str| {
-        let words = [
-            name,
-            "--role",
-            "robot",
-            "--service",
-            "adder_py",
-            "--robot",
-            robot,
-        ];
+        let words = [name, "--role", "robot", "--service", "adder_py", "--robot", robot];
         create_token(&daemon, &words)
     };
     let another = robot("another", "r2")?;
     let over = robot("over", "r1")?;
-    daemon
-        .deployer()
-        .run(&["token", "revoke", "over"])?
-        .expect_success()?;
+    daemon.deployer().run(&["token", "revoke", "over"])?.expect_success()?;
     let expired = expired_token(&daemon)?;
-    let viewer = create_token(
-        &daemon,
-        &["eve", "--role", "viewer", "--service", "adder_py"],
-    )?;
+    let viewer = create_token(&daemon, &["eve", "--role", "viewer", "--service", "adder_py"])?;
     // In the handshake, as a query, which is checked like a header.
-    for (token, status) in [
-        (&over, 401),
-        (&expired, 401),
-        (&another, 403),
-        (&viewer, 403),
-    ] {
+    for (token, status) in [(&over, 401), (&expired, 401), (&another, 403), (&viewer, 403)] {
         let url = daemon.url(&format!("adder_py?robot=r1&token={token}"));
         let Err(refusal) = Robot::try_connect(&url) else {
             anyhow::bail!("a connection was let in that should have got {status}")
@@ -236,15 +177,10 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
         for message in messages {
             let mut robot = daemon.robot("adder_py?robot=r1")?;
             robot.send(message.clone())?;
-            let close = robot
-                .wait_for_close()
-                .with_context(|| format!("after {message}"))?;
+            let close = robot.wait_for_close().with_context(|| format!("after {message}"))?;
             ensure!(u16::from(close.code) == 1008, "{message}: {close:?}");
         }
     }
-    ensure!(
-        daemon.servant_of("adder_py", "r1").is_err(),
-        "a servant was started for who never said who it is"
-    );
+    ensure!(daemon.servant_of("adder_py", "r1").is_err(), "a servant was started for who never said who it is");
     Ok(())
 }

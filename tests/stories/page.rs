@@ -64,9 +64,7 @@ fn begin_step(daemon: &Daemon, step: &str, token: &str) -> anyhow::Result<Child>
 
 /// Starts a step at another address of the daemon.
 fn begin_step_at(daemon: &Daemon, url: &str, step: &str, token: &str) -> anyhow::Result<Child> {
-    step_command(daemon, url, step, token)
-        .spawn()
-        .context("node, which make deps installs")
+    step_command(daemon, url, step, token).spawn().context("node, which make deps installs")
 }
 
 fn step_command(daemon: &Daemon, url: &str, step: &str, token: &str) -> Command {
@@ -89,11 +87,7 @@ fn step_command(daemon: &Daemon, url: &str, step: &str, token: &str) -> Command 
 
 fn finish_step(mut child: Child, step: &str) -> Verdict {
     let mut said = String::new();
-    child
-        .stderr
-        .take()
-        .context("its standard error")?
-        .read_to_string(&mut said)?;
+    child.stderr.take().context("its standard error")?.read_to_string(&mut said)?;
     let status = child.wait()?;
     ensure!(status.success(), "{step}: {said}");
     Ok(())
@@ -135,9 +129,7 @@ pub fn a_canary_is_begun_promoted_and_taken_back() -> Verdict {
     };
     pushes(&[])?;
     run_step(&daemon, "canary", &admin)?;
-    daemon.wait_for("/api/v1/services/adder_py", "revision 2", |service| {
-        (service["revision"] == 2).then_some(())
-    })?;
+    daemon.wait_for("/api/v1/services/adder_py", "revision 2", |service| (service["revision"] == 2).then_some(()))?;
     pushes(&["--canary", "1"])?;
     let viewer = create_token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
     run_step(&daemon, "bystander", &viewer)?;
@@ -148,28 +140,19 @@ pub fn a_canary_is_begun_promoted_and_taken_back() -> Verdict {
 }
 
 pub fn a_robot_is_paired_from_the_page() -> Verdict {
-    let daemon = world()
-        .setup("page-pairing")
-        .config("[tls]\nserve = \"tls\"\n")
-        .start()?;
+    let daemon = world().setup("page-pairing").config("[tls]\nserve = \"tls\"\n").start()?;
     let admin = create_token(&daemon, &["admin", "--role", "admin"])?;
     let url = format!("https://{}/", daemon.address);
     finish_step(begin_step_at(&daemon, &url, "pairing", &admin)?, "pairing")?;
     let waiting = daemon.deployer().run_json(&["pair", "--list"])?;
-    ensure!(
-        waiting[0]["robot"] == "rover" && waiting[0]["state"] == "waiting",
-        "{waiting:#}"
-    );
+    ensure!(waiting[0]["robot"] == "rover" && waiting[0]["state"] == "waiting", "{waiting:#}");
     Ok(())
 }
 
 pub fn what_response_times_cost_is_measured_from_the_page() -> Verdict {
     let daemon = daemon("page-calibrates")?;
     let admin = create_token(&daemon, &["admin", "--role", "admin"])?;
-    daemon
-        .deployer()
-        .push("teller_py", TELLER.arguments)?
-        .expect_success()?;
+    daemon.deployer().push("teller_py", TELLER.arguments)?.expect_success()?;
     // Large enough for the progress of the upload to be visible.
     let machine = Machine::new()?;
     let recorded = r#"
@@ -180,9 +163,7 @@ with rosbag.Bag("/root/talk.bag", "w") as bag:
         bag.write("/chatter", String("word %d" % number))
         bag.write("/noise", Float64MultiArray(data=[0.5] * 3000))
 "#;
-    machine
-        .run_script("sh", &format!("python3 - << 'END'\n{recorded}END"))?
-        .expect_success()?;
+    machine.run_script("sh", &format!("python3 - << 'END'\n{recorded}END"))?.expect_success()?;
     let path = format!("teller_py?robot=talker&token={admin}");
     let mut robot = daemon.robot(&path)?;
     robot.send(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
@@ -190,9 +171,7 @@ with rosbag.Bag("/root/talk.bag", "w") as bag:
     robot.wait_for_subscriber("/teller/say")?;
     let say = json!({"op": "publish", "topic": "/teller/say", "msg": {"data": "hello"}});
     // Messages are lost until the node has connected to the robot.
-    robot.send_until(&say, "what it says", |value| {
-        value["topic"] == "/teller/said"
-    })?;
+    robot.send_until(&say, "what it says", |value| value["topic"] == "/teller/said")?;
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let talks = scope.spawn(|| -> Verdict {
@@ -209,9 +188,7 @@ with rosbag.Bag("/root/talk.bag", "w") as bag:
             .map_err(anyhow::Error::from)
             .and_then(|child| finish_step(child, "calibrator"));
         over.store(true, Ordering::Relaxed);
-        let talked = talks
-            .join()
-            .unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
+        let talked = talks.join().unwrap_or_else(|_| anyhow::bail!("the robot panicked"));
         told.and(talked)
     })
 }
@@ -224,20 +201,9 @@ pub fn what_flows_inside_a_servant_is_drawn_and_changed() -> Verdict {
         .start()?;
     let admin = create_token(&daemon, &["admin", "--role", "admin"])?;
     let viewer = create_token(&daemon, &["viewer", "--role", "viewer", "--service", "*"])?;
-    daemon
-        .deployer()
-        .push("sights_py", inside::SIGHTS)?
-        .expect_success()?;
+    daemon.deployer().push("sights_py", inside::SIGHTS)?.expect_success()?;
     // The robot belongs to another principal than the viewer.
-    let own = [
-        "rover",
-        "--role",
-        "robot",
-        "--robot",
-        "rover",
-        "--service",
-        "sights_py",
-    ];
+    let own = ["rover", "--role", "robot", "--robot", "rover", "--service", "sights_py"];
     let mut robot = daemon.robot(&format!("sights_py?token={}", create_token(&daemon, &own)?))?;
     robot.call("/rosapi/get_time", json!({}))?;
     run_step(&daemon, "looker", &admin)?;
@@ -261,10 +227,7 @@ pub fn settings_of_a_node_are_changed_inside() -> Verdict {
     robot.call("/rosapi/get_time", json!({}))?;
     run_step(&daemon, "settings", "")?;
     // The node uses the settings: it has written them to its parameters.
-    let padding = robot.call(
-        "/rosapi/get_param",
-        json!({"name": "/people_detect/padding"}),
-    )?;
+    let padding = robot.call("/rosapi/get_param", json!({"name": "/people_detect/padding"}))?;
     ensure!(padding["values"]["value"] == "17", "{padding}");
     robot.leave()
 }

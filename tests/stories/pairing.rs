@@ -25,9 +25,7 @@ fn secure_setup(name: &str, more: &str) -> DaemonSetup {
 
 /// Returns the line that `cloudroidctl pair` prints for a robot.
 fn pairing_line(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
-    let made = daemon
-        .deployer()
-        .run_json(&[&["pair"], arguments].concat())?;
+    let made = daemon.deployer().run_json(&[&["pair"], arguments].concat())?;
     Ok(made["line"].as_str().context("a line")?.to_owned())
 }
 
@@ -64,20 +62,12 @@ impl PairedRobot {
         let begin = text.find("-----BEGIN").context("a certificate")?;
         let end = text.find("-----END CERTIFICATE-----").context("its end")?;
         let path = self.own.path().join("certificate.pem");
-        std::fs::write(
-            &path,
-            format!("{}-----END CERTIFICATE-----\n", &text[begin..end]),
-        )?;
+        std::fs::write(&path, format!("{}-----END CERTIFICATE-----\n", &text[begin..end]))?;
         Ok(path)
     }
 
     /// Starts a stub whose configuration contains nothing but the server's address.
-    fn start_stub(
-        &self,
-        site: &Site,
-        daemon: &Daemon,
-        service: (&str, &str),
-    ) -> anyhow::Result<NodeProcess> {
+    fn start_stub(&self, site: &Site, daemon: &Daemon, service: (&str, &str)) -> anyhow::Result<NodeProcess> {
         let toml = format!(
             "server = \"wss://{}\"\nservice = \"{}\"\nlocal = \"none\"\nidentity = {:?}\n",
             daemon.address,
@@ -89,12 +79,7 @@ impl PairedRobot {
 }
 
 /// Runs curl with a certificate and its key.
-fn curl(
-    daemon: &Daemon,
-    path: &str,
-    pair: Option<(&Path, &Path)>,
-    more: &[&str],
-) -> anyhow::Result<CommandOutcome> {
+fn curl(daemon: &Daemon, path: &str, pair: Option<(&Path, &Path)>, more: &[&str]) -> anyhow::Result<CommandOutcome> {
     let mut command = Command::new("curl");
     command
         .args([
@@ -120,9 +105,7 @@ fn file_mode(path: &Path) -> anyhow::Result<u32> {
 
 /// Returns the time in milliseconds since 1970.
 fn unix_millis() -> anyhow::Result<u64> {
-    Ok(u64::try_from(
-        SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis(),
-    )?)
+    Ok(u64::try_from(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis())?)
 }
 
 const AUDIT: [&str; 5] = ["audit", "-n", "1000", "--format", "json"];
@@ -131,11 +114,7 @@ const AUDIT: [&str; 5] = ["audit", "-n", "1000", "--format", "json"];
 fn wait_for_audit(daemon: &Daemon, words: &str) -> Verdict {
     wait_until(&format!("{words:?} in the audit log"), || {
         let audit = daemon.deployer().run(&AUDIT)?.expect_success()?;
-        Ok(if audit.stdout.contains(words) {
-            Ok(())
-        } else {
-            Err(audit.stdout)
-        })
+        Ok(if audit.stdout.contains(words) { Ok(()) } else { Err(audit.stdout) })
     })
 }
 
@@ -144,44 +123,27 @@ const NODE: (&str, &str) = ("teller_py", "teller.py");
 pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
     let daemon = secure_setup("paired", "").start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push(TELLER.name, TELLER.arguments)?
-        .expect_success()?;
-    deployer
-        .push(ADDER.name, ADDER.arguments)?
-        .expect_success()?;
+    deployer.push(TELLER.name, TELLER.arguments)?.expect_success()?;
+    deployer.push(ADDER.name, ADDER.arguments)?.expect_success()?;
     // For people: the line alone on standard output, a QR code on standard error.
-    let printed = deployer
-        .run(&["pair", "rover1", "--services", "teller_py"])?
-        .expect_success()?;
+    let printed = deployer.run(&["pair", "rover1", "--services", "teller_py"])?.expect_success()?;
     ensure!(
         printed.stdout.trim().lines().count() == 1 && printed.stdout.starts_with("cloudroid://"),
         "{}",
         printed.output()
     );
     for words in ["▀", "cloudroid-stub pair 'LINE'", "install.sh --pair"] {
-        ensure!(
-            printed.stderr.contains(words),
-            "{words}: {}",
-            printed.output()
-        );
+        ensure!(printed.stderr.contains(words), "{words}: {}", printed.output());
     }
     let line = printed.stdout.trim();
     let robot = PairedRobot::new()?;
     let paired = robot.pair(line)?.expect_success()?;
     for words in ["paired with", "as rover1", "7 days"] {
-        ensure!(
-            paired.stdout.contains(words),
-            "{words}: {}",
-            paired.output()
-        );
+        ensure!(paired.stdout.contains(words), "{words}: {}", paired.output());
     }
     ensure!(file_mode(&robot.key())? == 0o600 && file_mode(&robot.directory())? == 0o700);
     ensure!(file_mode(&daemon.home.join("tls/authority.pem"))? == 0o600);
-    for (file, words) in [
-        ("known_servers", daemon.address.as_str()),
-        ("servers.pub", "cloudroid ssh-ed25519 AAAA"),
-    ] {
+    for (file, words) in [("known_servers", daemon.address.as_str()), ("servers.pub", "cloudroid ssh-ed25519 AAAA")] {
         let text = std::fs::read_to_string(robot.directory().join(file))?;
         ensure!(text.contains(words), "{file}: {text}");
     }
@@ -195,11 +157,7 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
     let pair = Some((&*certificate, &*key));
     let whoami = curl(&daemon, "/api/v1/whoami", pair, &[])?.expect_success()?;
     for words in ["\"name\":\"rover1\"", "\"robot\"", "\"teller_py\"", "\n200"] {
-        ensure!(
-            whoami.stdout.contains(words),
-            "{words}: {}",
-            whoami.output()
-        );
+        ensure!(whoami.stdout.contains(words), "{words}: {}", whoami.output());
     }
     // It has no further rights, and without its certificate nobody has its identity.
     for (path, given, status) in [
@@ -209,24 +167,13 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
         ("/api/v1/services", None, "401"),
     ] {
         let answer = curl(&daemon, path, given, &[])?.expect_success()?;
-        ensure!(
-            answer.stdout.ends_with(status),
-            "{path}: {}",
-            answer.output()
-        );
+        ensure!(answer.stdout.ends_with(status), "{path}: {}", answer.output());
     }
     let other = robot.start_stub(&site, &daemon, ("adder_py", "adder.py"))?;
     other.wait_for_output("may not connect to service adder_py")?;
     // Revocation ends everything of the robot.
     let mut watched = Command::new(binaries::python())
-        .args([
-            "-c",
-            WATCH,
-            &daemon.address,
-            path_str(&certificate),
-            path_str(&key),
-            &patience().as_secs().to_string(),
-        ])
+        .args(["-c", WATCH, &daemon.address, path_str(&certificate), path_str(&key), &patience().as_secs().to_string()])
         .stdout(Stdio::piped())
         .spawn()?;
     let mut told = BufReader::new(watched.stdout.take().context("what it says")?).lines();
@@ -238,37 +185,21 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
     for _ in 0..2 {
         let said = next()?;
         let (at, what) = said.split_once(' ').context("a time")?;
-        ends.push(format!(
-            "{what} after {} ms",
-            at.parse::<u64>()?.saturating_sub(began)
-        ));
+        ends.push(format!("{what} after {} ms", at.parse::<u64>()?.saturating_sub(began)));
     }
     let all = ends.join(", ");
     println!("unpaired: {all}");
-    ensure!(
-        all.contains("API") && all.contains("rosbridge 1008 robot rover1 was unpaired"),
-        "{all}"
-    );
+    ensure!(all.contains("API") && all.contains("rosbridge 1008 robot rover1 was unpaired"), "{all}");
     watched.wait()?;
     stub.wait_for_output("robot rover1 was unpaired")?;
     let refused = curl(&daemon, "/api/v1/whoami", pair, &[])?.expect_success()?;
-    for words in [
-        "robot rover1 was unpaired",
-        "cloudroidctl pair ROBOT",
-        "\n401",
-    ] {
-        ensure!(
-            refused.stdout.contains(words),
-            "{words}: {}",
-            refused.output()
-        );
+    for words in ["robot rover1 was unpaired", "cloudroidctl pair ROBOT", "\n401"] {
+        ensure!(refused.stdout.contains(words), "{words}: {}", refused.output());
     }
     let renewal = ["--data-binary", "{\"request\":\"x\"}"];
     let refused = curl(&daemon, "/api/v1/renew", pair, &renewal)?.expect_success()?;
     ensure!(refused.stdout.ends_with("\n401"), "{}", refused.output());
-    deployer
-        .run(&["unpair", "rover1"])?
-        .expect_failure(&["robot \"rover1\" is not paired", "pair --list"])?;
+    deployer.run(&["unpair", "rover1"])?.expect_failure(&["robot \"rover1\" is not paired", "pair --list"])?;
     // The audit log contains who did it, and no secret.
     for words in [
         "POST /api/v1/pairings",
@@ -354,13 +285,9 @@ pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict
     let good_for = format!("robot_certificates = \"{}s\"\n", scale_seconds(6));
     let daemon = secure_setup("renewing", &good_for).start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push(TELLER.name, TELLER.arguments)?
-        .expect_success()?;
+    deployer.push(TELLER.name, TELLER.arguments)?.expect_success()?;
     let robot = PairedRobot::new()?;
-    robot
-        .pair(&pairing_line(&daemon, &["rover1"])?)?
-        .expect_success()?;
+    robot.pair(&pairing_line(&daemon, &["rover1"])?)?.expect_success()?;
     let site = Site::new()?;
     let mut stub = robot.start_stub(&site, &daemon, NODE)?;
     stub.wait_for_output("linked to wss://")?;
@@ -368,13 +295,7 @@ pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict
     stub.wait_for_output_times("was renewed", 2)?;
     ensure!(!stub.output().contains("was lost"), "{}", stub.output());
     let renewed = robot.certificate(&daemon.address)?;
-    curl(
-        &daemon,
-        "/api/v1/whoami",
-        Some((&renewed, &robot.key())),
-        &[],
-    )?
-    .expect_success()?;
+    curl(&daemon, "/api/v1/whoami", Some((&renewed, &robot.key())), &[])?.expect_success()?;
     wait_for_audit(&daemon, "renewed its certificate")?;
     // Switched off for longer than that.
     stub.signal(nix::sys::signal::Signal::SIGINT)?;
@@ -382,11 +303,7 @@ pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict
     wait_until("the certificate's end", || {
         let pairings = deployer.run_json(&["pair", "--list"])?;
         let end = pairings[0]["expires"].as_u64().context("an end")?;
-        Ok(if unix_millis()? >= end {
-            Ok(())
-        } else {
-            Err(pairings.to_string())
-        })
+        Ok(if unix_millis()? >= end { Ok(()) } else { Err(pairings.to_string()) })
     })?;
     let late = robot.start_stub(&site, &daemon, NODE)?;
     late.wait_for_output("certificate has expired")?;
@@ -395,9 +312,7 @@ pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict
     wait_for_audit(&daemon, "presented a certificate that was refused")?;
     // The same key is paired again, and the robot works.
     let key = std::fs::read(robot.key())?;
-    robot
-        .pair(&pairing_line(&daemon, &["rover1"])?)?
-        .expect_success()?;
+    robot.pair(&pairing_line(&daemon, &["rover1"])?)?.expect_success()?;
     ensure!(std::fs::read(robot.key())? == key, "another key was made");
     let stub = robot.start_stub(&site, &daemon, NODE)?;
     stub.wait_for_output("linked to wss://")?;
@@ -416,14 +331,8 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     let code = good.rsplit('=').next().context("a code")?.to_owned();
     // Errors before anything is sent.
     for (wrong, words) in [
-        (
-            good.replace("robot=rover1", "robot=rover\u{7}1"),
-            "control characters",
-        ),
-        (
-            good.replace("robot=rover1", "robot=a\nb"),
-            "control characters",
-        ),
+        (good.replace("robot=rover1", "robot=rover\u{7}1"), "control characters"),
+        (good.replace("robot=rover1", "robot=a\nb"), "control characters"),
         (good[..good.len() - 1].to_owned(), "25 characters"),
         (good[..good.len() - 40].to_owned(), "not a pairing line"),
     ] {
@@ -437,10 +346,7 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     refused(&other, &["the connection may be intercepted", "SHA256:"])?;
     // Invalid codes.
     refused(&good.replace(&code, &"a".repeat(26)), &["not known", "401"])?;
-    refused(
-        &good.replace("robot=rover1", "robot=rover2"),
-        &["for another robot"],
-    )?;
+    refused(&good.replace("robot=rover1", "robot=rover2"), &["for another robot"])?;
     // A key that others can read.
     let key = robot.key();
     std::fs::set_permissions(&key, PermissionsExt::from_mode(0o644))?;
@@ -449,18 +355,12 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     std::fs::set_permissions(&key, PermissionsExt::from_mode(0o600))?;
     let second = pairing_line(&daemon, &["rover1"])?;
     refused(&good, &["replaced by a newer one"])?;
-    deployer
-        .run(&["pair", "rover1", "--cancel"])?
-        .expect_success()?;
+    deployer.run(&["pair", "rover1", "--cancel"])?.expect_success()?;
     refused(&second, &["cancelled"])?;
     let short = pairing_line(&daemon, &["rover1", "--ttl", "1s"])?;
     wait_until("the code's end", || {
         let left = deployer.run_json(&["pair", "--list"])?;
-        Ok(if left.as_array().is_some_and(Vec::is_empty) {
-            Ok(())
-        } else {
-            Err(left.to_string())
-        })
+        Ok(if left.as_array().is_some_and(Vec::is_empty) { Ok(()) } else { Err(left.to_string()) })
     })?;
     refused(&short, &["has expired"])?;
     let once = pairing_line(&daemon, &["rover1"])?;
@@ -470,9 +370,7 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     let code = pairing_line(&daemon, &["rover3"])?;
     let code = code.rsplit('=').next().context("a code")?;
     let place = world().directory("requests")?;
-    let made = run(Command::new("sh")
-        .args(["-euc", REQUESTS])
-        .current_dir(place.path()))?;
+    let made = run(Command::new("sh").args(["-euc", REQUESTS]).current_dir(place.path()))?;
     made.expect_success()?;
     let asks = |file: &str, text: &str| -> anyhow::Result<CommandOutcome> {
         let body = place.path().join(file);
@@ -492,11 +390,7 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
         (made("ca.pem")?, "not a certificate request", "400"),
     ] {
         let answer = asks("body", &text)?.expect_success()?;
-        ensure!(
-            answer.stdout.contains(words) && answer.stdout.ends_with(status),
-            "{words}: {}",
-            answer.output()
-        );
+        ensure!(answer.stdout.contains(words) && answer.stdout.ends_with(status), "{words}: {}", answer.output());
     }
     let answer = asks("body", &made("good.csr")?)?.expect_success()?;
     ensure!(answer.stdout.ends_with("200"), "{}", answer.output());
@@ -505,10 +399,7 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
         (&["pair", "a b"][..], "robot"),
         (&["pair", "root"], "is a reserved name"),
         (&["pair", "r", "--ttl", "8d"], "at most 7d"),
-        (
-            &["pair", "r", "--address", "nowhere"],
-            "--address HOST:PORT",
-        ),
+        (&["pair", "r", "--address", "nowhere"], "--address HOST:PORT"),
         (&["pair", "r", "--own-certificate"], "client_authorities"),
         (&["pair", "r", "--cancel"], "no pending pairing code"),
     ] {
@@ -516,15 +407,9 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     }
     // Pairing is not possible in plain text.
     let plain = world().setup("unpaired-plain").start()?;
-    plain
-        .deployer()
-        .run(&["pair", "rover1"])?
-        .expect_failure(&["over TLS", "serve = \"tls\""])?;
+    plain.deployer().run(&["pair", "rover1"])?.expect_failure(&["over TLS", "serve = \"tls\""])?;
     let (status, body) = plain.request("POST", "/api/v1/pair", &[])?;
-    ensure!(
-        status == 400 && body.contains("over TLS"),
-        "{status} {body}"
-    );
+    ensure!(status == 400 && body.contains("over TLS"), "{status} {body}");
     Ok(())
 }
 
@@ -540,10 +425,7 @@ openssl req -x509 $ec -subj /CN=robot:rover3 -out ca.pem
 
 pub fn a_labs_own_authority_speaks_for_its_robots() -> Verdict {
     let place = world().directory("authority")?;
-    run(Command::new("sh")
-        .args(["-euc", AUTHORITY])
-        .current_dir(place.path()))?
-    .expect_success()?;
+    run(Command::new("sh").args(["-euc", AUTHORITY]).current_dir(place.path()))?.expect_success()?;
     let at = |name: &str| place.path().join(name);
     let named = format!("client_authorities = {:?}\n", at("lab.pem"));
     let daemon = secure_setup("lab", &named).start()?;
@@ -562,26 +444,16 @@ pub fn a_labs_own_authority_speaks_for_its_robots() -> Verdict {
         Ok(())
     };
     says("r1", "robot r1 is not paired", "401")?;
-    deployer
-        .run(&["pair", "r1", "--services", "det*", "--own-certificate"])?
-        .expect_success()?;
+    deployer.run(&["pair", "r1", "--services", "det*", "--own-certificate"])?.expect_success()?;
     says("r1", "\"robot\":\"r1\"", "200")?;
     says("person", "names no robot", "401")?;
     // With the corresponding TLS alert (RFC 8446, section 6.2).
     for (name, alert) in [("stranger", "unknown ca"), ("over", "certificate expired")] {
         let refused = asks(name)?;
-        ensure!(
-            refused.status != 0 && refused.stderr.to_lowercase().contains(alert),
-            "{name}: {}",
-            refused.output()
-        );
+        ensure!(refused.status != 0 && refused.stderr.to_lowercase().contains(alert), "{name}: {}", refused.output());
     }
     let listed = deployer.run(&["pair", "--list"])?.expect_success()?;
-    ensure!(
-        listed.stdout.contains("own certificate"),
-        "{}",
-        listed.output()
-    );
+    ensure!(listed.stdout.contains("own certificate"), "{}", listed.output());
     deployer.run(&["unpair", "r1"])?.expect_success()?;
     says("r1", "robot r1 was unpaired", "401")
 }
@@ -609,13 +481,9 @@ while [ "$(date +%s)" -le "$end" ]; do sleep 0.1; done
 pub fn a_stub_is_installed_and_paired_by_one_line() -> Verdict {
     let daemon = secure_setup("installed", "").start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push(TELLER.name, TELLER.arguments)?
-        .expect_success()?;
+    deployer.push(TELLER.name, TELLER.arguments)?.expect_success()?;
     let place = world().directory("stub")?;
-    deployer
-        .run(&["stub", "teller_py", "-o", path_str(place.path())])?
-        .expect_success()?;
+    deployer.run(&["stub", "teller_py", "-o", path_str(place.path())])?.expect_success()?;
     let machine = Machine::new()?;
     machine.unpack(&place.path().join("teller_py.tar.gz"))?;
     let line = pairing_line(&daemon, &["rover1"])?;
@@ -624,10 +492,7 @@ pub fn a_stub_is_installed_and_paired_by_one_line() -> Verdict {
     let letter = if &line[at..=at] == "A" { "B" } else { "A" };
     let other = format!("{}{letter}{}", &line[..at], &line[at + 1..]);
     machine
-        .run_script(
-            "sh",
-            &format!("sh teller_py-stub/install.sh --pair '{other}'"),
-        )?
+        .run_script("sh", &format!("sh teller_py-stub/install.sh --pair '{other}'"))?
         .expect_failure(&["another key than the one this robot knows"])?;
     let unlike = machine.run_script("sh", "sh teller_py-stub/install.sh --pair 'https://x'")?;
     unlike.expect_failure(&["--pair", "cloudroid://"])?;
@@ -646,17 +511,9 @@ cat /opt/cloudroid/share/teller_py/stub.toml
         "server = \"wss://127.0.0.1",
         "this robot is paired as rover1",
     ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     // The key from the archive was not asked about.
-    ensure!(
-        !outcome.stderr.contains("trusting the key that came"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(!outcome.stderr.contains("trusting the key that came"), "{}", outcome.output());
     Ok(())
 }

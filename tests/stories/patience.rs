@@ -6,10 +6,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{
-    Bus, FailureReason, Publisher, SerializedMessage, ServiceHandler, ServiceType,
-    wait_for_connected,
-};
+use ros::bus::{Bus, FailureReason, Publisher, SerializedMessage, ServiceHandler, ServiceType, wait_for_connected};
 use ros::ros1::Ros1Bus;
 use support::Verdict;
 use support::cable::{Cable, NetworkImpairment};
@@ -17,21 +14,13 @@ use support::patience::{Deadline, scale};
 use support::site::{NodeProcess, Site, string};
 use support::world::world;
 
-use crate::crossing::{
-    MessageBytes, advertise, message_types, subscribe, wait_for_answer, with_log,
-};
+use crate::crossing::{MessageBytes, advertise, message_types, subscribe, wait_for_answer, with_log};
 
 /// Number of the goal that is reached when the robot says so.
 const FAR: u32 = 1000;
 /// Polling interval.
 const MOMENT: Duration = Duration::from_millis(200);
-const SILENT: NetworkImpairment = NetworkImpairment {
-    rate: 100_000,
-    delay: 1,
-    jitter: 0,
-    loss: 1.0,
-    limit: 1000,
-};
+const SILENT: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 1, jitter: 0, loss: 1.0, limit: 1000 };
 
 /// A service with a constant response.
 struct FixedAnswer(&'static [u8]);
@@ -65,11 +54,7 @@ impl<'a> NavigationBase<'a> {
         let action = types.action("actionlib/Test")?;
         let app = site.node("/app")?;
         let trigger = ServiceType::new("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522");
-        let map = app.serve(
-            "/static_map",
-            trigger,
-            Arc::new(FixedAnswer(&[1, 0, 0, 0, 0])),
-        );
+        let map = app.serve("/static_map", trigger, Arc::new(FixedAnswer(&[1, 0, 0, 0, 0])));
         let map = site.runtime.block_on(map)?;
         let scans = types.message("sensor_msgs/LaserScan")?;
         let transforms = types.message("tf2_msgs/TFMessage")?;
@@ -86,18 +71,9 @@ impl<'a> NavigationBase<'a> {
     /// Publishes its position and a scan, as it does continuously.
     fn publish_state(&self) {
         let now = link::clock::now();
-        let transform = MessageBytes::default()
-            .word(1)
-            .word(0)
-            .time(now)
-            .text("map")
-            .text("chassis");
+        let transform = MessageBytes::default().word(1).word(0).time(now).text("map").text("chassis");
         self.transforms.publish(transform.zeros(7 * 8).0.into());
-        let scan = MessageBytes::default()
-            .word(0)
-            .time(now)
-            .text("chassis")
-            .zeros(7 * 4 + 8);
+        let scan = MessageBytes::default().word(0).time(now).text("chassis").zeros(7 * 4 + 8);
         self.scans.publish(scan.0.into());
     }
 
@@ -129,13 +105,7 @@ impl<'a> NavigationBase<'a> {
 
     fn send_goal(&self, id: &str, number: u32) {
         let now = link::clock::now();
-        let goal = MessageBytes::default()
-            .word(0)
-            .time(now)
-            .text("")
-            .time(now)
-            .text(id)
-            .word(number);
+        let goal = MessageBytes::default().word(0).time(now).text("").time(now).text(id).word(number);
         self.goals.publish(goal.0.into());
     }
 }
@@ -154,16 +124,12 @@ fn is_about_goal(message: &SerializedMessage, id: &str) -> bool {
 pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
     let daemon = world().ensure_shared()?;
     // Its frame is only known from its warnings, its name only when it runs.
-    let pushed = daemon
-        .deployer()
-        .push("patient_py", &["--node", "patient.py"])?
-        .expect_success()?;
+    let pushed = daemon.deployer().push("patient_py", &["--node", "patient.py"])?.expect_success()?;
     let service = daemon.deployer().run_json(&["services", "patient_py"])?;
     let interface = &service["interface"];
     let names = |kind: &str| -> Vec<String> {
         let all = interface[kind].as_array().into_iter().flatten();
-        all.filter_map(|one| Some(one["name"].as_str()?.to_owned()))
-            .collect()
+        all.filter_map(|one| Some(one["name"].as_str()?.to_owned())).collect()
     };
     ensure!(
         names("topics") == ["/arrived", "/scan", "/tf"] && names("actions") == ["/move_base"],
@@ -178,18 +144,11 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
         "server = \"ws://{}\"\nservice = \"patient_py\"\nrobot = \"patience\"\nlocal = \"none\"\n",
         daemon.address
     );
-    let stub = site.start_stub_with_config(
-        &settings,
-        "patient_py",
-        "patient.py",
-        &["__name:=move_base"],
-    )?;
+    let stub = site.start_stub_with_config(&settings, "patient_py", "patient.py", &["__name:=move_base"])?;
     let base = NavigationBase::new(&site)?;
-    base.wait_until_driven(&stub).with_context(|| {
-        match daemon.deployer().run(&["logs", "patient_py"]) {
-            Ok(node) => format!("the node said: {}", node.output()),
-            Err(error) => error.to_string(),
-        }
+    base.wait_until_driven(&stub).with_context(|| match daemon.deployer().run(&["logs", "patient_py"]) {
+        Ok(node) => format!("the node said: {}", node.output()),
+        Err(error) => error.to_string(),
     })?;
     let mut results = subscribe(&site, &base.app, "/move_base/result")?;
     let drives = || {
@@ -205,10 +164,7 @@ pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> V
     let daemon = world().ensure_shared()?;
     let service = "patient_original";
     let pushed = ["--node", "patient.py", "--name", service];
-    daemon
-        .deployer()
-        .push("patient_py", &pushed)?
-        .expect_success()?;
+    daemon.deployer().push("patient_py", &pushed)?.expect_success()?;
     let cable = Cable::new(&daemon.address)?;
     let site = Site::new()?;
     let overlay = site.install_stub(&daemon, service, "")?;
@@ -233,10 +189,7 @@ pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> V
     let base = NavigationBase::new(&site)?;
     base.wait_until_driven(&stub)?;
     let count = |words: &str| stub.output().matches(words).count();
-    let (over, back) = (
-        "the local original answers, too why=LinkDown",
-        "the cloud answers alone why=LinkUp",
-    );
+    let (over, back) = ("the local original answers, too why=LinkDown", "the cloud answers alone why=LinkUp");
     // On a slow machine the original may already have taken over before the first link.
     base.publish_until("no link", &stub, || {
         std::thread::sleep(scale(MOMENT));
@@ -285,9 +238,6 @@ pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> V
         Ok(near.is_some())
     })?;
     let near = near.context("a result")?;
-    ensure!(
-        is_about_goal(&near, "near") && result_number(&near)? == 7,
-        "{near:?}"
-    );
+    ensure!(is_about_goal(&near, "near") && result_number(&near)? == 7, "{near:?}");
     Ok(())
 }

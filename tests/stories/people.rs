@@ -17,11 +17,7 @@ const OTHER: &str = "nine loud yellow kettles";
 const PATH: &str = "/api/v1/session";
 
 /// Runs a command for accounts, with a password on standard input.
-pub fn run_account(
-    daemon: &Daemon,
-    arguments: &[&str],
-    password: &str,
-) -> anyhow::Result<CommandOutcome> {
+pub fn run_account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::Result<CommandOutcome> {
     let mut child = Command::new(binaries::path("cloudroidctl"))
         .arg("account")
         .args(arguments)
@@ -75,11 +71,7 @@ fn set_cookie(head: &str) -> anyhow::Result<(String, String)> {
 }
 
 impl<'a> SignedInBrowser<'a> {
-    pub fn sign_in(
-        daemon: &'a Daemon,
-        name: &str,
-        password: &str,
-    ) -> anyhow::Result<SignedInBrowser<'a>> {
+    pub fn sign_in(daemon: &'a Daemon, name: &str, password: &str) -> anyhow::Result<SignedInBrowser<'a>> {
         SignedInBrowser::sign_in_with_headers(daemon, name, password, &[])
     }
 
@@ -100,12 +92,7 @@ impl<'a> SignedInBrowser<'a> {
         ensure!(!rest.contains("Domain"), "{rest}");
         let told: Value = serde_json::from_str(&body)?;
         ensure!(told["name"] == name, "{told}");
-        Ok(SignedInBrowser {
-            daemon,
-            origin,
-            cookie,
-            csrf: told["csrf"].as_str().context("a csrf")?.to_owned(),
-        })
+        Ok(SignedInBrowser { daemon, origin, cookie, csrf: told["csrf"].as_str().context("a csrf")?.to_owned() })
     }
 
     fn session_secret(&self) -> &str {
@@ -114,11 +101,7 @@ impl<'a> SignedInBrowser<'a> {
 
     /// Sends a request as the page does.
     pub fn request(&self, method: &str, path: &str) -> anyhow::Result<(u16, String)> {
-        self.request_with_headers(
-            method,
-            path,
-            &[("Origin", &self.origin), ("X-CSRF-Token", &self.csrf)],
-        )
+        self.request_with_headers(method, path, &[("Origin", &self.origin), ("X-CSRF-Token", &self.csrf)])
     }
 
     /// Sends a request with the cookie and only these headers.
@@ -143,47 +126,22 @@ impl<'a> SignedInBrowser<'a> {
 pub fn people_sign_in_and_out() -> Verdict {
     let setup = world().setup("people");
     let daemon = setup.start()?;
-    run_account(
-        &daemon,
-        &["create", "alice", "--role", "operator"],
-        PASSWORD,
-    )?
-    .expect_success()?;
-    run_account(
-        &daemon,
-        &["create", "eve", "--role", "viewer", "--service", "adder*"],
-        OTHER,
-    )?
-    .expect_success()?;
+    run_account(&daemon, &["create", "alice", "--role", "operator"], PASSWORD)?.expect_success()?;
+    run_account(&daemon, &["create", "eve", "--role", "viewer", "--service", "adder*"], OTHER)?.expect_success()?;
     // From the first account on unauthenticated requests are refused.
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     let open = daemon.get_json(PATH)?;
-    ensure!(
-        open["needed"] == true && open["accounts"] == true && open["name"].is_null(),
-        "{open}"
-    );
+    ensure!(open["needed"] == true && open["accounts"] == true && open["name"].is_null(), "{open}");
     // A cookie that came from elsewhere is not adopted as the session.
     let invented = "cloudroid=abcdefghijklmnopqrstuvwxyz";
-    let alice =
-        SignedInBrowser::sign_in_with_headers(&daemon, "alice", PASSWORD, &[("Cookie", invented)])?;
+    let alice = SignedInBrowser::sign_in_with_headers(&daemon, "alice", PASSWORD, &[("Cookie", invented)])?;
     ensure!(alice.cookie != invented && alice.cookie.starts_with("cloudroid="));
     ensure!(alice.is_signed_in()? && alice.request("GET", "/api/v1/services")?.0 == 200);
-    ensure!(
-        alice.request("GET", "/api/v1/tokens")?.0 == 403,
-        "an operator"
-    );
+    ensure!(alice.request("GET", "/api/v1/tokens")?.0 == 403, "an operator");
     let eve = SignedInBrowser::sign_in(&daemon, "eve", OTHER)?;
-    ensure!(
-        eve.request("GET", "/api/v1/status")?.0 == 403,
-        "a viewer of some"
-    );
+    ensure!(eve.request("GET", "/api/v1/status")?.0 == 403, "a viewer of some");
     // Signing in again creates a new session and ends the previous one.
-    let again = SignedInBrowser::sign_in_with_headers(
-        &daemon,
-        "alice",
-        PASSWORD,
-        &[("Cookie", &alice.cookie)],
-    )?;
+    let again = SignedInBrowser::sign_in_with_headers(&daemon, "alice", PASSWORD, &[("Cookie", &alice.cookie)])?;
     ensure!(again.cookie != alice.cookie && again.is_signed_in()?);
     ensure!(!alice.is_signed_in()?, "the one before");
     // Sessions survive a restart.
@@ -191,37 +149,20 @@ pub fn people_sign_in_and_out() -> Verdict {
     let address = daemon.address.clone();
     daemon.stop()?;
     let daemon = setup.listen(&address).start()?;
-    let alice = SignedInBrowser {
-        daemon: &daemon,
-        origin: format!("http://{address}"),
-        cookie,
-        csrf,
-    };
+    let alice = SignedInBrowser { daemon: &daemon, origin: format!("http://{address}"), cookie, csrf };
     ensure!(alice.is_signed_in()?, "after the restart");
     let listed = daemon.deployer().run_json(&["account", "sessions"])?;
-    ensure!(
-        listed.as_array().is_some_and(|all| all.len() == 2),
-        "{listed}"
-    );
+    ensure!(listed.as_array().is_some_and(|all| all.len() == 2), "{listed}");
     let (status, body) = alice.request("DELETE", PATH)?;
     ensure!(status == 204, "{status} {body}");
     ensure!(!alice.is_signed_in()?, "signed out");
     // No secret is written anywhere.
-    let audited = daemon
-        .deployer()
-        .run(&["--format", "json", "audit"])?
-        .expect_success()?
-        .stdout;
-    for words in [
-        "account alice",
-        "POST /api/v1/session",
-        "DELETE /api/v1/session",
-    ] {
+    let audited = daemon.deployer().run(&["--format", "json", "audit"])?.expect_success()?.stdout;
+    for words in ["account alice", "POST /api/v1/session", "DELETE /api/v1/session"] {
         ensure!(audited.contains(words), "{words}: {audited}");
     }
     let log = std::fs::read_to_string(daemon.home.join("daemon.log"))?;
-    let state =
-        String::from_utf8_lossy(&std::fs::read(daemon.home.join("cloudroid.db"))?).into_owned();
+    let state = String::from_utf8_lossy(&std::fs::read(daemon.home.join("cloudroid.db"))?).into_owned();
     for secret in [PASSWORD, OTHER, alice.session_secret(), &alice.csrf] {
         for (name, text) in [("audit log", &audited), ("log", &log), ("database", &state)] {
             ensure!(!text.contains(secret), "the {name} has a secret");
@@ -232,98 +173,55 @@ pub fn people_sign_in_and_out() -> Verdict {
 
 pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
     let daemon = world().setup("people-refused").start()?;
-    let creates = |name: &str, role: &[&str], password: &str| {
-        run_account(&daemon, &[&["create", name], role].concat(), password)
-    };
+    let creates =
+        |name: &str, role: &[&str], password: &str| run_account(&daemon, &[&["create", name], role].concat(), password);
     creates("alice", &["--role", "operator"], PASSWORD)?.expect_success()?;
     for (name, role, password, words) in [
         ("bob", &["--role", "operator"][..], "short", "at least 12"),
-        (
-            "bob",
-            &["--role", "operator"],
-            "passwordpassword",
-            "too easy to guess",
-        ),
-        (
-            "bob",
-            &["--role", "robot"],
-            PASSWORD,
-            "cannot have the role robot",
-        ),
+        ("bob", &["--role", "operator"], "passwordpassword", "too easy to guess"),
+        ("bob", &["--role", "robot"], PASSWORD, "cannot have the role robot"),
         ("bob", &["--role", "viewer"], PASSWORD, "--service"),
         ("b b", &["--role", "admin"], PASSWORD, "is not a valid name"),
-        (
-            "local",
-            &["--role", "admin"],
-            PASSWORD,
-            "is a reserved name",
-        ),
+        ("local", &["--role", "admin"], PASSWORD, "is a reserved name"),
         ("alice", &["--role", "admin"], PASSWORD, "already"),
     ] {
         creates(name, role, password)?.expect_failure(&[words])?;
     }
     let token = ["token", "create", "alice", "--role", "admin"];
-    daemon
-        .deployer()
-        .run(&token)?
-        .expect_failure(&["already"])?;
+    daemon.deployer().run(&token)?.expect_failure(&["already"])?;
     // The response for an unknown name is the same.
     let wrong = request_sign_in(&daemon, "alice", OTHER, &[])?;
     let unknown = request_sign_in(&daemon, "nobody", OTHER, &[])?;
-    ensure!(
-        wrong.0 == 401 && wrong.2 == unknown.2,
-        "{wrong:?} {unknown:?}"
-    );
+    ensure!(wrong.0 == 401 && wrong.2 == unknown.2, "{wrong:?} {unknown:?}");
     let long = "x".repeat(1025);
     for (body, status) in [
-        (
-            json!({"name": "x".repeat(65), "password": PASSWORD}).to_string(),
-            400,
-        ),
+        (json!({"name": "x".repeat(65), "password": PASSWORD}).to_string(), 400),
         (json!({"name": "alice", "password": long}).to_string(), 400),
         (json!({"name": "alice"}).to_string(), 400),
-        (
-            json!({"name": "alice", "password": PASSWORD, "role": "admin"}).to_string(),
-            400,
-        ),
+        (json!({"name": "alice", "password": PASSWORD, "role": "admin"}).to_string(), 400),
         ("{\"name\": \"alice\"".to_owned(), 400),
         (String::new(), 400),
         ("x".repeat(17 << 10), 413),
     ] {
         let (found, _, said) = daemon.request_with_body("POST", PATH, &[], &body)?;
-        ensure!(
-            found == status && !said.contains(PASSWORD),
-            "{found} {said}"
-        );
+        ensure!(found == status && !said.contains(PASSWORD), "{found} {said}");
     }
     // Another site cannot sign a user in.
     let evil = [("Origin", "https://evil.example")];
     let (status, _, body) = request_sign_in(&daemon, "alice", PASSWORD, &evil)?;
     ensure!(status == 403, "{status} {body}");
     // Users without access cannot sign in.
-    daemon
-        .deployer()
-        .run(&["account", "disable", "alice"])?
-        .expect_success()?;
+    daemon.deployer().run(&["account", "disable", "alice"])?.expect_success()?;
     let disabled = request_sign_in(&daemon, "alice", PASSWORD, &[])?;
     ensure!(disabled.0 == 401 && disabled.2 == wrong.2, "{disabled:?}");
-    daemon
-        .deployer()
-        .run(&["account", "enable", "alice"])?
-        .expect_success()?;
+    daemon.deployer().run(&["account", "enable", "alice"])?.expect_success()?;
     SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
     run_account(&daemon, &["passwd", "alice"], OTHER)?.expect_success()?;
     ensure!(request_sign_in(&daemon, "alice", PASSWORD, &[])?.0 == 401);
     SignedInBrowser::sign_in(&daemon, "alice", OTHER)?;
-    daemon
-        .deployer()
-        .run(&["account", "remove", "alice"])?
-        .expect_success()?;
+    daemon.deployer().run(&["account", "remove", "alice"])?.expect_success()?;
     ensure!(request_sign_in(&daemon, "alice", OTHER, &[])?.0 == 401);
-    ensure!(
-        daemon.get("/api/v1/services")?.0 == 401,
-        "the door does not open again"
-    );
+    ensure!(daemon.get("/api/v1/services")?.0 == 401, "the door does not open again");
     for verb in ["remove", "disable", "enable"] {
         let typed = daemon.deployer().run(&["account", verb, "alice"])?;
         typed.expect_failure(&["there is no account", "account list"])?;
@@ -333,12 +231,7 @@ pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
 
 pub fn who_guesses_passwords_is_slowed() -> Verdict {
     let daemon = world().setup("people-guessed").start()?;
-    run_account(
-        &daemon,
-        &["create", "alice", "--role", "operator"],
-        PASSWORD,
-    )?
-    .expect_success()?;
+    run_account(&daemon, &["create", "alice", "--role", "operator"], PASSWORD)?.expect_success()?;
     let alice = SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
     // Each wrong attempt doubles the waiting time: however slow this machine is, one comes too early.
     wait_until("who guesses to be slowed", || {
@@ -351,10 +244,7 @@ pub fn who_guesses_passwords_is_slowed() -> Verdict {
     })?;
     let metrics = alice.request("GET", "/metrics")?;
     ensure!(
-        metrics.0 == 200
-            && metrics
-                .1
-                .contains("cloudroid_refused_passwords_total{why=\"wrong\"}"),
+        metrics.0 == 200 && metrics.1.contains("cloudroid_refused_passwords_total{why=\"wrong\"}"),
         "who is signed in stays so: {metrics:?}"
     );
     Ok(())
@@ -363,15 +253,8 @@ pub fn who_guesses_passwords_is_slowed() -> Verdict {
 pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
     let daemon = world().setup("people-sites").start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
-    run_account(
-        &daemon,
-        &["create", "alice", "--role", "operator"],
-        PASSWORD,
-    )?
-    .expect_success()?;
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
+    run_account(&daemon, &["create", "alice", "--role", "operator"], PASSWORD)?.expect_success()?;
     run_account(&daemon, &["create", "bob", "--role", "operator"], PASSWORD)?.expect_success()?;
     let alice = SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
     let bob = SignedInBrowser::sign_in(&daemon, "bob", PASSWORD)?;
@@ -400,17 +283,12 @@ pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
     // A token is sufficient by itself, whatever the browser adds.
     let secret = deployer.run_json(&["token", "create", "tool", "--role", "operator"])?;
     let bearer = format!("Bearer {}", secret["secret"].as_str().context("a secret")?);
-    let (status, body) =
-        alice.request_with_headers("DELETE", stop, &[("Authorization", &bearer)])?;
+    let (status, body) = alice.request_with_headers("DELETE", stop, &[("Authorization", &bearer)])?;
     ensure!(status == 404, "{status} {body}");
     // The WebSocket of another page is refused in the handshake.
     let url = daemon.url("adder_py?robot=r1");
     let shown = ("Cookie", &*alice.cookie);
-    for headers in [
-        &[shown][..],
-        &[shown, ("Origin", "https://evil.example")],
-        &[shown, ("Origin", "null")],
-    ] {
+    for headers in [&[shown][..], &[shown, ("Origin", "https://evil.example")], &[shown, ("Origin", "null")]] {
         let Err(refusal) = Robot::try_connect_with_headers(&url, headers) else {
             bail!("a page of another site was let in: {headers:?}");
         };
@@ -419,8 +297,7 @@ pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
     let connects = |browser: &SignedInBrowser<'_>, robot: &str| {
         let headers = [("Cookie", &*browser.cookie), ("Origin", &*browser.origin)];
         let url = daemon.url(&format!("adder_py?robot={robot}"));
-        Robot::try_connect_with_headers(&url, &headers)
-            .map_err(|refusal| anyhow::anyhow!("{refusal}"))
+        Robot::try_connect_with_headers(&url, &headers).map_err(|refusal| anyhow::anyhow!("{refusal}"))
     };
     let mut page = connects(&alice, "r1")?;
     let mut beside = connects(&bob, "r2")?;
@@ -428,34 +305,19 @@ pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
         ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     }
     // When the role changes, connections opened with the old one end at once.
-    deployer
-        .run(&["account", "role", "alice", "viewer", "--service", "*"])?
-        .expect_success()?;
+    deployer.run(&["account", "role", "alice", "viewer", "--service", "*"])?.expect_success()?;
     let close = page.wait_for_close()?;
-    ensure!(
-        u16::from(close.code) == 1008 && close.reason.contains("session"),
-        "{close:?}"
-    );
+    ensure!(u16::from(close.code) == 1008 && close.reason.contains("session"), "{close:?}");
     ensure!(!alice.is_signed_in()?, "in another role");
     ensure!(beside.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
-    deployer
-        .run(&["account", "logout", "bob"])?
-        .expect_success()?;
+    deployer.run(&["account", "logout", "bob"])?.expect_success()?;
     ensure!(u16::from(beside.wait_for_close()?.code) == 1008 && !bob.is_signed_in()?);
     Ok(())
 }
 
 pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
-    let daemon = world()
-        .setup("people-tls")
-        .config("[tls]\nserve = \"tls\"\n")
-        .start()?;
-    run_account(
-        &daemon,
-        &["create", "alice", "--role", "operator"],
-        PASSWORD,
-    )?
-    .expect_success()?;
+    let daemon = world().setup("people-tls").config("[tls]\nserve = \"tls\"\n").start()?;
+    run_account(&daemon, &["create", "alice", "--role", "operator"], PASSWORD)?.expect_success()?;
     let port = daemon.address.rsplit(':').next().context("a port")?;
     let site = format!("https://localhost:{port}");
     let own = daemon.home.join("tls/own.pem");
@@ -472,10 +334,7 @@ pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
     let origin = format!("Origin: {site}");
     let said = asks(&["-H", &origin, "--data", &body], PATH)?.stdout;
     let (cookie, rest) = set_cookie(&said.replace('\r', ""))?;
-    ensure!(
-        cookie.starts_with("__Host-cloudroid=") && rest.contains("Secure"),
-        "{cookie} {rest}"
-    );
+    ensure!(cookie.starts_with("__Host-cloudroid=") && rest.contains("Secure"), "{cookie} {rest}");
     let known = asks(&["--cookie", &cookie], "/api/v1/whoami")?.stdout;
     ensure!(known.contains("alice"), "{known}");
     // Without the `__Host-` prefix anyone in the network could have set it.

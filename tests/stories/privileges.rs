@@ -64,10 +64,7 @@ fn expect_limited((name, fields): &Thread) -> Verdict {
     for set in ["CapPrm", "CapEff", "CapBnd"] {
         let held = u64::from_str_radix(fields.get(set).context("there")?, 16)?;
         for (number, capability) in NEVER {
-            ensure!(
-                held & 1 << number == 0,
-                "{name} holds {capability} in {set}"
-            );
+            ensure!(held & 1 << number == 0, "{name} holds {capability} in {set}");
         }
     }
     Ok(())
@@ -95,11 +92,7 @@ fn expect_least_privilege(pid: i32, user: &str) -> Verdict {
             }
         }
     }
-    ensure!(
-        portals >= 2,
-        "{:?}",
-        threads.iter().map(|thread| &thread.0).collect::<Vec<_>>()
-    );
+    ensure!(portals >= 2, "{:?}", threads.iter().map(|thread| &thread.0).collect::<Vec<_>>());
     Ok(())
 }
 
@@ -130,9 +123,6 @@ pub fn the_portals_user_is_who_the_configuration_says() -> Verdict {
     expect_least_privilege(daemon.pid(), "4711")?;
     daemon.stop()?;
     let refused = setup.config("portal_user = \"root\"\n").expect_refusal()?;
-    ensure!(
-        refused.contains("portal_user") && refused.contains("root"),
-        "{refused}"
-    );
+    ensure!(refused.contains("portal_user") && refused.contains("root"), "{refused}");
     Ok(())
 }

@@ -12,12 +12,7 @@ use support::world::{ADDER, GREETER, world};
 use support::{Verdict, binaries};
 
 /// Requests a greeting from the greeter of a service.
-fn request_greeting(
-    daemon: &Daemon,
-    path: &str,
-    input: &str,
-    output: &str,
-) -> anyhow::Result<Value> {
+fn request_greeting(daemon: &Daemon, path: &str, input: &str, output: &str) -> anyhow::Result<Value> {
     let mut robot = daemon.robot(path)?;
     robot.subscribe(output)?;
     robot.send(json!({"op": "advertise", "topic": input, "type": "std_msgs/String"}))?;
@@ -30,13 +25,8 @@ pub fn a_cpp_package_is_compiled_and_greets() -> Verdict {
     let daemon = world().daemon_with(GREETER)?;
     let heard = request_greeting(&daemon, "greeter_cpp", "/greeter/name", "/greeter/greeting")?;
     ensure!(heard["text"] == "hi Ada" && heard["count"] == 1, "{heard}");
-    let answer = daemon
-        .robot("greeter_cpp")?
-        .call("/greeter/count", json!({}))?;
-    ensure!(
-        answer["result"] == true && answer["values"]["style"] == "plain",
-        "yaml-cpp was found: {answer}"
-    );
+    let answer = daemon.robot("greeter_cpp")?.call("/greeter/count", json!({}))?;
+    ensure!(answer["result"] == true && answer["values"]["style"] == "plain", "yaml-cpp was found: {answer}");
     Ok(())
 }
 
@@ -54,10 +44,7 @@ pub fn which_output_answers_which_input_is_found_or_said() -> Verdict {
     ensure!(pushed.output().contains(words), "{}", pushed.output());
     let about = daemon.get_json("/api/v1/services/asked")?;
     let said = &about["interface"]["requests"];
-    ensure!(
-        said[0]["input"] == "/greeter/name" && said[0]["reason"] == "stated",
-        "{said}"
-    );
+    ensure!(said[0]["input"] == "/greeter/name" && said[0]["reason"] == "stated", "{said}");
     Ok(())
 }
 
@@ -66,10 +53,7 @@ pub fn a_python_package_adds() -> Verdict {
     let mut robot = daemon.robot("adder_py")?;
     robot.subscribe("/sums")?;
     let answer = robot.call("/add_two", json!({"a": 20, "b": 22}))?;
-    ensure!(
-        answer["result"] == true && answer["values"]["sum"] == 42,
-        "{answer}"
-    );
+    ensure!(answer["result"] == true && answer["values"]["sum"] == 42, "{answer}");
     Ok(())
 }
 
@@ -77,39 +61,15 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Verdict {
     let daemon = world().ensure_shared()?;
     let deployer = daemon.deployer();
     deployer
-        .push(
-            "greeter_cpp",
-            &[
-                "--name",
-                "launched",
-                "--launch",
-                "two.launch",
-                "--arg",
-                "word:=bonjour",
-            ],
-        )?
+        .push("greeter_cpp", &["--name", "launched", "--launch", "two.launch", "--arg", "word:=bonjour"])?
         .expect_success()?;
-    let heard = request_greeting(
-        &daemon,
-        "launched",
-        "/left/first/name",
-        "/left/first/greeting",
-    )?;
-    ensure!(
-        heard["text"] == "bonjour Ada",
-        "the argument and the private parameter arrived: {heard}"
-    );
+    let heard = request_greeting(&daemon, "launched", "/left/first/name", "/left/first/greeting")?;
+    ensure!(heard["text"] == "bonjour Ada", "the argument and the private parameter arrived: {heard}");
     let heard = request_greeting(&daemon, "launched", "/names", "/second/greeting")?;
-    ensure!(
-        heard["text"] == "hello Ada",
-        "the remapping arrived: {heard}"
-    );
+    ensure!(heard["text"] == "hello Ada", "the remapping arrived: {heard}");
     // Errors of roslaunch are reported in its own words.
     deployer
-        .push(
-            "greeter_cpp",
-            &["--name", "unlaunched", "--launch", "needy.launch"],
-        )?
+        .push("greeter_cpp", &["--name", "unlaunched", "--launch", "needy.launch"])?
         .expect_failure(&["requires the 'who' arg to be set"])?;
     Ok(())
 }
@@ -120,11 +80,7 @@ pub fn a_workspace_is_built_in_order() -> Verdict {
     let source = place.path().join("lab_ws/src");
     std::fs::create_dir_all(&source)?;
     for package in ["greeter_cpp", "adder_py"] {
-        run(Command::new("cp")
-            .arg("-r")
-            .arg(binaries::package(package))
-            .arg(&source))?
-        .expect_success()?;
+        run(Command::new("cp").arg("-r").arg(binaries::package(package)).arg(&source))?.expect_success()?;
     }
     let workspace = place.path().join("lab_ws");
     daemon
@@ -173,20 +129,12 @@ fn write_workspace(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
                 target_link_libraries(app ${catkin_LIBRARIES})\n\
                 install(TARGETS app RUNTIME DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
     // Unique, so that no cache contains it and the story's claims about compiling hold in every run.
-    let unique = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)?
-        .as_nanos();
+    let unique = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.as_nanos();
     for (path, text) in [
         ("aa_lib/package.xml", manifest("aa_lib", "")),
         ("aa_lib/CMakeLists.txt", list("aa_lib", "", library)),
-        (
-            "aa_lib/include/aa_lib/aa.h",
-            "#pragma once\n#include <string>\nstd::string aa();\n".into(),
-        ),
-        (
-            "aa_lib/src/aa.cpp",
-            format!("// {unique}\n#include <aa_lib/aa.h>\nstd::string aa() {{ return \"aa\"; }}\n"),
-        ),
+        ("aa_lib/include/aa_lib/aa.h", "#pragma once\n#include <string>\nstd::string aa();\n".into()),
+        ("aa_lib/src/aa.cpp", format!("// {unique}\n#include <aa_lib/aa.h>\nstd::string aa() {{ return \"aa\"; }}\n")),
         ("bb_app/package.xml", manifest("bb_app", names)),
         ("bb_app/CMakeLists.txt", list("bb_app", "aa_lib", node)),
         (
@@ -230,9 +178,7 @@ fn push_workspace(
 }
 
 fn compiled_packages(steps: &[String]) -> Vec<&str> {
-    let titles = steps
-        .iter()
-        .filter_map(|step| step.strip_prefix("compiling "));
+    let titles = steps.iter().filter_map(|step| step.strip_prefix("compiling "));
     titles.filter_map(|rest| rest.split(' ').next()).collect()
 }
 
@@ -242,16 +188,10 @@ pub fn what_was_compiled_before_a_failure_stays_compiled() -> Verdict {
     let workspace = write_workspace(place.path(), "<depend>aa_lib</depend>")?;
     let source = workspace.join("src/bb_app/src/app.cpp");
     let good = std::fs::read_to_string(&source)?;
-    std::fs::write(
-        &source,
-        good.replace("ros::spin()", "ros::no_such_function()"),
-    )?;
+    std::fs::write(&source, good.replace("ros::spin()", "ros::no_such_function()"))?;
     let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
     outcome.expect_failure(&["no_such_function"])?;
-    ensure!(
-        compiled_packages(&steps) == ["aa_lib", "bb_app"],
-        "{steps:?}"
-    );
+    ensure!(compiled_packages(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
     std::fs::write(&source, &good)?;
     let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
     outcome.expect_success()?;
@@ -265,10 +205,7 @@ pub fn what_was_compiled_before_a_failure_stays_compiled() -> Verdict {
     std::fs::write(&library, text.replace("\"aa\"", "\"bb\""))?;
     let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
     outcome.expect_success()?;
-    ensure!(
-        compiled_packages(&steps) == ["aa_lib", "bb_app"],
-        "{steps:?}"
-    );
+    ensure!(compiled_packages(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
     let mut robot = daemon.robot("of_two?robot=later")?;
     robot.subscribe("/said")?;
     ensure!(robot.next_message_on("/said")?["data"] == "bb");
@@ -281,10 +218,7 @@ pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Verdict {
     let workspace = write_workspace(place.path(), "<depend>aa_lib</depend>")?;
     let list = workspace.join("src/bb_app/CMakeLists.txt");
     let good = std::fs::read_to_string(&list)?;
-    std::fs::write(
-        &list,
-        good.replace("std_msgs aa_lib", "std_msgs aa_lib no_such_package"),
-    )?;
+    std::fs::write(&list, good.replace("std_msgs aa_lib", "std_msgs aa_lib no_such_package"))?;
     let (outcome, steps) = push_workspace(&daemon, &workspace, "unconfigured")?;
     outcome.expect_failure(&["the build of bb_app failed", "no_such_package"])?;
     ensure!(compiled_packages(&steps).is_empty(), "{steps:?}");
@@ -297,13 +231,7 @@ pub fn a_package_may_use_others_that_it_does_not_name() -> Verdict {
     let workspace = write_workspace(place.path(), "")?;
     let (outcome, _) = push_workspace(&daemon, &workspace, "unnamed")?;
     let outcome = outcome.expect_success()?;
-    ensure!(
-        outcome
-            .stdout
-            .contains("bb_app uses packages of the workspace"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(outcome.stdout.contains("bb_app uses packages of the workspace"), "{}", outcome.output());
     let mut robot = daemon.robot("unnamed")?;
     robot.subscribe("/said")?;
     ensure!(robot.next_message_on("/said")?["data"] == "aa");
@@ -317,9 +245,7 @@ pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
     let daemon = world().ensure_shared()?;
     let mut images = Vec::new();
     for package in ["image_proc", "stereo_image_proc"] {
-        let outcome = daemon.deployer().run(&[
-            "--format", "json", "push", "--apt", package, "--node", package,
-        ])?;
+        let outcome = daemon.deployer().run(&["--format", "json", "push", "--apt", package, "--node", package])?;
         let outcome = outcome.expect_success()?;
         let events = outcome.stdout.lines();
         let mut events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
@@ -332,18 +258,12 @@ pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
     let [first, second] = &images[..] else {
         bail!("two images");
     };
-    let bytes = |layers: &[&Value]| -> u64 {
-        layers
-            .iter()
-            .filter_map(|layer| layer["size"].as_u64())
-            .sum()
-    };
+    let bytes = |layers: &[&Value]| -> u64 { layers.iter().filter_map(|layer| layer["size"].as_u64()).sum() };
     let above_base = second.iter().filter(|layer| layer["name"] != "base");
     let above_base: Vec<&Value> = above_base.collect();
     let shared = above_base.iter().copied();
-    let shared: Vec<&Value> = shared
-        .filter(|layer| first.iter().any(|other| other["digest"] == layer["digest"]))
-        .collect();
+    let shared: Vec<&Value> =
+        shared.filter(|layer| first.iter().any(|other| other["digest"] == layer["digest"])).collect();
     ensure!(
         bytes(&shared) * 10 > bytes(&above_base) * 9,
         "nine tenths of what stands on the base are the same layers: {images:#?}"
@@ -355,20 +275,8 @@ pub fn a_prebuilt_space_is_served() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let place = tempfile::tempdir()?;
     let space = extract_install_space(&daemon, "adder_py", place.path())?;
-    daemon
-        .deployer()
-        .run(&[
-            "push",
-            path_str(&space),
-            "--name",
-            "prebuilt",
-            "--node",
-            "adder.py",
-        ])?
-        .expect_success()?;
-    let answer = daemon
-        .robot("prebuilt")?
-        .call("/add_two", json!({"a": 2, "b": 3}))?;
+    daemon.deployer().run(&["push", path_str(&space), "--name", "prebuilt", "--node", "adder.py"])?.expect_success()?;
+    let answer = daemon.robot("prebuilt")?.call("/add_two", json!({"a": 2, "b": 3}))?;
     ensure!(answer["values"]["sum"] == 5, "{answer}");
     Ok(())
 }
@@ -381,10 +289,7 @@ pub fn extract_install_space(
 ) -> anyhow::Result<std::path::PathBuf> {
     let bundle = to.join("bundle");
     let image = format!("{}:{service}", daemon.home.join("images").display());
-    run(Command::new("umoci")
-        .args(["unpack", "--image", &image])
-        .arg(&bundle))?
-    .expect_success()?;
+    run(Command::new("umoci").args(["unpack", "--image", &image]).arg(&bundle))?.expect_success()?;
     let space = bundle.join("rootfs/opt/cloudroid/install");
     ensure!(space.is_dir(), "an install space in the image");
     Ok(space)
@@ -392,10 +297,7 @@ pub fn extract_install_space(
 
 pub fn an_unchanged_push_builds_no_layer() -> Verdict {
     let daemon = world().daemon_with(GREETER)?;
-    let outcome = daemon
-        .deployer()
-        .push("greeter_cpp", &["--name", "again", "--node", "greeter"])?
-        .expect_success()?;
+    let outcome = daemon.deployer().push("greeter_cpp", &["--name", "again", "--node", "greeter"])?.expect_success()?;
     ensure!(outcome.stdout.contains("again"), "{}", outcome.output());
     let first = daemon.get_json("/api/v1/services/again")?;
     let answer = daemon.deployer().run(&[
@@ -416,46 +318,23 @@ pub fn an_unchanged_push_builds_no_layer() -> Verdict {
         .find(|event| event["type"] == "done")
         .with_context(|| format!("a done event in {}", answer.stdout))?;
     let layers = done["layers"].as_array().context("layers")?;
-    ensure!(
-        !layers.is_empty() && layers.iter().all(|layer| layer["cached"] == true),
-        "{layers:#?}"
-    );
+    ensure!(!layers.is_empty() && layers.iter().all(|layer| layer["cached"] == true), "{layers:#?}");
     let second = daemon.get_json("/api/v1/services/again")?;
-    ensure!(
-        first["image"] == second["image"],
-        "the same inputs give the same digest"
-    );
+    ensure!(first["image"] == second["image"], "the same inputs give the same digest");
     Ok(())
 }
 
 pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Verdict {
     let daemon = world().daemon_with(GREETER)?;
     let place = tempfile::tempdir()?;
-    run(Command::new("cp")
-        .arg("-r")
-        .arg(binaries::package("greeter_cpp"))
-        .arg(place.path()))?
-    .expect_success()?;
+    run(Command::new("cp").arg("-r").arg(binaries::package("greeter_cpp")).arg(place.path()))?.expect_success()?;
     let package = place.path().join("greeter_cpp");
-    let push = [
-        "push",
-        path_str(&package),
-        "--name",
-        "steady",
-        "--node",
-        "greeter",
-    ];
+    let push = ["push", path_str(&package), "--name", "steady", "--node", "greeter"];
     daemon.deployer().run(&push)?.expect_success()?;
     let source = package.join("src/greeter.cpp");
     let text = std::fs::read_to_string(&source)?;
-    std::fs::write(
-        &source,
-        text.replace("ros::spin()", "ros::no_such_function()"),
-    )?;
-    daemon
-        .deployer()
-        .run(&push)?
-        .expect_failure(&["no_such_function", "greeter.cpp:4"])?;
+    std::fs::write(&source, text.replace("ros::spin()", "ros::no_such_function()"))?;
+    daemon.deployer().run(&push)?.expect_failure(&["no_such_function", "greeter.cpp:4"])?;
     let answer = daemon.robot("steady")?.call("/greeter/count", json!({}))?;
     ensure!(answer["result"] == true, "{answer}");
     ensure!(daemon.get_json("/api/v1/services/steady")?["revision"] == 1);
@@ -467,64 +346,29 @@ pub fn what_package_xml_forgot_is_named_and_added() -> Verdict {
     let deployer = daemon.deployer();
     let node = ["--node", "recorder", "--param", "file=/tmp/heard.bag"];
     // CMake's search for roslint, which the distribution does not package, is satisfied; this one is not.
-    deployer.push("undeclared_cpp", &node)?.expect_failure(&[
-        "the CMake package rosbag_storage is missing",
-        "--with rosbag_storage",
-    ])?;
+    deployer
+        .push("undeclared_cpp", &node)?
+        .expect_failure(&["the CMake package rosbag_storage is missing", "--with rosbag_storage"])?;
     let missed = ["--param", "/recorder/file=/tmp/nobody.bag"];
     let added = ["--with", "rosbag_storage"];
-    let pushed = deployer
-        .push("undeclared_cpp", &[&node[..], &missed, &added].concat())?
-        .expect_success()?;
+    let pushed = deployer.push("undeclared_cpp", &[&node[..], &missed, &added].concat())?.expect_success()?;
     // An anonymous node has its program's name without the unique suffix, also for its parameters.
     let service = deployer.run_json(&["services", "undeclared_cpp"])?;
+    ensure!(service["nodes"][0]["name"] == "/bag_recorder", "{service:#}");
+    let parameters = service["interface"]["parameters"].as_array().context("a list")?;
     ensure!(
-        service["nodes"][0]["name"] == "/bag_recorder",
+        parameters.iter().any(|one| one["name"] == "/bag_recorder/file" && one["value"] == "/tmp/heard.bag"),
         "{service:#}"
     );
-    let parameters = service["interface"]["parameters"]
-        .as_array()
-        .context("a list")?;
-    ensure!(
-        parameters
-            .iter()
-            .any(|one| one["name"] == "/bag_recorder/file" && one["value"] == "/tmp/heard.bag"),
-        "{service:#}"
-    );
-    ensure!(
-        pushed
-            .output()
-            .contains("parameter /recorder/file matches no node"),
-        "{}",
-        pushed.output()
-    );
+    ensure!(pushed.output().contains("parameter /recorder/file matches no node"), "{}", pushed.output());
     Ok(())
 }
 
 pub fn a_revision_is_rolled_back() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let deployer = daemon.deployer();
-    deployer
-        .push(
-            "adder_py",
-            &[
-                "--name", "moody", "--node", "adder.py", "--param", "offset=1",
-            ],
-        )?
-        .expect_success()?;
-    deployer
-        .push(
-            "adder_py",
-            &[
-                "--name",
-                "moody",
-                "--node",
-                "adder.py",
-                "--param",
-                "offset=100",
-            ],
-        )?
-        .expect_success()?;
+    deployer.push("adder_py", &["--name", "moody", "--node", "adder.py", "--param", "offset=1"])?.expect_success()?;
+    deployer.push("adder_py", &["--name", "moody", "--node", "adder.py", "--param", "offset=100"])?.expect_success()?;
     let sum = |robot: &str| -> anyhow::Result<Value> {
         let mut robot = daemon.robot(&format!("moody?robot={robot}"))?;
         Ok(robot.call("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"].clone())
@@ -533,10 +377,7 @@ pub fn a_revision_is_rolled_back() -> Verdict {
     deployer.run(&["rollback", "moody"])?.expect_success()?;
     ensure!(sum("old")? == 3);
     deployer.run(&["rm", "moody"])?.expect_success()?;
-    ensure!(
-        daemon.servants_of("moody")?.is_empty(),
-        "its servants went with it"
-    );
+    ensure!(daemon.servants_of("moody")?.is_empty(), "its servants went with it");
     ensure!(daemon.get("/api/v1/services/moody")?.0 == 404);
     Ok(())
 }
@@ -549,18 +390,8 @@ pub fn five_packaged_nodes_answer() -> Verdict {
         .arg(binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home))?;
     let outcome = outcome.expect_success()?;
-    for node in [
-        "people_detect",
-        "face_detection",
-        "fback_flow",
-        "image_proc",
-        "stereo_image_proc",
-    ] {
-        ensure!(
-            outcome.stdout.contains(&format!("{node}: answered")),
-            "{}",
-            outcome.output()
-        );
+    for node in ["people_detect", "face_detection", "fback_flow", "image_proc", "stereo_image_proc"] {
+        ensure!(outcome.stdout.contains(&format!("{node}: answered")), "{}", outcome.output());
     }
     Ok(())
 }

@@ -18,16 +18,10 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Starts a daemon with capacity for one servant of the greeter.
 fn start_full(name: &str, config: &str) -> anyhow::Result<Daemon> {
     let servant = "[servant]\nwarm_pool = 0\ngrace = \"0s\"\n";
-    let daemon = world()
-        .setup(name)
-        .config(&format!("[capacity]\ncpus = 1.0\n{config}\n{servant}"))
-        .start()?;
+    let daemon = world().setup(name).config(&format!("[capacity]\ncpus = 1.0\n{config}\n{servant}")).start()?;
     let package = GREETER.package.context("a package")?;
     let arguments = [GREETER.arguments, &["--cpus", "1"]].concat();
-    daemon
-        .deployer()
-        .push(package, &arguments)?
-        .expect_success()?;
+    daemon.deployer().push(package, &arguments)?.expect_success()?;
     Ok(daemon)
 }
 
@@ -102,15 +96,9 @@ pub fn robots_of_a_higher_class_go_first() -> Verdict {
     let mut urgent = daemon.robot("greeter_cpp?robot=urgent&class=urgent")?;
     urgent.wait_for_status("number 1 of 2")?;
     second.wait_for_status("number 2 of 2")?;
-    let fit = daemon
-        .deployer()
-        .run(&["--format", "json", "fit", "greeter_cpp"])?
-        .expect_success()?;
+    let fit = daemon.deployer().run(&["--format", "json", "fit", "greeter_cpp"])?.expect_success()?;
     let fit: Value = serde_json::from_str(&fit.stdout)?;
-    ensure!(
-        fit["now"] == false && fit["more"] == 0 && fit["waiting"] == 2,
-        "{fit}"
-    );
+    ensure!(fit["now"] == false && fit["more"] == 0 && fit["waiting"] == 2, "{fit}");
     first.leave()?;
     urgent.call("/rosapi/get_time", json!({}))?;
     second.wait_for_status("number 1 of 1")?;
@@ -126,15 +114,10 @@ pub fn a_probe_gives_way_to_a_robot() -> Verdict {
     // Capacity for one servant with the default limits, and enough time to examine a node that never registers.
     let daemon = world()
         .setup("probe-gives-way")
-        .config(
-            "[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n[push]\nprobe = \"30m\"\n",
-        )
+        .config("[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n[push]\nprobe = \"30m\"\n")
         .start()?;
     let package = GREETER.package.context("a package")?;
-    daemon
-        .deployer()
-        .push(package, GREETER.arguments)?
-        .expect_success()?;
+    daemon.deployer().push(package, GREETER.arguments)?.expect_success()?;
     let place = world().directory("sleeper")?;
     let sleeper = place.path().join("sleeper_py");
     std::fs::create_dir_all(sleeper.join("scripts"))?;
@@ -152,9 +135,7 @@ pub fn a_probe_gives_way_to_a_robot() -> Verdict {
     )?;
     let deployer = daemon.deployer();
     let path = sleeper.to_string_lossy().into_owned();
-    let push = std::thread::spawn(move || {
-        deployer.run(&["push", &path, "--node", "sleeper.py", "--name", "sleeper"])
-    });
+    let push = std::thread::spawn(move || deployer.run(&["push", &path, "--node", "sleeper.py", "--name", "sleeper"]));
     // However long the build takes.
     let until = |is: fn(&Value) -> bool| -> Verdict {
         while !is(&daemon.get_json("/api/v1/status")?["capacity"]) {

@@ -9,15 +9,10 @@ use support::world::{BURGLAR, world};
 
 /// Starts a daemon with the burglar, whose servants may write little.
 fn start_daemon(name: &str, quotas: &str) -> anyhow::Result<Daemon> {
-    let setup = world()
-        .setup(name)
-        .config(&format!("[servant]\n{quotas}\n"));
+    let setup = world().setup(name).config(&format!("[servant]\n{quotas}\n"));
     let daemon = setup.start()?;
     let package = BURGLAR.package.context("a package")?;
-    daemon
-        .deployer()
-        .push(package, BURGLAR.arguments)?
-        .expect_success()?;
+    daemon.deployer().push(package, BURGLAR.arguments)?.expect_success()?;
     Ok(daemon)
 }
 
@@ -41,10 +36,7 @@ pub fn what_a_servant_may_not_write_is_refused_to_it_alone() -> Verdict {
     let mut filler = daemon.robot("burglar_cpp?robot=filler")?;
     for place in ["/tmp", "/var/tmp", "/root", "/dev/shm"] {
         let (bytes, why) = written_amount(&mut filler, "fill", place)?;
-        ensure!(
-            (4 << 20..=8 << 20).contains(&bytes),
-            "{bytes} bytes in {place}"
-        );
+        ensure!((4 << 20..=8 << 20).contains(&bytes), "{bytes} bytes in {place}");
         ensure!(why == "No space left on device", "{place}: {why}");
     }
     // The space of others is not affected.
@@ -68,20 +60,13 @@ pub fn a_node_that_shouts_costs_no_disk() -> Verdict {
     let text = support::wait_until("word of what was left out", || {
         try_attempt(&mut robot, "shout", "1")?;
         let text = std::fs::read_to_string(directory.join("log.jsonl"))?;
-        Ok(if text.contains("log_rate") {
-            Ok(text)
-        } else {
-            Err(format!("{} bytes without it", text.len()))
-        })
+        Ok(if text.contains("log_rate") { Ok(text) } else { Err(format!("{} bytes without it", text.len())) })
     })?;
     // Ten seconds' worth plus the current rate: far less than was printed, which would have rotated the log.
     ensure!(text.len() < 16 << 20, "{} bytes", text.len());
     let rotated = directory.join("log.jsonl.1").exists();
     ensure!(!rotated, "so much was written that the log was rotated");
     let told = daemon.deployer().run(&["logs", id])?.expect_success()?;
-    ensure!(
-        told.output().contains("are not in this log"),
-        "the deployer is not told"
-    );
+    ensure!(told.output().contains("are not in this log"), "the deployer is not told");
     Ok(())
 }

@@ -28,14 +28,7 @@ fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
             .deployer()
             .push(
                 "slow_py",
-                &[
-                    "--node",
-                    "slow.py",
-                    "--param",
-                    &format!("/port={port}"),
-                    "--egress",
-                    &format!("127.0.0.1:{port}"),
-                ],
+                &["--node", "slow.py", "--param", &format!("/port={port}"), "--egress", &format!("127.0.0.1:{port}")],
             )?
             .expect_success()?;
         serving.join().expect("a thread")?;
@@ -67,9 +60,7 @@ pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Verdict {
     ensure!(closed == Message::Close(None), "{closed:?}");
     // Since the robot cannot return to its servant, the start is aborted.
     daemon.wait_for_event("a servant's end before it was ready", |event| {
-        event["message"]
-            .as_str()
-            .is_some_and(|text| text.contains("its robot left before it was ready"))
+        event["message"].as_str().is_some_and(|text| text.contains("its robot left before it was ready"))
     })?;
 
     // A robot that stays may send messages meanwhile, and they are processed in order.
@@ -98,11 +89,7 @@ pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdi
     let began = Instant::now();
     while began.elapsed() < LONG {
         let servant = daemon.servant_of("slow_py", "patient")?;
-        ensure!(
-            servant["phase"] == "starting",
-            "taken for ready after {:?}: {servant:#}",
-            began.elapsed()
-        );
+        ensure!(servant["phase"] == "starting", "taken for ready after {:?}: {servant:#}", began.elapsed());
         std::thread::sleep(Duration::from_millis(100));
     }
     node.write_all(b"2")?;
@@ -115,13 +102,7 @@ pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdi
     ensure!(daemon.servant_of("slow_py", "patient")?["phase"] == "ready");
     let events = daemon.deployer().run_json(&["events"])?;
     let incomplete = events.as_array().context("events")?.iter();
-    ensure!(
-        incomplete
-            .filter(|event| event["kind"] == "interface-incomplete")
-            .count()
-            == 0,
-        "{events:#}"
-    );
+    ensure!(incomplete.filter(|event| event["kind"] == "interface-incomplete").count() == 0, "{events:#}");
     drop(robot);
     daemon.stop()?;
     Ok(())

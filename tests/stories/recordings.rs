@@ -36,17 +36,10 @@ struct TalkingRobot(Child);
 impl TalkingRobot {
     /// Starts it; returns once its messages are answered.
     fn start(scene: &InsideScene) -> anyhow::Result<TalkingRobot> {
-        let url = scene
-            .daemon
-            .url(&format!("sights_py?token={}", scene.token));
+        let url = scene.daemon.url(&format!("sights_py?token={}", scene.token));
         let mut talks = Command::new(binaries::python());
-        talks
-            .arg(binaries::checkout().join("tests/robots/talks_with_roslibpy.py"))
-            .arg(url);
-        let mut child = tell_patience(&mut talks)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()?;
+        talks.arg(binaries::checkout().join("tests/robots/talks_with_roslibpy.py")).arg(url);
+        let mut child = tell_patience(&mut talks).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
         let mut line = String::new();
         let mut out = BufReader::with_capacity(1, child.stdout.as_mut().context("piped")?);
         out.read_line(&mut line)?;
@@ -115,10 +108,7 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     let said = topic_texts(&read, "/sights/said")?;
     let first = heard.iter().position(|word| Some(word) == said.first());
     let during = &heard[first.context("recorded and not heard")?..];
-    ensure!(
-        said.len() > 10 && during.starts_with(&said),
-        "{said:?} {during:?}"
-    );
+    ensure!(said.len() > 10 && during.starts_with(&said), "{said:?} {during:?}");
 
     // When the recording is replayed, the node gives the same answers.
     scene.rover.subscribe("/sights/said")?;
@@ -129,12 +119,8 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     scene.rover.send(say("advertise"))?;
     support::wait_until("what it says itself comes back", || {
         scene.rover.send(say("publish"))?;
-        let unheard = scene
-            .rover
-            .has_not_heard(|said| said["topic"] == "/sights/said")?;
-        Ok((!unheard)
-            .then_some(())
-            .ok_or_else(|| "not heard".to_owned()))
+        let unheard = scene.rover.has_not_heard(|said| said["topic"] == "/sights/said")?;
+        Ok((!unheard).then_some(()).ok_or_else(|| "not heard".to_owned()))
     })?;
     let replay = |more: &[&str]| {
         let typed = ["replay", path_str(&file), "--to", &scene.servant];
@@ -152,14 +138,7 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     // A viewer may record, but not publish.
     let eve = scene.viewer_token("eve", "sights*")?;
     let server = format!("http://{}", scene.daemon.address);
-    let hers = [
-        "--server",
-        &server,
-        "--token",
-        &eve,
-        "--topic",
-        "/sights/say",
-    ];
+    let hers = ["--server", &server, "--token", &eve, "--topic", "/sights/say"];
     replay(&hers)?.expect_failure(&["publish:/sights/say is not granted"])?;
     scene.daemon.stop()?;
     Ok(())
@@ -193,10 +172,7 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         Ok(child)
     };
     let interrupted = begins("interrupted.mcap")?;
-    kill(
-        Pid::from_raw(i32::try_from(interrupted.id())?),
-        Signal::SIGINT,
-    )?;
+    kill(Pid::from_raw(i32::try_from(interrupted.id())?), Signal::SIGINT)?;
     let mut killed = begins("killed.mcap")?;
     killed.kill()?;
     killed.wait()?;
@@ -206,98 +182,33 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         let ended = child.wait_with_output()?;
         let said = String::from_utf8_lossy(&ended.stdout).into_owned();
         ensure!(ended.status.success(), "{said}");
-        ensure!(
-            said.contains("/sights/scan  sensor_msgs/LaserScan"),
-            "{said}"
-        );
+        ensure!(said.contains("/sights/scan  sensor_msgs/LaserScan"), "{said}");
     }
     for name in ["interrupted.mcap", "served.mcap"] {
         let read = read_recording(&at(name))?;
-        ensure!(
-            read["topics"] == json!({"/sights/scan": "sensor_msgs/LaserScan"}),
-            "{read}"
-        );
+        ensure!(read["topics"] == json!({"/sights/scan": "sensor_msgs/LaserScan"}), "{read}");
     }
 
     // Errors with their message and exit status.
     std::fs::write(at("text.mcap"), "no recording")?;
     with_python("foreign", &at("foreign.mcap"))?;
-    let mut rover = scene
-        .daemon
-        .robot(&format!("sights_py?token={}", scene.token))?;
+    let mut rover = scene.daemon.robot(&format!("sights_py?token={}", scene.token))?;
     rover.call("/rosapi/get_time", json!({}))?;
     let servant = scene.daemon.servant_of("sights_py", "rover")?;
     let servant = servant["id"].as_str().context("an id")?;
     let server = format!("http://{}", scene.daemon.address);
-    let (text, foreign, killed, new) = (
-        at("text.mcap"),
-        at("foreign.mcap"),
-        at("killed.mcap"),
-        at("new.mcap"),
-    );
+    let (text, foreign, killed, new) = (at("text.mcap"), at("foreign.mcap"), at("killed.mcap"), at("new.mcap"));
     let nowhere = at("no/such/directory.mcap");
     let rows: [(&[&str], i32, &[&str]); 9] = [
-        (
-            &["record", servant, "-o", path_str(&text)],
-            1,
-            &["exists", "-o must name a new file"],
-        ),
-        (
-            &["record", servant, "-o", path_str(&nowhere)],
-            1,
-            &["cannot create"],
-        ),
-        (
-            &["record", "nothing", "-o", path_str(&new)],
-            5,
-            &["nothing"],
-        ),
-        (
-            &[
-                "record",
-                servant,
-                "-o",
-                path_str(&new),
-                "--duration",
-                "soon",
-            ],
-            2,
-            &["--duration"],
-        ),
-        (
-            &[
-                "record",
-                servant,
-                "-o",
-                path_str(&new),
-                "--server",
-                &server,
-                "--token",
-                &stranger,
-            ],
-            4,
-            &["may not see"],
-        ),
-        (
-            &["replay", path_str(&text), "--to", servant],
-            1,
-            &["is not an MCAP file"],
-        ),
-        (
-            &["replay", path_str(&new), "--to", servant],
-            1,
-            &["cannot be read"],
-        ),
-        (
-            &["replay", path_str(&foreign), "--to", servant],
-            1,
-            &["/chatter was skipped", "this servant expects ros1"],
-        ),
-        (
-            &["replay", path_str(&text), "--to", servant, "--rate", "0"],
-            2,
-            &["greater than 0"],
-        ),
+        (&["record", servant, "-o", path_str(&text)], 1, &["exists", "-o must name a new file"]),
+        (&["record", servant, "-o", path_str(&nowhere)], 1, &["cannot create"]),
+        (&["record", "nothing", "-o", path_str(&new)], 5, &["nothing"]),
+        (&["record", servant, "-o", path_str(&new), "--duration", "soon"], 2, &["--duration"]),
+        (&["record", servant, "-o", path_str(&new), "--server", &server, "--token", &stranger], 4, &["may not see"]),
+        (&["replay", path_str(&text), "--to", servant], 1, &["is not an MCAP file"]),
+        (&["replay", path_str(&new), "--to", servant], 1, &["cannot be read"]),
+        (&["replay", path_str(&foreign), "--to", servant], 1, &["/chatter was skipped", "this servant expects ros1"]),
+        (&["replay", path_str(&text), "--to", servant, "--rate", "0"], 2, &["greater than 0"]),
     ];
     for (words, status, said) in rows {
         let outcome = types(words)?.expect_failure(said)?;
@@ -305,35 +216,21 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
     }
     ensure!(!new.exists(), "what failed leaves no file");
     // The file of a killed recorder is played up to its last complete part.
-    let outcome = types(&[
-        "replay",
-        path_str(&killed),
-        "--to",
-        servant,
-        "--rate",
-        "100",
-    ])?;
+    let outcome = types(&["replay", path_str(&killed), "--to", servant, "--rate", "100"])?;
     let outcome = outcome.expect_success()?;
-    ensure!(
-        outcome.stderr.contains("is truncated"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(outcome.stderr.contains("is truncated"), "{}", outcome.output());
     scene.daemon.stop()?;
     Ok(())
 }
 
 pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
-    let config =
-        "[black_box]\nseconds = \"20s\"\ntopics = [\"/sights/scan\", \"/tf*\"]\nfiles = 2\n";
+    let config = "[black_box]\nseconds = \"20s\"\ntopics = [\"/sights/scan\", \"/tf*\"]\nfiles = 2\n";
     let scene = InsideScene::new("black-box", config)?;
     let place = world().directory("black-box")?;
     let types = |words: &[&str]| scene.daemon.deployer().run(words);
     let listed = |words: &[&str]| -> anyhow::Result<Vec<Value>> {
         let typed = [&["--format", "json", "recordings", "list"], words].concat();
-        Ok(serde_json::from_str(
-            &types(&typed)?.expect_success()?.stdout,
-        )?)
+        Ok(serde_json::from_str(&types(&typed)?.expect_success()?.stdout)?)
     };
     ensure!(listed(&[])?.is_empty(), "nobody has waited yet");
 
@@ -351,10 +248,7 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         Ok(enough.then_some(()).ok_or_else(|| taken.to_string()))
     })?;
     // No answer arrives within twenty microseconds.
-    let path = format!(
-        "sights_py?token={}&rrt=0.00001&max_rrt=0.00002",
-        scene.token
-    );
+    let path = format!("sights_py?token={}&rrt=0.00001&max_rrt=0.00002", scene.token);
     let mut rover = scene.daemon.robot(&path)?;
     let written = support::wait_until("a recording", || {
         rover.call("/sights/ping", json!({}))?;
@@ -362,25 +256,14 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         Ok(all.first().cloned().ok_or_else(|| "none yet".to_owned()))
     })?;
     let why = written["why"].as_str().context("a reason")?;
-    ensure!(
-        why.contains("a request took") && why.contains("its robot accepts"),
-        "{why}"
-    );
+    ensure!(why.contains("a request took") && why.contains("its robot accepts"), "{why}");
     scene
         .daemon
-        .wait_for_event("that it is recorded", |event| {
-            event["kind"] == "recorded" && event["robot"] == "rover"
-        })?;
+        .wait_for_event("that it is recorded", |event| event["kind"] == "recorded" && event["robot"] == "rover")?;
     // At most once per minute, however many answers are late.
     rover.call("/sights/ping", json!({}))?;
-    let times: Vec<u64> = listed(&[])?
-        .iter()
-        .filter_map(|one| one["time"].as_u64())
-        .collect();
-    ensure!(
-        !times.is_empty() && times.windows(2).all(|two| two[0] - two[1] > 59_000),
-        "{times:?}"
-    );
+    let times: Vec<u64> = listed(&[])?.iter().filter_map(|one| one["time"].as_u64()).collect();
+    ensure!(!times.is_empty() && times.windows(2).all(|two| two[0] - two[1] > 59_000), "{times:?}");
 
     // It contains earlier messages, latched messages, and nothing else.
     let number = written["number"].to_string();
@@ -393,44 +276,20 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     for topic in ["/tf_static", "/sights/scan", "/tf"] {
         ensure!(read["topics"].get(topic).is_some(), "{topic}: {read}");
     }
-    ensure!(
-        read["topics"]
-            .as_object()
-            .is_some_and(|topics| topics.len() == 3),
-        "{read}"
-    );
-    types(&[
-        "replay",
-        path_str(&file),
-        "--to",
-        &scene.servant,
-        "--rate",
-        "100",
-    ])?
-    .expect_success()?;
+    ensure!(read["topics"].as_object().is_some_and(|topics| topics.len() == 3), "{read}");
+    types(&["replay", path_str(&file), "--to", &scene.servant, "--rate", "100"])?.expect_success()?;
 
     // Principals who may view the service may read recordings; those who may operate it may also take them.
     let server = format!("http://{}", scene.daemon.address);
-    let typed_by = |token: &str, words: &[&str]| {
-        types(
-            &[
-                &["--server", &server, "--token", token, "recordings"],
-                words,
-            ]
-            .concat(),
-        )
-    };
+    let typed_by =
+        |token: &str, words: &[&str]| types(&[&["--server", &server, "--token", token, "recordings"], words].concat());
     let eve = scene.viewer_token("eve", "sights*")?;
     let stranger = scene.viewer_token("stranger", "other*")?;
     let copy = place.path().join("copy.mcap");
     typed_by(&eve, &["get", &number, "-o", path_str(&copy)])?.expect_success()?;
-    ensure!(
-        std::fs::read(&copy)? == std::fs::read(&file)?,
-        "another file"
-    );
+    ensure!(std::fs::read(&copy)? == std::fs::read(&file)?, "another file");
     // As far as the rules permit her to receive the topics.
-    let refused =
-        |who: &str| typed_by(who, &["get", &number])?.expect_failure(&["may not subscribe to"]);
+    let refused = |who: &str| typed_by(who, &["get", &number])?.expect_failure(&["may not subscribe to"]);
     let allow = |grant: &str| {
         let rule = ["policy", "allow", "narrow", grant, "--service", "sights*"];
         types(&rule)?.expect_success()
@@ -446,15 +305,7 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     // A robot may read its own recordings, and no others.
     let own = place.path().join("own.mcap");
     typed_by(&scene.token, &["get", &number, "-o", path_str(&own)])?.expect_success()?;
-    let other = [
-        "other",
-        "--role",
-        "robot",
-        "--robot",
-        "other",
-        "--service",
-        "sights*",
-    ];
+    let other = ["other", "--role", "robot", "--robot", "other", "--service", "sights*"];
     let other = create_token(&scene.daemon, &other)?;
     let hidden = typed_by(&other, &["list"])?.expect_success()?;
     ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
@@ -470,60 +321,35 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     }
     let hidden = typed_by(&stranger, &["list"])?.expect_success()?;
     ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
-    types(&["recordings", "get", "99"])?
-        .expect_failure(&["there is no recording 99", "recordings list"])?;
+    types(&["recordings", "get", "99"])?.expect_failure(&["there is no recording 99", "recordings list"])?;
 
     // The oldest recording is deleted when there are more than two.
     let take = || types(&["recordings", "take", &scene.servant]);
     for _ in 0..2 {
         support::wait_until("another file", || {
             let taken = take()?;
-            Ok((taken.status == 0)
-                .then_some(())
-                .ok_or_else(|| taken.output()))
+            Ok((taken.status == 0).then_some(()).ok_or_else(|| taken.output()))
         })?;
     }
     // Recordings cannot be taken in quick succession.
     let soon = support::wait_until("a refusal", || {
         let taken = take()?;
-        Ok(if taken.status == 0 {
-            Err("this machine took its time to ask again".to_owned())
-        } else {
-            Ok(taken)
-        })
+        Ok(if taken.status == 0 { Err("this machine took its time to ask again".to_owned()) } else { Ok(taken) })
     })?;
     let soon = soon.expect_failure(&["a moment ago"])?;
     ensure!(soon.status == 7, "{}", soon.status);
     let all = listed(&[])?;
-    ensure!(
-        all.len() == 2 && all.iter().all(|one| one["number"] != written["number"]),
-        "{all:?}"
-    );
-    ensure!(
-        all[0]["why"]
-            .as_str()
-            .is_some_and(|why| why.contains("asked for it")),
-        "{all:?}"
-    );
-    let files = || -> anyhow::Result<usize> {
-        Ok(std::fs::read_dir(scene.daemon.home.join("recordings"))?.count())
-    };
+    ensure!(all.len() == 2 && all.iter().all(|one| one["number"] != written["number"]), "{all:?}");
+    ensure!(all[0]["why"].as_str().is_some_and(|why| why.contains("asked for it")), "{all:?}");
+    let files = || -> anyhow::Result<usize> { Ok(std::fs::read_dir(scene.daemon.home.join("recordings"))?.count()) };
     ensure!(files()? == 2, "{} files", files()?);
     let last = all[1]["number"].to_string();
     types(&["recordings", "rm", &last])?.expect_success()?;
-    ensure!(
-        (listed(&[])?.len(), files()?) == (1, 1),
-        "{} files",
-        files()?
-    );
+    ensure!((listed(&[])?.len(), files()?) == (1, 1), "{} files", files()?);
 
     // Recordings are removed with their service, because the next service of that name may have another owner.
     types(&["rm", "sights_py"])?.expect_success()?;
-    ensure!(
-        (listed(&[])?.len(), files()?) == (0, 0),
-        "{} files",
-        files()?
-    );
+    ensure!((listed(&[])?.len(), files()?) == (0, 0), "{} files", files()?);
 
     // Without a black box that is reported.
     scene.daemon.stop()?;

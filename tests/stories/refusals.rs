@@ -11,14 +11,8 @@ use support::world::{ADDER, world};
 
 /// Checks that there is no service of this name, no build directory and no servant.
 fn expect_nothing_left(daemon: &Daemon, service: &str) -> Verdict {
-    ensure!(
-        daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404,
-        "{service} was published"
-    );
-    ensure!(
-        daemon.servants_of(service)?.is_empty(),
-        "{service} has servants"
-    );
+    ensure!(daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404, "{service} was published");
+    ensure!(daemon.servants_of(service)?.is_empty(), "{service} has servants");
     Ok(())
 }
 
@@ -27,15 +21,9 @@ pub fn a_directory_without_a_package() -> Verdict {
     let place = tempfile::tempdir()?;
     let empty = place.path().join("empty_thing");
     std::fs::create_dir(&empty)?;
-    daemon
-        .deployer()
-        .run(&["push", path_str(&empty)])?
-        .expect_failure(&["package.xml", "empty_thing"])?;
+    daemon.deployer().run(&["push", path_str(&empty)])?.expect_failure(&["package.xml", "empty_thing"])?;
     let missing = place.path().join("not_there");
-    daemon
-        .deployer()
-        .run(&["push", path_str(&missing)])?
-        .expect_failure(&["not_there"])?;
+    daemon.deployer().run(&["push", path_str(&missing)])?.expect_failure(&["not_there"])?;
     expect_nothing_left(&daemon, "empty_thing")
 }
 
@@ -44,32 +32,28 @@ pub fn malformed_xml() -> Verdict {
     let place = tempfile::tempdir()?;
     let package = place.path().join("torn");
     std::fs::create_dir(&package)?;
-    std::fs::write(
-        package.join("package.xml"),
-        "<package>\n  <name>torn</name>\n  <version>1.0.0\n</package>\n",
-    )?;
-    daemon
-        .deployer()
-        .run(&["push", path_str(&package)])?
-        .expect_failure(&["package.xml", "line 4"])?;
+    std::fs::write(package.join("package.xml"), "<package>\n  <name>torn</name>\n  <version>1.0.0\n</package>\n")?;
+    daemon.deployer().run(&["push", path_str(&package)])?.expect_failure(&["package.xml", "line 4"])?;
     expect_nothing_left(&daemon, "torn")
 }
 
 pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Verdict {
     let daemon = world().ensure_shared()?;
-    daemon
-        .deployer()
-        .push("wants_the_impossible", &["--node", "any"])?
-        .expect_failure(&["warp_drive", "flux_capacitor_msgs", "--map"])?;
+    daemon.deployer().push("wants_the_impossible", &["--node", "any"])?.expect_failure(&[
+        "warp_drive",
+        "flux_capacitor_msgs",
+        "--map",
+    ])?;
     expect_nothing_left(&daemon, "wants_the_impossible")
 }
 
 pub fn a_node_that_leaves_at_once() -> Verdict {
     let daemon = world().ensure_shared()?;
-    daemon
-        .deployer()
-        .push("leaver_py", &["--node", "leaver.py"])?
-        .expect_failure(&["leaver", "3", "the map file is missing"])?;
+    daemon.deployer().push("leaver_py", &["--node", "leaver.py"])?.expect_failure(&[
+        "leaver",
+        "3",
+        "the map file is missing",
+    ])?;
     expect_nothing_left(&daemon, "leaver_py")
 }
 
@@ -102,9 +86,7 @@ fn append_raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryT
     header.set_mtime(0);
     header.set_size(0);
     header.set_cksum();
-    builder
-        .append(&header, std::io::empty())
-        .expect("into memory");
+    builder.append(&header, std::io::empty()).expect("into memory");
 }
 
 pub fn archives_that_reach_out_of_their_tree() -> Verdict {
@@ -121,10 +103,7 @@ pub fn archives_that_reach_out_of_their_tree() -> Verdict {
     ];
     for (index, (name, kind, link)) in cases.into_iter().enumerate() {
         let archive = place.path().join(format!("sly{index}.tar"));
-        std::fs::write(
-            &archive,
-            archive_with(|builder| append_raw(builder, name, kind, link))?,
-        )?;
+        std::fs::write(&archive, archive_with(|builder| append_raw(builder, name, kind, link))?)?;
         daemon
             .deployer()
             .run(&["push", path_str(&archive), "--name", "sly", "--node", "x"])?
@@ -143,10 +122,7 @@ pub fn reserved_and_taken_names() -> Verdict {
             .expect_failure(&[name, "reserved"])?;
     }
     for name in ["../up", "a b", "", "Ümlaut"] {
-        daemon
-            .deployer()
-            .push("adder_py", &["--name", name, "--node", "adder.py"])?
-            .expect_failure(&["name"])?;
+        daemon.deployer().push("adder_py", &["--name", name, "--node", "adder.py"])?.expect_failure(&["name"])?;
     }
     // The name of a service is not taken over by another package by accident.
     daemon
@@ -159,10 +135,7 @@ pub fn reserved_and_taken_names() -> Verdict {
 pub fn a_full_disk_ends_a_push_and_nothing_else() -> Verdict {
     let disk = SmallDisk::mount("small", "24M")?;
     let daemon = DaemonSetup::new(&disk.home()).start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_failure(&["no space"])?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_failure(&["no space"])?;
     expect_nothing_left(&daemon, "adder_py")?;
     ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
     Ok(())

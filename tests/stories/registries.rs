@@ -42,20 +42,13 @@ impl Containerd {
             let ended = started.process.try_wait()?;
             ensure!(ended.is_none(), "containerd ended: {ended:?}");
             let version = started.run_ctr(&["version"])?;
-            Ok(if version.status == 0 {
-                Ok(())
-            } else {
-                Err(version.output().to_owned())
-            })
+            Ok(if version.status == 0 { Ok(()) } else { Err(version.output().to_owned()) })
         })?;
         Ok(started)
     }
 
     fn run_ctr(&self, words: &[&str]) -> anyhow::Result<CommandOutcome> {
-        run(Command::new("ctr")
-            .arg("--address")
-            .arg(self.place.path().join("containerd.sock"))
-            .args(words))
+        run(Command::new("ctr").arg("--address").arg(self.place.path().join("containerd.sock")).args(words))
     }
 
     /// Fetches an image's manifest, configuration and layers, and forgets it again.
@@ -77,10 +70,7 @@ impl Drop for Containerd {
 fn expect_refusal(refused: &CommandOutcome, expected: &[&str]) -> Verdict {
     let output = refused.output().to_lowercase();
     ensure!(refused.status != 0, "pulled: {output}");
-    ensure!(
-        expected.iter().any(|words| output.contains(words)),
-        "{output}"
-    );
+    ensure!(expected.iter().any(|words| output.contains(words)), "{output}");
     Ok(())
 }
 
@@ -89,12 +79,7 @@ fn read_error(daemon: &Daemon, token: &str, path: &str) -> anyhow::Result<(u16, 
     let authorization = format!("Bearer {token}");
     let (status, body) = daemon.request("GET", path, &[("authorization", &authorization)])?;
     let body: Value = serde_json::from_str(&body)?;
-    let text = |key: &str| {
-        body["errors"][0][key]
-            .as_str()
-            .unwrap_or_default()
-            .to_owned()
-    };
+    let text = |key: &str| body["errors"][0][key].as_str().unwrap_or_default().to_owned();
     Ok((status, text("code"), text("message")))
 }
 
@@ -121,76 +106,40 @@ pub fn skopeo_and_containerd_pull_with_a_token() -> Verdict {
         let pulled = run(Command::new("skopeo")
             .args(["--insecure-policy", "copy"])
             .args(words)
-            .args([
-                &format!("docker://{image}"),
-                &format!("dir:{}", to.display()),
-            ]))?;
+            .args([&format!("docker://{image}"), &format!("dir:{}", to.display())]))?;
         let _ = std::fs::remove_dir_all(to);
         anyhow::Ok(pulled)
     };
     let text = |path: &Path| path.display().to_string();
     let (directory, authority) = (text(&trusted), text(&proxy.authority()));
     for (host, of_skopeo, of_containerd) in [
-        (
-            daemon.address.as_str(),
-            vec!["--src-tls-verify=false"],
-            vec!["--plain-http"],
-        ),
-        (
-            secure.as_str(),
-            vec!["--src-cert-dir", &directory],
-            vec!["--tlscacert", &authority],
-        ),
+        (daemon.address.as_str(), vec!["--src-tls-verify=false"], vec!["--plain-http"]),
+        (secure.as_str(), vec!["--src-cert-dir", &directory], vec!["--tlscacert", &authority]),
     ] {
         let image = format!("{host}/open_adder:latest");
         let hidden = format!("{host}/vault:latest");
-        let skopeo_as = |credentials: &str, image: &str| {
-            skopeo(
-                image,
-                &[&of_skopeo[..], &["--src-creds", credentials]].concat(),
-            )
-        };
+        let skopeo_as =
+            |credentials: &str, image: &str| skopeo(image, &[&of_skopeo[..], &["--src-creds", credentials]].concat());
         let containerd_as = |credentials: &str, image: &str| {
-            containerd.pull(
-                image,
-                &[&of_containerd[..], &["--user", credentials]].concat(),
-            )
+            containerd.pull(image, &[&of_containerd[..], &["--user", credentials]].concat())
         };
         skopeo_as(&token, &image)?.expect_success()?;
         containerd_as(&token, &image)?.expect_success()?;
         // A service that the token does not see is refused like one that is not there.
-        expect_refusal(
-            &skopeo_as(&token, &hidden)?,
-            &["name unknown", "manifest unknown"],
-        )?;
+        expect_refusal(&skopeo_as(&token, &hidden)?, &["name unknown", "manifest unknown"])?;
         expect_refusal(&containerd_as(&token, &hidden)?, &["not found"])?;
         let guessed = "cluster:guessed";
-        expect_refusal(
-            &skopeo_as(guessed, &image)?,
-            &["unauthorized", "authentication"],
-        )?;
-        expect_refusal(
-            &containerd_as(guessed, &image)?,
-            &["unauthorized", "authorization"],
-        )?;
+        expect_refusal(&skopeo_as(guessed, &image)?, &["unauthorized", "authentication"])?;
+        expect_refusal(&containerd_as(guessed, &image)?, &["unauthorized", "authorization"])?;
     }
 
     // Whoever refuses, authentication, permissions or a handler: the format is the one of registries.
     let (status, code, message) = read_error(&daemon, &eve, "/v2/vault/tags/list")?;
-    ensure!(
-        (status, code.as_str()) == (404, "NAME_UNKNOWN"),
-        "{status} {code} {message}"
-    );
+    ensure!((status, code.as_str()) == (404, "NAME_UNKNOWN"), "{status} {code} {message}");
     let (status, code, message) = read_error(&daemon, &eve, "/v2/open_adder/manifests/99")?;
-    ensure!(
-        (status, code.as_str()) == (404, "MANIFEST_UNKNOWN"),
-        "{status} {code} {message}"
-    );
+    ensure!((status, code.as_str()) == (404, "MANIFEST_UNKNOWN"), "{status} {code} {message}");
     let (status, code, message) = read_error(&daemon, "guessed", "/v2/_catalog")?;
-    ensure!(
-        (status, code.as_str()) == (401, "UNAUTHORIZED"),
-        "{status} {code} {message}"
-    );
+    ensure!((status, code.as_str()) == (401, "UNAUTHORIZED"), "{status} {code} {message}");
     daemon.stop()?;
     Ok(())
 }

@@ -25,10 +25,7 @@ fn start_stub(network: &RobotNetwork, site: &Site, robot: &str) -> anyhow::Resul
 }
 
 /// Adds the stub's log to an error.
-fn with_stub_log<T>(
-    stub: &NodeProcess,
-    acts: impl FnOnce() -> anyhow::Result<T>,
-) -> anyhow::Result<T> {
+fn with_stub_log<T>(stub: &NodeProcess, acts: impl FnOnce() -> anyhow::Result<T>) -> anyhow::Result<T> {
     acts().with_context(|| format!("the stub said:\n{}", stub.output()))
 }
 
@@ -97,10 +94,7 @@ pub fn another_machine_finds_a_stub_by_a_server_that_comes_later_and_again() -> 
     let stub = start_stub(&network, &site, "network-server")?;
     let mut application = network.start_application(RCLPY, &[])?;
     with_stub_log(&stub, || {
-        ensure!(
-            !sees_node(&mut application, NODE)?,
-            "there is no server yet"
-        );
+        ensure!(!sees_node(&mut application, NODE)?, "there is no server yet");
         let server = network.start_discovery_server()?;
         expect_correspondence(&mut application)?;
         // Participants that have discovered each other continue without the server; new ones are not discovered.

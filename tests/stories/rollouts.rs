@@ -24,10 +24,7 @@ pub fn a_canary_that_fails_is_taken_back_and_its_robot_goes_on() -> Verdict {
     daemon.kill()?;
     let daemon = setup.start()?;
     let shown = daemon.deployer().run_json(&["rollout", "adder_py"])?;
-    ensure!(
-        shown["state"] == "canary" && shown["candidate"] == 2,
-        "{shown}"
-    );
+    ensure!(shown["state"] == "canary" && shown["candidate"] == 2, "{shown}");
     old = connect_to_revision(&daemon, "old", 1)?;
     let mut first = connect_to_revision(&daemon, "first", 2)?;
     let taken_back = |daemon: &Daemon| -> anyhow::Result<bool> {
@@ -52,10 +49,7 @@ pub fn a_canary_that_fails_is_taken_back_and_its_robot_goes_on() -> Verdict {
     ensure!(request_sum(&mut first)? == 2 && request_sum(&mut old)? == 2);
     connect_to_revision(&daemon, "third", 1)?;
     let promote = ["rollout", "adder_py", "promote"];
-    daemon
-        .deployer()
-        .run(&promote)?
-        .expect_failure(&["revision 2 of adder_py is not a canary"])?;
+    daemon.deployer().run(&promote)?.expect_failure(&["revision 2 of adder_py is not a canary"])?;
     Ok(())
 }
 
@@ -76,18 +70,12 @@ pub fn a_canary_is_promoted_and_robots_keep_what_they_have_until_the_deadline() 
     ensure!(close.reason.contains("deadline"), "{close:?}");
     let mut old = connect_to_revision(&daemon, "old", 2)?;
     ensure!(request_sum(&mut old)? == 102);
-    ensure!(
-        request_sum(&mut first)? == 102,
-        "the canary's robot goes on"
-    );
+    ensure!(request_sum(&mut first)? == 102, "the canary's robot goes on");
 
     // An incompatible revision is not tried on robots.
     let other = ["--remap", "/add_two:=/sum_two", "--canary", "50%"];
     let arguments = [["--node", "adder.py"].as_slice(), &other].concat();
-    daemon
-        .deployer()
-        .push("adder_py", &arguments)?
-        .expect_failure(&["cannot be a canary", "/add_two"])?;
+    daemon.deployer().push("adder_py", &arguments)?.expect_failure(&["cannot be a canary", "/add_two"])?;
     connect_to_revision(&daemon, "fourth", 2)?;
     Ok(())
 }

@@ -12,8 +12,7 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, NodeEntities, ParamValue,
-    RosVersion, WireFormat,
+    Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, NodeEntities, ParamValue, RosVersion, WireFormat,
 };
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
@@ -57,36 +56,25 @@ pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
         Ok(names.map(str::to_owned).collect())
     };
     // Registrations that every node has are not part of a service's interface.
-    ensure!(
-        names("topics")? == ["/greeting", "/name"] && names("services")? == ["/greet"],
-        "{service:#}"
-    );
+    ensure!(names("topics")? == ["/greeting", "/name"] && names("services")? == ["/greet"], "{service:#}");
     ensure!(names("actions")? == ["/count"], "{service:#}");
     let mut robot = daemon.robot("herald?robot=herald-asked")?;
     let greeted = robot.call("/greet", json!({"name": "robot"}))?;
     let greeting = &greeted["values"]["greeting"];
-    ensure!(
-        greeting["text"] == "Hello, robot" && greeting["wide"] == "HELLO, ROBOT",
-        "{greeted}"
-    );
+    ensure!(greeting["text"] == "Hello, robot" && greeting["wide"] == "HELLO, ROBOT", "{greeted}");
     robot.send(json!({"op": "subscribe", "topic": "/greeting", "qos": {"reliability": "reliable", "depth": 5}}))?;
     robot.send(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String"}))?;
     let crowd = json!({"op": "publish", "topic": "/name", "msg": {"data": "crowd"}});
     let greeted = robot.send_until(&crowd, "a greeting", |told| told["topic"] == "/greeting")?;
     ensure!(greeted["msg"]["text"] == "Hello, crowd", "{greeted}");
-    robot.send(
-        json!({"op": "send_action_goal", "id": "goal", "action": "/count",
-        "action_type": "herald_msgs/action/Count", "args": {"to": 3}, "feedback": true}),
-    )?;
+    robot.send(json!({"op": "send_action_goal", "id": "goal", "action": "/count",
+        "action_type": "herald_msgs/action/Count", "args": {"to": 3}, "feedback": true}))?;
     for at in 1..=3 {
         let told = robot.wait_for("feedback", |told| told["op"] == "action_feedback")?;
         ensure!(told["values"]["at"] == at, "{told}");
     }
     let told = robot.wait_for("a result", |told| told["op"] == "action_result")?;
-    ensure!(
-        told["values"]["counted"] == json!([1, 2, 3]) && told["result"] == true,
-        "{told}"
-    );
+    ensure!(told["values"]["counted"] == json!([1, 2, 3]) && told["result"] == true, "{told}");
     robot.leave()
 }
 
@@ -95,14 +83,7 @@ pub fn a_prebuilt_space_is_served_with_its_interfaces() -> Verdict {
     let place = tempfile::tempdir()?;
     let space = extract_install_space(&daemon, "herald", place.path())?;
     let space = space.to_string_lossy();
-    let words = [
-        "push",
-        &*space,
-        "--name",
-        "prebuilt-herald",
-        "--node",
-        "herald/herald",
-    ];
+    let words = ["push", &*space, "--name", "prebuilt-herald", "--node", "herald/herald"];
     daemon.deployer().run(&words)?.expect_success()?;
     let mut robot = daemon.robot("prebuilt-herald?robot=herald-of-a-space")?;
     let greeted = robot.call("/greet", json!({"name": "robot"}))?;
@@ -114,10 +95,7 @@ pub fn a_prebuilt_space_is_served_with_its_interfaces() -> Verdict {
 pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict {
     let daemon = world().ensure_shared()?;
     let arguments = ["--name", "duets", "--node", "duet", "--node", "duet"];
-    daemon
-        .deployer()
-        .push("duet_ros2", &arguments)?
-        .expect_success()?;
+    daemon.deployer().push("duet_ros2", &arguments)?.expect_success()?;
     let service = daemon.get_json("/api/v1/services/duets")?;
     let topics = service["interface"]["topics"].as_array();
     let topics = topics.context("a list")?.iter();
@@ -137,31 +115,15 @@ pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict 
     let overlay = site.install_stub(&daemon, "duets", "local = \"none\"\n")?;
     let server = format!("ws://{}", daemon.address);
     let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "choir")];
-    for (argv, second) in [
-        (&[][..], "tenor"),
-        (&["--ros-args", "-r", "tenor:__node:=bass"], "bass"),
-    ] {
-        let mut stub = site.start_installed_with_environment(
-            &environment,
-            &overlay,
-            "duet_ros2",
-            "duet",
-            argv,
-        )?;
+    for (argv, second) in [(&[][..], "tenor"), (&["--ros-args", "-r", "tenor:__node:=bass"], "bass")] {
+        let mut stub = site.start_installed_with_environment(&environment, &overlay, "duet_ros2", "duet", argv)?;
         for name in ["alto", second] {
             let node = format!("/{name}");
             let mut songs = site.subscribe(&app, &format!("{node}/song"))?;
             let song = with_log(site.next_message(&mut songs), &stub)?;
-            ensure!(
-                contains(&song.bytes, name) && song.publisher.node() == node,
-                "{song:?}\n{}",
-                stub.output()
-            );
+            ensure!(contains(&song.bytes, name) && song.publisher.node() == node, "{song:?}\n{}", stub.output());
             let parameters = format!("{node}/get_parameters");
-            let graph = with_log(
-                site.wait_for_graph(&*app, &parameters, has_service(&parameters)),
-                &stub,
-            )?;
+            let graph = with_log(site.wait_for_graph(&*app, &parameters, has_service(&parameters)), &stub)?;
             ensure!(graph.services[&parameters] == node, "{graph:#?}");
             let asked = ["use_sim_time".to_owned()];
             let held = app.node_parameters()?.get(&node, &asked);
@@ -196,12 +158,7 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
     let topics = topics.context("a list")?.iter();
     let mut topics: Vec<&str> = topics.filter_map(|one| one["name"].as_str()).collect();
     topics.sort();
-    let nodes = [
-        ("/camera", "detector"),
-        ("/left", "detector"),
-        ("/right", "detector"),
-        ("/tower", "seeker"),
-    ];
+    let nodes = [("/camera", "detector"), ("/left", "detector"), ("/right", "detector"), ("/tower", "seeker")];
     let all = nodes.map(|(above, _)| [format!("{above}/found"), format!("{above}/image")]);
     ensure!(topics == all.concat(), "{service:#}");
     let mut robot = daemon.robot("spotters?robot=asked")?;
@@ -221,17 +178,9 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
     let overlay = site.install_stub(&daemon, "spotters", "local = \"none\"\n")?;
     let server = format!("ws://{}", daemon.address);
     let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "spots")];
-    for (argv, above) in [
-        (&[][..], "/camera"),
-        (&["--ros-args", "-r", "__ns:=/front"], "/front"),
-    ] {
-        let mut stub = site.start_installed_with_environment(
-            &environment,
-            &overlay,
-            "spotter_ros2",
-            "spotter",
-            argv,
-        )?;
+    for (argv, above) in [(&[][..], "/camera"), (&["--ros-args", "-r", "__ns:=/front"], "/front")] {
+        let mut stub =
+            site.start_installed_with_environment(&environment, &overlay, "spotter_ros2", "spotter", argv)?;
         let node = format!("{above}/detector");
         let images = site.advertise_strings(&app, &format!("{above}/image"), false)?;
         let mut finds = site.subscribe(&app, &format!("{above}/found"))?;
@@ -240,11 +189,7 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
         images.publish(string_in(WireFormat::Cdr, "view"));
         let found = with_log(site.next_message(&mut finds), &stub)?;
         let words = format!("a cat in view by {node}");
-        ensure!(
-            contains(&found.bytes, &words) && found.publisher.node() == node,
-            "{found:?}\n{}",
-            stub.output()
-        );
+        ensure!(contains(&found.bytes, &words) && found.publisher.node() == node, "{found:?}\n{}", stub.output());
         stub.signal(Signal::SIGINT)?;
         stub.wait_for_exit()?;
     }
@@ -296,10 +241,7 @@ fn expect_count(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
     for number in 1..=to {
         expected.u32(number);
     }
-    ensure!(
-        end.outcome == GoalOutcome::Succeeded && end.result == expected.finish(),
-        "{end:?}"
-    );
+    ensure!(end.outcome == GoalOutcome::Succeeded && end.result == expected.finish(), "{end:?}");
     ensure!(*heard.feedback.lock() == to as usize);
     Ok(())
 }
@@ -308,22 +250,10 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     let daemon = world().daemon_with(HERALD)?;
     let site = Site::with_ros(RosVersion::Two)?;
     let app = site.join("/app")?;
-    let argv = [
-        "--ros-args",
-        "-r",
-        "__node:=crier",
-        "-r",
-        "__ns:=/front",
-        "-r",
-        "name:=/who",
-        "-p",
-        "salutation:=Good day",
-    ];
+    let argv =
+        ["--ros-args", "-r", "__node:=crier", "-r", "__ns:=/front", "-r", "name:=/who", "-p", "salutation:=Good day"];
     let mut stub = site.start_stub(&daemon, THE_HERALD, "ros2-herald", &argv)?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/front/greet")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/front/greet")), &stub)?;
     // An input topic, remapped; an output topic; both with the original's names and types.
     let names = site.advertise_strings(&app, "/who", false)?;
     let mut greetings = site.subscribe(&app, "/front/greeting")?;
@@ -333,8 +263,7 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     let greeting = with_log(site.next_message(&mut greetings), &stub)?;
     ensure!(contains(&greeting.bytes, "Good day, robot"), "{greeting:?}");
     ensure!(
-        greeting.wire_type.name == "herald_msgs/msg/Greeting"
-            && greeting.publisher.node() == "/front/crier",
+        greeting.wire_type.name == "herald_msgs/msg/Greeting" && greeting.publisher.node() == "/front/crier",
         "{greeting:?}"
     );
     // A service and a parameter of the node in the cloud.
@@ -342,17 +271,9 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     let parameters = app.node_parameters()?;
     let asked = ["salutation".to_owned()];
     let held = run(parameters.get("/front/crier", &asked))?;
-    ensure!(
-        held == [Some(ParamValue::String("Good day".into()))],
-        "{held:?}"
-    );
-    let change = (
-        "salutation".to_owned(),
-        Some(ParamValue::String("Hi".into())),
-    );
-    let set = site
-        .runtime
-        .block_on(parameters.set("/front/crier", vec![change]))?;
+    ensure!(held == [Some(ParamValue::String("Good day".into()))], "{held:?}");
+    let change = ("salutation".to_owned(), Some(ParamValue::String("Hi".into())));
+    let set = site.runtime.block_on(parameters.set("/front/crier", vec![change]))?;
     ensure!(set == [Ok(())], "{set:?}");
     let request = MessageLayout::new(RosVersion::Two).text("lab").finish();
     let greeted = site.call_service(&app, "/front/greet", &request)?;
@@ -362,9 +283,7 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
     stub.signal(Signal::SIGINT)?;
     let status = stub.wait_for_exit()?;
     ensure!(status.code() == Some(0), "{status}: {}", stub.output());
-    site.wait_for_graph(&app, "an empty graph", |graph| {
-        !graph.nodes.contains_key("/front/crier")
-    })?;
+    site.wait_for_graph(&app, "an empty graph", |graph| !graph.nodes.contains_key("/front/crier"))?;
     Ok(())
 }
 
@@ -375,16 +294,10 @@ fn wait_for_ends(
     node: &str,
     wanted: impl Fn(&NodeEntities) -> bool,
 ) -> anyhow::Result<NodeEntities> {
-    let graph = site.wait_for_graph(watcher, "the node's ends", |graph| {
-        graph.ends.get(node).is_some_and(&wanted)
-    })?;
+    let graph = site.wait_for_graph(watcher, "the node's ends", |graph| graph.ends.get(node).is_some_and(&wanted))?;
     let mut ends = graph.ends[node].clone();
     // The history depth is local to each endpoint, and discovery need not include it.
-    for (_, qos) in ends
-        .publishers
-        .values_mut()
-        .chain(ends.subscribers.values_mut())
-    {
+    for (_, qos) in ends.publishers.values_mut().chain(ends.subscribers.values_mut()) {
         qos.depth = 0;
     }
     Ok(ends)
@@ -428,35 +341,22 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     let daemon = world().daemon_with(SEER)?;
     let site = Site::with_ros(RosVersion::Two)?;
     let cable = Cable::new(&daemon.address)?;
-    let stub = people::installed_stub(
-        &site,
-        &daemon,
-        &cable,
-        (SEER.name, "ros2-rclpy"),
-        "local = \"none\"",
-    )?;
+    let stub = people::installed_stub(&site, &daemon, &cable, (SEER.name, "ros2-rclpy"), "local = \"none\"")?;
     let mut command = Command::new(binaries::ros2().join("bin/python"));
     command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
     site.system.configure(&mut command);
-    tell_patience(&mut command)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped());
+    tell_patience(&mut command).stdin(Stdio::piped()).stdout(Stdio::piped());
     let mut application = command.spawn()?;
     let mut told = String::new();
     BufReader::new(application.stdout.as_mut().context("piped")?).read_line(&mut told)?;
     let explained = support::wait_until("whom the stub cannot reach", || {
         let told = daemon.get_json("/api/v1/robots/ros2-rclpy/explain")?;
         let causes = told["causes"].to_string();
-        Ok(causes
-            .contains("between /application and /people_detect")
-            .then_some(causes.clone())
-            .ok_or(causes))
+        Ok(causes.contains("between /application and /people_detect").then_some(causes.clone()).ok_or(causes))
     });
     let ended = application.wait_with_output()?;
-    let told = with_log(
-        serde_json::from_str::<Value>(&told).with_context(|| format!("{told}{}", ended.status)),
-        &stub,
-    )?;
+    let told =
+        with_log(serde_json::from_str::<Value>(&told).with_context(|| format!("{told}{}", ended.status)), &stub)?;
     let explained = explained?;
     ensure!(
         explained.contains(
@@ -470,19 +370,13 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
         let corners = json!([[left, 10.0], [left + 7.0, 19.0]]);
         ensure!(told["answers"][number.to_string()] == corners, "{told:#}");
     }
-    ensure!(
-        told["before"] == false && told["accepted"] == true,
-        "{told:#}"
-    );
+    ensure!(told["before"] == false && told["accepted"] == true, "{told:#}");
     let image = json!(["sensor_msgs/msg/Image"]);
     ensure!(told["subscribes"]["/image"] == image, "{told:#}");
     // The original requests images with this quality of service.
     ensure!(told["reliable"] == json!(["BEST_EFFORT"]), "{told:#}");
     let found = json!(["geometry_msgs/msg/PolygonStamped"]);
-    ensure!(
-        told["publishes"]["/people_detect/found"] == found,
-        "{told:#}"
-    );
+    ensure!(told["publishes"]["/people_detect/found"] == found, "{told:#}");
     Ok(())
 }
 
@@ -512,10 +406,7 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
     let site = Site::with_ros(RosVersion::Two)?;
     let app = site.join("/app")?;
     let stub = site.start_stub(&daemon, THE_HERALD, "ros2-again", &[])?;
-    with_log(
-        site.wait_for_graph(&app, "the service", has_service("/greet")),
-        &stub,
-    )?;
+    with_log(site.wait_for_graph(&app, "the service", has_service("/greet")), &stub)?;
     let request = MessageLayout::new(RosVersion::Two).text("lab").finish();
     let first = with_log(site.call_service(&app, "/greet", &request), &stub)?;
     ensure!(was_greeted(&first) == Some(false), "{first:?}");
@@ -540,24 +431,14 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
         Err(other) => return Err(other.into()),
     }
     let again = with_log(site.call_service(&app, "/greet", &request), &stub)?;
-    ensure!(
-        was_greeted(&again) == Some(true),
-        "it has forgotten what it did: {again:?}\n{}",
-        stub.output()
-    );
+    ensure!(was_greeted(&again) == Some(true), "it has forgotten what it did: {again:?}\n{}", stub.output());
     // The endpoints that had been discovered by then; more may have been discovered since.
     site.wait_for_graph(&app, "all that the node had", |graph| {
-        graph
-            .ends
-            .get("/herald")
-            .is_some_and(|now| has_all(now, &before))
+        graph.ends.get("/herald").is_some_and(|now| has_all(now, &before))
     })?;
     // The node was told that the participants of the previous daemon are gone, so it can discover the new ones.
     let now = participants(&daemon)?;
-    ensure!(
-        !earlier.is_empty() && earlier.is_subset(&now) && earlier != now,
-        "{earlier:?} {now:?}"
-    );
+    ensure!(!earlier.is_empty() && earlier.is_subset(&now) && earlier != now, "{earlier:?} {now:?}");
     drop(stub);
     daemon.deployer().run(&["stop", "--all"])?;
     daemon.stop()?;
@@ -574,11 +455,7 @@ fn wall_pixels(number: u32, (width, height): (u32, u32)) -> Vec<u8> {
             noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             let bits = |shift: u32| (noise >> shift & 3) as u8;
             let shade = (row / 2 + (column + number).abs_diff(width / 2) / 3) as u8;
-            pixels.extend([
-                shade + bits(28),
-                shade / 2 + bits(24),
-                200 - shade / 2 + bits(20),
-            ]);
+            pixels.extend([shade + bits(28), shade / 2 + bits(24), 200 - shade / 2 + bits(20)]);
         }
     }
     pixels
@@ -601,19 +478,14 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
         let settled = |carried: &[u64]| {
             let last = &carried[carried.len().saturating_sub(SETTLED)..];
             let is = |bytes: &u64| {
-                if smaller {
-                    *bytes < size * 2 / 5
-                } else {
-                    *bytes >= size
-                }
+                if smaller { *bytes < size * 2 / 5 } else { *bytes >= size }
             };
             last.len() == SETTLED && last.iter().all(is)
         };
         let deadline = Deadline::begin();
         let mut number = 0;
         while number < TRIED || !settled(&carried) {
-            deadline
-                .check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
+            deadline.check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
             number += 1;
             let before = cable.transferred_bytes()?.0;
             let pixels = wall_pixels(number, SIZE);
@@ -633,11 +505,7 @@ pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
     world().daemon_with(ADDER)?;
     for (ros, (service, package, executable), words) in [
         (RosVersion::One, THE_HERALD, ["herald", "ROS 2"]),
-        (
-            RosVersion::Two,
-            ("adder_py", "adder_py", "adder.py"),
-            ["adder_py", "ROS 1"],
-        ),
+        (RosVersion::Two, ("adder_py", "adder_py", "adder.py"), ["adder_py", "ROS 1"]),
     ] {
         let site = Site::with_ros(ros)?;
         let toml = format!(
@@ -647,10 +515,7 @@ pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
         let mut stub = site.start_stub_with_config(&toml, package, executable, &[])?;
         let status = stub.wait_for_exit()?;
         let said = stub.output();
-        ensure!(
-            status.code() == Some(1) && words.iter().all(|word| said.contains(word)),
-            "{status}\n{said}"
-        );
+        ensure!(status.code() == Some(1) && words.iter().all(|word| said.contains(word)), "{status}\n{said}");
     }
     Ok(())
 }

@@ -6,11 +6,7 @@ use support::deployer::path_str;
 use support::machine::{Machine, free_port};
 use support::world::{PEOPLE, world};
 
-const SHELLS: [(&str, &str); 3] = [
-    ("sh", "setup.sh"),
-    ("bash", "setup.bash"),
-    ("zsh", "setup.zsh"),
-];
+const SHELLS: [(&str, &str); 3] = [("sh", "setup.sh"), ("bash", "setup.bash"), ("zsh", "setup.zsh")];
 const OVERLAY: &str = "/opt/cloudroid";
 
 /// Prints where each tool finds the package and its nodes, one line each.
@@ -39,20 +35,9 @@ fn machine_with_stub() -> anyhow::Result<Machine> {
 
 fn machine_with_installed_stub() -> anyhow::Result<Machine> {
     let machine = machine_with_stub()?;
-    let outcome = machine
-        .run_script("sh", "sh opencv_apps-stub/install.sh")?
-        .expect_success()?;
-    for words in [
-        "ok    server",
-        "ok    clock",
-        "the token is valid",
-        ". /opt/cloudroid/setup.sh",
-    ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+    let outcome = machine.run_script("sh", "sh opencv_apps-stub/install.sh")?.expect_success()?;
+    for words in ["ok    server", "ok    clock", "the token is valid", ". /opt/cloudroid/setup.sh"] {
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     Ok(machine)
 }
@@ -60,23 +45,15 @@ fn machine_with_installed_stub() -> anyhow::Result<Machine> {
 pub fn on_debians_layout_every_tool_finds_the_stub() -> Verdict {
     let machine = machine_with_installed_stub()?;
     let before = machine.run_script("sh", LOOK)?.expect_success()?;
-    ensure!(
-        before.stdout == expected_paths("/usr"),
-        "{}",
-        before.output()
-    );
+    ensure!(before.stdout == expected_paths("/usr"), "{}", before.output());
     for (shell, setup) in SHELLS {
         // Twice, and with arguments that belong to the script and that `.` would pass on.
-        let script = format!(
-            "set -- --extend x\n. {OVERLAY}/{setup}\n. {OVERLAY}/{setup}\n{LOOK}\necho $CMAKE_PREFIX_PATH $*"
-        );
+        let script =
+            format!("set -- --extend x\n. {OVERLAY}/{setup}\n. {OVERLAY}/{setup}\n{LOOK}\necho $CMAKE_PREFIX_PATH $*");
         let found = machine.run_script(shell, &script)?.expect_success()?;
         let expected = format!("{}{OVERLAY}:/usr --extend x\n", expected_paths(OVERLAY));
         ensure!(found.stdout == expected, "{shell}: {}", found.output());
-        let left = machine.run_script(
-            shell,
-            &format!(". {OVERLAY}/{setup}; set | grep ^_cloudroid"),
-        )?;
+        let left = machine.run_script(shell, &format!(". {OVERLAY}/{setup}; set | grep ^_cloudroid"))?;
         ensure!(left.stdout.is_empty(), "{shell} keeps {}", left.stdout);
     }
     Ok(())
@@ -90,38 +67,22 @@ pub fn what_is_not_outsourced_becomes_the_original() -> Verdict {
          readlink /proc/$!/exe; tr '\\0' '\\n' < /proc/$!/environ | grep -c '{OVERLAY}'; cat /tmp/said >&2"
     );
     let become_it = machine.run_script("sh", &script)?;
-    ensure!(
-        become_it.stdout == "/usr/lib/opencv_apps/face_detection\n0\n",
-        "{}",
-        become_it.output()
-    );
+    ensure!(become_it.stdout == "/usr/lib/opencv_apps/face_detection\n0\n", "{}", become_it.output());
     Ok(())
 }
 
 pub fn without_the_original_the_stub_stands_alone() -> Verdict {
     let machine = machine_with_installed_stub()?;
-    machine
-        .run_script("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?
-        .expect_success()?;
+    machine.run_script("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?.expect_success()?;
     for (shell, setup) in SHELLS {
         let found = machine.run_script(shell, &format!(". {OVERLAY}/{setup}\n{LOOK}"))?;
-        ensure!(
-            found.stdout == expected_paths(OVERLAY),
-            "{shell}: {}",
-            found.output()
-        );
+        ensure!(found.stdout == expected_paths(OVERLAY), "{shell}: {}", found.output());
     }
     let source = format!(". {OVERLAY}/setup.sh\n");
     machine
-        .run_script(
-            "sh",
-            &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
-        )?
+        .run_script("sh", &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"))?
         .expect_failure(&["no original opencv_apps/face_detection is installed"])?;
-    let doctor = machine.run_script(
-        "sh",
-        &format!("{source}rosrun opencv_apps cloudroid-stub doctor"),
-    )?;
+    let doctor = machine.run_script("sh", &format!("{source}rosrun opencv_apps cloudroid-stub doctor"))?;
     let said = doctor.expect_success()?.stdout;
     ensure!(
         said.contains("people_detect is not installed on this robot, so it runs in the cloud only")
@@ -152,22 +113,13 @@ pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Verdict {
     let machine = machine_with_installed_stub()?;
     machine.run_script("bash", OPT_ROS)?.expect_success()?;
     for (shell, setup) in SHELLS {
-        let upstream = format!(
-            "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n"
-        );
+        let upstream =
+            format!("set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n");
         let before = machine.run_script(shell, &format!("{upstream}{LOOK}"))?;
-        ensure!(
-            before.stdout == expected_paths("/opt/ros/noetic"),
-            "{shell}: {}",
-            before.output()
-        );
+        ensure!(before.stdout == expected_paths("/opt/ros/noetic"), "{shell}: {}", before.output());
         let script = format!("{upstream}. {OVERLAY}/{setup}\n{LOOK}");
         let found = machine.run_script(shell, &script)?;
-        ensure!(
-            found.stdout == expected_paths(OVERLAY),
-            "{shell}: {}",
-            found.output()
-        );
+        ensure!(found.stdout == expected_paths(OVERLAY), "{shell}: {}", found.output());
     }
     // The original is found there as well; sourcing upstream again takes precedence over the stub, which is reported.
     let source = format!(
@@ -175,20 +127,14 @@ pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Verdict {
          {OVERLAY}/setup.sh\n"
     );
     let doctor = format!("{OVERLAY}/lib/opencv_apps/cloudroid-stub doctor");
-    let good = machine
-        .run_script("sh", &format!("{source}{doctor}"))?
-        .expect_success()?;
+    let good = machine.run_script("sh", &format!("{source}{doctor}"))?.expect_success()?;
     ensure!(
-        good.stdout
-            .contains("people_detect is /opt/ros/noetic/lib/opencv_apps/people_detect"),
+        good.stdout.contains("people_detect is /opt/ros/noetic/lib/opencv_apps/people_detect"),
         "{}",
         good.output()
     );
     machine
-        .run_script(
-            "sh",
-            &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"),
-        )?
+        .run_script("sh", &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"))?
         .expect_failure(&["FAIL  shadowing", "fix it:  . /opt/cloudroid/setup.sh"])?;
     Ok(())
 }
@@ -197,10 +143,7 @@ pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Verd
     let machine = machine_with_installed_stub()?;
     machine.run_script("bash", OPT_ROS)?.expect_success()?;
     machine
-        .run_script(
-            "sh",
-            "rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps",
-        )?
+        .run_script("sh", "rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps")?
         .expect_success()?;
     for (shell, setup) in SHELLS {
         let source = format!(
@@ -208,23 +151,14 @@ pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Verd
              {OVERLAY}/{setup}\n"
         );
         let found = machine.run_script(shell, &format!("{source}{LOOK}"))?;
-        ensure!(
-            found.stdout == expected_paths(OVERLAY),
-            "{shell}: {}",
-            found.output()
-        );
+        ensure!(found.stdout == expected_paths(OVERLAY), "{shell}: {}", found.output());
         machine
-            .run_script(
-                shell,
-                &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
-            )?
+            .run_script(shell, &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"))?
             .expect_failure(&["no original opencv_apps/face_detection is installed"])?;
         let doctor = format!("{source}rosrun opencv_apps cloudroid-stub doctor");
         let doctor = machine.run_script(shell, &doctor)?.expect_success()?;
         ensure!(
-            doctor.stdout.contains(
-                "people_detect is not installed on this robot, so it runs in the cloud only"
-            ),
+            doctor.stdout.contains("people_detect is not installed on this robot, so it runs in the cloud only"),
             "{shell}: {}",
             doctor.output()
         );
@@ -243,24 +177,14 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
     let written = machine.run_script("sh", &format!("ls -d {OVERLAY}"))?;
     ensure!(written.status != 0, "{}", written.output());
     machine
-        .run_script(
-            "sh",
-            "sh opencv_apps-stub/setup.sh; sh -c '. opencv_apps-stub/setup.sh'",
-        )?
+        .run_script("sh", "sh opencv_apps-stub/setup.sh; sh -c '. opencv_apps-stub/setup.sh'")?
         .expect_success()
         .and_then(|outcome| {
-            ensure!(
-                outcome.stderr.contains("run install.sh"),
-                "{}",
-                outcome.output()
-            );
+            ensure!(outcome.stderr.contains("run install.sh"), "{}", outcome.output());
             Ok(())
         })?;
     machine
-        .run_script(
-            "sh",
-            "sh opencv_apps-stub/install.sh --prefix /root/mine --robot rover --token secret",
-        )?
+        .run_script("sh", "sh opencv_apps-stub/install.sh --prefix /root/mine --robot rover --token secret")?
         .expect_success()?;
     let settings = machine
         .run_script("sh", "cat /root/mine/share/opencv_apps/stub.toml; stat -c %a /root/mine/share/opencv_apps/token")?
@@ -270,55 +194,32 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
         let of = |line: &&str| line.starts_with(key);
         settings.lines().filter(of).collect::<Vec<_>>()
     };
-    ensure!(
-        sets("robot") == ["robot = \"rover\""] && settings.ends_with("600\n"),
-        "{settings}"
-    );
+    ensure!(sets("robot") == ["robot = \"rover\""] && settings.ends_with("600\n"), "{settings}");
     // At the place in the file where they are explained.
-    ensure!(
-        settings.starts_with("# How this robot uses") && !settings.contains("# robot"),
-        "{settings}"
-    );
+    ensure!(settings.starts_with("# How this robot uses") && !settings.contains("# robot"), "{settings}");
     // Settings of the owner survive another installation.
     let again = "echo 'max = 0.4' >> /root/mine/share/opencv_apps/stub.toml\n\
                  sh opencv_apps-stub/install.sh --prefix /root/mine > /dev/null\n\
                  cat /root/mine/share/opencv_apps/stub.toml";
     let kept = machine.run_script("sh", again)?.expect_success()?.stdout;
-    ensure!(
-        kept.contains("max = 0.4") && kept.contains("robot = \"rover\""),
-        "{kept}"
-    );
-    machine
-        .run_script(
-            "sh",
-            "sh /root/mine/share/opencv_apps/install.sh --uninstall",
-        )?
-        .expect_success()?;
+    ensure!(kept.contains("max = 0.4") && kept.contains("robot = \"rover\""), "{kept}");
+    machine.run_script("sh", "sh /root/mine/share/opencv_apps/install.sh --uninstall")?.expect_success()?;
     let left = machine.run_script("sh", "ls -A /root/mine; rospack find opencv_apps")?;
-    ensure!(
-        left.stdout == "/usr/share/opencv_apps\n",
-        "{}",
-        left.output()
-    );
+    ensure!(left.stdout == "/usr/share/opencv_apps\n", "{}", left.output());
     Ok(())
 }
 
 pub fn a_stub_that_was_changed_on_its_way_is_not_installed() -> Verdict {
     let machine = machine_with_stub()?;
     let program = "opencv_apps-stub/lib/opencv_apps/cloudroid-stub";
-    let tampered = format!(
-        "printf '#!/bin/sh\\ntouch /root/ran\\n' > {program}; sh opencv_apps-stub/install.sh"
-    );
-    machine.run_script("sh", &tampered)?.expect_failure(&[
-        "./lib/opencv_apps/cloudroid-stub",
-        "differ from what the server signed",
-    ])?;
+    let tampered = format!("printf '#!/bin/sh\\ntouch /root/ran\\n' > {program}; sh opencv_apps-stub/install.sh");
+    machine
+        .run_script("sh", &tampered)?
+        .expect_failure(&["./lib/opencv_apps/cloudroid-stub", "differ from what the server signed"])?;
     let left = machine.run_script("sh", &format!("ls -d {OVERLAY} /root/ran"))?;
     ensure!(left.stdout.is_empty(), "{}", left.output());
     let unsigned = "rm opencv_apps-stub/MANIFEST.sig; sh opencv_apps-stub/install.sh";
-    machine
-        .run_script("sh", unsigned)?
-        .expect_failure(&["this archive is not signed"])?;
+    machine.run_script("sh", unsigned)?.expect_failure(&["this archive is not signed"])?;
     Ok(())
 }
 
@@ -343,11 +244,7 @@ timeout "$PATIENCE" roslaunch load.launch || echo "roslaunch: $?""#
     let refused = machine.run_script("bash", &script)?.expect_success()?;
     // As a process of its own, and in a manager from a launch file, where the loader exits and is required.
     for words in ["standalone: ", "REQUIRED process [people"] {
-        ensure!(
-            refused.output().contains(words),
-            "{words}: {}",
-            refused.output()
-        );
+        ensure!(refused.output().contains(words), "{words}: {}", refused.output());
     }
     let why = "opencv_apps runs in the cloud: its nodelets cannot be loaded";
     let times = refused.output().matches(why).count();
@@ -358,15 +255,9 @@ timeout "$PATIENCE" roslaunch load.launch || echo "roslaunch: $?""#
 pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
     let daemon = world().daemon_with(PEOPLE)?;
     let (status, body) = daemon.get("/stubs/nobody.tar.gz")?;
-    ensure!(
-        status == 404 && body.contains("opencv_apps"),
-        "{status} {body}"
-    );
+    ensure!(status == 404 && body.contains("opencv_apps"), "{status} {body}");
     let (status, body) = daemon.get("/stubs/opencv_apps.tar.gz?arch=riscv64")?;
-    ensure!(
-        status == 404 && body.contains("make stub-cross"),
-        "{status} {body}"
-    );
+    ensure!(status == 404 && body.contains("make stub-cross"), "{status} {body}");
     let stubs = daemon.deployer().run_json(&["stub"])?;
     ensure!(stubs["architectures"][0] == "x86_64", "{stubs}");
     // The available architectures depend on what was built; for each of them there is a response.
@@ -385,9 +276,6 @@ pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
         daemon.deployer().run(&words)?.expect_success()?;
         std::fs::read(directory.join("opencv_apps.tar.gz")).context("the archive")
     };
-    ensure!(
-        archive("a")? == archive("b")?,
-        "the same stub twice differs"
-    );
+    ensure!(archive("a")? == archive("b")?, "the same stub twice differs");
     Ok(())
 }

@@ -78,12 +78,7 @@ impl SharerNode {
     }
 
     /// Waits until the group of servants satisfies `is`, and returns it.
-    fn wait_for_group(
-        self,
-        daemon: &Daemon,
-        what: &str,
-        is: impl Fn(&Value) -> bool,
-    ) -> anyhow::Result<Value> {
+    fn wait_for_group(self, daemon: &Daemon, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
         daemon.wait_for(&self.service_path(), what, |service| {
             let groups = service["groups"].as_array()?;
             groups.iter().find(|group| is(group)).cloned()
@@ -112,9 +107,7 @@ impl SharerNode {
 
 fn ready_count(group: &Value) -> usize {
     let servants = group["servants"].as_array();
-    servants.map_or(0, |all| {
-        all.iter().filter(|one| one["ready"] == true).count()
-    })
+    servants.map_or(0, |all| all.iter().filter(|one| one["ready"] == true).count())
 }
 
 /// Kills a servant, as a failing machine would.
@@ -159,10 +152,7 @@ pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed(ros: RosVersi
                     let who = format!("{name} {}", answers.len());
                     let answer = robot.call("/work", json!({"who": who, "seconds": 0.01}))?;
                     if answer["result"] == true {
-                        ensure!(
-                            answer["values"]["who"] == who.as_str(),
-                            "not its own: {answer}"
-                        );
+                        ensure!(answer["values"]["who"] == who.as_str(), "not its own: {answer}");
                     }
                     answers.push(answer);
                 }
@@ -173,9 +163,7 @@ pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed(ros: RosVersi
             })
         })
         .collect();
-    sharer.wait_for_group(&daemon, "many answers of the other", |group| {
-        group["answered"].as_u64() > Some(100)
-    })?;
+    sharer.wait_for_group(&daemon, "many answers of the other", |group| group["answered"].as_u64() > Some(100))?;
     kill_shim(&daemon, &victim)?;
     sharer.wait_for_group(&daemon, "another in its place", |group| {
         ready_count(group) == 2 && !group["servants"].to_string().contains(&victim)
@@ -187,18 +175,12 @@ pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed(ros: RosVersi
     ensure!(answer["result"] == false && told, "{answer}");
     let mut by: BTreeMap<String, usize> = BTreeMap::new();
     for robot in working {
-        for answer in robot
-            .join()
-            .map_err(|_| anyhow::anyhow!("a robot panicked"))??
-        {
+        for answer in robot.join().map_err(|_| anyhow::anyhow!("a robot panicked"))?? {
             let place = if answer["result"] == true {
                 answer["values"]["where"].as_str()
             } else {
                 let words = answer["values"].as_str().unwrap_or_default();
-                ensure!(
-                    words.contains(&victim) && words.contains("--idempotent"),
-                    "{answer}"
-                );
+                ensure!(words.contains(&victim) && words.contains("--idempotent"), "{answer}");
                 Some("failed")
             };
             *by.entry(place.unwrap_or_default().to_owned()).or_default() += 1;
@@ -213,20 +195,14 @@ pub fn twenty_robots_share_two_servants_and_one_of_these_is_killed(ros: RosVersi
 
 pub fn a_shared_service_grows_under_load_and_shrinks_after_it() -> Verdict {
     let sharer = OF_ONE;
-    let daemon = sharer.start_daemon(
-        "sharing-scale",
-        "[servant]\ngrace = \"3s\"\n",
-        &["--max", "2", "--cpus", "0.2"],
-    )?;
-    let mut busy = (0..6)
-        .map(|number| sharer.connect(&daemon, &format!("r{number}")))
-        .collect::<anyhow::Result<Vec<_>>>()?;
+    let daemon =
+        sharer.start_daemon("sharing-scale", "[servant]\ngrace = \"3s\"\n", &["--max", "2", "--cpus", "0.2"])?;
+    let mut busy =
+        (0..6).map(|number| sharer.connect(&daemon, &format!("r{number}"))).collect::<anyhow::Result<Vec<_>>>()?;
     let deadline = Deadline::begin();
     loop {
         for robot in &mut busy {
-            robot.send(
-                json!({"op": "call_service", "service": "/work", "args": {"seconds": 0.2}}),
-            )?;
+            robot.send(json!({"op": "call_service", "service": "/work", "args": {"seconds": 0.2}}))?;
         }
         for robot in &mut busy {
             let answer = robot.wait_for("its answer", |value| value["op"] == "service_response")?;
@@ -239,20 +215,13 @@ pub fn a_shared_service_grows_under_load_and_shrinks_after_it() -> Verdict {
         deadline.check(|| format!("{service:#}"))?;
     }
     let few = sharer.wait_for_group(&daemon, "one servant again", |group| {
-        group["servants"]
-            .as_array()
-            .is_some_and(|all| all.len() == 1)
+        group["servants"].as_array().is_some_and(|all| all.len() == 1)
     })?;
     ensure!(few["failed"] == 0, "{few:#}");
     let answer = busy[0].call("/work", json!({"who": "still", "seconds": 0.0}))?;
     ensure!(answer["values"]["who"] == "still", "{answer}");
-    for reason in [
-        "concurrent requests are many for 1 servants",
-        "are few for 2 servants",
-    ] {
-        daemon.wait_for_event(reason, |event| {
-            event["message"].to_string().contains(reason)
-        })?;
+    for reason in ["concurrent requests are many for 1 servants", "are few for 2 servants"] {
+        daemon.wait_for_event(reason, |event| event["message"].to_string().contains(reason))?;
     }
     Ok(())
 }
@@ -290,10 +259,7 @@ pub fn goals_of_robots_do_not_meet(ros: RosVersion) -> Verdict {
         RosVersion::Two => send_goal(&mut two, sharer, "mine", goal)?,
     }
     let result = one.wait_for("its result", |value| value["op"] == "action_result")?;
-    ensure!(
-        result["values"] == json!({"who": "one", "all": [1, 2, 3, 4, 5]}),
-        "{result}"
-    );
+    ensure!(result["values"] == json!({"who": "one", "all": [1, 2, 3, 4, 5]}), "{result}");
     let result = match ros {
         RosVersion::One => {
             let result = two.next_message_on("/count/result")?;
@@ -306,15 +272,10 @@ pub fn goals_of_robots_do_not_meet(ros: RosVersion) -> Verdict {
             result["values"].clone()
         }
     };
-    ensure!(
-        result == json!({"who": "two", "all": [1, 2, 3]}),
-        "{result}"
-    );
+    ensure!(result == json!({"who": "two", "all": [1, 2, 3]}), "{result}");
     let foreign = |value: &Value| {
         let feedback = match ros {
-            RosVersion::One => {
-                value["topic"] == "/count/feedback" && value["msg"]["feedback"]["who"] != "two"
-            }
+            RosVersion::One => value["topic"] == "/count/feedback" && value["msg"]["feedback"]["who"] != "two",
             RosVersion::Two => value["op"] == "action_feedback" && value["values"]["who"] != "two",
         };
         feedback || value["topic"] == "/count/status" && value.to_string().contains("one")
@@ -329,22 +290,13 @@ pub fn goals_of_robots_do_not_meet(ros: RosVersion) -> Verdict {
     };
     two.send(json!({"op": "subscribe", "topic": "/rosout", "type": log}))?;
     let refused = two.wait_for_status("/rosout")?;
-    ensure!(
-        refused["msg"]
-            .as_str()
-            .is_some_and(|words| words.contains("robots share")),
-        "{refused}"
-    );
+    ensure!(refused["msg"].as_str().is_some_and(|words| words.contains("robots share")), "{refused}");
     // They may not change the node either.
     if ros == RosVersion::Two {
-        let set =
-            json!({"parameters": [{"name": "speed", "value": {"type": 3, "double_value": 100.0}}]});
+        let set = json!({"parameters": [{"name": "speed", "value": {"type": 3, "double_value": 100.0}}]});
         let refused = two.call("/sharer/set_parameters", set)?;
         ensure!(refused["result"] == false, "{refused}");
-        let refused = two.call(
-            "/rosapi/set_param",
-            json!({"name": "/sharer:speed", "value": "100.0"}),
-        )?;
+        let refused = two.call("/rosapi/set_param", json!({"name": "/sharer:speed", "value": "100.0"}))?;
         let words = refused.to_string();
         ensure!(words.contains("robots share"), "{refused}");
     }
@@ -352,29 +304,19 @@ pub fn goals_of_robots_do_not_meet(ros: RosVersion) -> Verdict {
 }
 
 pub fn what_robots_cannot_share_is_refused_with_what_was_found(ros: RosVersion) -> Verdict {
-    let daemon = world()
-        .setup(&format!("sharing-refused-{}", ros.number()))
-        .start()?;
+    let daemon = world().setup(&format!("sharing-refused-{}", ros.number())).start()?;
     let (package, arguments) = match ros {
         RosVersion::One => ("greeter_cpp", &["--node", "greeter", "--shared"][..]),
         RosVersion::Two => ("herald_ros2", &["--node", "herald/herald", "--shared"][..]),
     };
     let refused = daemon.deployer().push(package, arguments)?;
-    refused.expect_failure(&[
-        "robots cannot share it",
-        "it subscribes to",
-        "it publishes",
-        "without --shared",
-    ])?;
+    refused.expect_failure(&["robots cannot share it", "it subscribes to", "it publishes", "without --shared"])?;
     let sharer = SharerNode::for_ros(ros);
     let numbers: &[&str] = &["--shared", "--min", "5", "--max", "2"];
     let arguments = [sharer.arguments, numbers].concat();
     let refused = daemon.deployer().push(sharer.service, &arguments)?;
     refused.expect_failure(&["--min 5", "--max 2"])?;
-    ensure!(
-        daemon.deployer().run_json(&["services"])? == json!([]),
-        "something was published"
-    );
+    ensure!(daemon.deployer().run_json(&["services"])? == json!([]), "something was published");
     Ok(())
 }
 
@@ -388,18 +330,10 @@ pub fn of_two_replicas_the_first_answers_and_the_cost_is_shown(ros: RosVersion) 
         ensure!(answer["values"]["who"] == format!("{number}"), "{answer}");
     }
     // The second answer to a request arrives long after the robot got the first.
-    let group = sharer.wait_for_group(&daemon, "five answers, each twice", |group| {
-        group["answered"] == 5 && group["wasted"] == 5
-    })?;
+    let group = sharer
+        .wait_for_group(&daemon, "five answers, each twice", |group| group["answered"] == 5 && group["wasted"] == 5)?;
     ensure!(group["failed"] == 0, "{group:#}");
-    let shown = daemon
-        .deployer()
-        .run(&["services", sharer.service])?
-        .expect_success()?;
-    ensure!(
-        shown.stdout.contains("5 of 10 answers unused"),
-        "{}",
-        shown.stdout
-    );
+    let shown = daemon.deployer().run(&["services", sharer.service])?.expect_success()?;
+    ensure!(shown.stdout.contains("5 of 10 answers unused"), "{}", shown.stdout);
     Ok(())
 }

@@ -18,27 +18,18 @@ use support::world::world;
 use support::{Verdict, leftovers, procfs};
 
 /// Starts a separate daemon whose servants outlive it, and pushes these packages.
-fn start_with_packages(
-    name: &str,
-    packages: &[(&str, &[&str])],
-) -> anyhow::Result<(DaemonSetup, Daemon)> {
+fn start_with_packages(name: &str, packages: &[(&str, &[&str])]) -> anyhow::Result<(DaemonSetup, Daemon)> {
     let setup = world().setup(name).config("keep_servants = true\n");
     let daemon = setup.start()?;
     for (package, arguments) in packages {
-        daemon
-            .deployer()
-            .push(package, arguments)?
-            .expect_success()?;
+        daemon.deployer().push(package, arguments)?.expect_success()?;
     }
     Ok((setup, daemon))
 }
 
 /// Checks that nothing is left after its servants have been stopped.
 fn expect_nothing_left(daemon: Daemon) -> Verdict {
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     let home = daemon.home.clone();
     daemon.stop()?;
     let left = leftovers::find_leftovers(&home);
@@ -50,9 +41,7 @@ fn expect_nothing_left(daemon: Daemon) -> Verdict {
 pub(crate) fn wait_for_event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<Value> {
     daemon.wait_for_event(&format!("an event {kind} with {words:?}"), |event| {
         event["kind"] == kind
-            && event["message"]
-                .as_str()
-                .is_some_and(|text| words.iter().all(|word| text.contains(word)))
+            && event["message"].as_str().is_some_and(|text| words.iter().all(|word| text.contains(word)))
     })
 }
 
@@ -62,9 +51,8 @@ fn greet(robot: &mut Robot, name: &str) -> anyhow::Result<Value> {
     robot.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": name}}))?;
     // roscpp may deliver the latched message twice to a late subscriber.
     let greets = format!("hi {name}");
-    let heard = robot.wait_for(&greets, |heard| {
-        heard["topic"] == "/greeter/greeting" && heard["msg"]["text"] == *greets
-    })?;
+    let heard =
+        robot.wait_for(&greets, |heard| heard["topic"] == "/greeter/greeting" && heard["msg"]["text"] == *greets)?;
     Ok(heard["msg"].clone())
 }
 
@@ -95,10 +83,7 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
     let mut caller = first.robot("burglar_cpp?robot=r1")?;
     greeter.subscribe("/greeter/greeting")?;
     ensure!(greet(&mut greeter, "Ada")?["count"] == 1);
-    let set = greeter.call(
-        "/rosapi/set_param",
-        json!({"name": "/kept", "value": "[1, 2]"}),
-    )?;
+    let set = greeter.call("/rosapi/set_param", json!({"name": "/kept", "value": "[1, 2]"}))?;
     ensure!(set["result"] == true, "{set}");
     ensure!(adder.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     let services = ["greeter_cpp", "adder_py", "burglar_cpp"];
@@ -106,10 +91,7 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
         let servant = daemon.servant_of(service, "r1")?;
         Ok((servant["id"].clone(), servant["pids"].clone()))
     };
-    let before: Vec<_> = services
-        .iter()
-        .map(|service| of(&first, service))
-        .collect::<Result<_, _>>()?;
+    let before: Vec<_> = services.iter().map(|service| of(&first, service)).collect::<Result<_, _>>()?;
     // Traffic, and a call that its node has not answered yet.
     let url = first.url("greeter_cpp?robot=r1");
     let (flowing, flows) = std::sync::mpsc::channel();
@@ -117,13 +99,9 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
         let Ok(mut robot) = Robot::connect(&url) else {
             return 0;
         };
-        let _ =
-            robot.send(json!({"op": "advertise", "topic": "/noise", "type": "std_msgs/String"}));
+        let _ = robot.send(json!({"op": "advertise", "topic": "/noise", "type": "std_msgs/String"}));
         let mut sent = 0;
-        while robot
-            .send(json!({"op": "publish", "topic": "/noise", "msg": {"data": "x"}}))
-            .is_ok()
-        {
+        while robot.send(json!({"op": "publish", "topic": "/noise", "msg": {"data": "x"}})).is_ok() {
             sent += 1;
             let _ = flowing.send(());
         }
@@ -133,53 +111,28 @@ pub fn a_killed_daemon_loses_nothing() -> Verdict {
         "op": "call_service", "id": "flying", "service": "/burglar/try",
         "args": {"what": "wait", "argument": "600000"},
     }))?;
-    ensure!(
-        try_attempt(&mut caller, "write", "/tmp/called yes")?.succeeded,
-        "another is answered meanwhile"
-    );
+    ensure!(try_attempt(&mut caller, "write", "/tmp/called yes")?.succeeded, "another is answered meanwhile");
     patience::receive(&flows).context("no traffic")?;
     first.kill()?;
-    ensure!(
-        traffic.join().is_ok_and(|sent| sent > 0),
-        "there was traffic"
-    );
+    ensure!(traffic.join().is_ok_and(|sent| sent > 0), "there was traffic");
     // The call is not answered, because its connection ends.
-    ensure!(
-        caller
-            .wait_for("an answer", |value| value["id"] == "flying")
-            .is_err()
-    );
+    ensure!(caller.wait_for("an answer", |value| value["id"] == "flying").is_err());
 
     let second = setup.start()?;
     for (service, before) in services.iter().zip(&before) {
-        ensure!(
-            of(&second, service)? == *before,
-            "{service} has another servant"
-        );
+        ensure!(of(&second, service)? == *before, "{service} has another servant");
         wait_for_event(&second, "servant-adopted", &[service])?;
     }
     let mut greeter = second.robot("greeter_cpp?robot=r1")?;
     greeter.subscribe("/greeter/greeting")?;
-    ensure!(
-        greeter.next_message_on("/greeter/greeting")?["text"] == "hi Ada",
-        "what was latched comes again"
-    );
-    ensure!(
-        greet(&mut greeter, "Bea")?["count"] == 2,
-        "the node has counted on"
-    );
+    ensure!(greeter.next_message_on("/greeter/greeting")?["text"] == "hi Ada", "what was latched comes again");
+    ensure!(greet(&mut greeter, "Bea")?["count"] == 2, "the node has counted on");
     let kept = greeter.call("/rosapi/get_param", json!({"name": "/kept"}))?;
-    ensure!(
-        kept["values"]["value"] == "[1,2]" || kept["values"]["value"] == "[1, 2]",
-        "{kept}"
-    );
+    ensure!(kept["values"]["value"] == "[1,2]" || kept["values"]["value"] == "[1, 2]", "{kept}");
     let mut adder = second.robot("adder_py?robot=r1")?;
     ensure!(adder.call("/add_two", json!({"a": 20, "b": 22}))?["values"]["sum"] == 42);
     let mut caller = second.robot("burglar_cpp?robot=r1")?;
-    ensure!(
-        try_attempt(&mut caller, "text-in-file", "/tmp/called yes")?.succeeded,
-        "its scratch is as it was"
-    );
+    ensure!(try_attempt(&mut caller, "text-in-file", "/tmp/called yes")?.succeeded, "its scratch is as it was");
     expect_nothing_left(second)
 }
 
@@ -196,10 +149,7 @@ pub fn a_daemon_that_is_ended_says_why_and_keeps_its_servants() -> Verdict {
     first.stop()?;
     // It failed with a reason, or the connection was closed with one.
     match robot.wait_for("an answer", |value| value["id"] == "flying") {
-        Ok(answer) => ensure!(
-            answer["result"] == false && answer["values"].to_string().len() > 4,
-            "{answer}"
-        ),
+        Ok(answer) => ensure!(answer["result"] == false && answer["values"].to_string().len() > 4, "{answer}"),
         Err(error) => ensure!(format!("{error:#}").contains("connect again"), "{error:#}"),
     }
     let second = setup.start()?;
@@ -216,10 +166,7 @@ fn parent_of_process(pid: i32) -> anyhow::Result<i32> {
 
 pub fn a_killed_init_and_a_killed_shim_are_told() -> Verdict {
     let (_, daemon) = start_with_packages("orphans", &[GREETER])?;
-    for (which, words) in [
-        ("init", "its init was killed by signal 9"),
-        ("shim", "its shim was killed"),
-    ] {
+    for (which, words) in [("init", "its init was killed by signal 9"), ("shim", "its shim was killed")] {
         let path = format!("greeter_cpp?robot={which}");
         let mut robot = daemon.robot(&path)?;
         robot.send(json!({"op": "set_level", "level": "warning"}))?;
@@ -227,25 +174,13 @@ pub fn a_killed_init_and_a_killed_shim_are_told() -> Verdict {
         let servant = daemon.servant_of("greeter_cpp", which)?;
         let node = servant["pids"][0].as_i64().context("a pid")? as i32;
         let init = parent_of_process(node)?;
-        let victim = if which == "init" {
-            init
-        } else {
-            parent_of_process(init)?
-        };
+        let victim = if which == "init" { init } else { parent_of_process(init)? };
         kill(Pid::from_raw(victim), Signal::SIGKILL)?;
         robot.wait_for_status("servant")?;
-        wait_for_event(
-            &daemon,
-            "servant-failed",
-            &[servant["id"].as_str().context("an id")?, words],
-        )?;
+        wait_for_event(&daemon, "servant-failed", &[servant["id"].as_str().context("an id")?, words])?;
         support::wait_until(&format!("the end of a node after its {which}'s"), || {
             let runs = Path::new(&format!("/proc/{node}")).exists();
-            Ok(if runs {
-                Err("it runs".to_owned())
-            } else {
-                Ok(())
-            })
+            Ok(if runs { Err("it runs".to_owned()) } else { Ok(()) })
         })?;
         // The robot returns and gets another servant.
         let mut robot = daemon.robot(&path)?;
@@ -255,18 +190,11 @@ pub fn a_killed_init_and_a_killed_shim_are_told() -> Verdict {
 }
 
 pub fn nodes_end_as_ros_users_know_it() -> Verdict {
-    let (_, daemon) =
-        start_with_packages("ends", &[("burglar_cpp", &["--launch", "ends.launch"])])?;
+    let (_, daemon) = start_with_packages("ends", &[("burglar_cpp", &["--launch", "ends.launch"])])?;
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
-    let id = daemon.servant_of("burglar_cpp", "r1")?["id"]
-        .as_str()
-        .context("an id")?
-        .to_owned();
+    let id = daemon.servant_of("burglar_cpp", "r1")?["id"].as_str().context("an id")?.to_owned();
     let mut end = |node: &str, how: &str| -> anyhow::Result<()> {
-        let answer = robot.call(
-            &format!("/{node}/try"),
-            json!({"what": "end", "argument": how}),
-        )?;
+        let answer = robot.call(&format!("/{node}/try"), json!({"what": "end", "argument": how}))?;
         ensure!(answer["result"] == true, "{answer}");
         Ok(())
     };
@@ -277,21 +205,13 @@ pub fn nodes_end_as_ros_users_know_it() -> Verdict {
     wait_for_respawn(&daemon, 2, "was killed by SIGSEGV")?;
     // A node without respawn is not restarted, and the others continue.
     end("mortal", "exit 0")?;
-    wait_for_event(
-        &daemon,
-        "node-ended",
-        &[&id, "/mortal", "exited with status 0"],
-    )?;
+    wait_for_event(&daemon, "node-ended", &[&id, "/mortal", "exited with status 0"])?;
     // `rosnode kill` calls `shutdown` of the node's own XML-RPC API, in its network namespace.
     rosnode_kill(&daemon, "phoenix")?;
     wait_for_respawn(&daemon, 3, "exited with status 0")?;
     // The end of a required node ends the servant.
     end("king", "exit 3")?;
-    wait_for_event(
-        &daemon,
-        "servant-failed",
-        &[&id, "required node /king", "exited with status 3"],
-    )?;
+    wait_for_event(&daemon, "servant-failed", &[&id, "required node /king", "exited with status 3"])?;
     expect_nothing_left(daemon)
 }
 
@@ -320,10 +240,7 @@ fn kill_again_when_back(daemon: &Daemon, node: &str, how: &str) -> Verdict {
     let deadline = Deadline::begin();
     let mut robot = daemon.robot("burglar_cpp?robot=r1")?;
     loop {
-        let answer = robot.call(
-            &format!("/{node}/try"),
-            json!({"what": "end", "argument": how}),
-        )?;
+        let answer = robot.call(&format!("/{node}/try"), json!({"what": "end", "argument": how}))?;
         if answer["result"] == true {
             let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?;
             let away = now.as_millis() as u64 - ended.as_u64().context("a time")?;
@@ -352,13 +269,8 @@ fn rosnode_kill(daemon: &Daemon, node: &str) -> Verdict {
         patience().as_secs()
     );
     let pid = daemon.servant_of("burglar_cpp", "r1")?["pids"][0].to_string();
-    run(Command::new("nsenter").args([
-        &format!("--net=/proc/{pid}/ns/net"),
-        "python3",
-        "-c",
-        &script,
-    ]))?
-    .expect_success()?;
+    run(Command::new("nsenter").args([&format!("--net=/proc/{pid}/ns/net"), "python3", "-c", &script]))?
+        .expect_success()?;
     Ok(())
 }
 
@@ -375,19 +287,13 @@ fn expect_in_database(daemon: &Daemon, event: &Value) -> Verdict {
         event["id"]
     );
     let found = run(Command::new("python3").args(["-c", &script]))?.expect_success()?;
-    ensure!(
-        Some(found.stdout.trim()) == event["kind"].as_str(),
-        "{} is not {event}",
-        found.stdout
-    );
+    ensure!(Some(found.stdout.trim()) == event["kind"].as_str(), "{} is not {event}", found.stdout);
     Ok(())
 }
 
 pub fn a_locked_database_is_named_and_waited_for() -> Verdict {
     let (_, daemon) = start_with_packages("locked", &[GREETER])?;
-    daemon
-        .robot("greeter_cpp?robot=before")?
-        .call("/greeter/count", json!({}))?;
+    daemon.robot("greeter_cpp?robot=before")?.call("/greeter/count", json!({}))?;
     let script = format!(
         "import sqlite3, sys\nc = sqlite3.connect({:?})\nc.isolation_level = None\nc.execute('BEGIN EXCLUSIVE')\n\
          print('locked', flush=True)\nsys.stdin.read()\n",
@@ -408,11 +314,7 @@ pub fn a_locked_database_is_named_and_waited_for() -> Verdict {
         Err(refusal) => refusal.to_string(),
         Ok(mut robot) => format!("{:?}", robot.wait_for_close()?),
     };
-    let unwritable = wait_for_event(
-        &daemon,
-        "state-unwritable",
-        &["another program has locked it", "cloudroid.db"],
-    )?;
+    let unwritable = wait_for_event(&daemon, "state-unwritable", &["another program has locked it", "cloudroid.db"])?;
     ensure!(status_warnings(&daemon)?.contains("another program has locked it"));
     ensure!(daemon.get("/healthz")?.0 == 200);
     before.call("/greeter/count", json!({"reset": false}))?;
@@ -431,10 +333,7 @@ pub fn a_locked_database_is_named_and_waited_for() -> Verdict {
 pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Verdict {
     let disk = SmallDisk::mount("full", "1500M")?;
     let daemon = DaemonSetup::new(&disk.home()).start()?;
-    daemon
-        .deployer()
-        .push(GREETER.0, GREETER.1)?
-        .expect_success()?;
+    daemon.deployer().push(GREETER.0, GREETER.1)?.expect_success()?;
     let mut early = daemon.robot("greeter_cpp?robot=early")?;
     ensure!(early.call("/greeter/count", json!({"reset": false}))?["result"] == true);
     disk.fill()?;
@@ -443,10 +342,7 @@ pub fn a_full_disk_is_named_and_robots_at_work_stay() -> Verdict {
         Ok(mut robot) => format!("{:?}", robot.wait_for_close()?),
     };
     ensure!(words.contains("space") || words.contains("full"), "{words}");
-    ensure!(
-        early.call("/greeter/count", json!({"reset": false}))?["result"] == true,
-        "at work"
-    );
+    ensure!(early.call("/greeter/count", json!({"reset": false}))?["result"] == true, "at work");
     // Known robots are admitted again.
     early.leave()?;
     let mut early = daemon.robot("greeter_cpp?robot=early")?;
@@ -468,17 +364,7 @@ pub fn what_a_full_disk_refuses_is_not_done() -> Verdict {
     let setup = DaemonSetup::new(&disk.home());
     let daemon = setup.start()?;
     let deployer = daemon.deployer();
-    let create = |name| {
-        [
-            "token",
-            "create",
-            name,
-            "--role",
-            "viewer",
-            "--service",
-            "*",
-        ]
-    };
+    let create = |name| ["token", "create", name, "--role", "viewer", "--service", "*"];
     deployer.run(&create("ada"))?.expect_success()?;
     disk.fill()?;
     // A token that is not stored would be useless, and a revocation that is not stored would be misleading.
@@ -503,10 +389,7 @@ pub fn what_a_full_disk_refuses_is_not_done() -> Verdict {
     ensure!(live(&daemon)? == ["\"ada\""], "{:?}", live(&daemon)?);
     let rules = daemon.deployer().run_json(&["policy", "list"])?.to_string();
     ensure!(!rules.contains("ada"), "{rules}");
-    daemon
-        .deployer()
-        .run(&["token", "revoke", "ada"])?
-        .expect_success()?;
+    daemon.deployer().run(&["token", "revoke", "ada"])?.expect_success()?;
     ensure!(live(&daemon)?.is_empty());
     expect_nothing_left(daemon)
 }

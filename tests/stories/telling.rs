@@ -30,18 +30,8 @@ fn rehearse_where(place: &Directory, script: &str) -> anyhow::Result<CommandOutc
     let rehearsal = rehearse_command(place, &["rehearsal::passes"])?;
     let script = format!("set -e\n{script}");
     let mut shell = Command::new("unshare");
-    shell.args([
-        "--mount",
-        "--propagation",
-        "private",
-        "sh",
-        "-c",
-        &script,
-        "sh",
-    ]);
-    shell
-        .arg(rehearsal.get_program())
-        .args(rehearsal.get_args());
+    shell.args(["--mount", "--propagation", "private", "sh", "-c", &script, "sh"]);
+    shell.arg(rehearsal.get_program()).args(rehearsal.get_args());
     shell.current_dir(place.path());
     for (key, value) in rehearsal.get_envs() {
         match value {
@@ -53,33 +43,24 @@ fn rehearse_where(place: &Directory, script: &str) -> anyhow::Result<CommandOutc
 }
 
 /// Mounts a /dev without loop devices.
-const WITHOUT_LOOP: &str =
-    "mount -t tmpfs none /dev\nmknod -m 666 /dev/null c 1 3\nmknod -m 666 /dev/urandom c 1 9\n";
+const WITHOUT_LOOP: &str = "mount -t tmpfs none /dev\nmknod -m 666 /dev/null c 1 3\nmknod -m 666 /dev/urandom c 1 9\n";
 
 pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
     let place = world().directory("telling")?;
-    let outcome = run(&mut rehearse_command(
-        &place,
-        &["rehearsal::passes", "fails_once", "panics_once"],
-    )?)?
-    .expect_success()?;
+    let outcome =
+        run(&mut rehearse_command(&place, &["rehearsal::passes", "fails_once", "panics_once"])?)?.expect_success()?;
     for said in [
         "FLAKY rehearsal::fails_once: it fails the first time",
         "FLAKY rehearsal::panics_once: panicked: it panics the first time",
         "\n3 passed, 0 failed",
     ] {
-        ensure!(
-            outcome.stdout.contains(said),
-            "{said:?} is not in {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(said), "{said:?} is not in {}", outcome.output());
     }
     let target = place.path().join("target");
     let flaky = std::fs::read_to_string(target.join("flaky.json"))?;
     ensure!(flaky.lines().count() == 2, "a line for each: {flaky}");
     let kept = target.join("stories/rehearsal/fails_once");
-    let read =
-        |name: &str| std::fs::read_to_string(kept.join(name)).with_context(|| name.to_owned());
+    let read = |name: &str| std::fs::read_to_string(kept.join(name)).with_context(|| name.to_owned());
     for (name, word) in [
         ("reason", "it fails the first time"),
         ("reason", "seed: "),
@@ -100,27 +81,13 @@ pub fn more_than_two_by_chance_fail_the_run_and_strictly_the_first() -> Verdict 
     let place = world().directory("telling")?;
     let once = ["fails_once", "is_missed_once", "times_out_once"];
     let outcome = run(&mut rehearse_command(&place, &once)?)?;
-    outcome.expect_failure(&[
-        "more than 2 stories failed and then passed",
-        "3 passed, 0 failed",
-    ])?;
+    outcome.expect_failure(&["more than 2 stories failed and then passed", "3 passed, 0 failed"])?;
     let strictly = run(rehearse_command(&place, &["is_missed_once"])?.env("STRICT", "1"))?;
     ensure!(strictly.status == 1, "{}", strictly.output());
-    ensure!(
-        !strictly.output().contains("FLAKY"),
-        "it is not told again: {}",
-        strictly.output()
-    );
-    let outcome = run(&mut rehearse_command(
-        &place,
-        &["rehearsal::fails", "rehearsal::passes", "--exact"],
-    )?)?;
-    outcome.expect_failure(&[
-        "== failed: rehearsal::fails\nit always fails",
-        "1 passed, 1 failed",
-    ])?;
-    run(&mut rehearse_command(&place, &["nobody"])?)?
-        .expect_failure(&["no story is called nobody"])?;
+    ensure!(!strictly.output().contains("FLAKY"), "it is not told again: {}", strictly.output());
+    let outcome = run(&mut rehearse_command(&place, &["rehearsal::fails", "rehearsal::passes", "--exact"])?)?;
+    outcome.expect_failure(&["== failed: rehearsal::fails\nit always fails", "1 passed, 1 failed"])?;
+    run(&mut rehearse_command(&place, &["nobody"])?)?.expect_failure(&["no story is called nobody"])?;
     Ok(())
 }
 
@@ -128,35 +95,22 @@ pub fn one_without_an_end_is_named_and_ends_the_run() -> Verdict {
     let place = world().directory("telling")?;
     let names = ["rehearsal::passes", "rehearsal::has_no_end"];
     let outcome = run(rehearse_command(&place, &names)?.env(rehearsal::VARIABLE, "2"))?;
-    outcome.expect_failure(&[
-        "test rehearsal::passes ... ok",
-        "== failed: rehearsal::has_no_end has no end",
-    ])?;
+    outcome.expect_failure(&["test rehearsal::passes ... ok", "== failed: rehearsal::has_no_end has no end"])?;
     Ok(())
 }
 
 pub fn what_the_machine_lacks_is_said_in_a_line() -> Verdict {
     let place = world().directory("telling")?;
     // The program is below root's home, where others can only execute it through a descriptor.
-    let by_nobody =
-        "exec 3<\"$1\"; shift; exec setpriv --reuid=65534 --clear-groups /proc/self/fd/3 \"$@\"";
-    rehearse_where(&place, by_nobody)?
-        .expect_failure(&["servants are started by root: sudo make stories"])?;
+    let by_nobody = "exec 3<\"$1\"; shift; exec setpriv --reuid=65534 --clear-groups /proc/self/fd/3 \"$@\"";
+    rehearse_where(&place, by_nobody)?.expect_failure(&["servants are started by root: sudo make stories"])?;
     let without_cgroups = "mount -t tmpfs none /sys/fs/cgroup; \"$@\"";
-    rehearse_where(&place, without_cgroups)?
-        .expect_failure(&["no cgroups with limits are mounted"])?;
+    rehearse_where(&place, without_cgroups)?.expect_failure(&["no cgroups with limits are mounted"])?;
     let without_loop = format!("{WITHOUT_LOOP}\"$@\"");
     let outcome = rehearse_where(&place, &without_loop)?.expect_success()?;
-    ensure!(
-        outcome
-            .stdout
-            .contains("no disk of their own for the stories' homes"),
-        "{}",
-        outcome.output()
-    );
+    ensure!(outcome.stdout.contains("no disk of their own for the stories' homes"), "{}", outcome.output());
     let full = "mkdir full; mount -t tmpfs -o size=64M none full; TMPDIR=$PWD/full XDG_CACHE_HOME=$PWD/full \"$@\"";
-    rehearse_where(&place, full)?
-        .expect_failure(&["GB free, and homes take 12 GB: make room there"])?;
+    rehearse_where(&place, full)?.expect_failure(&["GB free, and homes take 12 GB: make room there"])?;
     let on_overlay = format!(
         "{WITHOUT_LOOP}mkdir -p lower upper work over; mount -t overlay -o lowerdir=lower,upperdir=upper,workdir=work \
          none over; TMPDIR=$PWD/over \"$@\""
@@ -176,9 +130,7 @@ struct RehearsalRun {
 impl RehearsalRun {
     fn start_with_servant(place: &Directory) -> anyhow::Result<RehearsalRun> {
         let mut run = RehearsalRun {
-            child: rehearse_command(place, &["waits"])?
-                .stdout(Stdio::piped())
-                .spawn()?,
+            child: rehearse_command(place, &["waits"])?.stdout(Stdio::piped()).spawn()?,
             network: PathBuf::new(),
         };
         let lines = BufReader::new(run.child.stdout.take().context("piped")?).lines();
@@ -208,13 +160,8 @@ impl Drop for RehearsalRun {
 }
 
 fn run_directories(parent: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(parent)?
-        .flatten()
-        .map(|entry| entry.path());
-    let is_place = |path: &PathBuf| {
-        path.file_name()
-            .is_some_and(|name| name.to_string_lossy().starts_with(PREFIX))
-    };
+    let entries = std::fs::read_dir(parent)?.flatten().map(|entry| entry.path());
+    let is_place = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(PREFIX));
     Ok(entries.filter(is_place).collect())
 }
 
@@ -223,11 +170,7 @@ pub fn what_a_killed_run_left_is_removed_by_the_next_and_a_living_one_is_left_al
     let mut first = RehearsalRun::start_with_servant(&place)?;
     let passes = || run(&mut rehearse_command(&place, &["rehearsal::passes"])?)?.expect_success();
     let outcome = passes()?;
-    ensure!(
-        !outcome.stdout.contains("removed"),
-        "the first is at work: {}",
-        outcome.output()
-    );
+    ensure!(!outcome.stdout.contains("removed"), "the first is at work: {}", outcome.output());
     let [left] = &run_directories(place.path())?[..] else {
         anyhow::bail!("{:?}", run_directories(place.path())?);
     };

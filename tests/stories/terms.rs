@@ -47,9 +47,7 @@ fn start_daemon(name: &str, twin: &Twin) -> anyhow::Result<Daemon> {
         ["--rrt", "50ms", "--cpus", "2", "--memory", "256M"],
     ] {
         let verb = ["sla", "set", service];
-        deployer
-            .run(&[&verb[..], &row[..]].concat())?
-            .expect_success()?;
+        deployer.run(&[&verb[..], &row[..]].concat())?.expect_success()?;
     }
     Ok(daemon)
 }
@@ -60,11 +58,7 @@ fn wait_for_cores(daemon: &Daemon, service: &str, robot: &str, cpus: f64) -> any
     support::wait_until(&format!("{cpus} cores of {robot}"), || {
         let servant = daemon.servant_of(service, robot)?;
         let are_in_force = servant["enforced"]["cpus"] == cpus;
-        Ok(if are_in_force {
-            Ok(servant)
-        } else {
-            Err(format!("{servant:#}"))
-        })
+        Ok(if are_in_force { Ok(servant) } else { Err(format!("{servant:#}")) })
     })
 }
 
@@ -76,10 +70,7 @@ fn wait_for_resources(
     (cpus, memory): (f64, u64),
 ) -> anyhow::Result<Value> {
     let servant = wait_for_cores(daemon, service, robot, cpus)?;
-    ensure!(
-        servant["enforced"]["memory"] == memory * MIB,
-        "{memory} MiB: {servant:#}"
-    );
+    ensure!(servant["enforced"]["memory"] == memory * MIB, "{memory} MiB: {servant:#}");
     Ok(servant)
 }
 
@@ -87,19 +78,16 @@ fn wait_for_resources(
 fn refused_handshake(daemon: &Daemon, path: &str) -> anyhow::Result<(u16, Value)> {
     match Robot::try_connect(&daemon.url(path)) {
         Ok(_) => anyhow::bail!("{path} was let in"),
-        Err(refusal) => Ok((
-            refusal.status,
-            serde_json::from_str(&refusal.body).with_context(|| refusal.body.clone())?,
-        )),
+        Err(refusal) => {
+            Ok((refusal.status, serde_json::from_str(&refusal.body).with_context(|| refusal.body.clone())?))
+        }
     }
 }
 
 pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     let daemon = start_daemon("terms", &Twin::greeter(RosVersion::One))?;
     let deployer = daemon.deployer();
-    let listed = deployer
-        .run(&["sla", "list", "greeter_cpp"])?
-        .expect_success()?;
+    let listed = deployer.run(&["sla", "list", "greeter_cpp"])?.expect_success()?;
     for words in ["rrt 50ms", "2 cpus, 256M", "rrt 200ms"] {
         ensure!(listed.stdout.contains(words), "{}", listed.stdout);
     }
@@ -111,88 +99,41 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     robot.call("/rosapi/get_time", json!({}))?;
     // The limits of the row are in force.
     let before = wait_for_resources(&daemon, GREETER.name, "rover", (0.75, 192))?;
-    ensure!(
-        before["terms"]["rows"][0]["id"] == 2 && before["terms"]["class"] == "default",
-        "it is shown: {before:#}"
-    );
+    ensure!(before["terms"]["rows"][0]["id"] == 2 && before["terms"]["class"] == "default", "it is shown: {before:#}");
     daemon.wait_for_event("what was stated", |event| {
-        event["kind"] == "terms"
-            && event["message"]
-                .as_str()
-                .is_some_and(|text| text.contains("rrt=100ms"))
+        event["kind"] == "terms" && event["message"].as_str().is_some_and(|text| text.contains("rrt=100ms"))
     })?;
     // It reconnects and requests more, in a class that permits it: the same nodes with higher limits.
     let mut again = daemon.robot("greeter_cpp?robot=rover&rrt=50ms&class=urgent")?;
     again.call("/greeter/count", json!({"reset": false}))?;
     let after = wait_for_resources(&daemon, GREETER.name, "rover", (2.0, 256))?;
-    ensure!(
-        after["pids"] == before["pids"],
-        "resized in place: {after:#}"
-    );
+    ensure!(after["pids"] == before["pids"], "resized in place: {after:#}");
     ensure!(after["terms"]["priority"] == 10, "{after:#}");
     robot.call("/greeter/count", json!({"reset": false}))?;
     for (verb, words) in [
         (&["servants"][..], ["rrt=50ms", "entry 3"]),
-        (
-            &["explain", "rover"],
-            ["rrt=50ms", "is the cheapest that reaches"],
-        ),
+        (&["explain", "rover"], ["rrt=50ms", "is the cheapest that reaches"]),
     ] {
         let said = deployer.run(verb)?.expect_success()?.stdout;
         for words in words {
-            ensure!(
-                said.contains(words),
-                "{verb:?} does not tell {words}: {said}"
-            );
+            ensure!(said.contains(words), "{verb:?} does not tell {words}: {said}");
         }
     }
     // More than available, permitted or reachable: each request is refused with a remedy, and the robot keeps its
     // limits.
     for (query, status, words) in [
-        (
-            "rrt=50ms",
-            403,
-            &[
-                "needs entry 3",
-                "1.5, the max_cpus of class default",
-                "rrt=100ms",
-            ][..],
-        ),
-        (
-            "class=urgent&cpus=2.9&memory=600M",
-            403,
-            &[
-                "memory = 600M",
-                "512M, the --max-memory",
-                "memory=512M or less",
-            ],
-        ),
-        (
-            "rrt=1ms&class=urgent",
-            422,
-            &[
-                "does not reach rrt 1ms",
-                "entry 3",
-                "request what fits: rrt=50ms",
-            ],
-        ),
-        (
-            "class=nope",
-            400,
-            &["class = \"nope\"", "request an existing class"],
-        ),
+        ("rrt=50ms", 403, &["needs entry 3", "1.5, the max_cpus of class default", "rrt=100ms"][..]),
+        ("class=urgent&cpus=2.9&memory=600M", 403, &["memory = 600M", "512M, the --max-memory", "memory=512M or less"]),
+        ("rrt=1ms&class=urgent", 422, &["does not reach rrt 1ms", "entry 3", "request what fits: rrt=50ms"]),
+        ("class=nope", 400, &["class = \"nope\"", "request an existing class"]),
         ("rrt=soon", 400, &["rrt = \"soon\" is not a time", "300ms"]),
         ("rtt=100ms", 400, &["rtt is not a key; write rrt"]),
     ] {
-        let (got, problem) =
-            refused_handshake(&daemon, &format!("greeter_cpp?robot=stranger&{query}"))?;
+        let (got, problem) = refused_handshake(&daemon, &format!("greeter_cpp?robot=stranger&{query}"))?;
         let said = format!("{} {}", problem["detail"], problem["next"]).replace("\\\"", "\"");
         ensure!(got == status, "{query}: {got} {said}");
         for words in words {
-            ensure!(
-                said.contains(words),
-                "{query}: {words:?} is missing: {said}"
-            );
+            ensure!(said.contains(words), "{query}: {words:?} is missing: {said}");
         }
     }
     // A robot that has a servant gets a status message and keeps its limits.
@@ -207,25 +148,14 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
         ensure!(code == 1008, "it will be refused again: {code}");
     }
     wait_for_resources(&daemon, GREETER.name, "rover", (2.0, 256))?;
-    ensure!(
-        daemon.servants_of("greeter_cpp")?.len() == 2,
-        "strangers left nothing"
-    );
+    ensure!(daemon.servants_of("greeter_cpp")?.len() == 2, "strangers left nothing");
     // There are four cores.
     let mut greedy = daemon.robot("greeter_cpp?robot=plain&class=urgent&cpus=2.5")?;
     greedy.wait_for_status("request at most cpus=")?;
     let code = u16::from(greedy.wait_for_close()?.code);
     ensure!(code == 1013, "there may be room later: {code}");
     // Limits that a robot would get, without connecting one.
-    let line = [
-        "sla",
-        "explain",
-        "greeter_cpp",
-        "--rrt",
-        "150ms",
-        "--max-rrt",
-        "250ms",
-    ];
+    let line = ["sla", "explain", "greeter_cpp", "--rrt", "150ms", "--max-rrt", "250ms"];
     let said = deployer.run(&line)?.expect_success()?.stdout;
     for words in [
         "gets 0.75 cpus, 192M",
@@ -236,17 +166,9 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     ] {
         ensure!(said.contains(words), "{words:?} is missing: {said}");
     }
-    let gone = deployer
-        .run(&["sla", "rm", "greeter_cpp", "1", "2", "3"])?
-        .expect_success()?;
-    ensure!(
-        gone.stdout.contains("is empty: every robot"),
-        "{}",
-        gone.stdout
-    );
-    deployer
-        .run(&["sla", "rm", "greeter_cpp", "7"])?
-        .expect_failure(&["no entry \"7\"", "sla list greeter_cpp"])?;
+    let gone = deployer.run(&["sla", "rm", "greeter_cpp", "1", "2", "3"])?.expect_success()?;
+    ensure!(gone.stdout.contains("is empty: every robot"), "{}", gone.stdout);
+    deployer.run(&["sla", "rm", "greeter_cpp", "7"])?.expect_failure(&["no entry \"7\"", "sla list greeter_cpp"])?;
     Ok(())
 }
 
@@ -261,8 +183,7 @@ fn set_stub_parameter(
     match app.parameters() {
         Ok(parameters) => {
             let name = format!("/greeter/cloudroid/{key}");
-            site.runtime
-                .block_on(parameters.set(&name, value.clone()))?;
+            site.runtime.block_on(parameters.set(&name, value.clone()))?;
         }
         Err(_) => {
             let value = match value {
@@ -303,10 +224,7 @@ pub fn a_stub_states_what_its_robot_says_before_it_is_admitted(ros: RosVersion) 
     };
     // The robot states nothing, so the terms of the push apply to its stubs.
     let first = run(&[], (0.75, 192))?;
-    ensure!(
-        first["terms"]["stated"]["/greeter"]["sla"] == json!({"rrt": "100ms", "max_rrt": "300ms"}),
-        "{first:#}"
-    );
+    ensure!(first["terms"]["stated"]["/greeter"]["sla"] == json!({"rrt": "100ms", "max_rrt": "300ms"}), "{first:#}");
     // It states other terms by parameters and is restarted: the same servant, resized.
     let times = [
         ("desire", ParamValue::Double(0.05)),
@@ -316,37 +234,22 @@ pub fn a_stub_states_what_its_robot_says_before_it_is_admitted(ros: RosVersion) 
     let second = run(&times, (2.0, 256))?;
     ensure!(second["id"] == first["id"], "{second:#}");
     // Explicit limits take precedence.
-    let direct = [
-        ("cpus", ParamValue::Double(1.25)),
-        ("memory", ParamValue::String("300M".into())),
-    ];
+    let direct = [("cpus", ParamValue::Double(1.25)), ("memory", ParamValue::String("300M".into()))];
     run(&direct, (1.25, 300)).map(drop)
 }
 
 /// Starts a daemon with a service whose rows cost more for larger messages: half a core up to the first value of a
 /// parameter, one and a half up to the second.
-fn start_sized_service(
-    name: &str,
-    service: &StoryService,
-    key: &str,
-    sizes: [&str; 2],
-) -> anyhow::Result<Daemon> {
-    let daemon = world()
-        .setup(name)
-        .config("[capacity]\ncpus = 4.0\n")
-        .start()?;
+fn start_sized_service(name: &str, service: &StoryService, key: &str, sizes: [&str; 2]) -> anyhow::Result<Daemon> {
+    let daemon = world().setup(name).config("[capacity]\ncpus = 4.0\n").start()?;
     let deployer = daemon.deployer();
     let package = service.package.context("a package")?;
-    deployer
-        .push(package, service.arguments)?
-        .expect_success()?;
+    deployer.push(package, service.arguments)?.expect_success()?;
     for (cpus, size) in ["0.5", "1.5"].into_iter().zip(sizes) {
         let aux = format!("{key}={size}");
         let row = ["--rrt", "100ms", "--cpus", cpus, "--aux", &aux];
         let verb = ["sla", "set", service.name];
-        deployer
-            .run(&[&verb[..], &row[..]].concat())?
-            .expect_success()?;
+        deployer.run(&[&verb[..], &row[..]].concat())?.expect_success()?;
     }
     Ok(daemon)
 }
@@ -391,16 +294,7 @@ pub fn a_robot_that_says_nothing_of_its_pictures_pays_for_those_that_it_sends() 
     let said = deployer.run(&["explain", "seer"])?.expect_success()?.stdout;
     ensure!(said.contains("aux.width=640"), "{said}");
     // Cost of a further robot that states this size.
-    let fit = [
-        "--format",
-        "json",
-        "fit",
-        FIXTURE.name,
-        "--rrt",
-        "100ms",
-        "--aux",
-        "width=320",
-    ];
+    let fit = ["--format", "json", "fit", FIXTURE.name, "--rrt", "100ms", "--aux", "width=320"];
     let fit = deployer.run(&fit)?.expect_success()?.stdout;
     let fit: Value = serde_json::from_str(&fit)?;
     ensure!(fit["cpus"] == 0.5 && fit["expected"]["rrt"] == 0.1, "{fit}");

@@ -20,10 +20,7 @@ pub fn a_robot_works_through_tls() -> Verdict {
     let proxy = TlsProxy::start(&daemon.address)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     machine.install_file(&proxy.authority(), "/root/authority.pem", 0o644)?;
-    let install = format!(
-        "sh teller_py-stub/install.sh --robot secure --server wss://localhost:{}",
-        proxy.port
-    );
+    let install = format!("sh teller_py-stub/install.sh --robot secure --server wss://localhost:{}", proxy.port);
     // This machine has no certificate authorities installed.
     machine.run_script("sh", &install)?.expect_failure(&[
         "no certificate authorities are installed on this robot",
@@ -45,17 +42,9 @@ timeout "$PATIENCE" rostopic echo -n 1 -p /teller/told
 cat said"#
     );
     let outcome = machine.run_script("bash", &script)?.expect_success()?;
-    for words in [
-        "ok    server     wss://localhost",
-        "ok    service",
-        "life 1 of /teller",
-        "linked to wss://localhost",
-    ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+    for words in ["ok    server     wss://localhost", "ok    service", "life 1 of /teller", "linked to wss://localhost"]
+    {
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     Ok(())
 }
@@ -74,19 +63,11 @@ pub fn what_stands_against_tls_is_said() -> Verdict {
     let secure = format!("127.0.0.1:{}", proxy.port);
     for (server, authority, words) in [
         (&secure, "ca_file = \"/nowhere.pem\"\n", "/nowhere.pem"),
-        (
-            &secure,
-            "ca_file = \"/dev/null\"\n",
-            "it should be a PEM file",
-        ),
+        (&secure, "ca_file = \"/dev/null\"\n", "it should be a PEM file"),
         (&secure, &*stranger, "install.sh --ca FILE"),
         (&mistaken, &*itself, "issue a server certificate with it"),
         // Another name of the same machine, which is not in the certificate.
-        (
-            &format!("127.0.0.2:{}", proxy.port),
-            &*authority,
-            "it belongs to another server",
-        ),
+        (&format!("127.0.0.2:{}", proxy.port), &*authority, "it belongs to another server"),
         (&plain, &*authority, "try ws:// instead of wss://"),
     ] {
         let toml = format!(
@@ -116,40 +97,23 @@ fn port(daemon: &Daemon) -> anyhow::Result<&str> {
 }
 
 pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
-    let daemon = world()
-        .setup("secured")
-        .config(TOKENS)
-        .listen("0.0.0.0:0")
-        .start()?;
+    let daemon = world().setup("secured").config(TOKENS).listen("0.0.0.0:0").start()?;
     let port = port(&daemon)?;
     for (path, words) in [("/healthz", "ok"), ("/api/v1/services", "[]")] {
         let answer = curl(&daemon, &format!("https://localhost:{port}{path}"))?.expect_success()?;
-        ensure!(
-            answer.stdout.contains(words) && answer.stdout.ends_with("\n200"),
-            "{path}: {}",
-            answer.output()
-        );
+        ensure!(answer.stdout.contains(words) && answer.stdout.ends_with("\n200"), "{path}: {}", answer.output());
         let refused = curl(&daemon, &format!("http://localhost:{port}{path}"))?.expect_success()?;
         let instead = format!("use https://localhost:{port}{path}");
-        ensure!(
-            refused.stdout.contains(&instead) && refused.stdout.ends_with("\n400"),
-            "{path}: {}",
-            refused.output()
-        );
+        ensure!(refused.stdout.contains(&instead) && refused.stdout.ends_with("\n400"), "{path}: {}", refused.output());
     }
     // Its fingerprint is printed, and others cannot read the key.
     let shown = fingerprint(&daemon.home.join("tls/own.pem"))?;
-    ensure!(
-        daemon.log_tail().contains(&shown),
-        "{shown}: {}",
-        daemon.log_tail()
-    );
+    ensure!(daemon.log_tail().contains(&shown), "{shown}: {}", daemon.log_tail());
     let status = daemon.deployer().run(&["status"])?.expect_success()?;
     let words = format!("certificate {shown}");
     ensure!(status.stdout.contains(&words), "{}", status.output());
     // Connections that send nothing, or neither TLS nor HTTP, are closed.
-    let connects =
-        || -> anyhow::Result<PatientStream<TcpStream>> { connect(&format!("127.0.0.1:{port}")) };
+    let connects = || -> anyhow::Result<PatientStream<TcpStream>> { connect(&format!("127.0.0.1:{port}")) };
     let (mut silent, mut garbled) = (connects()?, connects()?);
     garbled.write_all(&[22, 3, 1, 0, 5, 255, 255, 255, 255, 255])?;
     garbled.read_to_end(&mut Vec::new())?;
@@ -158,14 +122,9 @@ pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
 }
 
 pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
-    let daemon = world()
-        .setup("secure-robots")
-        .config("[tls]\nserve = \"tls\"\n")
-        .start()?;
+    let daemon = world().setup("secure-robots").config("[tls]\nserve = \"tls\"\n").start()?;
     let deployer = daemon.deployer();
-    deployer
-        .push("adder_py", ADDER.arguments)?
-        .expect_success()?;
+    deployer.push("adder_py", ADDER.arguments)?.expect_success()?;
     let port = port(&daemon)?;
     let own = daemon.home.join("tls/own.pem");
     let url = format!("wss://localhost:{port}/{}?robot=secure", ADDER.name);
@@ -193,19 +152,12 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
         .arg(&archive)
         .arg(&url))?;
     fetched.expect_success()?;
-    let settings = run(Command::new("tar")
-        .args(["--wildcards", "-xzOf"])
-        .arg(&archive)
-        .arg("*/stub.toml"))?
-    .expect_success()?;
+    let settings =
+        run(Command::new("tar").args(["--wildcards", "-xzOf"]).arg(&archive).arg("*/stub.toml"))?.expect_success()?;
     let server = format!("server = \"wss://localhost:{port}\"");
     let fingerprint = format!("fingerprint = \"{}\"", fingerprint(&own)?);
     for line in [&server, &fingerprint] {
-        ensure!(
-            settings.stdout.contains(line),
-            "{line}: {}",
-            settings.output()
-        );
+        ensure!(settings.stdout.contains(line), "{line}: {}", settings.output());
     }
     // A robot that was installed before the server had TLS, and one that trusted another certificate, follow the
     // change.
@@ -220,9 +172,7 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
             format!("wss://localhost:{port} instead of ws://localhost:9090"),
         ),
         (
-            format!(
-                "server = \"wss://localhost:{port}\"\nservice = \"{name}\"\nfingerprint = \"{other}\"\nmax = 0.4"
-            ),
+            format!("server = \"wss://localhost:{port}\"\nservice = \"{name}\"\nfingerprint = \"{other}\"\nmax = 0.4"),
             format!("instead of {other}"),
         ),
     ] {
@@ -232,27 +182,18 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
         );
         let outcome = machine.run_script("sh", &script)?.expect_success()?;
         for line in [&server, &fingerprint, "max = 0.4"] {
-            ensure!(
-                outcome.stdout.contains(line),
-                "{line}: {}",
-                outcome.output()
-            );
+            ensure!(outcome.stdout.contains(line), "{line}: {}", outcome.output());
         }
-        ensure!(
-            outcome.stderr.contains(&words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stderr.contains(&words), "{words}: {}", outcome.output());
     }
     Ok(())
 }
 
 /// Returns the fingerprint of a certificate, computed by openssl.
 fn fingerprint(certificate: &Path) -> anyhow::Result<String> {
-    let shown = run(Command::new("openssl")
-        .args(["x509", "-noout", "-fingerprint", "-sha256", "-in"])
-        .arg(certificate))?
-    .expect_success()?;
+    let shown =
+        run(Command::new("openssl").args(["x509", "-noout", "-fingerprint", "-sha256", "-in"]).arg(certificate))?
+            .expect_success()?;
     let digits = shown.stdout.rsplit('=').next().unwrap_or_default();
     let digits = digits.trim().replace(':', "").to_lowercase();
     Ok(format!("SHA256:{digits}"))
@@ -283,19 +224,11 @@ pub fn a_certificate_is_remembered_and_no_other_is_taken_for_it() -> Verdict {
     let first = fingerprint(&daemon.home.join("tls/own.pem"))?;
     let outcome = types(&asks)?.expect_success()?;
     for words in ["first connection to", &first, "cloudroid/known_servers"] {
-        ensure!(
-            outcome.stderr.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stderr.contains(words), "{words}: {}", outcome.output());
     }
-    ensure!(
-        types(&asks)?.expect_success()?.stderr.is_empty(),
-        "known by now"
-    );
+    ensure!(types(&asks)?.expect_success()?.stderr.is_empty(), "known by now");
     let plain = format!("http://localhost:{port}");
-    types(&["--server", &plain, "services"])?
-        .expect_failure(&["this port requires https", &server])?;
+    types(&["--server", &plain, "services"])?.expect_failure(&["this port requires https", &server])?;
     stub()?.wait_for_output("404")?;
     ensure!(std::fs::read_to_string(&known)?.contains(&first));
     let address = daemon.address.clone();
@@ -320,50 +253,28 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
         run(Command::new("openssl")
             .args(["req", "-x509", "-newkey", "ec", "-pkeyopt"])
             .args(["ec_paramgen_curve:P-256", "-nodes", "-days", "2"])
-            .args([
-                "-subj",
-                "/CN=server",
-                "-addext",
-                "subjectAltName=DNS:localhost",
-            ])
-            .args([
-                "-keyout",
-                &format!("{name}.key"),
-                "-out",
-                &format!("{name}.pem"),
-            ])
+            .args(["-subj", "/CN=server", "-addext", "subjectAltName=DNS:localhost"])
+            .args(["-keyout", &format!("{name}.key"), "-out", &format!("{name}.pem")])
             .current_dir(place.path()))?
         .expect_success()
     };
     makes("shown")?;
     makes("next")?;
-    let config = format!(
-        "[tls]\ncertificate = {:?}\nkey = {:?}\n",
-        at("shown.pem"),
-        at("shown.key")
-    );
+    let config = format!("[tls]\ncertificate = {:?}\nkey = {:?}\n", at("shown.pem"), at("shown.key"));
     let daemon = world().setup("renewed").config(&config).start()?;
     let port = port(&daemon)?;
     let healthy = |authority: &str| {
         let url = format!("https://localhost:{port}/healthz");
         run(Command::new("curl")
-            .args([
-                "--silent",
-                "--show-error",
-                "--fail",
-                "--max-time",
-                &patience().as_secs().to_string(),
-                "--cacert",
-            ])
+            .args(["--silent", "--show-error", "--fail", "--max-time", &patience().as_secs().to_string(), "--cacert"])
             .arg(at(authority))
             .arg(url))
     };
     std::fs::copy(at("shown.pem"), at("first.pem"))?;
     healthy("first.pem")?.expect_success()?;
     std::fs::write(at("shown.pem"), "no certificate\n")?;
-    let refused = daemon.wait_for_event("a word about what is there now", |event| {
-        event["kind"] == "certificate-refused"
-    })?;
+    let refused =
+        daemon.wait_for_event("a word about what is there now", |event| event["kind"] == "certificate-refused")?;
     let message = refused["message"].as_str().unwrap_or_default();
     let kept = fingerprint(&at("first.pem"))?;
     for words in ["shown.pem", "PEM file", &kept] {
@@ -379,10 +290,7 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
         event["kind"] == "certificate-shown" && message.contains(&new)
     })?;
     healthy("shown.pem")?.expect_success()?;
-    ensure!(
-        healthy("first.pem")?.status != 0,
-        "the first is still shown"
-    );
+    ensure!(healthy("first.pem")?.status != 0, "the first is still shown");
     Ok(())
 }
 
@@ -399,17 +307,10 @@ ros.terminate()
 
 pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
     let named = "trusted_proxies = [\"127.0.0.1\"]\n";
-    let daemon = world()
-        .setup("proxied")
-        .config(&format!("{TOKENS}{named}"))
-        .start()?;
+    let daemon = world().setup("proxied").config(&format!("{TOKENS}{named}")).start()?;
     let asks = |method: &str, path: &str, token: &str, client: &str| {
         let bearer = format!("Bearer {token}");
-        let headers = [
-            ("Authorization", bearer.as_str()),
-            ("X-Forwarded-For", client),
-            ("X-Forwarded-Proto", "https"),
-        ];
+        let headers = [("Authorization", bearer.as_str()), ("X-Forwarded-For", client), ("X-Forwarded-Proto", "https")];
         daemon.request(method, path, &headers)
     };
     // Each wrong attempt doubles the waiting time: however slow this machine is, one comes too early.
@@ -426,25 +327,14 @@ pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
         let (status, body) = asks("GET", "/api/v1/services", "guess", client)?;
         ensure!(status == 401, "{client}: {status} {body}");
     }
-    let (status, _) = asks(
-        "DELETE",
-        "/api/v1/services/none",
-        "open sesame",
-        "192.0.2.4",
-    )?;
+    let (status, _) = asks("DELETE", "/api/v1/services/none", "open sesame", "192.0.2.4")?;
     ensure!(status == 404, "{status}");
     daemon.wait_for("/api/v1/audit", "the client's address", |records| {
         let text = records.to_string();
         text.contains("192.0.2.4").then_some(())
     })?;
-    let two = [
-        ("X-Forwarded-For", "192.0.2.5"),
-        ("Forwarded", "for=192.0.2.6"),
-    ];
+    let two = [("X-Forwarded-For", "192.0.2.5"), ("Forwarded", "for=192.0.2.6")];
     let (status, body) = daemon.request("GET", "/healthz", &two)?;
-    ensure!(
-        status == 400 && body.contains("two clients"),
-        "{status} {body}"
-    );
+    ensure!(status == 400 && body.contains("two clients"), "{status} {body}");
     Ok(())
 }

@@ -9,9 +9,7 @@ use support::world::{ADDER, world};
 
 /// The portal's own table, so that new routes are covered automatically.
 const TABLE: &str = include_str!("../../src/portal/src/routes.rs");
-const METHODS: [&str; 8] = [
-    "GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE",
-];
+const METHODS: [&str; 8] = ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"];
 
 /// Returns methods and paths of the table, with parameters filled in.
 pub fn read_routes() -> anyhow::Result<Vec<(String, String)>> {
@@ -32,35 +30,20 @@ pub fn read_routes() -> anyhow::Result<Vec<(String, String)>> {
 }
 
 fn start_guarded(name: &str) -> anyhow::Result<Daemon> {
-    world()
-        .setup(name)
-        .config("tokens = [\"open sesame\"]\n")
-        .start()
+    world().setup(name).config("tokens = [\"open sesame\"]\n").start()
 }
 
 /// Without `Sec-WebSocket-Key`, so that a request which passes the token check is refused by the next check without
 /// waiting.
-const UPGRADE: [(&str, &str); 3] = [
-    ("Upgrade", "websocket"),
-    ("Connection", "Upgrade, close"),
-    ("Sec-WebSocket-Version", "13"),
-];
+const UPGRADE: [(&str, &str); 3] =
+    [("Upgrade", "websocket"), ("Connection", "Upgrade, close"), ("Sec-WebSocket-Version", "13")];
 
 pub fn no_route_answers_without_a_token() -> Verdict {
     let daemon = start_guarded("walked")?;
     let routes = read_routes()?;
-    for known in [
-        ("POST", "/api/v1/push"),
-        ("ANY", "/"),
-        ("GET", "/v2/_catalog"),
-    ] {
-        let listed = routes
-            .iter()
-            .any(|(method, path)| (&**method, &**path) == known);
-        ensure!(
-            listed,
-            "{known:?} is not in the table as it was read: {routes:?}"
-        );
+    for known in [("POST", "/api/v1/push"), ("ANY", "/"), ("GET", "/v2/_catalog")] {
+        let listed = routes.iter().any(|(method, path)| (&**method, &**path) == known);
+        ensure!(listed, "{known:?} is not in the table as it was read: {routes:?}");
     }
     let mut answered = Vec::new();
     for (_, path) in &routes {
@@ -101,10 +84,7 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         ("GET", "/no_such_service/", true, 400),
     ];
     answered.retain(|route| !open.contains(route));
-    ensure!(
-        answered.is_empty(),
-        "answered without a token (method, address, as a handshake, status): {answered:?}"
-    );
+    ensure!(answered.is_empty(), "answered without a token (method, address, as a handshake, status): {answered:?}");
     for (method, path, upgrade, expected) in open {
         let headers = if upgrade { &UPGRADE[..] } else { &[] };
         let (status, body) = daemon.request(method, path, headers)?;
@@ -117,15 +97,9 @@ pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Verdict {
     let daemon = start_guarded("told")?;
     let server = format!("http://{}", daemon.address);
     let deployer = daemon.deployer();
-    deployer
-        .run(&["--server", &server, "services"])?
-        .expect_failure(&["--token", "CLOUDROID_TOKEN"])?;
-    deployer
-        .run(&["--server", &server, "--token", "guess", "services"])?
-        .expect_failure(&["not known", "--token"])?;
-    deployer
-        .run(&["--server", &server, "--token", "open sesame", "services"])?
-        .expect_success()?;
+    deployer.run(&["--server", &server, "services"])?.expect_failure(&["--token", "CLOUDROID_TOKEN"])?;
+    deployer.run(&["--server", &server, "--token", "guess", "services"])?.expect_failure(&["not known", "--token"])?;
+    deployer.run(&["--server", &server, "--token", "open sesame", "services"])?.expect_success()?;
     // Root of this machine needs none on the socket.
     deployer.run(&["services"])?.expect_success()?;
     let (status, body) = daemon.get("/api/v1/services")?;
@@ -139,15 +113,9 @@ pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Verdict {
 
 pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
-    let (status, body) = daemon.request(
-        "GET",
-        "/api/v1/services",
-        &[("Host", "localhost"), ("X-Forwarded-Proto", "https")],
-    )?;
-    ensure!(
-        status == 403 && body.contains("configure tokens"),
-        "{status} {body}"
-    );
+    let (status, body) =
+        daemon.request("GET", "/api/v1/services", &[("Host", "localhost"), ("X-Forwarded-Proto", "https")])?;
+    ensure!(status == 403 && body.contains("configure tokens"), "{status} {body}");
     Ok(())
 }
 
@@ -164,10 +132,7 @@ pub fn a_page_of_another_site_uses_nobodys_browser() -> Verdict {
             for upgrade in [&[][..], &UPGRADE[..]] {
                 let headers = [upgrade, &[header]].concat();
                 let (status, body) = daemon.request("GET", path, &headers)?;
-                ensure!(
-                    status == 403 && !body.contains("revision"),
-                    "{header:?} {path}: {status} {body}"
-                );
+                ensure!(status == 403 && !body.contains("revision"), "{header:?} {path}: {status} {body}");
             }
         }
     }
@@ -177,10 +142,7 @@ pub fn a_page_of_another_site_uses_nobodys_browser() -> Verdict {
 
 pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
     let daemon = start_guarded("untold")?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     for path in ["", "adder_py", "no_such_service"] {
         if let Err(refusal) = Robot::try_connect(&daemon.url(path)) {
             ensure!(refusal.status == 401, "{path:?}: {refusal}");
@@ -190,22 +152,15 @@ pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
     let mut guesser = daemon.robot("no_such_service")?;
     guesser.send(json!({"op": "auth", "mac": "guess"}))?;
     let close = guesser.wait_for_close()?;
-    ensure!(
-        u16::from(close.code) == 1008 && !close.reason.contains("service"),
-        "{close:?}"
-    );
+    ensure!(u16::from(close.code) == 1008 && !close.reason.contains("service"), "{close:?}");
     let mut known = daemon.robot("no_such_service")?;
     known.send(json!({"op": "auth", "mac": "open sesame"}))?;
     let close = known.wait_for_close()?;
     ensure!(close.reason.contains("no_such_service"), "{close:?}");
-    let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service?token=open%20sesame"))
-    else {
+    let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service?token=open%20sesame")) else {
         anyhow::bail!("an unknown service accepted a robot")
     };
-    ensure!(
-        refusal.status == 404 && refusal.body.contains("adder_py"),
-        "{refusal}"
-    );
+    ensure!(refusal.status == 404 && refusal.body.contains("adder_py"), "{refusal}");
     // The auth message of rosbridge gives access.
     let mut robot = daemon.robot("adder_py")?;
     robot.send(json!({"op": "auth", "mac": "open sesame"}))?;
@@ -218,10 +173,7 @@ pub fn a_resume_token_is_no_way_into_another_s_servant() -> Verdict {
         .setup("resumers")
         .config("tokens = [\"open sesame\", \"rosebuds\"]\n[servant]\nanonymous_grace = \"60s\"\n")
         .start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let asks = |token: &str| daemon.robot(&format!("adder_py?resume=mine&token={token}"));
     let count = || Ok::<_, anyhow::Error>(daemon.servants_of("adder_py")?.len());
     let first = asks("open%20sesame")?;

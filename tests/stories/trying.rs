@@ -18,20 +18,13 @@ const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 /// Checks that trials leave no service behind.
 fn expect_nothing_left(daemon: &Daemon) -> Verdict {
     let services = daemon.deployer().run_json(&["services"])?;
-    ensure!(
-        services.as_array().is_some_and(Vec::is_empty),
-        "{services:#}"
-    );
+    ensure!(services.as_array().is_some_and(Vec::is_empty), "{services:#}");
     Ok(())
 }
 
 fn expect_suggestions(daemon: &Daemon, outcome: &CommandOutcome) -> Verdict {
     for words in ["requests answered", "initial values: desire = ", ", max = "] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     expect_nothing_left(daemon)
 }
@@ -59,16 +52,8 @@ pub fn a_packaged_node_is_tried_on_a_picture() -> Verdict {
             path_str(&picture),
         ])?
         .expect_success()?;
-    for words in [
-        "/people_detect/found",
-        "of 20 requests answered",
-        "\"rects\"",
-    ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+    for words in ["/people_detect/found", "of 20 requests answered", "\"rects\""] {
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     expect_suggestions(&daemon, &outcome)
 }
@@ -86,20 +71,11 @@ with rosbag.Bag("/root/talk.bag", "w") as bag:
 with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
     bag.write("/chatter", String("word"))
 "#;
-    machine
-        .run_script("sh", &format!("python3 - << 'END'\n{recorded}END"))?
-        .expect_success()?;
+    machine.run_script("sh", &format!("python3 - << 'END'\n{recorded}END"))?.expect_success()?;
     let package = binaries::package("teller_py");
     let tried = |bag: &str| {
         let bag = machine.host_path(bag);
-        let words = [
-            "try",
-            path_str(&package),
-            "--node",
-            "teller.py",
-            "--bag",
-            path_str(&bag),
-        ];
+        let words = ["try", path_str(&package), "--node", "teller.py", "--bag", path_str(&bag)];
         daemon.deployer().run(&words)
     };
     let outcome = tried("/root/talk.bag")?.expect_success()?;
@@ -112,11 +88,7 @@ with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
         "not used of",
         "/temperature",
     ] {
-        ensure!(
-            outcome.stdout.contains(words),
-            "{words}: {}",
-            outcome.output()
-        );
+        ensure!(outcome.stdout.contains(words), "{words}: {}", outcome.output());
     }
     expect_suggestions(&daemon, &outcome)?;
     tried("/root/packed.bag")?.expect_failure(&["compressed (bz2)", "rosbag decompress"])?;
@@ -135,10 +107,8 @@ pub fn a_robot_is_explained() -> Verdict {
     let stub = site.start_stub(&daemon, of, robot, &[])?;
     let mut said = site.subscribe(&app, "/teller/said")?;
     let say = site.advertise_strings(&app, "/elsewhere", false)?;
-    site.wait_for_graph(&app, "the node", |graph| {
-        graph.topics.contains_key("/teller/say")
-    })
-    .with_context(|| stub.output())?;
+    site.wait_for_graph(&app, "the node", |graph| graph.topics.contains_key("/teller/say"))
+        .with_context(|| stub.output())?;
     // A wrong remapping: nobody publishes the node's input.
     let screen = explained()?.expect_success()?.stdout;
     for words in [
@@ -149,23 +119,17 @@ pub fn a_robot_is_explained() -> Verdict {
     ] {
         ensure!(screen.contains(words), "{words}: {screen}");
     }
-    ensure!(
-        screen.lines().count() <= 24,
-        "more than one screen: {screen}"
-    );
+    ensure!(screen.lines().count() <= 24, "more than one screen: {screen}");
     drop((say, stub));
     site.wait_for_publishers(&said, 0)?;
     // With the right remapping it gets its input.
     let stub = site.start_stub(&daemon, of, robot, &["~say:=/elsewhere"])?;
     let say = site.advertise_strings(&app, "/elsewhere", false)?;
-    site.wait_for_subscribers(&*say, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*say, 1).with_context(|| stub.output())?;
     // Earlier answers are lost, as they are where the node itself runs.
-    site.wait_for_publishers(&said, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_publishers(&said, 1).with_context(|| stub.output())?;
     say.publish(string("hello"));
-    site.next_message(&mut said)
-        .with_context(|| stub.output())?;
+    site.next_message(&mut said).with_context(|| stub.output())?;
     let screen = explained()?.expect_success()?.stdout;
     ensure!(!screen.contains("listens to /elsewhere"), "{screen}");
     // After its end the output says where to look.

@@ -13,22 +13,15 @@ use support::world::{ADDER, GREETER, world};
 use tokio_tungstenite::tungstenite::Message;
 
 pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
-    let daemon = world()
-        .setup("dribbled")
-        .config("[portal]\nhandshake = \"1s\"\n")
-        .start()?;
+    let daemon = world().setup("dribbled").config("[portal]\nhandshake = \"1s\"\n").start()?;
     // Some send nothing, some start a request and send another byte of it from time to time.
-    let mut dribblers: Vec<TcpStream> = (0..200)
-        .map(|_| TcpStream::connect(&daemon.address))
-        .collect::<Result<_, _>>()?;
+    let mut dribblers: Vec<TcpStream> =
+        (0..200).map(|_| TcpStream::connect(&daemon.address)).collect::<Result<_, _>>()?;
     let request = b"GET /adder_py HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nX-Padding: ";
     for dribbler in dribblers.iter_mut().step_by(2) {
         dribbler.write_all(request)?;
     }
-    ensure!(
-        daemon.get("/healthz")?.0 == 200,
-        "others are answered meanwhile"
-    );
+    ensure!(daemon.get("/healthz")?.0 == 200, "others are answered meanwhile");
     // All are disconnected, after an error response if they had started a request.
     for (index, mut dribbler) in dribblers.into_iter().enumerate() {
         dribbler.set_nonblocking(true)?;
@@ -61,41 +54,26 @@ pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
     let daemon = world().setup("crowded").start()?;
     // As many descriptors as permitted, whatever the shell's limit.
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", daemon.pid()))?;
-    let line = limits
-        .lines()
-        .find(|line| line.starts_with("Max open files"));
+    let line = limits.lines().find(|line| line.starts_with("Max open files"));
     let mut numbers = line.context("a limit")?.split_whitespace().skip(3);
     let (soft, hard) = (numbers.next(), numbers.next());
-    ensure!(
-        soft == hard || soft == Some("524288"),
-        "{soft:?} of {hard:?}"
-    );
+    ensure!(soft == hard || soft == Some("524288"), "{soft:?} of {hard:?}");
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
     setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
-    let silent: Vec<TcpStream> = (0..1_100)
-        .map(|_| TcpStream::connect(&daemon.address))
-        .collect::<Result<_, _>>()?;
+    let silent: Vec<TcpStream> = (0..1_100).map(|_| TcpStream::connect(&daemon.address)).collect::<Result<_, _>>()?;
     ensure!(daemon.get("/healthz")?.0 == 200, "others are answered");
     let (_, told) = daemon.get("/metrics")?;
     let value = |name: &str| {
         let mut rows = told.lines().filter_map(|row| row.strip_prefix(name));
-        rows.find_map(|row| row.trim().parse::<f64>().ok())
-            .context(name.to_owned())
+        rows.find_map(|row| row.trim().parse::<f64>().ok()).context(name.to_owned())
     };
-    let (dropped, kept) = (
-        value("cloudroid_dropped_strangers_total")?,
-        value("cloudroid_strangers")?,
-    );
-    ensure!(
-        dropped >= 70.0 && kept <= 1024.0,
-        "{dropped} dropped, {kept} kept"
-    );
+    let (dropped, kept) = (value("cloudroid_dropped_strangers_total")?, value("cloudroid_strangers")?);
+    ensure!(dropped >= 70.0 && kept <= 1024.0, "{dropped} dropped, {kept} kept");
     drop(silent);
     // A header is parsed again with each further part.
     for (length, status) in [(60_000, "HTTP/1.1 200"), (70_000, "HTTP/1.1 431")] {
         let mut connection = connect(&daemon.address)?;
-        connection
-            .write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nX: ")?;
+        connection.write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nX: ")?;
         // After the refusal the rest is not read.
         let _ = connection.write_all(&vec![b'x'; length]);
         let _ = connection.write_all(b"\r\n\r\n");
@@ -109,9 +87,7 @@ pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
 pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
     let daemon = world().daemon_with(ADDER)?;
     let mut connection = connect(&daemon.address)?;
-    connection.write_all(&[
-        0x16, 3, 1, 2, 0, 1, 0, 1, 0xfc, 3, 3, b'\r', b'\n', b'\r', b'\n',
-    ])?;
+    connection.write_all(&[0x16, 3, 1, 2, 0, 1, 0, 1, 0xfc, 3, 3, b'\r', b'\n', b'\r', b'\n'])?;
     let mut answer = String::new();
     // A reset after the response does not affect it.
     let _ = connection.read_to_string(&mut answer);
@@ -120,16 +96,9 @@ pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
     let (status, body) = daemon.request(
         "GET",
         "/adder_py",
-        &[
-            ("Host", "127.0.0.1"),
-            ("Upgrade", "websocket"),
-            ("Sec-WebSocket-Version", "8"),
-        ],
+        &[("Host", "127.0.0.1"), ("Upgrade", "websocket"), ("Sec-WebSocket-Version", "8")],
     )?;
-    ensure!(
-        status == 400 && body.contains("handshake"),
-        "{status} {body}"
-    );
+    ensure!(status == 400 && body.contains("handshake"), "{status} {body}");
     Ok(())
 }
 
@@ -141,17 +110,11 @@ pub fn two_sockets_of_one_robot_share_its_servant() -> Verdict {
         socket.call("/rosapi/get_time", json!({}))?;
     }
     let servants = daemon.servants_of("greeter_cpp")?;
-    let of_both = servants
-        .iter()
-        .filter(|servant| servant["robot"] == "shared");
+    let of_both = servants.iter().filter(|servant| servant["robot"] == "shared");
     ensure!(of_both.count() == 1, "{servants:?}");
     // Registrations of one connection are removed when it ends; those of the other remain.
-    viewer.send(
-        json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}),
-    )?;
-    stub.send(
-        json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}),
-    )?;
+    viewer.send(json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}))?;
+    stub.send(json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}))?;
     stub.leave()?;
     viewer.send(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
     viewer.wait_for_subscriber("/greeter/name")?;
@@ -161,26 +124,15 @@ pub fn two_sockets_of_one_robot_share_its_servant() -> Verdict {
 }
 
 pub fn nobody_takes_over_anothers_robot() -> Verdict {
-    let daemon = world()
-        .setup("owned")
-        .config("tokens = [\"open sesame\", \"rosebuds\"]\n")
-        .start()?;
-    daemon
-        .deployer()
-        .push("adder_py", &["--node", "adder.py"])?
-        .expect_success()?;
+    let daemon = world().setup("owned").config("tokens = [\"open sesame\", \"rosebuds\"]\n").start()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
     let asks = |token: &str| Robot::try_connect(&daemon.url(&format!("adder_py?robot=r1{token}")));
     let mut owner = asks("&token=open%20sesame").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
     ensure!(owner.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     for token in ["&token=rosebuds", "&token=guess"] {
-        let Err(refusal) = asks(token) else {
-            anyhow::bail!("{token:?} took over r1")
-        };
+        let Err(refusal) = asks(token) else { anyhow::bail!("{token:?} took over r1") };
         let known = token != "&token=guess";
-        ensure!(
-            refusal.status == if known { 403 } else { 401 },
-            "{token:?}: {refusal}"
-        );
+        ensure!(refusal.status == if known { 403 } else { 401 }, "{token:?}: {refusal}");
         if known {
             ensure!(refusal.body.contains("r1"), "{token:?}: {refusal}");
         }
@@ -192,10 +144,7 @@ pub fn nobody_takes_over_anothers_robot() -> Verdict {
     ensure!(close.reason.contains("r1"), "{close:?}");
     // Not even after the owner has left.
     owner.leave()?;
-    ensure!(
-        asks("&token=rosebuds").is_err(),
-        "the name stays its owner's"
-    );
+    ensure!(asks("&token=rosebuds").is_err(), "the name stays its owner's");
     asks("&token=open%20sesame").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
     Ok(())
 }
@@ -220,20 +169,14 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     // Its answer is in the queue once three answers have been queued.
     let answered = || -> anyhow::Result<u64> {
         let metrics = daemon.get("/metrics")?.1;
-        let counts = metrics.lines().filter(|line| {
-            line.starts_with("cloudroid_bridge_answers_total{") && line.contains("backlog")
-        });
-        counts
-            .map(|line| Ok(line.rsplit(' ').next().context("a value")?.parse::<u64>()?))
-            .sum()
+        let counts = metrics
+            .lines()
+            .filter(|line| line.starts_with("cloudroid_bridge_answers_total{") && line.contains("backlog"));
+        counts.map(|line| Ok(line.rsplit(' ').next().context("a value")?.parse::<u64>()?)).sum()
     };
     support::wait_until("three answers in the queue", || {
         let count = answered()?;
-        Ok(if count < 3 {
-            Err(count.to_string())
-        } else {
-            Ok(())
-        })
+        Ok(if count < 3 { Err(count.to_string()) } else { Ok(()) })
     })?;
     let mut ahead = 0;
     loop {

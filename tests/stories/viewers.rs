@@ -68,18 +68,13 @@ pub fn foxgloves_client_hears_and_an_operators_acts() -> Verdict {
     let id = channels.iter().find(|channel| is_later(channel));
     let id = id.context("the channel")?["id"].clone();
     scene.rover.send(op("unadvertise"))?;
-    viewer.wait_for("its end", |said| {
-        said["op"] == "unadvertise" && said["channelIds"] == json!([id])
-    })?;
+    viewer.wait_for("its end", |said| said["op"] == "unadvertise" && said["channelIds"] == json!([id]))?;
     // The ends of its token and of the servant are reported.
     let mut stays = attach(&scene, &olga)?;
     let revoke = ["token", "revoke", "eve"];
     scene.daemon.deployer().run(&revoke)?.expect_success()?;
     let close = viewer.wait_for_close()?;
-    ensure!(
-        u16::from(close.code) == 1008 && close.reason.contains("revoked"),
-        "{close:?}"
-    );
+    ensure!(u16::from(close.code) == 1008 && close.reason.contains("revoked"), "{close:?}");
     let stop = ["stop", &scene.servant];
     scene.daemon.deployer().run(&stop)?.expect_success()?;
     let close = stays.wait_for_close()?;
@@ -134,39 +129,25 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
         Message::text(r#"{"op":"launch"}"#),
         Message::text(r#"{"op":"subscribe","subscriptions":[{"id":-1,"channelId":"x"}]}"#),
         // A message with a megabyte of payload.
-        Message::text(format!(
-            r#"{{"op":"unsubscribe","subscriptionIds":[{}0]}}"#,
-            "0,".repeat(600_000)
-        )),
+        Message::text(format!(r#"{{"op":"unsubscribe","subscriptionIds":[{}0]}}"#, "0,".repeat(600_000))),
         Message::binary(Bytes::new()),
         Message::binary(&b"\xffwhat"[..]),
         Message::binary(&b"\x01\x02"[..]),
         Message::binary(&b"\x02\x01\x00"[..]),
     ] {
         viewer.send_frame(rubbish.clone())?;
-        viewer
-            .wait_for("a complaint", complaint)
-            .with_context(|| format!("{rubbish:?}"))?;
+        viewer.wait_for("a complaint", complaint).with_context(|| format!("{rubbish:?}"))?;
     }
-    let channel =
-        viewer.wait_for("channels", |said| said["op"] == "advertise")?["channels"][0]["id"]
-            .as_u64()
-            .context("a channel")?;
-    let subscriptions: Vec<_> = (0..513)
-        .map(|id| json!({"id": id, "channelId": channel}))
-        .collect();
+    let channel = viewer.wait_for("channels", |said| said["op"] == "advertise")?["channels"][0]["id"]
+        .as_u64()
+        .context("a channel")?;
+    let subscriptions: Vec<_> = (0..513).map(|id| json!({"id": id, "channelId": channel})).collect();
     viewer.send(json!({"op": "subscribe", "subscriptions": subscriptions}))?;
     let told = viewer.wait_for("the bound", complaint)?;
-    ensure!(
-        told["message"].to_string().contains("512 subscriptions"),
-        "{told}"
-    );
+    ensure!(told["message"].to_string().contains("512 subscriptions"), "{told}");
     viewer.send(json!({"op": "subscribe", "subscriptions": [subscriptions[0]]}))?;
     let told = viewer.wait_for("the second of one number", complaint)?;
-    ensure!(
-        told["message"].to_string().contains("already exists"),
-        "{told}"
-    );
+    ensure!(told["message"].to_string().contains("already exists"), "{told}");
     // A message that is too large closes the connection.
     viewer.send_frame(Message::binary(vec![1; (16 << 20) + 1]))?;
     let close = viewer.wait_for_close()?;
@@ -177,9 +158,7 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
     request_pictures(&mut slow)?;
     support::wait_until("a picture that it does not take", || {
         let bytes = slow.count_waiting_bytes()?;
-        Ok((bytes >= SOME)
-            .then_some(())
-            .ok_or(format!("{bytes} bytes")))
+        Ok((bytes >= SOME).then_some(()).ok_or(format!("{bytes} bytes")))
     })?;
     // Its queue is full once another viewer has received this many more.
     let mut quick = attach(&scene, &eve)?;
@@ -192,10 +171,7 @@ pub fn viewers_that_ask_badly_are_told_and_cost_nothing() -> Verdict {
     ensure!(scene.servant()?["dropped"] == 0, "{:#}", scene.servant()?);
     wait_for_picture(&mut slow)?;
     let missed = slow.wait_for("what it missed", |said| said["op"] == "status")?;
-    ensure!(
-        missed["message"].to_string().contains("were dropped"),
-        "{missed}"
-    );
+    ensure!(missed["message"].to_string().contains("were dropped"), "{missed}");
     scene.daemon.stop()?;
     Ok(())
 }

@@ -31,11 +31,7 @@ impl AcmeDirectory {
     pub fn new() -> anyhow::Result<AcmeDirectory> {
         let place = world().directory("acme")?;
         make_certificates(place.path())?;
-        Ok(AcmeDirectory {
-            place,
-            port: free_port()?,
-            management: free_port()?,
-        })
+        Ok(AcmeDirectory { place, port: free_port()?, management: free_port()? })
     }
 
     /// Returns the URL of the ACME directory.
@@ -71,22 +67,11 @@ impl AcmeDirectory {
         std::fs::write(&file, config.to_string())?;
         let names = free_port()?;
         let quiet = |command: &mut Command| -> anyhow::Result<Child> {
-            let log = std::fs::File::options()
-                .create(true)
-                .append(true)
-                .open(place.join("log"))?;
-            let child = command
-                .stdin(Stdio::null())
-                .stdout(log.try_clone()?)
-                .stderr(log)
-                .spawn();
+            let log = std::fs::File::options().create(true).append(true).open(place.join("log"))?;
+            let child = command.stdin(Stdio::null()).stdout(log.try_clone()?).stderr(log).spawn();
             child.context("cannot start Pebble; the Debian package is pebble")
         };
-        let mut authority = PebbleServer {
-            directory: self.port,
-            place: place.to_owned(),
-            running: Vec::new(),
-        };
+        let mut authority = PebbleServer { directory: self.port, place: place.to_owned(), running: Vec::new() };
         authority.running.push(quiet(
             Command::new("pebble-challtestsrv")
                 .args(["-defaultIPv6", "", "-http01", "", "-https01", ""])
@@ -94,11 +79,11 @@ impl AcmeDirectory {
                 .args(["-management", &format!("127.0.0.1:{}", free_port()?)]),
         )?);
         authority.running.push(quiet(
-            Command::new("pebble")
-                .env("PEBBLE_VA_NOSLEEP", "1")
-                .arg("-config")
-                .arg(&file)
-                .args(["-strict", "-dnsserver", &format!("127.0.0.1:{names}")]),
+            Command::new("pebble").env("PEBBLE_VA_NOSLEEP", "1").arg("-config").arg(&file).args([
+                "-strict",
+                "-dnsserver",
+                &format!("127.0.0.1:{names}"),
+            ]),
         )?);
         authority.wait_until_ready()?;
         let root = run(Command::new("curl")

@@ -9,25 +9,15 @@ pub fn path(name: &str) -> PathBuf {
         return PathBuf::from(installed).join(name);
     }
     let test = std::env::current_exe().expect("the path of the running test");
-    let directory = test
-        .parent()
-        .and_then(|deps| deps.parent())
-        .expect("target/PROFILE/deps");
+    let directory = test.parent().and_then(|deps| deps.parent()).expect("target/PROFILE/deps");
     let path = directory.join(name);
-    assert!(
-        path.exists(),
-        "{} is missing; run make build-dev",
-        path.display()
-    );
+    assert!(path.exists(), "{} is missing; run make build-dev", path.display());
     path
 }
 
 /// Returns the checkout of these stories.
 pub fn checkout() -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
-        .parent()
-        .expect("tests/ lies in the checkout")
-        .to_owned()
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the checkout").to_owned()
 }
 
 /// Returns a package below `tests/packages`.
@@ -74,9 +64,7 @@ pub fn web_modules() -> PathBuf {
 pub fn cache() -> PathBuf {
     let caches = std::env::var_os("XDG_CACHE_HOME").map(PathBuf::from);
     let home = || PathBuf::from(std::env::var_os("HOME").unwrap_or_else(|| "/root".into()));
-    caches
-        .unwrap_or_else(|| home().join(".cache"))
-        .join("cloudroid")
+    caches.unwrap_or_else(|| home().join(".cache")).join("cloudroid")
 }
 
 /// Returns the directory for results of this checkout: its `target`, or `CLOUDROID_TARGET` for runs that are themselves

@@ -42,11 +42,7 @@ pub fn try_all(robot: &mut Robot) -> anyhow::Result<Vec<String>> {
 }
 
 /// Asks the package to make an attempt; with an empty name, for the list of attempts.
-pub fn try_attempt(
-    robot: &mut Robot,
-    what: &str,
-    argument: &str,
-) -> anyhow::Result<BurglarAttempt> {
+pub fn try_attempt(robot: &mut Robot, what: &str, argument: &str) -> anyhow::Result<BurglarAttempt> {
     let answer = robot.call("/burglar/try", json!({"what": what, "argument": argument}))?;
     ensure!(answer["result"] == true, "{what} {argument}: {answer}");
     let values = &answer["values"];

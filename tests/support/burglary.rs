@@ -40,33 +40,19 @@ pub fn nothing_of_the_host_is_reached(daemon: &Daemon) -> Verdict {
     let name = format!("cloudroid-story-{}", std::process::id());
     let _abstract = UnixListener::bind_addr(&SocketAddr::from_abstract_name(&name)?)?;
     let made = run(Command::new("ipcmk").args(["-M", "4096", "-p", "0666"]))?.expect_success()?;
-    let segment = made
-        .stdout
-        .rsplit(' ')
-        .next()
-        .context("an id")?
-        .trim()
-        .to_owned();
+    let segment = made.stdout.rsplit(' ').next().context("an id")?.trim().to_owned();
     let told = (|| {
         let port = tcp.local_addr()?.port();
         let mut addresses = vec![format!("127.0.0.1:{port}"), daemon.address.clone()];
         let own = run(Command::new("hostname").arg("-I"))?.stdout;
-        addresses.extend(
-            own.split_whitespace()
-                .filter(|ip| ip.contains('.'))
-                .map(|ip| format!("{ip}:{port}")),
-        );
+        addresses.extend(own.split_whitespace().filter(|ip| ip.contains('.')).map(|ip| format!("{ip}:{port}")));
         addresses.extend(["192.0.2.1:80".to_owned(), "169.254.169.254:80".to_owned()]);
         for address in &addresses {
             expect_failure(&mut robot, "connect", address)?;
         }
         udp.set_nonblocking(true)?;
         // A datagram to the servant itself may be sent; it must not arrive here.
-        let _ = try_attempt(
-            &mut robot,
-            "datagram",
-            &format!("127.0.0.1:{}", udp.local_addr()?.port()),
-        )?;
+        let _ = try_attempt(&mut robot, "datagram", &format!("127.0.0.1:{}", udp.local_addr()?.port()))?;
         ensure!(udp.recv(&mut [0; 8]).is_err(), "a datagram arrived");
         expect_failure(&mut robot, "datagram", "192.0.2.1:53")?;
         expect_failure(&mut robot, "abstract-socket", &name)?;
@@ -103,41 +89,21 @@ pub fn nothing_of_the_host_is_reached(daemon: &Daemon) -> Verdict {
 
 /// See the story of this name.
 pub fn neighbours_are_not_reached(daemon: &Daemon) -> Verdict {
-    let (mut first, mut second) = (
-        daemon.robot("burglar_cpp?robot=first")?,
-        daemon.robot("burglar_cpp?robot=second")?,
-    );
+    let (mut first, mut second) = (daemon.robot("burglar_cpp?robot=first")?, daemon.robot("burglar_cpp?robot=second")?);
     let _third = daemon.robot("greeter_cpp?robot=third")?;
     // Files in the scratch space are visible to their own servant only.
     let marker = "/tmp/marked";
     try_attempt(&mut first, "write", &format!("{marker} of the first"))?;
-    ensure!(
-        try_attempt(
-            &mut first,
-            "text-in-file",
-            &format!("{marker} of the first")
-        )?
-        .succeeded
-    );
-    expect_failure(
-        &mut second,
-        "text-in-file",
-        &format!("{marker} of the first"),
-    )?;
+    ensure!(try_attempt(&mut first, "text-in-file", &format!("{marker} of the first"))?.succeeded);
+    expect_failure(&mut second, "text-in-file", &format!("{marker} of the first"))?;
     // Its own Master answers on its own port, which is the same in all servants; other servants' nodes do not.
     ensure!(try_attempt(&mut first, "connect", "127.0.0.1:11311")?.succeeded);
     for (service, robot) in [("burglar_cpp", "second"), ("greeter_cpp", "third")] {
-        for pid in daemon.servant_of(service, robot)?["pids"]
-            .as_array()
-            .context("pids")?
-        {
+        for pid in daemon.servant_of(service, robot)?["pids"].as_array().context("pids")? {
             expect_failure(&mut first, "foreign-process", &pid.to_string())?;
             for port in listening_ports(pid.as_i64().context("a pid")?)? {
-                let own = listening_ports(
-                    daemon.servant_of("burglar_cpp", "first")?["pids"][0]
-                        .as_i64()
-                        .context("a pid")?,
-                )?;
+                let own =
+                    listening_ports(daemon.servant_of("burglar_cpp", "first")?["pids"][0].as_i64().context("a pid")?)?;
                 if !own.contains(&port) {
                     expect_failure(&mut first, "connect", &format!("127.0.0.1:{port}"))?;
                 }

@@ -32,9 +32,7 @@ const PREFIX: &str = "cloudroid-cable-";
 /// Removes the network namespaces of runs that were killed; returns their names.
 pub fn remove_abandoned() -> Vec<String> {
     let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
-    let names = entries
-        .flatten()
-        .map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let names = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned());
     let is_abandoned = |name: &String| {
         let mut words = name.strip_prefix(PREFIX).unwrap_or_default().split('-');
         match (words.next(), words.next()) {
@@ -64,13 +62,7 @@ pub struct NetworkImpairment {
 
 impl NetworkImpairment {
     /// A slow network without other impairments: 20 Mbit/s.
-    pub const SLOW: Self = Self {
-        rate: 20_000,
-        delay: 5,
-        jitter: 0,
-        loss: 0.0,
-        limit: 10_000,
-    };
+    pub const SLOW: Self = Self { rate: 20_000, delay: 5, jitter: 0, loss: 0.0, limit: 10_000 };
 
     /// Returns the arguments of netem.
     fn netem_arguments(self) -> Vec<String> {
@@ -126,22 +118,11 @@ impl Cable {
         let subnet = (id.wrapping_mul(8).wrapping_add(number) % (1 << 15)) * 4;
         let address = |host: u32| {
             let low = subnet + host;
-            format!(
-                "198.{}.{}.{}",
-                18 + (low >> 16),
-                (low >> 8) & 255,
-                low & 255
-            )
+            format!("198.{}.{}.{}", 18 + (low >> 16), (low >> 8) & 255, low & 255)
         };
         ip(&["netns", "add", &name])?;
-        let mut cable = Self {
-            server: ([0, 0, 0, 0], 0).into(),
-            name,
-            ends,
-            robot_inside,
-            shaper: None,
-            over: Arc::default(),
-        };
+        let mut cable =
+            Self { server: ([0, 0, 0, 0], 0).into(), name, ends, robot_inside, shaper: None, over: Arc::default() };
         cable.create_devices()?;
         let [ours, theirs] = &cable.ends;
         ip(&["addr", "add", &format!("{}/30", address(1)), "dev", ours])?;
@@ -164,9 +145,7 @@ impl Cable {
     /// Creates a veth pair if the kernel can degrade it, otherwise TUN devices.
     fn create_devices(&mut self) -> anyhow::Result<()> {
         let [ours, theirs] = &self.ends;
-        ip(&[
-            "link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", &self.name,
-        ])?;
+        ip(&["link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", &self.name])?;
         ip(&["link", "set", ours, "up"])?;
         let tried = tc(&["qdisc", "add", "dev", ours, "root", "netem", "delay", "1ms"]);
         if tried.is_ok() {
@@ -193,11 +172,7 @@ impl Cable {
             Ok(text.trim().parse()?)
         };
         let (out, back) = (count("tx")?, count("rx")?);
-        Ok(if self.robot_inside {
-            (back, out)
-        } else {
-            (out, back)
-        })
+        Ok(if self.robot_inside { (back, out) } else { (out, back) })
     }
 
     /// Returns the path of the namespace.
@@ -227,9 +202,7 @@ impl Cable {
         let [ours, theirs] = &self.ends;
         let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
         tc(&[&["qdisc", what, "dev", ours, "root"], &rules[..]].concat())?;
-        let there = [
-            "netns", "exec", &self.name, "tc", "qdisc", what, "dev", theirs, "root",
-        ];
+        let there = ["netns", "exec", &self.name, "tc", "qdisc", what, "dev", theirs, "root"];
         ip(&[&there[..], &rules[..]].concat())
     }
 
@@ -241,17 +214,12 @@ impl Cable {
     /// Opens a listening socket in the namespace.
     fn listen(&self, address: &str) -> anyhow::Result<TcpListener> {
         let address = format!("{address}:0");
-        Ok(run_in_namespace(&self.namespace(), || {
-            TcpListener::bind(address)
-        })??)
+        Ok(run_in_namespace(&self.namespace(), || TcpListener::bind(address))??)
     }
 }
 
 /// Runs `act` in a network namespace, on a new thread. Processes that it starts stay in the namespace.
-pub fn run_in_namespace<T: Send>(
-    namespace: &Path,
-    act: impl FnOnce() -> T + Send,
-) -> anyhow::Result<T> {
+pub fn run_in_namespace<T: Send>(namespace: &Path, act: impl FnOnce() -> T + Send) -> anyhow::Result<T> {
     let place = File::open(namespace).with_context(|| namespace.display().to_string())?;
     std::thread::scope(|scope| {
         let acting = scope.spawn(move || {
@@ -281,9 +249,7 @@ fn forward_connections(listener: &TcpListener, portal: &str, over: &AtomicBool) 
         let Ok(server) = TcpStream::connect(portal) else {
             continue;
         };
-        let both = robot
-            .try_clone()
-            .and_then(|robot| Ok((robot, server.try_clone()?)));
+        let both = robot.try_clone().and_then(|robot| Ok((robot, server.try_clone()?)));
         let Ok((robot_too, server_too)) = both else {
             continue;
         };
@@ -334,10 +300,7 @@ pub fn ip(arguments: &[&str]) -> anyhow::Result<()> {
 }
 
 fn run(program: &str, arguments: &[&str]) -> anyhow::Result<()> {
-    let output = Command::new(program)
-        .args(arguments)
-        .output()
-        .with_context(|| program.to_owned())?;
+    let output = Command::new(program).args(arguments).output().with_context(|| program.to_owned())?;
     ensure!(
         output.status.success(),
         "{program} {}: {}",

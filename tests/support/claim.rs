@@ -38,10 +38,7 @@ pub fn find_abandoned(parent: &Path, prefix: &str) -> Vec<PathBuf> {
         let owner = fs::read_to_string(directory.join(OWNER)).ok();
         owner.is_some_and(|owner| !is_alive(&owner))
     };
-    named
-        .map(|entry| entry.path())
-        .filter(is_abandoned)
-        .collect()
+    named.map(|entry| entry.path()).filter(is_abandoned).collect()
 }
 
 /// Ends the processes that use an abandoned directory, and removes their cgroups, their mounts in this namespace, and
@@ -73,10 +70,7 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
     let mut cgroups: Vec<PathBuf> = pids
         .iter()
         .flat_map(|pid| procfs::cgroups(*pid))
-        .filter(|path| {
-            path.parent()
-                .is_some_and(|parent| parent.ends_with("cloudroid"))
-        })
+        .filter(|path| path.parent().is_some_and(|parent| parent.ends_with("cloudroid")))
         .collect();
     cgroups.sort();
     cgroups.dedup();
@@ -90,9 +84,7 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
     }
     for cgroup in &cgroups {
         // A process that has just ended is charged to the cgroup for a moment longer.
-        while fs::remove_dir(cgroup)
-            .is_err_and(|error| error.kind() == std::io::ErrorKind::ResourceBusy)
-        {
+        while fs::remove_dir(cgroup).is_err_and(|error| error.kind() == std::io::ErrorKind::ResourceBusy) {
             ensure!(begun.elapsed() < END, "{} stays busy", cgroup.display());
             std::thread::sleep(Duration::from_millis(20));
         }
@@ -103,8 +95,7 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
 /// Returns whether the process that wrote this note still exists.
 pub fn is_alive(owner: &str) -> bool {
     let (pid, start) = owner.split_once(' ').unwrap_or((owner, ""));
-    pid.parse()
-        .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == start))
+    pid.parse().is_ok_and(|pid| start_time(pid).is_some_and(|now| now == start))
 }
 
 /// Returns the start time of a process in ticks since boot, because pids are reused (proc(5), field 22 of `stat`).

@@ -22,9 +22,8 @@ pub fn acquire() -> CorePermit {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     let began = Instant::now();
     let taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
-    let (mut taken, _) = FREED
-        .wait_timeout_while(taken, LONGEST_WAIT, |taken| *taken >= cores)
-        .unwrap_or_else(PoisonError::into_inner);
+    let (mut taken, _) =
+        FREED.wait_timeout_while(taken, LONGEST_WAIT, |taken| *taken >= cores).unwrap_or_else(PoisonError::into_inner);
     *taken += 1;
     drop(taken);
     story::add_wait(began.elapsed());

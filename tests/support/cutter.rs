@@ -37,13 +37,7 @@ impl Cutter {
             cuts: AtomicUsize::new(0),
             over: AtomicBool::new(false),
             closed: AtomicBool::new(false),
-            state: Mutex::new(State {
-                left: None,
-                remaining: cuts,
-                longest,
-                random: seed | 1,
-                open: Vec::new(),
-            }),
+            state: Mutex::new(State { left: None, remaining: cuts, longest, random: seed | 1, open: Vec::new() }),
         });
         let (portal, passing) = (portal.to_owned(), Arc::clone(&shared));
         std::thread::spawn(move || accept(&listener, server, &portal, &passing));
@@ -143,10 +137,7 @@ fn accept(listener: &TcpListener, server: SocketAddr, portal: &str, shared: &Arc
         let (Ok(robot_too), Ok(cloud_too)) = clones else {
             continue;
         };
-        shared
-            .state()
-            .open
-            .extend([robot.try_clone(), cloud.try_clone()].into_iter().flatten());
+        shared.state().open.extend([robot.try_clone(), cloud.try_clone()].into_iter().flatten());
         let (up, down) = (Arc::clone(shared), Arc::clone(shared));
         // Replaces the host name by the portal's own, as a reverse proxy does.
         let names = (server.to_string(), portal.to_owned());
@@ -155,12 +146,7 @@ fn accept(listener: &TcpListener, server: SocketAddr, portal: &str, shared: &Arc
     }
 }
 
-fn copy(
-    mut from: TcpStream,
-    mut to: TcpStream,
-    mut names: Option<(String, String)>,
-    shared: &Shared,
-) {
+fn copy(mut from: TcpStream, mut to: TcpStream, mut names: Option<(String, String)>, shared: &Shared) {
     let mut buffer = vec![0; 1 << 14];
     while let Ok(count) = from.read(&mut buffer) {
         if count == 0 {
@@ -168,9 +154,7 @@ fn copy(
         }
         let mut bytes = buffer[..count].to_vec();
         if let Some((ours, theirs)) = names.take() {
-            bytes = String::from_utf8_lossy(&bytes)
-                .replace(&ours, &theirs)
-                .into_bytes();
+            bytes = String::from_utf8_lossy(&bytes).replace(&ours, &theirs).into_bytes();
         }
         let passes = shared.pass(bytes.len());
         if to.write_all(&bytes[..passes]).is_err() {

@@ -89,10 +89,7 @@ impl DaemonSetup {
     fn command(&self) -> anyhow::Result<Command> {
         std::fs::create_dir_all(&self.home)?;
         let mut command = Command::new(binaries::path("cloudroidd"));
-        command
-            .arg("--home")
-            .arg(&self.home)
-            .args(["--listen", &self.listen]);
+        command.arg("--home").arg(&self.home).args(["--listen", &self.listen]);
         if !self.config.is_empty() {
             let path = self.home.join("test-config.toml");
             std::fs::write(&path, &self.config)?;
@@ -106,22 +103,11 @@ impl DaemonSetup {
 
     /// Starts the daemon and waits until it answers.
     pub fn start(&self) -> anyhow::Result<Daemon> {
-        let log = File::options()
-            .create(true)
-            .append(true)
-            .open(self.home.join("daemon.log"))
-            .or_else(|_| {
-                std::fs::create_dir_all(&self.home)?;
-                File::options()
-                    .create(true)
-                    .append(true)
-                    .open(self.home.join("daemon.log"))
-            })?;
-        let child = self
-            .command()?
-            .stdout(log.try_clone()?)
-            .stderr(log)
-            .spawn()?;
+        let log = File::options().create(true).append(true).open(self.home.join("daemon.log")).or_else(|_| {
+            std::fs::create_dir_all(&self.home)?;
+            File::options().create(true).append(true).open(self.home.join("daemon.log"))
+        })?;
+        let child = self.command()?.stdout(log.try_clone()?).stderr(log).spawn()?;
         let mut daemon = Daemon {
             home: self.home.clone(),
             address: "localhost".to_owned(),
@@ -147,21 +133,10 @@ impl DaemonSetup {
 
     /// Starts the daemon, which must refuse to start; returns its exit status and output.
     pub fn expect_refusal(&self) -> anyhow::Result<String> {
-        let output = self
-            .command()?
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()?;
+        let output = self.command()?.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
         let output = wait_with_output(output)?;
-        let said = format!(
-            "{}{}",
-            String::from_utf8_lossy(&output.1),
-            String::from_utf8_lossy(&output.2)
-        );
-        ensure!(
-            !output.0.success(),
-            "cloudroidd started and ended well:\n{said}"
-        );
+        let said = format!("{}{}", String::from_utf8_lossy(&output.1), String::from_utf8_lossy(&output.2));
+        ensure!(!output.0.success(), "cloudroidd started and ended well:\n{said}");
         ensure!(!said.contains("panicked"), "cloudroidd panicked:\n{said}");
         Ok(said)
     }
@@ -170,10 +145,7 @@ impl DaemonSetup {
 /// Waits for its end, within the time limit of a story.
 fn wait_with_output(mut child: Child) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
     let pid = Pid::from_raw(child.id() as i32);
-    let (mut out, mut err) = (
-        child.stdout.take().expect("piped"),
-        child.stderr.take().expect("piped"),
-    );
+    let (mut out, mut err) = (child.stdout.take().expect("piped"), child.stderr.take().expect("piped"));
     let (done, ended) = std::sync::mpsc::channel::<()>();
     let watchdog = std::thread::spawn(move || {
         if patience::receive(&ended).is_err() {
@@ -201,12 +173,7 @@ impl Daemon {
     /// Attaches to a daemon with its state in `home` that another process has started, once it answers; `not` is the
     /// pid of a daemon to ignore.
     pub fn attach(home: &Path, not: Option<i32>) -> anyhow::Result<Daemon> {
-        let mut daemon = Daemon {
-            home: home.to_owned(),
-            address: "localhost".to_owned(),
-            child: None,
-            _space: None,
-        };
+        let mut daemon = Daemon { home: home.to_owned(), address: "localhost".to_owned(), child: None, _space: None };
         daemon.address = crate::wait_until("a daemon that answers", || {
             let listens = daemon.status().and_then(|status| {
                 ensure!(not.is_none_or(|pid| status["pid"] != pid), "{status:#}");
@@ -223,15 +190,12 @@ impl Daemon {
 
     /// Returns a deployer on this machine.
     pub fn deployer(&self) -> Deployer {
-        Deployer {
-            home: self.home.clone(),
-        }
+        Deployer { home: self.home.clone() }
     }
 
     /// Connects a robot to `path`, such as `opencv_apps?robot=r2`.
     pub fn robot(&self, path: &str) -> anyhow::Result<Robot> {
-        Robot::connect(&self.url(path))
-            .with_context(|| format!("the daemon said:\n{}", self.log_tail()))
+        Robot::connect(&self.url(path)).with_context(|| format!("the daemon said:\n{}", self.log_tail()))
     }
 
     /// Returns the WebSocket URL of `path`.
@@ -252,12 +216,7 @@ impl Daemon {
     }
 
     /// Sends an HTTP/1.1 request without a client library, so that the story controls the headers.
-    pub fn request(
-        &self,
-        method: &str,
-        path: &str,
-        headers: &[(&str, &str)],
-    ) -> anyhow::Result<(u16, String)> {
+    pub fn request(&self, method: &str, path: &str, headers: &[(&str, &str)]) -> anyhow::Result<(u16, String)> {
         let stream = patience::connect(&self.address)?;
         self.exchange(stream, method, path, headers)
     }
@@ -271,16 +230,8 @@ impl Daemon {
         body: &str,
     ) -> anyhow::Result<(u16, String, String)> {
         let mut stream = patience::connect(&self.address)?;
-        let given = |usual: &str| {
-            headers
-                .iter()
-                .any(|(name, _)| name.eq_ignore_ascii_case(usual))
-        };
-        let host = if given("host") {
-            String::new()
-        } else {
-            format!("Host: {}\r\n", self.address)
-        };
+        let given = |usual: &str| headers.iter().any(|(name, _)| name.eq_ignore_ascii_case(usual));
+        let host = if given("host") { String::new() } else { format!("Host: {}\r\n", self.address) };
         let mut text = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n{host}");
         for (name, value) in headers {
             text.push_str(&format!("{name}: {value}\r\n"));
@@ -303,12 +254,7 @@ impl Daemon {
     }
 
     /// Polls the API until `find` returns a value for a response.
-    pub fn wait_for<T>(
-        &self,
-        path: &str,
-        what: &str,
-        mut find: impl FnMut(&Value) -> Option<T>,
-    ) -> anyhow::Result<T> {
+    pub fn wait_for<T>(&self, path: &str, what: &str, mut find: impl FnMut(&Value) -> Option<T>) -> anyhow::Result<T> {
         crate::wait_until(what, || {
             let answer = self.api(path)?;
             Ok(find(&answer).ok_or_else(|| format!("{answer:#}")))
@@ -348,10 +294,7 @@ impl Daemon {
         let (head, body) = answer.split_at(head.context("an HTTP answer")?);
         let (head, body) = (String::from_utf8_lossy(head), &body[4..]);
         let status = head.split(' ').nth(1).context("a status line")?.parse()?;
-        let body = if head
-            .to_ascii_lowercase()
-            .contains("transfer-encoding: chunked")
-        {
+        let body = if head.to_ascii_lowercase().contains("transfer-encoding: chunked") {
             dechunk(body)
         } else {
             body.to_owned()
@@ -363,11 +306,7 @@ impl Daemon {
     pub fn servants_of(&self, service: &str) -> anyhow::Result<Vec<Value>> {
         let all = self.api("/api/v1/servants")?;
         let list = all.as_array().context("servants is a list")?;
-        Ok(list
-            .iter()
-            .filter(|servant| servant["service"] == service)
-            .cloned()
-            .collect())
+        Ok(list.iter().filter(|servant| servant["service"] == service).cloned().collect())
     }
 
     /// Returns the servant of a robot.

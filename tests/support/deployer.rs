@@ -37,37 +37,18 @@ impl CommandOutcome {
 
     /// Returns the result if the command succeeded, otherwise an error.
     pub fn expect_success(self) -> anyhow::Result<CommandOutcome> {
-        ensure!(
-            self.status == 0,
-            "{} ended with {}:\n{}",
-            self.command,
-            self.status,
-            self.output()
-        );
+        ensure!(self.status == 0, "{} ended with {}:\n{}", self.command, self.status, self.output());
         Ok(self)
     }
 
     /// Returns the result if the command failed and printed all of `words`, otherwise an error.
     pub fn expect_failure(self, words: &[&str]) -> anyhow::Result<CommandOutcome> {
-        ensure!(
-            self.status != 0,
-            "{} succeeded:\n{}",
-            self.command,
-            self.output()
-        );
+        ensure!(self.status != 0, "{} succeeded:\n{}", self.command, self.output());
         let said = self.output();
         for word in words {
-            ensure!(
-                said.contains(word),
-                "{} did not say {word:?}; it said:\n{said}",
-                self.command
-            );
+            ensure!(said.contains(word), "{} did not say {word:?}; it said:\n{said}", self.command);
         }
-        ensure!(
-            !said.contains("panicked"),
-            "{} panicked:\n{said}",
-            self.command
-        );
+        ensure!(!said.contains("panicked"), "{} panicked:\n{said}", self.command);
         Ok(self)
     }
 }
@@ -77,9 +58,7 @@ impl Deployer {
     pub fn run<S: AsRef<str>>(&self, arguments: &[S]) -> anyhow::Result<CommandOutcome> {
         let arguments: Vec<&str> = arguments.iter().map(AsRef::as_ref).collect();
         // Commands that unpack, compile or pack keep a core busy.
-        let is_work = arguments
-            .iter()
-            .any(|word| ["push", "import"].contains(word));
+        let is_work = arguments.iter().any(|word| ["push", "import"].contains(word));
         let _core = is_work.then(cores::acquire);
         let push = FirstPush::begin(&self.home, &arguments);
         let outcome = run(Command::new(binaries::path("cloudroidctl"))
@@ -94,9 +73,7 @@ impl Deployer {
 
     /// Runs a command with `--format json` and parses its output.
     pub fn run_json(&self, arguments: &[&str]) -> anyhow::Result<Value> {
-        let outcome = self
-            .run(&[&["--format", "json"], arguments].concat())?
-            .expect_success()?;
+        let outcome = self.run(&[&["--format", "json"], arguments].concat())?.expect_success()?;
         serde_json::from_str(&outcome.stdout)
             .with_context(|| format!("{} printed no JSON: {}", outcome.command, outcome.stdout))
     }
@@ -111,10 +88,7 @@ impl Deployer {
 /// Runs a command to its end.
 pub fn run(command: &mut Command) -> anyhow::Result<CommandOutcome> {
     let typed = format!("{command:?}");
-    let output = command
-        .stdin(Stdio::null())
-        .output()
-        .with_context(|| format!("cannot run {typed}"))?;
+    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {typed}"))?;
     Ok(CommandOutcome {
         command: typed,
         status: output.status.code().unwrap_or(-1),

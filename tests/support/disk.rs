@@ -46,33 +46,16 @@ pub fn mount_on(place: &Path, parent: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(parent)?;
     remove_forgotten(parent);
     let free = free_bytes(parent)? >> 30;
-    ensure!(
-        free >= LEAST + RESERVE,
-        "{} has {free} GB free, and {} are needed",
-        parent.display(),
-        LEAST + RESERVE
-    );
-    let file = tempfile::Builder::new()
-        .prefix(PREFIX)
-        .tempfile_in(parent)?;
+    ensure!(free >= LEAST + RESERVE, "{} has {free} GB free, and {} are needed", parent.display(), LEAST + RESERVE);
+    let file = tempfile::Builder::new().prefix(PREFIX).tempfile_in(parent)?;
     file.as_file().set_len(SIZE.min(free - RESERVE) << 30)?;
     let path = path_str(file.path());
-    let format = [
-        "-q",
-        "-F",
-        "-m",
-        "0",
-        "-O",
-        "has_journal",
-        "-E",
-        "lazy_itable_init=1,lazy_journal_init=1,nodiscard",
-        path,
-    ];
+    let format =
+        ["-q", "-F", "-m", "0", "-O", "has_journal", "-E", "lazy_itable_init=1,lazy_journal_init=1,nodiscard", path];
     run(Command::new("mke2fs").args(["-t", "ext4"]).args(format))?.expect_success()?;
     // The content need not survive a power cut, so no write waits for the underlying disk.
     let options = "loop,noatime,nobarrier,data=writeback";
-    run(Command::new("mount").args(["-t", "ext4", "-o", options, path, path_str(place)]))?
-        .expect_success()?;
+    run(Command::new("mount").args(["-t", "ext4", "-o", options, path, path_str(place)]))?.expect_success()?;
     let _ = std::fs::remove_dir(place.join("lost+found"));
     Ok(())
 }

@@ -33,13 +33,7 @@ fn note_machine_in(directory: &Path) {
         let _ = fs::write(directory.join("ps"), output.stdout);
     }
     let mut text = String::new();
-    for name in [
-        "loadavg",
-        "pressure/cpu",
-        "pressure/io",
-        "pressure/memory",
-        "meminfo",
-    ] {
+    for name in ["loadavg", "pressure/cpu", "pressure/io", "pressure/memory", "meminfo"] {
         let said = fs::read_to_string(Path::new("/proc").join(name));
         let said = said.unwrap_or_else(|error| format!("{error}\n"));
         text.push_str(&format!("== /proc/{name}\n{said}"));
@@ -52,45 +46,25 @@ fn note_machine_in(directory: &Path) {
 ///
 /// # Errors
 /// If nothing can be written.
-pub fn keep(
-    telling: &StoryRun,
-    reason: &str,
-    seed: &str,
-    shared: Option<&Daemon>,
-) -> std::io::Result<()> {
+pub fn keep(telling: &StoryRun, reason: &str, seed: &str, shared: Option<&Daemon>) -> std::io::Result<()> {
     let place = &telling.evidence;
     fs::create_dir_all(place)?;
-    fs::write(
-        place.join("reason"),
-        format!("{}\n{reason}\nseed: {seed}\n", telling.name),
-    )?;
+    fs::write(place.join("reason"), format!("{}\n{reason}\nseed: {seed}\n", telling.name))?;
     note_machine_in(place);
     let mut room = LARGEST;
     for home in telling.homes() {
-        let to = place
-            .join("homes")
-            .join(home.file_name().unwrap_or_default());
+        let to = place.join("homes").join(home.file_name().unwrap_or_default());
         copy(&home, &to, &mut room);
         write_events(&home, &to.join("events.jsonl"));
     }
     for directory in telling.directories() {
-        copy(
-            &directory,
-            &place
-                .join("directories")
-                .join(directory.file_name().unwrap_or_default()),
-            &mut room,
-        );
+        copy(&directory, &place.join("directories").join(directory.file_name().unwrap_or_default()), &mut room);
     }
     if let Some(daemon) = shared {
         let to = place.join("shared");
         fs::create_dir_all(&to)?;
         let _ = fs::copy(daemon.home.join("daemon.log"), to.join("daemon.log"));
-        copy(
-            &daemon.home.join("servants"),
-            &to.join("servants"),
-            &mut room,
-        );
+        copy(&daemon.home.join("servants"), &to.join("servants"), &mut room);
         if let Ok(events) = daemon.api("/api/v1/events?limit=10000") {
             let _ = fs::write(to.join("events.json"), format!("{events:#}"));
         }
@@ -108,15 +82,10 @@ for row in rows.execute('SELECT * FROM events ORDER BY id'):
 ";
     let database = home.join("cloudroid.db");
     if database.exists()
-        && let Ok(output) = Command::new("python3")
-            .args(["-c", READ])
-            .arg(database)
-            .output()
+        && let Ok(output) = Command::new("python3").args(["-c", READ]).arg(database).output()
         && let Ok(mut file) = fs::File::create(to)
     {
-        let _ = file
-            .write_all(&output.stdout)
-            .and_then(|()| file.write_all(&output.stderr));
+        let _ = file.write_all(&output.stdout).and_then(|()| file.write_all(&output.stderr));
     }
 }
 

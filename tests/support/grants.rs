@@ -71,38 +71,18 @@ pub fn create_models(models: &Path) -> Verdict {
 pub fn check_grants(robot: &mut Robot, listener: &TcpListener) -> Verdict {
     let port = listener.local_addr()?.port();
     let other = TcpListener::bind("127.0.0.1:0")?;
-    let mut can = |what: &str, argument: &str| -> anyhow::Result<bool> {
-        Ok(try_attempt(robot, what, argument)?.succeeded)
-    };
-    ensure!(
-        can("text-in-file", "/models/net.bin weights")?,
-        "the volume is there"
-    );
-    ensure!(
-        !can("write", "/models/net.bin other")?,
-        "and cannot be written"
-    );
+    let mut can =
+        |what: &str, argument: &str| -> anyhow::Result<bool> { Ok(try_attempt(robot, what, argument)?.succeeded) };
+    ensure!(can("text-in-file", "/models/net.bin weights")?, "the volume is there");
+    ensure!(!can("write", "/models/net.bin other")?, "and cannot be written");
     ensure!(!can("write", "/models/new other")?);
-    ensure!(
-        !can("read", "/models/sly")?,
-        "a link in it leads nowhere outside"
-    );
+    ensure!(!can("read", "/models/sly")?, "a link in it leads nowhere outside");
     ensure!(can("read", "/dev/story0")?, "the device works");
-    ensure!(
-        can("environment", "STORY_DEVICE")?,
-        "and brings its environment"
-    );
-    ensure!(
-        can("connect", &format!("127.0.1.1:{port}"))?,
-        "the way out is open"
-    );
+    ensure!(can("environment", "STORY_DEVICE")?, "and brings its environment");
+    ensure!(can("connect", &format!("127.0.1.1:{port}"))?, "the way out is open");
     listener.accept()?;
     let closed = other.local_addr()?.port();
-    for address in [
-        format!("127.0.1.1:{closed}"),
-        format!("127.0.0.1:{port}"),
-        format!("127.0.0.1:{closed}"),
-    ] {
+    for address in [format!("127.0.1.1:{closed}"), format!("127.0.0.1:{port}"), format!("127.0.0.1:{closed}")] {
         ensure!(!can("connect", &address)?, "{address} is open, too");
     }
     Ok(())

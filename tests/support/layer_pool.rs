@@ -34,15 +34,9 @@ impl FirstPush {
         if is_apart || !home.join("layers").exists() || !list_layers(home).is_empty() {
             return None;
         }
-        let push = FirstPush {
-            key: find_key(arguments)?,
-            home: home.to_owned(),
-        };
+        let push = FirstPush { key: find_key(arguments)?, home: home.to_owned() };
         let known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
-        let layers = known
-            .as_ref()
-            .and_then(|known| known.get(&push.key))
-            .cloned();
+        let layers = known.as_ref().and_then(|known| known.get(&push.key)).cloned();
         drop(known);
         for layer in layers.into_iter().flatten() {
             link_layer(&pool_directory(), home, &layer);
@@ -81,10 +75,7 @@ fn find_key(arguments: &[&str]) -> Option<String> {
 
 /// Returns the names of extracted layers.
 fn list_layers(home: &Path) -> HashSet<String> {
-    let entries = fs::read_dir(home.join("layers"))
-        .into_iter()
-        .flatten()
-        .flatten();
+    let entries = fs::read_dir(home.join("layers")).into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
     // The digest of a layer in hexadecimal; a tree that is being written has a longer name.
     let is_layer = |name: &String| name.len() == 64;
@@ -100,10 +91,7 @@ fn link_layer(from: &Path, to: &Path, layer: &str) {
         return;
     };
     let digest = about["digest"].as_str().unwrap_or_default();
-    let blob = format!(
-        "images/blobs/sha256/{}",
-        digest.trim_start_matches("sha256:")
-    );
+    let blob = format!("images/blobs/sha256/{}", digest.trim_start_matches("sha256:"));
     for file in [&blob, &record] {
         let target = to.join(file);
         let _ = target.parent().map(fs::create_dir_all);
@@ -113,11 +101,7 @@ fn link_layer(from: &Path, to: &Path, layer: &str) {
         }
     }
     let half = to.join(format!("layers/linking-{layer}"));
-    let copied = Command::new("cp")
-        .args(["-al", "--"])
-        .arg(from.join("layers").join(layer))
-        .arg(&half)
-        .status();
+    let copied = Command::new("cp").args(["-al", "--"]).arg(from.join("layers").join(layer)).arg(&half).status();
     if copied.is_ok_and(|status| status.success()) {
         let _ = fs::rename(&half, to.join("layers").join(layer));
     }

@@ -26,8 +26,7 @@ impl MessageLayout {
     fn align(&mut self, to: usize) {
         if self.format == WireFormat::Cdr {
             let written = self.out.len() - HEADER.len();
-            self.out
-                .put_bytes(0, written.next_multiple_of(to) - written);
+            self.out.put_bytes(0, written.next_multiple_of(to) - written);
         }
     }
 
@@ -85,8 +84,7 @@ impl MessageLayout {
     /// Appends a time, given in nanoseconds since 1970.
     pub fn time(&mut self, at: i64) -> &mut Self {
         let part = |part: i64| u32::try_from(part).unwrap_or(0);
-        self.u32(part(at / 1_000_000_000))
-            .u32(part(at % 1_000_000_000))
+        self.u32(part(at / 1_000_000_000)).u32(part(at % 1_000_000_000))
     }
 
     /// Appends a std_msgs/Header with this time.

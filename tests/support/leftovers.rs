@@ -16,11 +16,7 @@ pub fn find_leftovers(home: &Path) -> Vec<String> {
             format!("process {pid}: {command}")
         })
         .collect();
-    found.extend(
-        mounts_below(home)
-            .iter()
-            .map(|mount| format!("mount {}", mount.display())),
-    );
+    found.extend(mounts_below(home).iter().map(|mount| format!("mount {}", mount.display())));
     found
 }
 
@@ -38,11 +34,7 @@ pub fn processes_of(home: &Path) -> Vec<i32> {
             // Processes in this mount namespace see the same mounts without using them.
             || (procfs::namespace(*pid, "mnt") != namespace && mounted.contains(&format!("{home}/")))
     };
-    procfs::pids()
-        .into_iter()
-        .filter(|pid| *pid != own)
-        .filter(refers)
-        .collect()
+    procfs::pids().into_iter().filter(|pid| *pid != own).filter(refers).collect()
 }
 
 /// Detaches all mounts below a directory in this mount namespace, the innermost first.

@@ -52,20 +52,14 @@ pub type Verdict = anyhow::Result<()>;
 ///
 /// # Errors
 /// If `look` fails, or if the time is up.
-pub fn wait_until<T>(
-    what: &str,
-    mut look: impl FnMut() -> anyhow::Result<Result<T, String>>,
-) -> anyhow::Result<T> {
+pub fn wait_until<T>(what: &str, mut look: impl FnMut() -> anyhow::Result<Result<T, String>>) -> anyhow::Result<T> {
     let deadline = Deadline::begin();
     loop {
         match look()? {
             Ok(found) => return Ok(found),
             Err(instead) if deadline.is_over() => {
                 evidence::note_machine();
-                bail!(
-                    "{what} did not come about; instead: {instead}\n{}",
-                    describe_slowness()
-                )
+                bail!("{what} did not come about; instead: {instead}\n{}", describe_slowness())
             }
             Err(_) => std::thread::sleep(LOOK_EVERY),
         }

@@ -69,10 +69,7 @@ impl Machine {
 
     /// Returns the host path of a file that was written in it.
     pub fn host_path(&self, path: &str) -> PathBuf {
-        self.own
-            .path()
-            .join("upper")
-            .join(path.trim_start_matches('/'))
+        self.own.path().join("upper").join(path.trim_start_matches('/'))
     }
 
     /// Copies a file of this host to an absolute path in the machine, with this mode.
@@ -80,10 +77,7 @@ impl Machine {
         let to = self.host_path(to);
         std::fs::create_dir_all(to.parent().context("a directory")?)?;
         std::fs::copy(file, &to)?;
-        Ok(std::fs::set_permissions(
-            to,
-            std::fs::Permissions::from_mode(mode),
-        )?)
+        Ok(std::fs::set_permissions(to, std::fs::Permissions::from_mode(mode))?)
     }
 
     /// Writes a file in the machine.
@@ -173,16 +167,7 @@ pub fn base() -> anyhow::Result<PathBuf> {
     );
     // Mounts of mmdebstrap are invisible to others, and disappear when it is killed.
     let made = run(Command::new("unshare")
-        .args([
-            "--mount",
-            "--propagation",
-            "private",
-            "--pid",
-            "--fork",
-            "--kill-child",
-            "--mount-proc",
-            "mmdebstrap",
-        ])
+        .args(["--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc", "mmdebstrap"])
         .args(["--quiet", "--mode=root", "--variant=minbase"])
         .arg(format!("--include={}", PACKAGES.join(",")))
         .arg("--aptopt=APT::Install-Recommends \"false\"")

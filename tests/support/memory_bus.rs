@@ -13,11 +13,10 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
-    GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, IncompatiblePeer, MatchedPeers,
-    MessageSender, NodeEntities, NodeParameters, ParamValue, PeerId, Publisher, QosProfile,
-    QosReliability, RosVersion, SerializedMessage, ServiceHandler, ServiceType, Subscription,
-    TopicNodes, TopicPeer, WireFormat, WireType, message_queue,
+    ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest, GoalEnd, GoalError,
+    GoalEvents, GoalOutcome, Graph, IncompatiblePeer, MatchedPeers, MessageSender, NodeEntities, NodeParameters,
+    ParamValue, PeerId, Publisher, QosProfile, QosReliability, RosVersion, SerializedMessage, ServiceHandler,
+    ServiceType, Subscription, TopicNodes, TopicPeer, WireFormat, WireType, message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
@@ -153,15 +152,8 @@ impl Topic {
             end.send_if_modified(|before| std::mem::replace(before, now.clone()) != now);
         };
         let add = |matched: &mut MatchedPeers, id: &PeerId, refusal: Option<String>| match refusal {
-            None => matched.peers.push(TopicPeer {
-                id: id.clone(),
-                connected: true,
-                offer: None,
-            }),
-            Some(why) => matched.refused.push(IncompatiblePeer {
-                peer: id.clone(),
-                why,
-            }),
+            None => matched.peers.push(TopicPeer { id: id.clone(), connected: true, offer: None }),
+            Some(why) => matched.refused.push(IncompatiblePeer { peer: id.clone(), why }),
         };
         for publisher in &self.publishers {
             let mut now = MatchedPeers::default();
@@ -221,10 +213,7 @@ impl State {
         let mut sought: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for (node, service, _) in self.clients.values() {
             if !self.services.contains_key(service) {
-                sought
-                    .entry(service.clone())
-                    .or_default()
-                    .push(node.clone());
+                sought.entry(service.clone()).or_default().push(node.clone());
             }
         }
         let nodes = self.nodes.iter();
@@ -233,9 +222,7 @@ impl State {
             topics: topics.collect(),
             services: services.chain(lists).collect(),
             actions: actions.collect(),
-            nodes: nodes
-                .map(|name| (name.clone(), "memory".to_owned()))
-                .collect(),
+            nodes: nodes.map(|name| (name.clone(), "memory".to_owned())).collect(),
             sought,
             ends: self.ends(),
             ..Graph::default()
@@ -255,10 +242,7 @@ impl State {
             }
             for listener in &topic.subscribers {
                 let ends = all.entry(listener.id.node().to_owned()).or_default();
-                let nothing = QosProfile {
-                    reliability: QosReliability::BestEffort,
-                    ..QosProfile::keep_last(1)
-                };
+                let nothing = QosProfile { reliability: QosReliability::BestEffort, ..QosProfile::keep_last(1) };
                 let end = (listener.of.clone(), listener.demanded.unwrap_or(nothing));
                 ends.subscribers.insert(name.clone(), end);
             }
@@ -279,22 +263,14 @@ impl MemorySystem {
     /// Joins as a node of this name.
     pub fn join(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
         self.change(|state| state.nodes.insert(node.to_owned()));
-        Arc::new(MemoryBus {
-            system: self.clone(),
-            node: node.to_owned(),
-            demands: false,
-        })
+        Arc::new(MemoryBus { system: self.clone(), node: node.to_owned(), demands: false })
     }
 
     /// Joins as a node that only receives from publishers that offer the requested quality of service.
     #[allow(dead_code, reason = "who includes this file need not have such nodes")]
     pub fn join_demanding(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
         self.change(|state| state.nodes.insert(node.to_owned()));
-        Arc::new(MemoryBus {
-            system: self.clone(),
-            node: node.to_owned(),
-            demands: true,
-        })
+        Arc::new(MemoryBus { system: self.clone(), node: node.to_owned(), demands: true })
     }
 
     /// Changes the registrations and notifies the observers.
@@ -418,25 +394,15 @@ impl Bus for MemoryBus {
         self.system.graph.subscribe()
     }
 
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError> {
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
         let (sender, messages) = message_queue(qos.depth);
         let (end, matched) = watch::channel(MatchedPeers::default());
         let id = self.system.change(|state| {
             let id = PeerId::new(self.node.as_str(), state.number());
             let topic = state.topics.entry(topic.to_owned()).or_default();
             topic.changed = true;
-            let listener = Listener {
-                id: id.clone(),
-                of,
-                demanded: self.demands.then_some(qos),
-                messages: sender,
-                matched: end,
-            };
+            let listener =
+                Listener { id: id.clone(), of, demanded: self.demands.then_some(qos), messages: sender, matched: end };
             let kept = topic.publishers.iter().filter(|it| it.reaches(&listener));
             for publisher in kept.filter(|_| qos.is_latching()) {
                 if let Some(last) = publisher.last.clone() {
@@ -453,20 +419,10 @@ impl Bus for MemoryBus {
                 topic.subscribers.retain(|it| it.id != id);
             }
         });
-        Ok(Subscription {
-            dropped: messages.drop_counter(),
-            messages,
-            matched,
-            guard: Box::new(guard),
-        })
+        Ok(Subscription { dropped: messages.drop_counter(), messages, matched, guard: Box::new(guard) })
     }
 
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError> {
+    async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
         let (end, matched) = watch::channel(MatchedPeers::default());
         let id = self.system.change(|state| {
             let id = PeerId::new(self.node.as_str(), state.number());
@@ -474,10 +430,7 @@ impl Bus for MemoryBus {
             topic.changed = true;
             topic.publishers.push(Publication {
                 id: id.clone(),
-                of: Arc::new(WireType {
-                    definition: String::new(),
-                    ..of
-                }),
+                of: Arc::new(WireType { definition: String::new(), ..of }),
                 qos,
                 last: None,
                 matched: end,
@@ -521,10 +474,7 @@ impl Bus for MemoryBus {
                 reason: reason.into(),
                 fate: CallFate::Answered,
             }),
-            Err(_) => Err(BusError::Timeout {
-                what: format!("service {service}"),
-                after: patience,
-            }),
+            Err(_) => Err(BusError::Timeout { what: format!("service {service}"), after: patience }),
         }
     }
 
@@ -539,10 +489,7 @@ impl Bus for MemoryBus {
         let publishers = known.publishers.iter().map(|it| WireType::clone(&it.of));
         let mut types = publishers.chain(known.subscribers.iter().map(|it| it.of.clone()));
         let told = types.find(|of| !of.digest.is_any());
-        Ok(told.unwrap_or_else(|| WireType {
-            format: WireFormat::Cdr,
-            ..WireType::any()
-        }))
+        Ok(told.unwrap_or_else(|| WireType { format: WireFormat::Cdr, ..WireType::any() }))
     }
 
     async fn serve(
@@ -558,31 +505,18 @@ impl Bus for MemoryBus {
                 return Err(BusError::AlreadyServed(name.clone()));
             }
             let number = state.number();
-            let served = Service {
-                number,
-                node: self.node.clone(),
-                of,
-                handler,
-            };
+            let served = Service { number, node: self.node.clone(), of, handler };
             state.services.insert(name.clone(), served);
             Ok(number)
         })?;
         Ok(Box::new(self.guard(move |state| {
-            if state
-                .services
-                .get(&name)
-                .is_some_and(|it| it.number == number)
-            {
+            if state.services.get(&name).is_some_and(|it| it.number == number) {
                 state.services.remove(&name);
             }
         })))
     }
 
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError> {
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         let number = self.system.change(|state| {
             let number = state.number();
             let known = state.actions.entry(action.to_owned()).or_default();
@@ -614,11 +548,7 @@ impl Bus for MemoryBus {
             known.server = Some((number, self.node.clone(), handler));
             number
         });
-        Ok(Box::new(MemoryServer {
-            system: self.system.clone(),
-            action: action.to_owned(),
-            number,
-        }))
+        Ok(Box::new(MemoryServer { system: self.system.clone(), action: action.to_owned(), number }))
     }
 
     fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
@@ -655,10 +585,7 @@ impl ActionClient for MemoryClient {
                 None => Ok(()),
             },
             Ok(Err(_)) => Err(BusError::Closed),
-            Err(_) => Err(BusError::Timeout {
-                what: format!("action {}", self.action),
-                after: patience,
-            }),
+            Err(_) => Err(BusError::Timeout { what: format!("action {}", self.action), after: patience }),
         }
     }
 
@@ -669,9 +596,7 @@ impl ActionClient for MemoryClient {
         {
             let mut state = self.system.state.lock();
             let action = state.actions.entry(self.action.clone()).or_default();
-            action
-                .goals
-                .insert(id.to_owned(), (self.number, events.clone()));
+            action.goals.insert(id.to_owned(), (self.number, events.clone()));
         }
         let taken = server.on_goal(id, goal);
         if let Err(reason) = taken {

@@ -21,20 +21,14 @@ pub const DEFINITIONS: [(&str, &str); 4] = [
          byte[] byte_array_value\nbool[] bool_array_value\nint64[] integer_array_value\n\
          float64[] double_array_value\nstring[] string_array_value\n",
     ),
-    (
-        "rcl_interfaces/msg/Parameter",
-        "string name\nParameterValue value\n",
-    ),
+    ("rcl_interfaces/msg/Parameter", "string name\nParameterValue value\n"),
     (
         "composition_interfaces/srv/LoadNode",
         "string package_name\nstring plugin_name\nstring node_name\nstring node_namespace\nuint8 log_level\n\
          string[] remap_rules\nrcl_interfaces/Parameter[] parameters\nrcl_interfaces/Parameter[] extra_arguments\n\
          ---\nbool success\nstring error_message\nstring full_node_name\nuint64 unique_id\n",
     ),
-    (
-        "composition_interfaces/srv/ListNodes",
-        "---\nstring[] full_node_names\nuint64[] unique_ids\n",
-    ),
+    ("composition_interfaces/srv/ListNodes", "---\nstring[] full_node_names\nuint64[] unique_ids\n"),
 ];
 
 /// Returns a registry with the definitions for loading components.
@@ -70,20 +64,12 @@ impl MemoryContainer {
             ("list_nodes", "composition_interfaces/srv/ListNodes"),
         ] {
             let of = registry.service(of).expect("defined");
-            let handler = Part {
-                of: Arc::clone(&of),
-                system: Arc::clone(system),
-                loaded: Arc::clone(&loaded),
-            };
+            let handler = Part { of: Arc::clone(&of), system: Arc::clone(system), loaded: Arc::clone(&loaded) };
             let service = format!("{name}/_container/{part}");
             let served = node.serve(&service, ServiceType::from_service(&of), Arc::new(handler));
             serving.push(served.await.expect("served"));
         }
-        Self {
-            loaded,
-            _node: node,
-            _serving: serving,
-        }
+        Self { loaded, _node: node, _serving: serving }
     }
 
     /// Returns the names of the loaded nodes.
@@ -110,11 +96,7 @@ struct Part {
 impl Part {
     fn load(&self, asked: Value) -> Value {
         let text = |field: &str| asked[field].as_str().unwrap_or_default().to_owned();
-        let (plugin, name, namespace) = (
-            text("plugin_name"),
-            text("node_name"),
-            text("node_namespace"),
-        );
+        let (plugin, name, namespace) = (text("plugin_name"), text("node_name"), text("node_namespace"));
         let mut loaded = self.loaded.lock();
         loaded.asked.push(asked.clone());
         if !plugin.ends_with("Talker") {
@@ -133,13 +115,7 @@ impl Part {
 impl ServiceHandler for Part {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
         let mut asked = Vec::new();
-        to_json(
-            &self.of.request,
-            &request,
-            &mut asked,
-            &JsonOptions::default(),
-        )
-        .expect("a request");
+        to_json(&self.of.request, &request, &mut asked, &JsonOptions::default()).expect("a request");
         let asked: Value = serde_json::from_slice(&asked).expect("JSON");
         let answer = match asked.get("plugin_name") {
             Some(_) => self.load(asked),
@@ -150,13 +126,7 @@ impl ServiceHandler for Part {
             }
         };
         let (text, mut bytes) = (answer.to_string(), Vec::new());
-        from_json(
-            &self.of.response,
-            text.as_bytes(),
-            &mut bytes,
-            &FillOptions::default(),
-        )
-        .expect("fits");
+        from_json(&self.of.response, text.as_bytes(), &mut bytes, &FillOptions::default()).expect("fits");
         Ok(bytes.into())
     }
 }

@@ -58,10 +58,7 @@ impl LoadMeter {
             busy: AtomicU64::new(1_f64.to_bits()),
             busiest: AtomicU64::new(1_f64.to_bits()),
         }));
-        thread::Builder::new()
-            .name("patience".to_owned())
-            .spawn(|| meter.measure_forever())
-            .expect("a thread");
+        thread::Builder::new().name("patience".to_owned()).spawn(|| meter.measure_forever()).expect("a thread");
         meter
     }
 
@@ -70,8 +67,7 @@ impl LoadMeter {
         let mut stalled = sum_stalls();
         let mut looked = Instant::now();
         // The load at the start of the first story is known before that story waits for anything.
-        let mut busy =
-            count_runnable().map_or(1.0, |threads| (threads / cores).clamp(1.0, BUSIEST));
+        let mut busy = count_runnable().map_or(1.0, |threads| (threads / cores).clamp(1.0, BUSIEST));
         loop {
             self.busy.store(busy.to_bits(), Ordering::Relaxed);
             // Non-negative floats have the same order as their bits.
@@ -89,8 +85,7 @@ impl LoadMeter {
             // A late sample, which means that this thread lacked a core as well, counts immediately.
             let slowly = busy.max(late.min(BUSIEST));
             let worked = passed.as_secs_f64() / slowly;
-            self.worked
-                .fetch_add((worked * 1e9) as u64, Ordering::Relaxed);
+            self.worked.fetch_add((worked * 1e9) as u64, Ordering::Relaxed);
         }
     }
 
@@ -169,9 +164,7 @@ impl Deadline {
 
     /// Returns a deadline after this working time.
     pub fn begin_for(time: Duration) -> Self {
-        Self {
-            end: METER.working_time() + time,
-        }
+        Self { end: METER.working_time() + time }
     }
 
     /// Returns whether the deadline has passed.
@@ -212,10 +205,7 @@ impl Deadline {
 
 /// Describes the load of the machine, for messages about timeouts.
 pub fn describe_slowness() -> String {
-    format!(
-        "the machine is {:.1} times as slow as it can be",
-        busyness()
-    )
+    format!("the machine is {:.1} times as slow as it can be", busyness())
 }
 
 /// Awaits a future, within the time limit of a story.
@@ -275,10 +265,7 @@ impl<S: ReadTimeout> PatientStream<S> {
     /// If the timeout cannot be set.
     pub fn new(stream: S) -> io::Result<Self> {
         stream.set_patience(Some(SLICE))?;
-        Ok(Self {
-            stream,
-            is_limited: false,
-        })
+        Ok(Self { stream, is_limited: false })
     }
 
     /// Sets the time limit of reads; `None` restores the limit of a story.
@@ -323,11 +310,7 @@ impl<S: Write> Write for PatientStream<S> {
 /// Returns whether an error only means that nothing arrived in time.
 pub(crate) fn is_slow(error: &io::Error) -> bool {
     // A signal, such as SIGCHLD, interrupts a read as well.
-    let of_waiting = [
-        ErrorKind::WouldBlock,
-        ErrorKind::TimedOut,
-        ErrorKind::Interrupted,
-    ];
+    let of_waiting = [ErrorKind::WouldBlock, ErrorKind::TimedOut, ErrorKind::Interrupted];
     of_waiting.contains(&error.kind())
 }
 

@@ -93,11 +93,7 @@ pub fn installed_stub(
     let workspace = site.install_original(daemon, service, original, of.program)?;
     let server = format!("ws://{}", cable.server);
     let prefixes = format!("{}:{}", overlay.display(), workspace.display());
-    let variables = [
-        (of.workspaces, prefixes.as_str()),
-        ("CLOUDROID_SERVER", server.as_str()),
-        ("NO_COLOR", "1"),
-    ];
+    let variables = [(of.workspaces, prefixes.as_str()), ("CLOUDROID_SERVER", server.as_str()), ("NO_COLOR", "1")];
     site.start_installed_with_environment(&variables, &overlay, of.package, of.executable, of.argv)
 }
 
@@ -132,11 +128,7 @@ impl PeopleCamera {
 
 /// Returns the type `sensor_msgs/Image`.
 pub fn image_type() -> WireType {
-    WireType::new(
-        "sensor_msgs/Image",
-        "060021388200f6f0f447d0fcd9c64743",
-        format!("{IMAGE}{HEADER}"),
-    )
+    WireType::new("sensor_msgs/Image", "060021388200f6f0f447d0fcd9c64743", format!("{IMAGE}{HEADER}"))
 }
 
 /// Returns the type `sensor_msgs/Image` for either version of ROS.
@@ -160,12 +152,7 @@ pub fn picture(number: u32, size: (u32, u32), pixels: &[u8]) -> Bytes {
 }
 
 /// Serializes a `sensor_msgs/Image` for either version of ROS.
-pub fn picture_of(
-    version: RosVersion,
-    number: u32,
-    (width, height): (u32, u32),
-    pixels: &[u8],
-) -> Bytes {
+pub fn picture_of(version: RosVersion, number: u32, (width, height): (u32, u32), pixels: &[u8]) -> Bytes {
     let mut out = MessageLayout::new(version);
     out.header(number, "camera").u32(height).u32(width);
     out.text("bgr8").u8(0).u32(width * 3).bytes(pixels).finish()

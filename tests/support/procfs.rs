@@ -13,38 +13,23 @@ pub fn status(pid: i32) -> Option<BTreeMap<String, String>> {
 /// Parses the fields of a `status` file, one per line.
 pub fn fields(status: &str) -> BTreeMap<String, String> {
     let fields = status.lines().filter_map(|line| line.split_once(':'));
-    fields
-        .map(|(key, value)| (key.to_owned(), value.trim().to_owned()))
-        .collect()
+    fields.map(|(key, value)| (key.to_owned(), value.trim().to_owned())).collect()
 }
 
 /// Returns the command line, with arguments separated by spaces.
 pub fn command_line(pid: i32) -> Option<String> {
     let bytes = fs::read(format!("/proc/{pid}/cmdline")).ok()?;
-    Some(
-        String::from_utf8_lossy(&bytes)
-            .replace('\0', " ")
-            .trim()
-            .to_owned(),
-    )
+    Some(String::from_utf8_lossy(&bytes).replace('\0', " ").trim().to_owned())
 }
 
 /// Returns the pids of all processes.
 pub fn pids() -> Vec<i32> {
-    fs::read_dir("/proc")
-        .expect("/proc")
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
-        .collect()
+    fs::read_dir("/proc").expect("/proc").filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok()).collect()
 }
 
 /// Returns the identity of a namespace of a process, such as `net:[4026531840]`.
 pub fn namespace(pid: i32, kind: &str) -> Option<String> {
-    Some(
-        fs::read_link(format!("/proc/{pid}/ns/{kind}"))
-            .ok()?
-            .to_string_lossy()
-            .into_owned(),
-    )
+    Some(fs::read_link(format!("/proc/{pid}/ns/{kind}")).ok()?.to_string_lossy().into_owned())
 }
 
 /// Returns whether a process exists and is not a zombie.
@@ -60,17 +45,9 @@ pub fn cgroups(pid: i32) -> Vec<PathBuf> {
         .filter_map(|line| {
             let mut fields = line.splitn(3, ':').skip(1);
             let (controllers, path) = (fields.next()?, fields.next()?);
-            let hierarchy = if controllers.is_empty() {
-                "unified"
-            } else {
-                controllers.trim_start_matches("name=")
-            };
+            let hierarchy = if controllers.is_empty() { "unified" } else { controllers.trim_start_matches("name=") };
             let hierarchy = PathBuf::from("/sys/fs/cgroup").join(hierarchy);
-            let root = if hierarchy.exists() {
-                hierarchy
-            } else {
-                PathBuf::from("/sys/fs/cgroup")
-            };
+            let root = if hierarchy.exists() { hierarchy } else { PathBuf::from("/sys/fs/cgroup") };
             Some(root.join(path.trim_start_matches('/')))
         })
         .collect()
@@ -78,19 +55,14 @@ pub fn cgroups(pid: i32) -> Vec<PathBuf> {
 
 /// Returns these processes with all their descendants.
 pub fn with_descendants(pids: &[i32]) -> Vec<i32> {
-    let parents: Vec<(i32, i32)> = self::pids()
-        .into_iter()
-        .filter_map(|pid| Some((pid, status(pid)?.get("PPid")?.parse().ok()?)))
-        .collect();
+    let parents: Vec<(i32, i32)> =
+        self::pids().into_iter().filter_map(|pid| Some((pid, status(pid)?.get("PPid")?.parse().ok()?))).collect();
     let mut all = pids.to_vec();
     let mut next = 0;
     while next < all.len() {
         let parent = all[next];
         let children = parents.iter().filter(|(_, of)| *of == parent);
-        let new: Vec<i32> = children
-            .map(|(pid, _)| *pid)
-            .filter(|pid| !all.contains(pid))
-            .collect();
+        let new: Vec<i32> = children.map(|(pid, _)| *pid).filter(|pid| !all.contains(pid)).collect();
         all.extend(new);
         next += 1;
     }

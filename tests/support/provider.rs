@@ -110,8 +110,7 @@ impl StoryIdentityProvider {
         let secrets = Arc::clone(&self.secrets);
         std::thread::spawn(move || {
             for line in lines.map_while(Result::ok) {
-                if let (Some(secret), Ok(mut all)) = (line.strip_prefix("secret "), secrets.lock())
-                {
+                if let (Some(secret), Ok(mut all)) = (line.strip_prefix("secret "), secrets.lock()) {
                     all.push(secret.to_owned());
                 }
             }
@@ -136,9 +135,7 @@ impl StoryIdentityProvider {
 
     fn set_knobs(&self, knobs: &Value) -> anyhow::Result<()> {
         let url = format!("{}/knobs", self.issuer());
-        let turned = Command::new("curl")
-            .args(["--silent", "--fail", "--data", &knobs.to_string(), &url])
-            .status()?;
+        let turned = Command::new("curl").args(["--silent", "--fail", "--data", &knobs.to_string(), &url]).status()?;
         ensure!(turned.success(), "the provider's knobs: {turned}");
         Ok(())
     }
@@ -155,10 +152,7 @@ impl StoryIdentityProvider {
 
     /// Returns the tokens that it has issued.
     pub fn secrets(&self) -> Vec<String> {
-        self.secrets
-            .lock()
-            .map(|all| all.clone())
-            .unwrap_or_default()
+        self.secrets.lock().map(|all| all.clone()).unwrap_or_default()
     }
 
     /// Returns a new daemon setup that uses this provider, with these roles.
@@ -172,25 +166,19 @@ impl StoryIdentityProvider {
         std::fs::write(&secret, format!("{SECRET}\n"))?;
         let closed = std::os::unix::fs::PermissionsExt::from_mode(0o600);
         std::fs::set_permissions(&secret, closed)?;
-        Ok(setup
-            .listen(&format!("127.0.0.1:{}", self.daemon))
-            .config(&format!(
-                "[oidc]\nissuer = \"{}\"\nname = \"Lab login\"\nclient_id = \"cloudroid\"\nclient_secret_file \
+        Ok(setup.listen(&format!("127.0.0.1:{}", self.daemon)).config(&format!(
+            "[oidc]\nissuer = \"{}\"\nname = \"Lab login\"\nclient_id = \"cloudroid\"\nclient_secret_file \
                  = \"{}\"\n\
                  redirect = \"{}\"\nscopes = [\"profile\", \"groups\"]\nroles = {{ {roles} }}\n",
-                self.issuer(),
-                path_str(&secret),
-                self.portal(),
-            )))
+            self.issuer(),
+            path_str(&secret),
+            self.portal(),
+        )))
     }
 
     /// Returns a browser without cookies.
     pub fn browser(&self, name: &str) -> CookieBrowser {
-        CookieBrowser {
-            jar: self.place.path().join(format!("jar-{name}")),
-            portal: self.portal(),
-            authority: None,
-        }
+        CookieBrowser { jar: self.place.path().join(format!("jar-{name}")), portal: self.portal(), authority: None }
     }
 }
 
@@ -233,10 +221,7 @@ impl PageVisit {
 impl CookieBrowser {
     /// Returns a browser that trusts a CA certificate.
     pub fn with_authority(self, authority: &Path) -> CookieBrowser {
-        CookieBrowser {
-            authority: Some(authority.to_owned()),
-            ..self
-        }
+        CookieBrowser { authority: Some(authority.to_owned()), ..self }
     }
 
     /// Returns the cookies in curl's format.
@@ -260,11 +245,7 @@ impl CookieBrowser {
         .expect_success()?;
         let (body, last) = outcome.stdout.rsplit_once('\n').context("a status")?;
         let (status, onward) = last.split_once(' ').context("an address")?;
-        Ok(PageVisit {
-            status: status.parse()?,
-            onward: onward.to_owned(),
-            body: body.to_owned(),
-        })
+        Ok(PageVisit { status: status.parse()?, onward: onward.to_owned(), body: body.to_owned() })
     }
 
     /// Opens a path of the portal and follows redirects.
@@ -303,10 +284,7 @@ impl CookieBrowser {
     /// Returns the session if this user with this role is signed in, otherwise an error.
     pub fn expect_user(&self, name: &str, role: &str) -> anyhow::Result<Value> {
         let session = self.session()?;
-        ensure!(
-            session["name"] == name && session["role"] == role,
-            "{session}"
-        );
+        ensure!(session["name"] == name && session["role"] == role, "{session}");
         Ok(session)
     }
 
@@ -317,10 +295,7 @@ impl CookieBrowser {
 
     /// Sends a request that changes something, as the page does.
     pub fn send_change(&self, method: &str, path: &str) -> anyhow::Result<PageVisit> {
-        let csrf = self.session()?["csrf"]
-            .as_str()
-            .unwrap_or_default()
-            .to_owned();
+        let csrf = self.session()?["csrf"].as_str().unwrap_or_default().to_owned();
         let origin = format!("Origin: {}", self.portal);
         let csrf = format!("X-CSRF-Token: {csrf}");
         let url = format!("{}{path}", self.portal);
@@ -338,14 +313,9 @@ impl CookieBrowser {
 
 /// Fails if any of the secrets occurs in files or output of a daemon.
 pub fn expect_no_secret(daemon: &Daemon, secrets: &[String]) -> anyhow::Result<()> {
-    let read = |path: &Path| -> anyhow::Result<String> {
-        Ok(String::from_utf8_lossy(&std::fs::read(path)?).into_owned())
-    };
-    let audited = daemon
-        .deployer()
-        .run(&["--format", "json", "audit"])?
-        .expect_success()?
-        .stdout;
+    let read =
+        |path: &Path| -> anyhow::Result<String> { Ok(String::from_utf8_lossy(&std::fs::read(path)?).into_owned()) };
+    let audited = daemon.deployer().run(&["--format", "json", "audit"])?.expect_success()?.stdout;
     let texts = [
         ("audit log", audited),
         ("log", read(&daemon.home.join("daemon.log"))?),

@@ -21,9 +21,7 @@ pub struct Robot {
 
 fn request_with_protocols(uri: Uri, protocols: &[&str]) -> ClientRequestBuilder {
     let request = ClientRequestBuilder::new(uri);
-    protocols.iter().fold(request, |request, protocol| {
-        request.with_sub_protocol(*protocol)
-    })
+    protocols.iter().fold(request, |request, protocol| request.with_sub_protocol(*protocol))
 }
 
 impl Robot {
@@ -34,20 +32,13 @@ impl Robot {
 
     /// Connects with a small receive buffer.
     pub fn connect_with_small_buffer(url: &str, protocols: &[&str]) -> anyhow::Result<Robot> {
-        let address = url
-            .strip_prefix("ws://")
-            .and_then(|rest| rest.split('/').next())
-            .context("a ws:// address")?;
+        let address = url.strip_prefix("ws://").and_then(|rest| rest.split('/').next()).context("a ws:// address")?;
         let stream = TcpStream::connect(address)?;
         nix::sys::socket::setsockopt(&stream, nix::sys::socket::sockopt::RcvBuf, &(64 * 1024))?;
         let request = request_with_protocols(url.parse()?, protocols);
         let (socket, _) = tungstenite::client(request, PatientStream::new(stream)?)
             .map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
-        Ok(Robot {
-            socket,
-            backlog: VecDeque::new(),
-            calls: 0,
-        })
+        Ok(Robot { socket, backlog: VecDeque::new(), calls: 0 })
     }
 
     /// Connects, or returns the HTTP status and body of the refusal.
@@ -56,10 +47,7 @@ impl Robot {
     }
 
     /// Connects with further headers, such as a browser's.
-    pub fn try_connect_with_headers(
-        url: &str,
-        headers: &[(&str, &str)],
-    ) -> Result<Robot, ConnectionRefusal> {
+    pub fn try_connect_with_headers(url: &str, headers: &[(&str, &str)]) -> Result<Robot, ConnectionRefusal> {
         Robot::try_connect_with(url, &[], headers).map(|(robot, _)| robot)
     }
 
@@ -80,36 +68,25 @@ impl Robot {
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
             .ok_or_else(|| ConnectionRefusal::without_status("not a ws:// address"))?;
-        let stream = TcpStream::connect(address)
-            .map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
+        let stream =
+            TcpStream::connect(address).map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
         let _ = stream.set_nodelay(true);
-        let stream = PatientStream::new(stream)
-            .map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
-        let uri = url
-            .parse()
-            .map_err(|error| ConnectionRefusal::without_status(&format!("{error}")))?;
+        let stream =
+            PatientStream::new(stream).map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
+        let uri = url.parse().map_err(|error| ConnectionRefusal::without_status(&format!("{error}")))?;
         let request = request_with_protocols(uri, protocols);
-        let request = headers.iter().fold(request, |request, (name, value)| {
-            request.with_header(*name, *value)
-        });
+        let request = headers.iter().fold(request, |request, (name, value)| request.with_header(*name, *value));
         match tungstenite::client(request, stream) {
             Ok((socket, response)) => {
                 let chosen = response.headers().get("sec-websocket-protocol");
                 let chosen = chosen.and_then(|chosen| Some(chosen.to_str().ok()?.to_owned()));
-                let robot = Robot {
-                    socket,
-                    backlog: VecDeque::new(),
-                    calls: 0,
-                };
+                let robot = Robot { socket, backlog: VecDeque::new(), calls: 0 };
                 Ok((robot, chosen))
             }
-            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => {
-                Err(ConnectionRefusal {
-                    status: response.status().as_u16(),
-                    body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default())
-                        .into_owned(),
-                })
-            }
+            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => Err(ConnectionRefusal {
+                status: response.status().as_u16(),
+                body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default()).into_owned(),
+            }),
             Err(error) => Err(ConnectionRefusal::without_status(&error.to_string())),
         }
     }
@@ -147,11 +124,7 @@ impl Robot {
     }
 
     /// Returns the first message that `wanted` accepts; other messages are kept for later.
-    pub fn wait_for(
-        &mut self,
-        what: &str,
-        wanted: impl Fn(&Value) -> bool,
-    ) -> anyhow::Result<Value> {
+    pub fn wait_for(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
         if let Some(index) = self.backlog.iter().position(&wanted) {
             return Ok(self.backlog.remove(index).expect("just found"));
         }
@@ -159,21 +132,14 @@ impl Robot {
         loop {
             deadline.check(|| {
                 let heard = &self.backlog;
-                format!(
-                    "{what} did not come; {}; heard instead: {heard:?}",
-                    describe_slowness()
-                )
+                format!("{what} did not come; {}; heard instead: {heard:?}", describe_slowness())
             })?;
-            let frame = self
-                .next_frame()
-                .with_context(|| format!("waiting for {what}; heard so far: {:?}", self.backlog))?;
+            let frame =
+                self.next_frame().with_context(|| format!("waiting for {what}; heard so far: {:?}", self.backlog))?;
             let value = match frame {
                 Message::Text(text) => serde_json::from_str(text.as_str())?,
                 Message::Binary(bytes) => ciborium::from_reader::<Value, _>(bytes.as_ref())?,
-                Message::Close(frame) => bail!(
-                    "closed while waiting for {what}: {frame:?}; heard {:?}",
-                    self.backlog
-                ),
+                Message::Close(frame) => bail!("closed while waiting for {what}: {frame:?}; heard {:?}", self.backlog),
                 _ => continue,
             };
             if wanted(&value) {
@@ -192,19 +158,15 @@ impl Robot {
 
     /// Returns the message of the next publication on a topic.
     pub fn next_message_on(&mut self, topic: &str) -> anyhow::Result<Value> {
-        let heard = self.wait_for(&format!("a message on {topic}"), |value| {
-            value["op"] == "publish" && value["topic"] == topic
-        })?;
+        let heard = self
+            .wait_for(&format!("a message on {topic}"), |value| value["op"] == "publish" && value["topic"] == topic)?;
         Ok(heard["msg"].clone())
     }
 
     /// Returns the next status message that contains `word`.
     pub fn wait_for_status(&mut self, word: &str) -> anyhow::Result<Value> {
         self.wait_for(&format!("a status that mentions {word:?}"), |value| {
-            value["op"] == "status"
-                && value["msg"]
-                    .as_str()
-                    .is_some_and(|text| text.contains(word))
+            value["op"] == "status" && value["msg"].as_str().is_some_and(|text| text.contains(word))
         })
     }
 
@@ -283,10 +245,7 @@ pub struct ConnectionRefusal {
 
 impl ConnectionRefusal {
     fn without_status(text: &str) -> ConnectionRefusal {
-        ConnectionRefusal {
-            status: 0,
-            body: text.to_owned(),
-        }
+        ConnectionRefusal { status: 0, body: text.to_owned() }
     }
 }
 

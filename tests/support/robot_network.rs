@@ -59,21 +59,14 @@ impl RobotNetwork {
         let robot = robot.context("a name")?.to_owned();
         let other = format!("{robot}-other");
         ip(&["netns", "add", &other])?;
-        let network = Self {
-            cable,
-            robot,
-            other,
-            servers,
-        };
+        let network = Self { cable, robot, other, servers };
         network.create_links()?;
         Ok(network)
     }
 
     fn create_links(&self) -> anyhow::Result<()> {
         let [robot, other] = [&*self.robot, &*self.other];
-        ip(&[
-            "-n", robot, "link", "add", CARD, "type", "veth", "peer", "name", CARD, "netns", other,
-        ])?;
+        ip(&["-n", robot, "link", "add", CARD, "type", "veth", "peer", "name", CARD, "netns", other])?;
         ip(&["-n", other, "link", "set", "lo", "up"])?;
         for (machine, address) in [(robot, "10.77.0.1/24"), (other, "10.77.0.2/24")] {
             ip(&["-n", machine, "addr", "add", address, "dev", CARD])?;
@@ -104,11 +97,7 @@ impl RobotNetwork {
     }
 
     /// Starts a program of `tests/robots` on the other machine.
-    pub fn start_application(
-        &self,
-        program: &str,
-        arguments: &[&str],
-    ) -> anyhow::Result<RobotProgram> {
+    pub fn start_application(&self, program: &str, arguments: &[&str]) -> anyhow::Result<RobotProgram> {
         let mut command = python(&Path::new("tests/robots").join(program));
         command.args(arguments);
         self.domain().configure(&mut command);
@@ -162,11 +151,8 @@ pub struct RobotProgram {
 impl RobotProgram {
     /// Starts it and waits until it is ready.
     fn start(mut command: Command, namespace: &Path) -> anyhow::Result<Self> {
-        patience::tell_patience(&mut command)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped());
-        let mut child =
-            run_in_namespace(namespace, || command.spawn())?.context("starting a program")?;
+        patience::tell_patience(&mut command).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = run_in_namespace(namespace, || command.spawn())?.context("starting a program")?;
         let (said, lines) = channel();
         let output = child.stdout.take().context("its output")?;
         std::thread::spawn(move || {
@@ -174,11 +160,7 @@ impl RobotProgram {
                 let _ = said.send(line);
             }
         });
-        let application = Self {
-            orders: child.stdin.take().context("its input")?,
-            child,
-            lines,
-        };
+        let application = Self { orders: child.stdin.take().context("its input")?, child, lines };
         application.read_answer("ready")?;
         Ok(application)
     }

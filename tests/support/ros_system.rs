@@ -87,11 +87,7 @@ impl Domain {
             let address = UnixAddress::from_abstract_name(name).ok()?;
             let lock = UnixListener::bind_addr(&address).ok()?;
             let id = u16::try_from(id).ok()?;
-            Some(Self {
-                id,
-                range: DomainRange::Machine,
-                _lock: Some(lock),
-            })
+            Some(Self { id, range: DomainRange::Machine, _lock: Some(lock) })
         });
         taken.context("all domains of ROS 2 are taken; end what is left of earlier runs")
     }
@@ -99,13 +95,7 @@ impl Domain {
     /// Returns a domain for separate networks, in which processes discover each other through these servers, or by
     /// multicast.
     pub fn for_network(id: u16, servers: Option<&str>) -> Self {
-        Self {
-            id,
-            range: DomainRange::Network {
-                servers: servers.map(str::to_owned),
-            },
-            _lock: None,
-        }
+        Self { id, range: DomainRange::Network { servers: servers.map(str::to_owned) }, _lock: None }
     }
 
     /// Makes a process join the domain.
@@ -133,10 +123,7 @@ impl RosSystem {
     pub fn new(version: RosVersion, runtime: &Runtime) -> anyhow::Result<Self> {
         match version {
             RosVersion::One => {
-                let mut system = Self::Master {
-                    address: ([127, 0, 0, 1], 0).into(),
-                    serving: None,
-                };
+                let mut system = Self::Master { address: ([127, 0, 0, 1], 0).into(), serving: None };
                 system.start_master(runtime)?;
                 Ok(system)
             }
@@ -197,9 +184,7 @@ impl RosSystem {
     pub fn configure(&self, command: &mut Command) {
         match self {
             Self::Master { address, .. } => {
-                command
-                    .env("ROS_MASTER_URI", format!("http://{address}"))
-                    .env_remove("ROS_NAMESPACE");
+                command.env("ROS_MASTER_URI", format!("http://{address}")).env_remove("ROS_NAMESPACE");
             }
             Self::Domain(domain) => domain.configure(command),
         }

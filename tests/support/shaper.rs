@@ -45,10 +45,7 @@ impl Shaper {
     /// Creates both devices and connects them.
     pub fn join_devices(one: &str, other: &str) -> anyhow::Result<Self> {
         let (one, other) = (open_tun(one)?, open_tun(other)?);
-        let ways = [
-            spawn_direction(one.try_clone()?, other.try_clone()?),
-            spawn_direction(other, one),
-        ];
+        let ways = [spawn_direction(one.try_clone()?, other.try_clone()?), spawn_direction(other, one)];
         Ok(Self { ways })
     }
 
@@ -94,21 +91,14 @@ impl State {
             }
             None => now,
         };
-        let after = self
-            .under_way
-            .back()
-            .map_or(due, |(last, _)| due.max(*last));
+        let after = self.under_way.back().map_or(due, |(last, _)| due.max(*last));
         self.under_way.push_back((after, packet.to_vec()));
     }
 
     /// Returns the delay of a packet, including jitter.
     fn transit_delay(&mut self, badness: &NetworkImpairment) -> Duration {
         let jitter = f64::from(badness.jitter);
-        let more = if badness.jitter == 0 {
-            0.0
-        } else {
-            jitter * (2.0 * self.random() - 1.0)
-        };
+        let more = if badness.jitter == 0 { 0.0 } else { jitter * (2.0 * self.random() - 1.0) };
         Duration::from_secs_f64((f64::from(badness.delay) + more).max(0.0) / 1e3)
     }
 
@@ -167,20 +157,13 @@ fn next_packet(way: &ShaperDirection) -> Option<Vec<u8>> {
                 let waited = way.changed.wait_timeout(state, due - now);
                 waited.unwrap_or_else(PoisonError::into_inner).0
             }
-            None => way
-                .changed
-                .wait(state)
-                .unwrap_or_else(PoisonError::into_inner),
+            None => way.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
         };
     }
 }
 
 mod request {
-    nix::ioctl_write_ptr_bad!(
-        tun_set_iff,
-        nix::request_code_write!(b'T', 202, 4),
-        super::TunRequest
-    );
+    nix::ioctl_write_ptr_bad!(tun_set_iff, nix::request_code_write!(b'T', 202, 4), super::TunRequest);
 }
 
 /// `struct ifreq` of linux/if.h, as TUNSETIFF takes it.
@@ -200,11 +183,7 @@ fn open_tun(name: &str) -> anyhow::Result<File> {
     let path = "/dev/net/tun";
     let file = File::options().read(true).write(true).open(path);
     let file = file.context(path)?;
-    let mut request = TunRequest {
-        name: [0; 16],
-        flags: TUN_WITHOUT_HEAD,
-        rest: [0; 22],
-    };
+    let mut request = TunRequest { name: [0; 16], flags: TUN_WITHOUT_HEAD, rest: [0; 22] };
     anyhow::ensure!(name.len() < request.name.len(), "{name} is too long");
     request.name[..name.len()].copy_from_slice(name.as_bytes());
     // SAFETY: the kernel reads and writes one ifreq, which is `request` and outlives the call.

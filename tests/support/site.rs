@@ -12,10 +12,7 @@ use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use ros::bus::{
-    Bus, Graph, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, WireFormat,
-    WireType,
-};
+use ros::bus::{Bus, Graph, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, WireFormat, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::schema::MessageType;
@@ -69,17 +66,9 @@ impl Site {
         namespace: Option<PathBuf>,
         system: impl FnOnce(&Runtime) -> anyhow::Result<RosSystem>,
     ) -> anyhow::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
         let place = Directory::new("site")?;
-        Ok(Self {
-            system: system(&runtime)?,
-            runtime,
-            namespace,
-            place,
-        })
+        Ok(Self { system: system(&runtime)?, runtime, namespace, place })
     }
 
     /// Returns the address of its Master.
@@ -118,9 +107,7 @@ impl Site {
         let mut graphs = node.bus().graph();
         let found = self.runtime.block_on(async {
             let found = patience::wait_for(graphs.wait_for(|graph| wanted(graph)));
-            found
-                .await
-                .map(|found| found.map(|graph| (**graph).clone()))
+            found.await.map(|found| found.map(|graph| (**graph).clone()))
         });
         match found {
             Ok(graph) => Ok(graph?),
@@ -137,44 +124,26 @@ impl Site {
     ) -> anyhow::Result<Box<dyn Publisher>> {
         let of = string_type(self.system.version())?;
         let qos = QosProfile::keep_last(100).latching(latch);
-        Ok(self
-            .runtime
-            .block_on(node.bus().advertise(topic, of, qos))?)
+        Ok(self.runtime.block_on(node.bus().advertise(topic, of, qos))?)
     }
 
     /// Subscribes to a topic of any type.
-    pub fn subscribe(
-        &self,
-        node: &(impl HasBus + ?Sized),
-        topic: &str,
-    ) -> anyhow::Result<Subscription> {
-        let subscribed = node
-            .bus()
-            .subscribe(topic, WireType::any(), QosProfile::keep_last(100));
+    pub fn subscribe(&self, node: &(impl HasBus + ?Sized), topic: &str) -> anyhow::Result<Subscription> {
+        let subscribed = node.bus().subscribe(topic, WireType::any(), QosProfile::keep_last(100));
         Ok(self.runtime.block_on(subscribed)?)
     }
 
     /// Subscribes to a topic including latched messages, which a late subscriber of ROS 2 has to request.
-    pub fn subscribe_latched(
-        &self,
-        node: &(impl HasBus + ?Sized),
-        topic: &str,
-    ) -> anyhow::Result<Subscription> {
+    pub fn subscribe_latched(&self, node: &(impl HasBus + ?Sized), topic: &str) -> anyhow::Result<Subscription> {
         let qos = QosProfile::keep_last(100).latching(true);
         let subscribed = node.bus().subscribe(topic, WireType::any(), qos);
         Ok(self.runtime.block_on(subscribed)?)
     }
 
     /// Returns the next message.
-    pub fn next_message(
-        &self,
-        subscription: &mut Subscription,
-    ) -> anyhow::Result<SerializedMessage> {
-        let next = self
-            .runtime
-            .block_on(patience::wait_for(subscription.messages.recv()));
-        next.context("a message should come")?
-            .context("the topic ended")
+    pub fn next_message(&self, subscription: &mut Subscription) -> anyhow::Result<SerializedMessage> {
+        let next = self.runtime.block_on(patience::wait_for(subscription.messages.recv()));
+        next.context("a message should come")?.context("the topic ended")
     }
 
     /// Returns the next message, if one arrives in time.
@@ -201,9 +170,7 @@ impl Site {
         let deadline = Deadline::begin();
         loop {
             ask()?;
-            while let Some(message) =
-                self.next_message_within(subscription, patience::scale(MOMENT))?
-            {
+            while let Some(message) = self.next_message_within(subscription, patience::scale(MOMENT))? {
                 if wanted(&message)? {
                     return Ok(message);
                 }
@@ -214,17 +181,11 @@ impl Site {
     }
 
     /// Waits until `count` subscribers are connected.
-    pub fn wait_for_subscribers(
-        &self,
-        publisher: &dyn Publisher,
-        count: usize,
-    ) -> anyhow::Result<()> {
+    pub fn wait_for_subscribers(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
         let mut now = publisher.matched_subscribers();
-        let reached = self.runtime.block_on(async {
-            patience::wait_for(now.wait_for(|now| now.connected_count() == count))
-                .await
-                .is_ok()
-        });
+        let reached = self
+            .runtime
+            .block_on(async { patience::wait_for(now.wait_for(|now| now.connected_count() == count)).await.is_ok() });
         ensure!(
             reached,
             "{count} subscribers should be connected, not {}",
@@ -234,17 +195,11 @@ impl Site {
     }
 
     /// Waits until `count` publishers are connected.
-    pub fn wait_for_publishers(
-        &self,
-        subscription: &Subscription,
-        count: usize,
-    ) -> anyhow::Result<()> {
+    pub fn wait_for_publishers(&self, subscription: &Subscription, count: usize) -> anyhow::Result<()> {
         let mut now = subscription.matched.clone();
-        let reached = self.runtime.block_on(async {
-            patience::wait_for(now.wait_for(|now| now.connected_count() == count))
-                .await
-                .is_ok()
-        });
+        let reached = self
+            .runtime
+            .block_on(async { patience::wait_for(now.wait_for(|now| now.connected_count() == count)).await.is_ok() });
         ensure!(
             reached,
             "{count} publishers should be connected, not {}",
@@ -254,12 +209,7 @@ impl Site {
     }
 
     /// Calls a service.
-    pub fn call_service(
-        &self,
-        node: &(impl HasBus + ?Sized),
-        service: &str,
-        request: &[u8],
-    ) -> anyhow::Result<Bytes> {
+    pub fn call_service(&self, node: &(impl HasBus + ?Sized), service: &str, request: &[u8]) -> anyhow::Result<Bytes> {
         let request = Bytes::copy_from_slice(request);
         let called = node.bus().call(service, request, patience());
         Ok(self.runtime.block_on(called)?)
@@ -300,10 +250,7 @@ impl Site {
         executable: &str,
         argv: &[&str],
     ) -> anyhow::Result<NodeProcess> {
-        let overlay = tempfile::Builder::new()
-            .prefix("stub")
-            .tempdir_in(self.place.path())?
-            .keep();
+        let overlay = tempfile::Builder::new().prefix("stub").tempdir_in(self.place.path())?.keep();
         let share = overlay.join("share").join(package);
         std::fs::create_dir_all(&share)?;
         std::fs::write(share.join("stub.toml"), toml)?;
@@ -320,12 +267,7 @@ impl Site {
     }
 
     /// Installs a stub of a service from its archive, with `settings` appended to its `stub.toml`; returns the overlay.
-    pub fn install_stub(
-        &self,
-        daemon: &Daemon,
-        service: &str,
-        settings: &str,
-    ) -> anyhow::Result<PathBuf> {
+    pub fn install_stub(&self, daemon: &Daemon, service: &str, settings: &str) -> anyhow::Result<PathBuf> {
         self.install_stub_for(daemon, service, std::env::consts::ARCH, settings)
     }
 
@@ -337,10 +279,7 @@ impl Site {
         architecture: &str,
         settings: &str,
     ) -> anyhow::Result<PathBuf> {
-        let place = tempfile::Builder::new()
-            .prefix("installed")
-            .tempdir_in(self.place.path())?
-            .keep();
+        let place = tempfile::Builder::new().prefix("installed").tempdir_in(self.place.path())?.keep();
         let directory = path_str(&place);
         let words = ["stub", service, "--arch", architecture, "-o", directory];
         daemon.deployer().run(&words)?.expect_success()?;
@@ -444,9 +383,7 @@ impl Site {
                 format!("HOME=/root {}", image_environment(daemon, service)?)
             }
         };
-        let text = format!(
-            "#!/bin/sh\nexec unshare --mount sh -c '{script}' sh env {variables} {program} \"$@\"\n"
-        );
+        let text = format!("#!/bin/sh\nexec unshare --mount sh -c '{script}' sh env {variables} {program} \"$@\"\n");
         std::fs::write(&launcher, text)?;
         let executable = std::os::unix::fs::PermissionsExt::from_mode(0o755);
         std::fs::set_permissions(&launcher, executable)?;
@@ -459,16 +396,9 @@ impl Site {
     }
 
     /// Starts a program in a root file system, through the commands of [`image_shell`].
-    pub fn start_in_image(
-        &self,
-        script: &str,
-        program: &str,
-        argv: &[String],
-    ) -> anyhow::Result<NodeProcess> {
+    pub fn start_in_image(&self, script: &str, program: &str, argv: &[String]) -> anyhow::Result<NodeProcess> {
         let mut command = Command::new("unshare");
-        command
-            .args(["--mount", "sh", "-c", script, "sh", program])
-            .args(argv);
+        command.args(["--mount", "sh", "-c", script, "sh", program]).args(argv);
         command.env("HOME", "/root").env("ROS_IP", "127.0.0.1");
         self.start(command, &self.place.path().join("original.log"))
     }
@@ -476,19 +406,13 @@ impl Site {
     fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<NodeProcess> {
         let file = File::create(log)?;
         self.system.configure(&mut command);
-        command
-            .stdin(Stdio::null())
-            .stdout(file.try_clone()?)
-            .stderr(file);
+        command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file);
         let spawned = match &self.namespace {
             Some(namespace) => run_in_namespace(namespace, || command.spawn())?,
             None => command.spawn(),
         };
         let child = spawned.context("starting a node")?;
-        Ok(NodeProcess {
-            child,
-            log: log.to_owned(),
-        })
+        Ok(NodeProcess { child, log: log.to_owned() })
     }
 }
 
@@ -499,13 +423,8 @@ pub fn image_shell(daemon: &Daemon, service: &str, root: &Path) -> anyhow::Resul
     let diffs = config["rootfs"]["diff_ids"].as_array().context("layers")?;
     std::fs::create_dir_all(root)?;
     let layers = diffs.iter().rev().filter_map(|diff| diff.as_str());
-    let layers: Vec<PathBuf> = layers
-        .map(|diff| layer_path(&daemon.home, diff))
-        .collect::<anyhow::Result<_>>()?;
-    let lowers: Vec<String> = layers
-        .iter()
-        .map(|layer| layer.display().to_string())
-        .collect();
+    let layers: Vec<PathBuf> = layers.map(|diff| layer_path(&daemon.home, diff)).collect::<anyhow::Result<_>>()?;
+    let lowers: Vec<String> = layers.iter().map(|layer| layer.display().to_string()).collect();
     Ok(format!(
         "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc \
          {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
@@ -526,11 +445,8 @@ fn image_environment(daemon: &Daemon, service: &str) -> anyhow::Result<String> {
     let config = image_config(daemon, service)?;
     let variables = config["config"]["Env"].as_array().context("variables")?;
     let variables = variables.iter().filter_map(|variable| variable.as_str());
-    let kept = variables.filter(|variable| {
-        !["ROS_DOMAIN_ID", "ROS_AUTOMATIC", "HOME="]
-            .iter()
-            .any(|own| variable.starts_with(own))
-    });
+    let kept = variables
+        .filter(|variable| !["ROS_DOMAIN_ID", "ROS_AUTOMATIC", "HOME="].iter().any(|own| variable.starts_with(own)));
     let quoted = kept.map(|variable| format!("'{}'", variable.replace('\'', "")));
     Ok(quoted.collect::<Vec<_>>().join(" "))
 }
@@ -539,14 +455,10 @@ fn image_environment(daemon: &Daemon, service: &str) -> anyhow::Result<String> {
 fn layer_path(home: &Path, diff: &str) -> anyhow::Result<PathBuf> {
     let layers = home.join("layers");
     let hex = diff.trim_start_matches("sha256:");
-    [
-        layers.join(hex),
-        layers.join(diff),
-        layers.join("sha256").join(hex),
-    ]
-    .into_iter()
-    .find(|path| path.is_dir())
-    .with_context(|| format!("layer {diff} below {}", layers.display()))
+    [layers.join(hex), layers.join(diff), layers.join("sha256").join(hex)]
+        .into_iter()
+        .find(|path| path.is_dir())
+        .with_context(|| format!("layer {diff} below {}", layers.display()))
 }
 
 impl NodeProcess {
@@ -576,10 +488,7 @@ impl NodeProcess {
 
     /// Sends it a signal.
     pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
-        Ok(kill(
-            Pid::from_raw(i32::try_from(self.child.id())?),
-            signal,
-        )?)
+        Ok(kill(Pid::from_raw(i32::try_from(self.child.id())?), signal)?)
     }
 
     /// Waits for its end.
@@ -644,9 +553,7 @@ pub fn string_in(format: WireFormat, text: &str) -> Bytes {
         WireFormat::Cdr => (&[0, 1, 0, 0], &[0]),
     };
     let length = u32::try_from(text.len() + end.len()).unwrap_or(0);
-    [header, &length.to_le_bytes(), text.as_bytes(), end]
-        .concat()
-        .into()
+    [header, &length.to_le_bytes(), text.as_bytes(), end].concat().into()
 }
 
 /// Returns the string at the end of a message, after `flags` bytes.

@@ -17,13 +17,7 @@ impl SmallDisk {
     pub fn mount(name: &str, size: &str) -> anyhow::Result<SmallDisk> {
         let directory = world().directory(name)?;
         let options = format!("size={size}");
-        mount(
-            Some("tmpfs"),
-            directory.path(),
-            Some("tmpfs"),
-            MsFlags::empty(),
-            Some(&*options),
-        )?;
+        mount(Some("tmpfs"), directory.path(), Some("tmpfs"), MsFlags::empty(), Some(&*options))?;
         Ok(SmallDisk { directory })
     }
 

@@ -32,12 +32,7 @@ thread_local! {
 impl StoryRun {
     /// Creates a run with the directory `evidence` for its evidence.
     pub fn new(name: &'static str, attempt: usize, evidence: PathBuf) -> Arc<StoryRun> {
-        Arc::new(StoryRun {
-            name,
-            evidence,
-            attempt,
-            made: Mutex::default(),
-        })
+        Arc::new(StoryRun { name, evidence, attempt, made: Mutex::default() })
     }
 
     /// Returns the homes of the daemons that the story started.

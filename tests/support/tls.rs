@@ -29,9 +29,7 @@ openssl x509 -req -in server.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 
 /// Creates an authority (`ca.pem`, `ca.key`) and a certificate for this machine (`server.pem`, `server.key`) in a
 /// directory.
 pub(crate) fn make_certificates(place: &Path) -> anyhow::Result<()> {
-    let made = run(Command::new("sh")
-        .args(["-euc", CERTIFICATES])
-        .current_dir(place))?;
+    let made = run(Command::new("sh").args(["-euc", CERTIFICATES]).current_dir(place))?;
     ensure!(made.status == 0, "{}", made.output());
     Ok(())
 }
@@ -60,11 +58,7 @@ impl TlsProxy {
             .stdin(Stdio::null())
             .stderr(Stdio::null())
             .spawn()?;
-        let mut proxy = Self {
-            port,
-            place,
-            serving,
-        };
+        let mut proxy = Self { port, place, serving };
         // It listens as soon as a connection succeeds.
         crate::wait_until("a proxy that listens", || {
             let reached = TcpStream::connect(("127.0.0.1", port));

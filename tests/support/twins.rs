@@ -45,20 +45,12 @@ impl Twin {
         Self::new(ros, (CROSSING, "crossing.py"), "caller")
     }
 
-    fn new(
-        ros: RosVersion,
-        (service, executable): (StoryService, &'static str),
-        two: &'static str,
-    ) -> Self {
+    fn new(ros: RosVersion, (service, executable): (StoryService, &'static str), two: &'static str) -> Self {
         let (service, executable) = match ros {
             RosVersion::One => (service, executable),
             RosVersion::Two => (TWINS, two),
         };
-        Self {
-            ros,
-            service,
-            executable,
-        }
+        Self { ros, service, executable }
     }
 
     /// Returns service, package and executable, as [`Site::start_stub`] takes them.
@@ -77,10 +69,7 @@ impl Twin {
         match self.ros {
             RosVersion::One => {
                 let remaps = remaps.iter().map(|(from, to)| format!("{from}:={to}"));
-                [format!("__name:={node}")]
-                    .into_iter()
-                    .chain(remaps)
-                    .collect()
+                [format!("__name:={node}")].into_iter().chain(remaps).collect()
             }
             RosVersion::Two => {
                 let remaps = remaps.iter().map(|(from, to)| {
@@ -117,11 +106,7 @@ impl Twin {
 }
 
 /// Returns how many names a greeter has received.
-pub fn greeting_count(
-    site: &Site,
-    app: &(impl HasBus + ?Sized),
-    node: &str,
-) -> anyhow::Result<u32> {
+pub fn greeting_count(site: &Site, app: &(impl HasBus + ?Sized), node: &str) -> anyhow::Result<u32> {
     let service = format!("{node}/count");
     match site.system.version() {
         RosVersion::One => {
@@ -160,16 +145,9 @@ pub fn parse_trigger_response(ros: RosVersion, answer: &[u8]) -> anyhow::Result<
 }
 
 /// Calls a std_srvs/Trigger.
-pub fn call_trigger(
-    site: &Site,
-    app: &(impl HasBus + ?Sized),
-    service: &str,
-) -> anyhow::Result<(bool, String)> {
+pub fn call_trigger(site: &Site, app: &(impl HasBus + ?Sized), service: &str) -> anyhow::Result<(bool, String)> {
     let ros = site.system.version();
-    parse_trigger_response(
-        ros,
-        &site.call_service(app, service, &trigger_request(ros))?,
-    )
+    parse_trigger_response(ros, &site.call_service(app, service, &trigger_request(ros))?)
 }
 
 /// Serializes a request to an adder: `number` and zero.

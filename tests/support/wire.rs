@@ -28,11 +28,7 @@ pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<St
             Ok(0) => break,
             Ok(length) => heard.extend_from_slice(&buffer[..length]),
             Err(error) => {
-                ensure!(
-                    !is_slow(&error),
-                    "the connection is still open after {:?}",
-                    String::from_utf8_lossy(&heard)
-                );
+                ensure!(!is_slow(&error), "the connection is still open after {:?}", String::from_utf8_lossy(&heard));
                 break;
             }
         }
@@ -42,11 +38,6 @@ pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<St
 
 /// Returns the statuses of all responses.
 pub fn statuses(heard: &str) -> Vec<u16> {
-    let lines = heard
-        .split("HTTP/1.1 ")
-        .skip(1)
-        .chain(heard.split("HTTP/1.0 ").skip(1));
-    lines
-        .filter_map(|rest| rest.get(..3)?.parse().ok())
-        .collect()
+    let lines = heard.split("HTTP/1.1 ").skip(1).chain(heard.split("HTTP/1.0 ").skip(1));
+    lines.filter_map(|rest| rest.get(..3)?.parse().ok()).collect()
 }

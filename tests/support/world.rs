@@ -38,10 +38,7 @@ pub struct Directory {
 impl Directory {
     fn new_in(parent: &Path, name: &str) -> anyhow::Result<Directory> {
         let prefix = format!("{name}-");
-        let path = tempfile::Builder::new()
-            .prefix(&prefix)
-            .tempdir_in(parent)?
-            .keep();
+        let path = tempfile::Builder::new().prefix(&prefix).tempdir_in(parent)?.keep();
         let of_story = story::add_directory(&path);
         Ok(Directory { path, of_story })
     }
@@ -99,29 +96,16 @@ impl StoryService {
 pub const PEOPLE: StoryService = StoryService {
     name: "opencv_apps",
     package: None,
-    arguments: &[
-        "--apt",
-        "opencv_apps",
-        "--node",
-        "people_detect",
-        "--param",
-        "debug_view=false",
-    ],
+    arguments: &["--apt", "opencv_apps", "--node", "people_detect", "--param", "debug_view=false"],
 };
 
 /// A package for ROS 2 with the same function.
-pub const SEER: StoryService = StoryService {
-    name: "seer_ros2",
-    package: Some("seer_ros2"),
-    arguments: &["--node", "people_detect"],
-};
+pub const SEER: StoryService =
+    StoryService { name: "seer_ros2", package: Some("seer_ros2"), arguments: &["--node", "people_detect"] };
 
 /// Our package for ROS 2 with topics for viewers.
-pub const SIGHTS_TWO: StoryService = StoryService {
-    name: "sights_ros2",
-    package: Some("sights_ros2"),
-    arguments: &["--node", "sights"],
-};
+pub const SIGHTS_TWO: StoryService =
+    StoryService { name: "sights_ros2", package: Some("sights_ros2"), arguments: &["--node", "sights"] };
 
 /// Our C++ package, compiled when it is pushed.
 pub const GREETER: StoryService = StoryService {
@@ -131,51 +115,31 @@ pub const GREETER: StoryService = StoryService {
 };
 
 /// Our Python package.
-pub const ADDER: StoryService = StoryService {
-    name: "adder_py",
-    package: Some("adder_py"),
-    arguments: &["--node", "adder.py"],
-};
+pub const ADDER: StoryService =
+    StoryService { name: "adder_py", package: Some("adder_py"), arguments: &["--node", "adder.py"] };
 
 /// Our package that reports how its node was started.
-pub const TELLER: StoryService = StoryService {
-    name: "teller_py",
-    package: Some("teller_py"),
-    arguments: &["--node", "teller.py"],
-};
+pub const TELLER: StoryService =
+    StoryService { name: "teller_py", package: Some("teller_py"), arguments: &["--node", "teller.py"] };
 
 /// A package with everything that crosses the link between a robot and its servant.
-pub const CROSSING: StoryService = StoryService {
-    name: "crossing_py",
-    package: Some("crossing_py"),
-    arguments: &["--node", "crossing.py"],
-};
+pub const CROSSING: StoryService =
+    StoryService { name: "crossing_py", package: Some("crossing_py"), arguments: &["--node", "crossing.py"] };
 
 /// Version of the crossing package for ROS 2, with the message type of transforms, which the base lacks.
 pub const CROSSING_TWO: StoryService = StoryService {
     name: "crossing_ros2",
     package: Some("crossing_ros2"),
-    arguments: &[
-        "--name",
-        "crossing_ros2",
-        "--node",
-        "crossing_ros2/crossing",
-    ],
+    arguments: &["--name", "crossing_ros2", "--node", "crossing_ros2/crossing"],
 };
 
 /// Our Python package that needs a map.
-pub const LOCALISER: StoryService = StoryService {
-    name: "localiser_py",
-    package: Some("localiser_py"),
-    arguments: &["--node", "localiser.py"],
-};
+pub const LOCALISER: StoryService =
+    StoryService { name: "localiser_py", package: Some("localiser_py"), arguments: &["--node", "localiser.py"] };
 
 /// Version of the localiser package for ROS 2.
-pub const LOCALISER_TWO: StoryService = StoryService {
-    name: "localiser_ros2",
-    package: Some("localiser_ros2"),
-    arguments: &["--node", "localiser"],
-};
+pub const LOCALISER_TWO: StoryService =
+    StoryService { name: "localiser_ros2", package: Some("localiser_ros2"), arguments: &["--node", "localiser"] };
 
 /// A workspace for ROS 2 with interfaces of its own, and a node that uses them.
 pub const HERALD: StoryService = StoryService {
@@ -185,55 +149,34 @@ pub const HERALD: StoryService = StoryService {
 };
 
 /// Our package for ROS 2 that carries letters, and calls its robot while it is being called.
-pub const COURIER: StoryService = StoryService {
-    name: "courier_ros2",
-    package: Some("courier_ros2"),
-    arguments: &["--node", "courier"],
-};
+pub const COURIER: StoryService =
+    StoryService { name: "courier_ros2", package: Some("courier_ros2"), arguments: &["--node", "courier"] };
 
 /// Our C++ package that calls services of other nodes.
-pub const CALLER: StoryService = StoryService {
-    name: "caller_cpp",
-    package: Some("caller_cpp"),
-    arguments: &["--node", "caller"],
-};
+pub const CALLER: StoryService =
+    StoryService { name: "caller_cpp", package: Some("caller_cpp"), arguments: &["--node", "caller"] };
 
 /// Our hostile package.
-pub const BURGLAR: StoryService = StoryService {
-    name: "burglar_cpp",
-    package: Some("burglar_cpp"),
-    arguments: &["--node", "burglar"],
-};
+pub const BURGLAR: StoryService =
+    StoryService { name: "burglar_cpp", package: Some("burglar_cpp"), arguments: &["--node", "burglar"] };
 
 /// A package with everything that the test suites of rosbridge clients expect.
 pub const FIXTURE: StoryService = StoryService {
     name: "rosbridge_fixture",
     package: Some("rosbridge_fixture"),
-    arguments: &[
-        "--name",
-        "rosbridge_fixture",
-        "--node",
-        "rosbridge_fixture/fixture",
-    ],
+    arguments: &["--name", "rosbridge_fixture", "--node", "rosbridge_fixture/fixture"],
 };
 
 /// Returns the shared resources of this run.
 pub fn world() -> &'static World {
-    WORLD.get_or_init(|| {
-        World::new().unwrap_or_else(|error| panic!("the stories have no place: {error:#}"))
-    })
+    WORLD.get_or_init(|| World::new().unwrap_or_else(|error| panic!("the stories have no place: {error:#}")))
 }
 
 impl World {
     fn new() -> anyhow::Result<World> {
         let place = tempfile::Builder::new().prefix(PREFIX).tempdir()?.keep();
         claim::claim(&place).with_context(|| place.display().to_string())?;
-        Ok(World {
-            place,
-            shared: Mutex::new(None),
-            services: Mutex::default(),
-            homes: Mutex::default(),
-        })
+        Ok(World { place, shared: Mutex::new(None), services: Mutex::default(), homes: Mutex::default() })
     }
 
     /// Returns the directory of this run.
@@ -284,18 +227,11 @@ impl World {
     /// one tries again.
     pub fn daemon_with(&self, service: StoryService) -> anyhow::Result<Arc<Daemon>> {
         let daemon = self.ensure_shared()?;
-        let pushed = self
-            .services
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .entry(service.name)
-            .or_default()
-            .clone();
+        let pushed =
+            self.services.lock().unwrap_or_else(PoisonError::into_inner).entry(service.name).or_default().clone();
         let mut is_pushed = pushed.lock().unwrap_or_else(PoisonError::into_inner);
         if !*is_pushed {
-            service
-                .push_to(&daemon)
-                .with_context(|| format!("{} could not be pushed", service.name))?;
+            service.push_to(&daemon).with_context(|| format!("{} could not be pushed", service.name))?;
             *is_pushed = true;
         }
         drop(is_pushed);
@@ -308,19 +244,12 @@ pub fn end() -> Vec<String> {
     let Some(world) = WORLD.get() else {
         return Vec::new();
     };
-    let daemon = world
-        .shared
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .take();
+    let daemon = world.shared.lock().unwrap_or_else(PoisonError::into_inner).take();
     let mut left = Vec::new();
     let mut servants = Vec::new();
     if let Some(daemon) = daemon {
         if let Ok(serde_json::Value::Array(list)) = daemon.deployer().run_json(&["servants"]) {
-            servants.extend(
-                list.iter()
-                    .filter_map(|servant| Some(servant["id"].as_str()?.to_owned())),
-            );
+            servants.extend(list.iter().filter_map(|servant| Some(servant["id"].as_str()?.to_owned())));
         }
         match Arc::try_unwrap(daemon).map(Daemon::stop) {
             Ok(Ok(_)) => {}
@@ -329,11 +258,7 @@ pub fn end() -> Vec<String> {
         }
     }
     left.extend(leftovers::find_leftovers(&world.place));
-    left.extend(
-        leftovers::cgroups(&servants)
-            .into_iter()
-            .map(|path| format!("cgroup {}", path.display())),
-    );
+    left.extend(leftovers::cgroups(&servants).into_iter().map(|path| format!("cgroup {}", path.display())));
     if left.is_empty() {
         // The run's disk, if there is one, disappears with its content.
         let _ = umount2(&world.place, MntFlags::MNT_DETACH);

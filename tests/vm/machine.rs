@@ -28,9 +28,7 @@ pub fn daemon() -> anyhow::Result<Daemon> {
 
 /// Returns its main pid according to systemd.
 pub fn main_pid() -> anyhow::Result<i32> {
-    property("cloudroid.service", "MainPID")?
-        .parse()
-        .context("a pid")
+    property("cloudroid.service", "MainPID")?.parse().context("a pid")
 }
 
 /// Returns a property of a systemd unit.
@@ -41,9 +39,7 @@ pub fn property(unit: &str, name: &str) -> anyhow::Result<String> {
 
 /// Runs a program that must succeed; returns its output.
 pub fn run_program(program: &str, arguments: &[&str]) -> anyhow::Result<String> {
-    let outcome = run(Command::new(program)
-        .args(arguments)
-        .env("DEBIAN_FRONTEND", "noninteractive"))?;
+    let outcome = run(Command::new(program).args(arguments).env("DEBIAN_FRONTEND", "noninteractive"))?;
     Ok(outcome.expect_success()?.stdout)
 }
 
@@ -56,22 +52,13 @@ pub fn read_control_file(id: &str, name: &str) -> anyhow::Result<String> {
 
 /// Returns the last log lines of the daemon and systemd.
 pub fn log_tail() -> String {
-    let journal = Command::new("journalctl")
-        .args(["-b", "--no-pager", "-o", "cat", "-n", "15"])
-        .output();
-    journal.map_or_else(
-        |error| error.to_string(),
-        |journal| String::from_utf8_lossy(&journal.stdout).into_owned(),
-    )
+    let journal = Command::new("journalctl").args(["-b", "--no-pager", "-o", "cat", "-n", "15"]).output();
+    journal.map_or_else(|error| error.to_string(), |journal| String::from_utf8_lossy(&journal.stdout).into_owned())
 }
 
 /// Records a failure.
 pub fn record_failure(name: &str) {
-    let mut file = fs::File::options()
-        .create(true)
-        .append(true)
-        .open(FAILURES)
-        .expect("the disk can be written");
+    let mut file = fs::File::options().create(true).append(true).open(FAILURES).expect("the disk can be written");
     writeln!(file, "{name}").expect("the disk can be written");
     file.sync_all().expect("the disk can be written");
 }

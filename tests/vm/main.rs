@@ -90,20 +90,13 @@ fn main() -> ExitCode {
     .flatten()
     .filter(|story| chosen(story.name))
     .collect();
-    let cuts: Vec<Cut> = cuts![
-        in_the_middle_of_a_start,
-        in_the_middle_of_a_push,
-        in_the_middle_of_a_database_write,
-    ]
-    .into_iter()
-    .filter(|cut| chosen(cut.name))
-    .collect();
+    let cuts: Vec<Cut> = cuts![in_the_middle_of_a_start, in_the_middle_of_a_push, in_the_middle_of_a_database_write,]
+        .into_iter()
+        .filter(|cut| chosen(cut.name))
+        .collect();
 
     if boot == 1 {
-        run_story(
-            "installation::a_package_leaves_a_running_service",
-            installation::installs,
-        );
+        run_story("installation::a_package_leaves_a_running_service", installation::installs);
         if machine::daemon().is_err() {
             return machine::verdict();
         }
@@ -125,10 +118,7 @@ fn main() -> ExitCode {
     // The second starts from the state that the first leaves.
     if chosen(REMOVAL) || chosen(BY_MAKE) {
         run_story(REMOVAL, installation::removes);
-        run_story(
-            BY_MAKE,
-            installation::installs_and_removes_without_a_package,
-        );
+        run_story(BY_MAKE, installation::installs_and_removes_without_a_package);
     }
     machine::verdict()
 }
@@ -141,10 +131,7 @@ fn run_story(name: &str, tell: impl FnOnce() -> Verdict) {
     match outcome {
         Ok(()) => println!("ok      {name} ({took:.1} s)"),
         Err(error) => {
-            println!(
-                "FAILED  {name} ({took:.1} s)\n{error:#}\n{}",
-                machine::log_tail()
-            );
+            println!("FAILED  {name} ({took:.1} s)\n{error:#}\n{}", machine::log_tail());
             machine::record_failure(name);
         }
     }

@@ -14,14 +14,8 @@ const CORES: u64 = 256_000;
 const ROUNDS: usize = 200;
 
 pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
-    let ids: Vec<String> = (0..SERVANTS)
-        .map(|number| format!("servant-{number}"))
-        .collect();
-    let mut facts: Vec<ControlFacts<'_>> = ids
-        .iter()
-        .zip(0..)
-        .map(|(id, number)| servant_facts(id, number))
-        .collect();
+    let ids: Vec<String> = (0..SERVANTS).map(|number| format!("servant-{number}")).collect();
+    let mut facts: Vec<ControlFacts<'_>> = ids.iter().zip(0..).map(|(id, number)| servant_facts(id, number)).collect();
     let began = Instant::now();
     let (pass, once) = (facts.clone(), facts.clone());
     let mut race = Race::new(ROUNDS);
@@ -40,9 +34,8 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         }
     });
     race.add("one pass", || {
-        let sum = |sum: u64, one: &ControlFacts<'_>| {
-            sum + one.quota + one.weight + one.used.unwrap_or(0) + one.promised
-        };
+        let sum =
+            |sum: u64, one: &ControlFacts<'_>| sum + one.quota + one.weight + one.used.unwrap_or(0) + one.promised;
         black_box(black_box(&pass).iter().fold(0, sum));
     });
     let times = race.run();
@@ -60,11 +53,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
 /// Facts of one servant. Of every three servants, one is promised cores, one has robots that state response times, and
 /// one is best effort.
 fn servant_facts(id: &str, number: u64) -> ControlFacts<'_> {
-    let promised = if number % 3 == 2 {
-        0
-    } else {
-        100 + number % 200
-    };
+    let promised = if number % 3 == 2 { 0 } else { 100 + number % 200 };
     let limit = if promised == 0 { CORES } else { promised };
     ControlFacts {
         id,
@@ -78,14 +67,9 @@ fn servant_facts(id: &str, number: u64) -> ControlFacts<'_> {
         used: Some(number * 37 % 400),
         throttled: (number % 5) as f64 / 10.0,
         waited: 0.0,
-        goal: (number % 3 == 1).then_some(ResponseGoal {
-            desire: Some(100.0),
-            max: Some(300.0),
-        }),
-        measured: (number % 2 == 0).then_some(MeasuredTimes {
-            total: (number % 40) as f64 * 10.0,
-            cloud: (number % 40) as f64 * 8.0,
-        }),
+        goal: (number % 3 == 1).then_some(ResponseGoal { desire: Some(100.0), max: Some(300.0) }),
+        measured: (number % 2 == 0)
+            .then_some(MeasuredTimes { total: (number % 40) as f64 * 10.0, cloud: (number % 40) as f64 * 8.0 }),
         history: Default::default(),
     }
 }

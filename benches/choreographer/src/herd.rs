@@ -49,31 +49,16 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let went = run_concurrently(|number| run_robot(&daemon, number))?;
     let told = |went: &[QueueSample]| went.iter().map(|one| one.told).max().unwrap_or_default();
     let lost = went.iter().filter(|one| one.answers == 0).count();
-    let twice =
-        went.iter().filter(|one| one.answers > 1).count() + count_duplicate_starts(&daemon)?;
+    let twice = went.iter().filter(|one| one.answers > 1).count() + count_duplicate_starts(&daemon)?;
     let waited = went.iter().filter(|one| one.waited).count();
     let title = format!("{ROBOTS} robots before {PLACES} places: the last knows where it stands");
     report
         .figure(title, "s", told(&went).as_secs_f64())
-        .relative_to(
-            "the last of as many HTTP answers",
-            floor
-                .iter()
-                .max()
-                .copied()
-                .unwrap_or_default()
-                .as_secs_f64(),
-        )
+        .relative_to("the last of as many HTTP answers", floor.iter().max().copied().unwrap_or_default().as_secs_f64())
         .require(Target::AtMost(1.0))
-        .note(format!(
-            "{waited} were told their number in the queue, the others were served at once"
-        ));
-    report
-        .figure("of them lost", "robots", lost as f64)
-        .require(Target::AtMost(0.0));
-    report
-        .figure("served twice", "robots", twice as f64)
-        .require(Target::AtMost(0.0));
+        .note(format!("{waited} were told their number in the queue, the others were served at once"));
+    report.figure("of them lost", "robots", lost as f64).require(Target::AtMost(0.0));
+    report.figure("served twice", "robots", twice as f64).require(Target::AtMost(0.0));
     Ok(())
 }
 
@@ -90,9 +75,7 @@ fn run_concurrently<T: Send>(each: impl Fn(usize) -> Result<T> + Sync) -> Result
                 })
             })
             .collect();
-        let joined = all
-            .into_iter()
-            .map(|one| one.join().ok().context("a robot's thread broke")?);
+        let joined = all.into_iter().map(|one| one.join().ok().context("a robot's thread broke")?);
         joined.collect()
     })
 }
@@ -101,14 +84,8 @@ fn run_concurrently<T: Send>(each: impl Fn(usize) -> Result<T> + Sync) -> Result
 fn run_robot(daemon: &Daemon, number: usize) -> Result<QueueSample> {
     let asked = Instant::now();
     let mut robot = Robot::connect(&daemon.url(&format!("worker?robot=r{number}")))?;
-    robot.send(
-        json!({"op": "call_service", "id": "it", "service": "/rosapi/get_time", "args": {}}),
-    )?;
-    let mut went = QueueSample {
-        told: Duration::MAX,
-        waited: false,
-        answers: 0,
-    };
+    robot.send(json!({"op": "call_service", "id": "it", "service": "/rosapi/get_time", "args": {}}))?;
+    let mut went = QueueSample { told: Duration::MAX, waited: false, answers: 0 };
     loop {
         let patience = if went.answers == 0 { PATIENCE } else { AGAIN };
         let Ok(frame) = robot.next_frame_within(patience) else {
@@ -121,10 +98,8 @@ fn run_robot(daemon: &Daemon, number: usize) -> Result<QueueSample> {
             continue;
         };
         let said: Value = serde_json::from_str(text.as_str())?;
-        let number = said["op"] == "status"
-            && said["msg"]
-                .as_str()
-                .is_some_and(|words| words.contains("this robot is number"));
+        let number =
+            said["op"] == "status" && said["msg"].as_str().is_some_and(|words| words.contains("this robot is number"));
         let answer = said["op"] == "service_response" && said["id"] == "it";
         if number || answer {
             went.told = went.told.min(asked.elapsed());

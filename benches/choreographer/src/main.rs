@@ -11,11 +11,7 @@ mod shared;
 use bench_report::{Part, run_parts};
 
 /// All parts, in the order in which they are measured.
-const PARTS: [Part; 3] = [
-    ("decide", decide::measure),
-    ("herd", herd::measure),
-    ("shared", shared::measure),
-];
+const PARTS: [Part; 3] = [("decide", decide::measure), ("herd", herd::measure), ("shared", shared::measure)];
 
 fn main() -> anyhow::Result<()> {
     run_parts("choreographer", &PARTS)

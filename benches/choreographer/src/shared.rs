@@ -23,31 +23,15 @@ const WORK: f64 = 0.002;
 const PUSHED: [(&str, &[&str]); 4] = [
     ("own", &["--node", "sharer"]),
     ("one", &["--node", "sharer", "--shared", "--max", "1"]),
-    (
-        "two",
-        &["--node", "sharer", "--shared", "--min", "2", "--max", "2"],
-    ),
-    (
-        "roscpp",
-        &[
-            "--node",
-            "sharer",
-            "--node",
-            "asker",
-            "--param",
-            "seconds=0.002",
-        ],
-    ),
+    ("two", &["--node", "sharer", "--shared", "--min", "2", "--max", "2"]),
+    ("roscpp", &["--node", "sharer", "--node", "asker", "--param", "seconds=0.002"]),
 ];
 
 pub fn measure(report: &mut BenchReport) -> Result<()> {
     let daemon = BenchDaemon::start("[capacity]\ncpus = 64\n")?;
     for (name, arguments) in PUSHED {
         let arguments = [&["--name", name, "--cpus", "0.5"], arguments].concat();
-        daemon
-            .deployer()
-            .push(PACKAGE, &arguments)?
-            .expect_success()?;
+        daemon.deployer().push(PACKAGE, &arguments)?.expect_success()?;
     }
     let roscpp = roscpp_call_rate(&daemon)?;
     let single = measure_call_rate(&daemon, "own", 1)?;
@@ -63,10 +47,9 @@ pub fn measure(report: &mut BenchReport) -> Result<()> {
             .relative_to(format!("{servants} x one robot at its own"), sum)
             .require(Target::RatioAtLeast(0.9));
         let title = format!("{ROBOTS} robots at {servants} shared");
-        report.figure(title, "calls/s", shared).relative_to(
-            format!("{servants} x roscpp in the same container"),
-            roscpp * f64::from(servants),
-        );
+        report
+            .figure(title, "calls/s", shared)
+            .relative_to(format!("{servants} x roscpp in the same container"), roscpp * f64::from(servants));
     }
     Ok(())
 }
@@ -80,26 +63,14 @@ fn measure_call_rate(daemon: &Daemon, service: &str, robots: usize) -> Result<f6
         ready.push(robot);
     }
     let wanted = if service == "two" { 2 } else { 1 };
-    daemon.wait_for(
-        &format!("/api/v1/services/{service}"),
-        "its servants",
-        |found| {
-            let groups = found["groups"].as_array();
-            let servants = groups
-                .and_then(|all| all.first())
-                .map(|group| &group["servants"]);
-            let ready = |one: &&Value| one["ready"] == true;
-            let count = servants.map_or(1, |all| {
-                all.as_array()
-                    .map_or(0, |all| all.iter().filter(ready).count())
-            });
-            (count >= wanted).then_some(())
-        },
-    )?;
-    let (counted, over) = (
-        Arc::new(AtomicU64::new(0)),
-        Arc::new(AtomicBool::new(false)),
-    );
+    daemon.wait_for(&format!("/api/v1/services/{service}"), "its servants", |found| {
+        let groups = found["groups"].as_array();
+        let servants = groups.and_then(|all| all.first()).map(|group| &group["servants"]);
+        let ready = |one: &&Value| one["ready"] == true;
+        let count = servants.map_or(1, |all| all.as_array().map_or(0, |all| all.iter().filter(ready).count()));
+        (count >= wanted).then_some(())
+    })?;
+    let (counted, over) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
     let began = Instant::now();
     let working: Vec<_> = ready
         .into_iter()
@@ -118,9 +89,7 @@ fn measure_call_rate(daemon: &Daemon, service: &str, robots: usize) -> Result<f6
     let rate = counted.load(Ordering::Relaxed) as f64 / began.elapsed().as_secs_f64();
     over.store(true, Ordering::Relaxed);
     for robot in working {
-        robot
-            .join()
-            .map_err(|_| anyhow::anyhow!("a robot panicked"))??;
+        robot.join().map_err(|_| anyhow::anyhow!("a robot panicked"))??;
     }
     Ok(rate)
 }

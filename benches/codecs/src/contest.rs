@@ -45,10 +45,7 @@ impl CodecComparison<'_> {
     }
 
     fn space_saved(&self, sizes: &[usize]) -> f64 {
-        let saved = sizes
-            .iter()
-            .zip(self.messages)
-            .map(|(&size, message)| 1.0 - size as f64 / message.len() as f64);
+        let saved = sizes.iter().zip(self.messages).map(|(&size, message)| 1.0 - size as f64 / message.len() as f64);
         100.0 * saved.sum::<f64>() / sizes.len() as f64
     }
 
@@ -73,21 +70,16 @@ impl CodecComparison<'_> {
         }
         let bytes = self.total_bytes();
         let times = encoding.run().into_iter().zip(decoding.run());
-        let result =
-            |((name, slow, saved), (encoding, decoding)): ((String, bool, f64), (Times, Times))| {
-                // A slow codec that did some work is timed by its longest run alone.
-                let took = if slow {
-                    encoding.longest()
-                } else {
-                    encoding.best()
-                };
-                CodecResult {
-                    name,
-                    saved,
-                    encode: bytes as f64 / 1e6 / took.as_secs_f64(),
-                    decode: decoding.megabytes_per_second(bytes),
-                }
-            };
+        let result = |((name, slow, saved), (encoding, decoding)): ((String, bool, f64), (Times, Times))| {
+            // A slow codec that did some work is timed by its longest run alone.
+            let took = if slow { encoding.longest() } else { encoding.best() };
+            CodecResult {
+                name,
+                saved,
+                encode: bytes as f64 / 1e6 / took.as_secs_f64(),
+                decode: decoding.megabytes_per_second(bytes),
+            }
+        };
         Ok(entered.into_iter().zip(times).map(result).collect())
     }
 
@@ -135,10 +127,7 @@ impl CodecComparison<'_> {
     }
 
     fn zstd<'a>(&'a self, level: i32, buffer: &'a RefCell<Vec<u8>>) -> Result<Contestant<'a>> {
-        let frames = self
-            .messages
-            .iter()
-            .map(|message| zstd::bulk::compress(message, level));
+        let frames = self.messages.iter().map(|message| zstd::bulk::compress(message, level));
         let frames: Vec<Vec<u8>> = frames.collect::<Result<_, _>>()?;
         let slow = level >= SLOW;
         let (mut context, mut runs) = (zstd::bulk::Compressor::new(level)?, 0);
@@ -146,11 +135,7 @@ impl CodecComparison<'_> {
             runs += 1;
             for message in self.messages_of_run(slow, runs) {
                 let mut frame = buffer.borrow_mut();
-                black_box(
-                    context
-                        .compress_to_buffer(message, &mut frame[..])
-                        .unwrap_or(0),
-                );
+                black_box(context.compress_to_buffer(message, &mut frame[..]).unwrap_or(0));
             }
         };
         let mut context = zstd::bulk::Decompressor::new()?;
@@ -158,11 +143,7 @@ impl CodecComparison<'_> {
         let decode = move || {
             for frame in &frames {
                 let mut message = buffer.borrow_mut();
-                black_box(
-                    context
-                        .decompress_to_buffer(frame, &mut message[..])
-                        .unwrap_or(0),
-                );
+                black_box(context.decompress_to_buffer(frame, &mut message[..]).unwrap_or(0));
             }
         };
         Ok(Contestant {
@@ -175,10 +156,7 @@ impl CodecComparison<'_> {
     }
 
     fn zlib<'a>(&'a self, buffer: &'a RefCell<Vec<u8>>) -> Contestant<'a> {
-        let frames = self
-            .messages
-            .iter()
-            .map(|message| zlib::compress(message, 6));
+        let frames = self.messages.iter().map(|message| zlib::compress(message, 6));
         let frames: Vec<Vec<u8>> = frames.collect();
         let sizes = frames.iter().map(Vec::len).collect();
         let mut runs = 0;
@@ -193,13 +171,7 @@ impl CodecComparison<'_> {
                 black_box(zlib::uncompress(frame, &mut buffer.borrow_mut()));
             }
         };
-        Contestant {
-            name: "zlib 6".to_owned(),
-            slow: true,
-            sizes,
-            encode: Box::new(encode),
-            decode: Box::new(decode),
-        }
+        Contestant { name: "zlib 6".to_owned(), slow: true, sizes, encode: Box::new(encode), decode: Box::new(decode) }
     }
 
     /// Returns the messages that a codec encodes in its run with this number: slow ones encode none after the second.
@@ -226,11 +198,7 @@ impl CodecComparison<'_> {
             let mut back = Vec::new();
             let decoded = decoder.decode(frame, &mut back)?;
             ensure!(back == *message, "{codec} changed a message");
-            ensure!(
-                decoded.codec.name() == codec.name(),
-                "{codec} fell back to {}",
-                decoded.codec
-            );
+            ensure!(decoded.codec.name() == codec.name(), "{codec} fell back to {}", decoded.codec);
         }
         Ok(())
     }

@@ -11,59 +11,33 @@ const SIZE: usize = 4000;
 pub fn measure_grids(report: &mut BenchReport) -> Result<()> {
     let office = samples::office_map()?;
     let small = [messages::grid(office.width, office.height, &office.data)];
-    let outcomes = CodecComparison {
-        schema: Schema::OccupancyGrid,
-        messages: &small,
-        rounds: 15,
-    }
-    .run(&[Codec::Grid], &[1, 3, 19])?;
+    let outcomes = CodecComparison { schema: Schema::OccupancyGrid, messages: &small, rounds: 15 }
+        .run(&[Codec::Grid], &[1, 3, 19])?;
     print_results("grid, 566×608", &outcomes);
-    let (ours, zstd) = (
-        find_result(&outcomes, "grid")?,
-        find_result(&outcomes, "zstd 19")?,
-    );
+    let (ours, zstd) = (find_result(&outcomes, "grid")?, find_result(&outcomes, "zstd 19")?);
     report
         .figure("grid 566×608: saved", "%", ours.saved)
         .relative_to("zstd 19", zstd.saved)
         .require(Target::AboveFloor);
 
-    let large = [messages::grid(
-        SIZE,
-        SIZE,
-        &samples::centre_in_grid(&office, SIZE),
-    )];
-    let outcomes = CodecComparison {
-        schema: Schema::OccupancyGrid,
-        messages: &large,
-        rounds: 15,
-    }
-    .run(&[Codec::Grid], &[1, 3])?;
+    let large = [messages::grid(SIZE, SIZE, &samples::centre_in_grid(&office, SIZE))];
+    let outcomes =
+        CodecComparison { schema: Schema::OccupancyGrid, messages: &large, rounds: 15 }.run(&[Codec::Grid], &[1, 3])?;
     print_results("grid, 4000×4000", &outcomes);
-    let (ours, zstd, copy) = (
-        find_result(&outcomes, "grid")?,
-        find_result(&outcomes, "zstd 1")?,
-        find_result(&outcomes, "memcpy")?,
-    );
-    let figure = report
-        .figure("grid 4000×4000: saved", "%", ours.saved)
-        .relative_to("zstd 1", zstd.saved);
+    let (ours, zstd, copy) =
+        (find_result(&outcomes, "grid")?, find_result(&outcomes, "zstd 1")?, find_result(&outcomes, "memcpy")?);
+    let figure = report.figure("grid 4000×4000: saved", "%", ours.saved).relative_to("zstd 1", zstd.saved);
     figure.require(Target::AtLeast(99.9));
-    let figure = report
-        .figure("grid 4000×4000: encoding", "MB/s", ours.encode)
-        .relative_to("memcpy", copy.encode);
+    let figure = report.figure("grid 4000×4000: encoding", "MB/s", ours.encode).relative_to("memcpy", copy.encode);
     figure.require(Target::RatioAtLeast(0.3));
-    report
-        .figure("grid 4000×4000: decoding", "MB/s", ours.decode)
-        .relative_to("memcpy", copy.decode);
+    report.figure("grid 4000×4000: decoding", "MB/s", ours.decode).relative_to("memcpy", copy.decode);
     measure_mapping(report, &office)
 }
 
 /// Measures a map that is being built: the size of each of its grids, all of which are sent in full.
 fn measure_mapping(report: &mut BenchReport, office: &samples::Picture) -> Result<()> {
-    let messages: Vec<_> = world::maps_in_progress(office, SIZE, 24)
-        .iter()
-        .map(|cells| messages::grid(SIZE, SIZE, cells))
-        .collect();
+    let messages: Vec<_> =
+        world::maps_in_progress(office, SIZE, 24).iter().map(|cells| messages::grid(SIZE, SIZE, cells)).collect();
     let mut encoder = Encoder::new(Schema::OccupancyGrid);
     let mut decoder = Decoder::new(messages[0].len());
     let (mut ours, mut fast, mut best, mut largest) = (0usize, 0usize, 0usize, 0usize);
@@ -86,9 +60,7 @@ fn measure_mapping(report: &mut BenchReport, office: &samples::Picture) -> Resul
     );
     for (name, size) in [("zstd 1", fast), ("zstd 9", best)] {
         let figure = report.figure("grid, a map being made: size", "B", mean(ours));
-        figure
-            .relative_to(name, mean(size))
-            .require(Target::RatioAtMost(1.0));
+        figure.relative_to(name, mean(size)).require(Target::RatioAtMost(1.0));
     }
     Ok(())
 }

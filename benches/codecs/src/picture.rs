@@ -11,50 +11,28 @@ use std::hint::black_box;
 const ROUNDS: usize = 15;
 
 fn image_comparison(messages: &[Vec<u8>]) -> CodecComparison<'_> {
-    CodecComparison {
-        schema: Schema::Image,
-        messages,
-        rounds: ROUNDS,
-    }
+    CodecComparison { schema: Schema::Image, messages, rounds: ROUNDS }
 }
 
 /// Serializes images, with what `data` makes of each.
-fn images(
-    encoding: &str,
-    pictures: &[Picture],
-    data: impl Fn(&Picture) -> Vec<u8>,
-) -> Vec<Vec<u8>> {
+fn images(encoding: &str, pictures: &[Picture], data: impl Fn(&Picture) -> Vec<u8>) -> Vec<Vec<u8>> {
     let one = |p: &Picture| image(encoding, p.width, p.height, &data(p));
     pictures.iter().map(one).collect()
 }
 
 /// Reports the four figures of a lossless image codec.
-fn report_lossless(
-    report: &mut BenchReport,
-    title: &str,
-    messages: &[Vec<u8>],
-    saved: Option<f64>,
-) -> Result<f64> {
+fn report_lossless(report: &mut BenchReport, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<f64> {
     let outcomes = image_comparison(messages).run(&[Codec::Image], &[1, 3, 19])?;
     print_results(title, &outcomes);
-    let (ours, zstd, best) = (
-        find_result(&outcomes, "image")?,
-        find_result(&outcomes, "zstd 1")?,
-        find_result(&outcomes, "zstd 19")?,
-    );
+    let (ours, zstd, best) =
+        (find_result(&outcomes, "image")?, find_result(&outcomes, "zstd 1")?, find_result(&outcomes, "zstd 19")?);
     let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
-    figure
-        .relative_to("zstd 19", best.saved)
-        .require(saved.map_or(Target::AboveFloor, Target::AtLeast));
-    let figure = report
-        .figure(format!("{title}: encoding"), "MB/s", ours.encode)
-        .relative_to("zstd 1", zstd.encode);
+    figure.relative_to("zstd 19", best.saved).require(saved.map_or(Target::AboveFloor, Target::AtLeast));
+    let figure = report.figure(format!("{title}: encoding"), "MB/s", ours.encode).relative_to("zstd 1", zstd.encode);
     if saved.is_some() {
         figure.require(Target::RatioAtLeast(0.4));
     }
-    report
-        .figure(format!("{title}: decoding"), "MB/s", ours.decode)
-        .relative_to("zstd 1", zstd.decode);
+    report.figure(format!("{title}: decoding"), "MB/s", ours.decode).relative_to("zstd 1", zstd.decode);
     Ok(ours.encode)
 }
 
@@ -62,16 +40,8 @@ fn report_lossless(
 fn png(picture: &Picture) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = png::Encoder::new(&mut out, picture.width as u32, picture.height as u32);
-    encoder.set_color(if picture.depth == 3 {
-        png::ColorType::Rgb
-    } else {
-        png::ColorType::Grayscale
-    });
-    encoder.set_depth(if picture.depth == 2 {
-        png::BitDepth::Sixteen
-    } else {
-        png::BitDepth::Eight
-    });
+    encoder.set_color(if picture.depth == 3 { png::ColorType::Rgb } else { png::ColorType::Grayscale });
+    encoder.set_depth(if picture.depth == 2 { png::BitDepth::Sixteen } else { png::BitDepth::Eight });
     encoder.set_compression(png::Compression::Balanced);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(&picture.data)?;
@@ -81,16 +51,8 @@ fn png(picture: &Picture) -> Result<Vec<u8>> {
 
 fn jpeg(picture: &Picture) -> Result<Vec<u8>> {
     let mut out = Vec::new();
-    let (width, height) = (
-        u16::try_from(picture.width)?,
-        u16::try_from(picture.height)?,
-    );
-    jpeg_encoder::Encoder::new(&mut out, 95).encode(
-        &picture.data,
-        width,
-        height,
-        jpeg_encoder::ColorType::Rgb,
-    )?;
+    let (width, height) = (u16::try_from(picture.width)?, u16::try_from(picture.height)?);
+    jpeg_encoder::Encoder::new(&mut out, 95).encode(&picture.data, width, height, jpeg_encoder::ColorType::Rgb)?;
     Ok(out)
 }
 
@@ -119,24 +81,14 @@ fn to_bayer(picture: &Picture) -> Vec<u8> {
 }
 
 /// Measures PNG and JPEG, which encode images rather than messages.
-fn measure_peers(
-    report: &mut BenchReport,
-    pictures: &[Picture],
-    messages: &[Vec<u8>],
-) -> Result<()> {
+fn measure_peers(report: &mut BenchReport, pictures: &[Picture], messages: &[Vec<u8>]) -> Result<()> {
     let bytes: usize = messages.iter().map(Vec::len).sum();
     let saved = |sizes: Vec<usize>| {
-        let saved = sizes
-            .iter()
-            .zip(pictures)
-            .map(|(&size, p)| 1.0 - size as f64 / p.data.len() as f64);
+        let saved = sizes.iter().zip(pictures).map(|(&size, p)| 1.0 - size as f64 / p.data.len() as f64);
         100.0 * saved.sum::<f64>() / pictures.len() as f64
     };
     let sizes = |encode: fn(&Picture) -> Result<Vec<u8>>| -> Result<Vec<usize>> {
-        pictures
-            .iter()
-            .map(|picture| Ok(encode(picture)?.len()))
-            .collect()
+        pictures.iter().map(|picture| Ok(encode(picture)?.len())).collect()
     };
     let (png_saved, jpeg_saved) = (saved(sizes(png)?), saved(sizes(jpeg)?));
     let mut race = Race::new(5);
@@ -149,48 +101,22 @@ fn measure_peers(
             black_box(&out);
         }
     });
-    race.add("PNG", || {
-        pictures
-            .iter()
-            .for_each(|picture| drop(black_box(png(picture))))
-    });
-    race.add("JPEG 95", || {
-        pictures
-            .iter()
-            .for_each(|picture| drop(black_box(jpeg(picture))))
-    });
+    race.add("PNG", || pictures.iter().for_each(|picture| drop(black_box(png(picture)))));
+    race.add("JPEG 95", || pictures.iter().for_each(|picture| drop(black_box(jpeg(picture)))));
     let times = race.run();
-    let speed: Vec<f64> = times
-        .iter()
-        .map(|times| times.megabytes_per_second(bytes))
-        .collect();
-    println!(
-        "    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s",
-        speed[1]
-    );
-    println!(
-        "    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy",
-        speed[2]
-    );
-    let figure = report
-        .figure("colour: encoding", "MB/s", speed[0])
-        .relative_to("PNG", speed[1]);
-    figure
-        .require(Target::RatioAtLeast(5.0))
-        .note(format!("PNG saves {png_saved:.1}%"));
-    let figure = report
-        .figure("colour: encoding", "MB/s", speed[0])
-        .relative_to("JPEG 95", speed[2]);
+    let speed: Vec<f64> = times.iter().map(|times| times.megabytes_per_second(bytes)).collect();
+    println!("    PNG          saved {png_saved:6.2}%   encode {:8.1} MB/s", speed[1]);
+    println!("    JPEG 95      saved {jpeg_saved:6.2}%   encode {:8.1} MB/s   lossy", speed[2]);
+    let figure = report.figure("colour: encoding", "MB/s", speed[0]).relative_to("PNG", speed[1]);
+    figure.require(Target::RatioAtLeast(5.0)).note(format!("PNG saves {png_saved:.1}%"));
+    let figure = report.figure("colour: encoding", "MB/s", speed[0]).relative_to("JPEG 95", speed[2]);
     figure.note(format!("JPEG saves {jpeg_saved:.1}%, lossy"));
     Ok(())
 }
 
 pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
     let pictures = samples::depth_frames()?;
-    ensure!(
-        !pictures.is_empty(),
-        "no depth image at hand: neither recordings nor scikit-image's samples"
-    );
+    ensure!(!pictures.is_empty(), "no depth image at hand: neither recordings nor scikit-image's samples");
     let whole = images("16UC1", &pictures, |picture| picture.data.clone());
     report_lossless(report, "depth", &whole, Some(83.0))?;
     let holes = images("16UC1", &pictures, with_holes);
@@ -198,11 +124,7 @@ pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
     let metres = images("32FC1", &pictures, to_metres);
     report_lossless(report, "float depth", &metres, None)?;
     if let Some(disparity) = samples::motorcycle_disparity() {
-        let data: Vec<u8> = disparity
-            .values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect();
+        let data: Vec<u8> = disparity.values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let message = image("32FC1", disparity.width, disparity.height, &data);
         report_lossless(report, "float disparity", &[message], None)?;
     }
@@ -229,11 +151,7 @@ fn to_metres(picture: &Picture) -> Vec<u8> {
         0 => f32::NAN,
         depth => f32::from(depth) * 0.001,
     };
-    with_holes(picture)
-        .chunks_exact(2)
-        .map(metres)
-        .flat_map(f32::to_le_bytes)
-        .collect()
+    with_holes(picture).chunks_exact(2).map(metres).flat_map(f32::to_le_bytes).collect()
 }
 
 /// Checks synthetic corner cases: each one is decoded to the original, and none grows.
@@ -242,30 +160,15 @@ pub fn measure_corner_cases(report: &mut BenchReport) -> Result<()> {
     let mut random = |count: usize| -> Vec<u8> { (0..count).map(|_| noise.next() as u8).collect() };
     let cases = [
         ("flat rgb8", image("rgb8", 640, 480, &[90; 640 * 480 * 3])),
-        (
-            "noise rgb8",
-            image("rgb8", 640, 480, &random(640 * 480 * 3)),
-        ),
-        (
-            "noise 16UC1",
-            image("16UC1", 640, 480, &random(640 * 480 * 2)),
-        ),
-        (
-            "noise 32FC1",
-            image("32FC1", 640, 480, &random(640 * 480 * 4)),
-        ),
+        ("noise rgb8", image("rgb8", 640, 480, &random(640 * 480 * 3))),
+        ("noise 16UC1", image("16UC1", 640, 480, &random(640 * 480 * 2))),
+        ("noise 32FC1", image("32FC1", 640, 480, &random(640 * 480 * 4))),
         ("one pixel", image("rgb8", 1, 1, &[1, 2, 3])),
         ("one row", image("mono8", 5000, 1, &random(5000))),
         ("one column", image("bgra8", 1, 5000, &random(20_000))),
-        (
-            "odd Bayer",
-            image("bayer_grbg8", 641, 479, &random(641 * 479)),
-        ),
+        ("odd Bayer", image("bayer_grbg8", 641, 479, &random(641 * 479))),
         ("padded rows", image("mono8", 639, 480, &random(641 * 480))),
-        (
-            "unknown encoding",
-            image("yuv422", 640, 480, &random(640 * 480 * 2)),
-        ),
+        ("unknown encoding", image("yuv422", 640, 480, &random(640 * 480 * 2))),
     ];
     let mut worst = f64::MIN;
     for (name, message) in &cases {
@@ -276,15 +179,8 @@ pub fn measure_corner_cases(report: &mut BenchReport) -> Result<()> {
         ensure!(back == *message, "{name} changed");
         let growth = frame.len() as f64 - message.len() as f64;
         worst = worst.max(growth);
-        println!(
-            "    {name:<18} {:>8} → {:>8} bytes by {}",
-            message.len(),
-            frame.len(),
-            encoded.codec
-        );
+        println!("    {name:<18} {:>8} → {:>8} bytes by {}", message.len(), frame.len(), encoded.codec);
     }
-    report
-        .figure("corner cases: growth at worst", "B", worst)
-        .require(Target::AtMost(16.0));
+    report.figure("corner cases: growth at worst", "B", worst).require(Target::AtMost(16.0));
     Ok(())
 }

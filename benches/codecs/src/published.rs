@@ -23,11 +23,7 @@ struct CompressionResult {
 }
 
 /// Encodes and decodes all messages, in order.
-fn encode_and_decode(
-    mut encoder: Encoder,
-    codec: Codec,
-    messages: &[Vec<u8>],
-) -> Result<CompressionResult> {
+fn encode_and_decode(mut encoder: Encoder, codec: Codec, messages: &[Vec<u8>]) -> Result<CompressionResult> {
     let mut decoder = Decoder::new(messages.iter().map(Vec::len).max().unwrap_or(0));
     let (mut frames, mut whole) = (0usize, 0usize);
     let mut psnr = Psnr::default();
@@ -35,11 +31,7 @@ fn encode_and_decode(
     for message in messages {
         let (mut frame, mut back) = (Vec::new(), Vec::new());
         let encoded = encoder.encode(codec, message, &mut frame);
-        ensure!(
-            encoded.codec == codec,
-            "{codec} fell back to {}",
-            encoded.codec
-        );
+        ensure!(encoded.codec == codec, "{codec} fell back to {}", encoded.codec);
         decoder.decode(&frame, &mut back)?;
         exact &= back == *message;
         // Header included: it is exact, but only a few bytes of a million.
@@ -56,29 +48,18 @@ fn encode_and_decode(
 
 pub fn measure_published_table(report: &mut BenchReport) -> Result<()> {
     println!("published table           published      ours  PSNR");
-    let mut row =
-        |kind: &str, published: f64, how: &str, outcome: &CompressionResult, target: bool| {
-            let psnr = outcome
-                .psnr
-                .map_or_else(|| "lossless".to_owned(), |psnr| format!("{psnr:.1} dB"));
-            println!(
-                "    {kind:<10} {how:<24} {published:5.1}%  {:6.2}%  {psnr}",
-                outcome.saved
-            );
-            let title = format!("published {kind}: saved by {how}");
-            let figure = report
-                .figure(title, "%", outcome.saved)
-                .relative_to("published", published)
-                .note(psnr);
-            if target {
-                figure.require(Target::AtLeast(published));
-            }
-        };
+    let mut row = |kind: &str, published: f64, how: &str, outcome: &CompressionResult, target: bool| {
+        let psnr = outcome.psnr.map_or_else(|| "lossless".to_owned(), |psnr| format!("{psnr:.1} dB"));
+        println!("    {kind:<10} {how:<24} {published:5.1}%  {:6.2}%  {psnr}", outcome.saved);
+        let title = format!("published {kind}: saved by {how}");
+        let figure = report.figure(title, "%", outcome.saved).relative_to("published", published).note(psnr);
+        if target {
+            figure.require(Target::AtLeast(published));
+        }
+    };
     let (width, height, pixels) = samples::decode_video(FRAMES)?;
-    let frames: Vec<_> = pixels
-        .chunks_exact(width * height * 3)
-        .map(|frame| image("bgr8", width, height, frame))
-        .collect();
+    let frames: Vec<_> =
+        pixels.chunks_exact(width * height * 3).map(|frame| image("bgr8", width, height, frame)).collect();
     let pictures: Vec<_> = samples::colour_frames()?
         .iter()
         .map(|picture| image("rgb8", picture.width, picture.height, &picture.data))
@@ -106,12 +87,6 @@ pub fn measure_published_table(report: &mut BenchReport) -> Result<()> {
     row("grid map", 99.9, "grid, 4000×4000", &outcome, true);
     let map = [grid(office.width, office.height, &office.data)];
     let outcome = encode_and_decode(Encoder::new(Schema::OccupancyGrid), Codec::Grid, &map)?;
-    row(
-        "grid map",
-        99.9,
-        "grid, only what is known",
-        &outcome,
-        false,
-    );
+    row("grid map", 99.9, "grid, only what is known", &outcome, false);
     Ok(())
 }

@@ -29,21 +29,10 @@ pub fn opencv_samples_directory() -> PathBuf {
 }
 
 fn read_picture(path: &Path) -> Result<Picture> {
-    let name = path
-        .file_name()
-        .unwrap_or_default()
-        .to_string_lossy()
-        .into_owned();
-    let decoder = png::Decoder::new(BufReader::new(
-        File::open(path).with_context(|| path.display().to_string())?,
-    ));
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let decoder = png::Decoder::new(BufReader::new(File::open(path).with_context(|| path.display().to_string())?));
     let mut reader = decoder.read_info()?;
-    let mut data = vec![
-        0;
-        reader
-            .output_buffer_size()
-            .context("picture is too large")?
-    ];
+    let mut data = vec![0; reader.output_buffer_size().context("picture is too large")?];
     let info = reader.next_frame(&mut data)?;
     data.truncate(info.buffer_size());
     let depth = match (info.color_type, info.bit_depth) {
@@ -55,28 +44,16 @@ fn read_picture(path: &Path) -> Result<Picture> {
         }
         (png::ColorType::Rgb, png::BitDepth::Eight) => 3,
         (png::ColorType::Rgba, png::BitDepth::Eight) => {
-            data = data
-                .chunks_exact(4)
-                .flat_map(|pixel| &pixel[..3])
-                .copied()
-                .collect();
+            data = data.chunks_exact(4).flat_map(|pixel| &pixel[..3]).copied().collect();
             3
         }
         other => bail!("{name} holds {other:?}, which is not measured"),
     };
-    Ok(Picture {
-        width: info.width as usize,
-        height: info.height as usize,
-        depth,
-        data,
-    })
+    Ok(Picture { width: info.width as usize, height: info.height as usize, depth, data })
 }
 
 fn read_pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
-    names
-        .iter()
-        .map(|name| read_picture(&directory.join(name)))
-        .collect()
+    names.iter().map(|name| read_picture(&directory.join(name))).collect()
 }
 
 /// Colour frames of a camera: from the recordings, or from the packaged video.
@@ -87,12 +64,7 @@ pub fn colour_frames() -> Result<Vec<Picture>> {
     let (width, height, mut data) = decode_video(150)?;
     data.chunks_exact_mut(3).for_each(|pixel| pixel.swap(0, 2));
     let frames = data.chunks_exact(width * height * 3).step_by(60);
-    let frames = frames.map(|frame| Picture {
-        width,
-        height,
-        depth: 3,
-        data: frame.to_vec(),
-    });
+    let frames = frames.map(|frame| Picture { width, height, depth: 3, data: frame.to_vec() });
     Ok(frames.collect())
 }
 
@@ -100,12 +72,7 @@ pub fn colour_frames() -> Result<Vec<Picture>> {
 pub fn packaged_photographs() -> Result<Vec<Picture>> {
     let mut pictures = read_pictures(&opencv_samples_directory(), &["graf1.png", "graf3.png"])?;
     if let Some(directory) = fetch_scikit_samples() {
-        let names = [
-            "astronaut.png",
-            "chelsea.png",
-            "coffee.png",
-            "motorcycle_left.png",
-        ];
+        let names = ["astronaut.png", "chelsea.png", "coffee.png", "motorcycle_left.png"];
         pictures.extend(self::read_pictures(&directory, &names)?);
     }
     pictures.retain(|picture| picture.depth == 3);
@@ -130,10 +97,7 @@ fn fetch_scikit_samples() -> Option<PathBuf> {
 pub fn depth_frames() -> Result<Vec<Picture>> {
     match recordings_directory() {
         Some(path) => read_pictures(&path, &["depth1.png", "depth2.png", "depth3.png"]),
-        None => Ok(motorcycle_disparity()
-            .iter()
-            .map(Disparity::to_depth)
-            .collect()),
+        None => Ok(motorcycle_disparity().iter().map(Disparity::to_depth).collect()),
     }
 }
 
@@ -149,24 +113,10 @@ impl Disparity {
     fn to_depth(&self) -> Picture {
         let millimetre = |&disparity: &f32| {
             let depth = 193.001 * 994.978 / (disparity + 32.778);
-            if depth.is_finite() && disparity.is_finite() {
-                depth as u16
-            } else {
-                0
-            }
+            if depth.is_finite() && disparity.is_finite() { depth as u16 } else { 0 }
         };
-        let data = self
-            .values
-            .iter()
-            .map(millimetre)
-            .flat_map(u16::to_le_bytes)
-            .collect();
-        Picture {
-            width: self.width,
-            height: self.height,
-            depth: 2,
-            data,
-        }
+        let data = self.values.iter().map(millimetre).flat_map(u16::to_le_bytes).collect();
+        Picture { width: self.width, height: self.height, depth: 2, data }
     }
 }
 
@@ -174,18 +124,10 @@ impl Disparity {
 pub fn motorcycle_disparity() -> Option<Disparity> {
     let path = fetch_scikit_samples()?.join("motorcycle_disp.f32");
     let bytes = std::fs::read(path).ok()?;
-    let size =
-        |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
+    let size = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     let (height, width) = (size(0)?, size(4)?);
-    let values: Vec<f32> = bytes[8..]
-        .chunks_exact(4)
-        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-        .collect();
-    (values.len() == width * height).then_some(Disparity {
-        width,
-        height,
-        values,
-    })
+    let values: Vec<f32> = bytes[8..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    (values.len() == width * height).then_some(Disparity { width, height, values })
 }
 
 /// Floor plan of an office, 566×608 cells, as an occupancy grid: unknown, free, occupied.
@@ -205,11 +147,7 @@ pub fn office_map() -> Result<Picture> {
             }
             at += 1;
         }
-        let end = at
-            + pgm[at..]
-                .iter()
-                .position(u8::is_ascii_whitespace)
-                .context("a header without end")?;
+        let end = at + pgm[at..].iter().position(u8::is_ascii_whitespace).context("a header without end")?;
         numbers.push(std::str::from_utf8(&pgm[at..end])?.parse::<usize>()?);
         at = end;
     }
@@ -222,18 +160,8 @@ pub fn office_map() -> Result<Picture> {
         _ => 255,
     };
     // A map starts at the bottom, an image at the top.
-    let data = pixels
-        .chunks_exact(width)
-        .rev()
-        .flatten()
-        .map(cell)
-        .collect();
-    Ok(Picture {
-        width,
-        height,
-        depth: 1,
-        data,
-    })
+    let data = pixels.chunks_exact(width).rev().flatten().map(cell).collect();
+    Ok(Picture { width, height, depth: 1, data })
 }
 
 /// Synthetic rooms and corridors, used without recordings.
@@ -247,12 +175,7 @@ fn synthetic_rooms() -> Picture {
             data[y * width + x] = if wall || noise { 100 } else { 0 };
         }
     }
-    Picture {
-        width,
-        height,
-        depth: 1,
-        data,
-    }
+    Picture { width, height, depth: 1, data }
 }
 
 /// Returns a grid of `size`×`size` cells with `map` at its centre, as gmapping publishes it.
@@ -271,22 +194,11 @@ pub fn decode_video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
     let output = Command::new("ffmpeg")
         .args(["-v", "error", "-i"])
         .arg(opencv_samples_directory().join("vtest.avi"))
-        .args([
-            "-frames:v",
-            &frames.to_string(),
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "bgr24",
-            "-",
-        ])
+        .args(["-frames:v", &frames.to_string(), "-f", "rawvideo", "-pix_fmt", "bgr24", "-"])
         .output()
         .context("ffmpeg decodes the video; install it")?;
     if !output.status.success() {
-        bail!(
-            "ffmpeg: {}; install opencv-doc for vtest.avi",
-            String::from_utf8_lossy(&output.stderr)
-        );
+        bail!("ffmpeg: {}; install opencv-doc for vtest.avi", String::from_utf8_lossy(&output.stderr));
     }
     Ok((768, 576, output.stdout))
 }

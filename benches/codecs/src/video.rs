@@ -13,21 +13,14 @@ const FRAMES: usize = 200;
 
 /// BT.601 luma of blue, green, red.
 fn luma(pixels: &[u8]) -> Vec<u8> {
-    let luma =
-        |p: &[u8]| (29 * u32::from(p[0]) + 150 * u32::from(p[1]) + 77 * u32::from(p[2]) + 128) >> 8;
-    pixels
-        .chunks_exact(3)
-        .map(|pixel| luma(pixel) as u8)
-        .collect()
+    let luma = |p: &[u8]| (29 * u32::from(p[0]) + 150 * u32::from(p[1]) + 77 * u32::from(p[2]) + 128) >> 8;
+    pixels.chunks_exact(3).map(|pixel| luma(pixel) as u8).collect()
 }
 
 pub fn measure_video(report: &mut BenchReport) -> Result<()> {
     let (width, height, pixels) = samples::decode_video(FRAMES)?;
     let frames: Vec<&[u8]> = pixels.chunks_exact(width * height * 3).collect();
-    let messages: Vec<Vec<u8>> = frames
-        .iter()
-        .map(|frame| image("bgr8", width, height, frame))
-        .collect();
+    let messages: Vec<Vec<u8>> = frames.iter().map(|frame| image("bgr8", width, height, frame)).collect();
     let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
     let mut decoder = Decoder::new(messages[0].len());
     let (mut encoding, mut decoding) = (Duration::ZERO, Duration::ZERO);
@@ -38,21 +31,14 @@ pub fn measure_video(report: &mut BenchReport) -> Result<()> {
         let start = thread_processor_time();
         let encoded = encoder.encode(Codec::Video, message, &mut out);
         encoding += thread_processor_time() - start;
-        ensure!(
-            encoded.codec == Codec::Video,
-            "video fell back to {}",
-            encoded.codec
-        );
+        ensure!(encoded.codec == Codec::Video, "video fell back to {}", encoded.codec);
         bytes += out.len();
         let mut back = Vec::new();
         let start = thread_processor_time();
         decoder.decode(&out, &mut back)?;
         decoding += thread_processor_time() - start;
         let head = message.len() - frame.len();
-        ensure!(
-            back[..head] == message[..head],
-            "video changed more than the pixels"
-        );
+        ensure!(back[..head] == message[..head], "video changed more than the pixels");
         colour.add(&back[head..], frame);
         grey.add(&luma(&back[head..]), &luma(frame));
     }
@@ -69,31 +55,16 @@ pub fn measure_video(report: &mut BenchReport) -> Result<()> {
         grey.decibels(),
         count / decoding.as_secs_f64()
     );
-    println!(
-        "    x264: saved {:.2}%, {:.1} dB colour, {:.0} frames/s",
-        peer.saved, peer.colour, peer.speed
-    );
+    println!("    x264: saved {:.2}%, {:.1} dB colour, {:.0} frames/s", peer.saved, peer.colour, peer.speed);
     let note = "of the 4:2:0 planes; of the message even more";
-    report
-        .figure("video: saved", "%", saved)
-        .relative_to("x264", peer.saved)
-        .require(Target::AtLeast(98.5))
-        .note(note);
+    report.figure("video: saved", "%", saved).relative_to("x264", peer.saved).require(Target::AtLeast(98.5)).note(note);
     report.figure("video: saved of the message", "%", saved_of_message);
-    let figure = report
-        .figure("video: PSNR of the colours", "dB", colour.decibels())
-        .relative_to("x264", peer.colour);
+    let figure = report.figure("video: PSNR of the colours", "dB", colour.decibels()).relative_to("x264", peer.colour);
     figure.require(Target::AtLeast(36.0));
     report.figure("video: PSNR of luma", "dB", grey.decibels());
-    let figure = report
-        .figure("video: encoding", "frames/s", speed)
-        .relative_to("x264", peer.speed);
+    let figure = report.figure("video: encoding", "frames/s", speed).relative_to("x264", peer.speed);
     figure.require(Target::AtLeast(100.0));
-    report.figure(
-        "video: decoding",
-        "frames/s",
-        count / decoding.as_secs_f64(),
-    );
+    report.figure("video: decoding", "frames/s", count / decoding.as_secs_f64());
     Ok(())
 }
 
@@ -113,31 +84,13 @@ fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<
         Command::new("ffmpeg")
             .args(["-v", "error", "-threads", "1"])
             .args(raw)
-            .args([
-                "-s",
-                &size,
-                "-i",
-                "-",
-                "-c:v",
-                "libx264",
-                "-preset",
-                "veryfast",
-                "-tune",
-                "zerolatency",
-            ])
-            .args([
-                "-crf", "23", "-threads", "1", "-pix_fmt", "yuv420p", "-f", "h264", "-",
-            ]),
+            .args(["-s", &size, "-i", "-", "-c:v", "libx264", "-preset", "veryfast", "-tune", "zerolatency"])
+            .args(["-crf", "23", "-threads", "1", "-pix_fmt", "yuv420p", "-f", "h264", "-"]),
         pixels,
     )?;
     let took = children_processor_time() - start;
-    let back = run_filter(
-        Command::new("ffmpeg")
-            .args(["-v", "error", "-f", "h264", "-i", "-"])
-            .args(raw)
-            .arg("-"),
-        &stream,
-    )?;
+    let back =
+        run_filter(Command::new("ffmpeg").args(["-v", "error", "-f", "h264", "-i", "-"]).args(raw).arg("-"), &stream)?;
     ensure!(back.len() == pixels.len(), "x264 lost frames");
     let mut colour = Psnr::default();
     for (back, frame) in back.chunks_exact(frames[0].len()).zip(frames) {
@@ -145,20 +98,12 @@ fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<
     }
     let count = frames.len() as f64;
     let saved = 100.0 * (1.0 - stream.len() as f64 / count / (width * height * 3 / 2) as f64);
-    Ok(X264Result {
-        saved,
-        colour: colour.decibels(),
-        speed: count / took.as_secs_f64(),
-    })
+    Ok(X264Result { saved, colour: colour.decibels(), speed: count / took.as_secs_f64() })
 }
 
 /// Runs `command` as a filter: writes `input` to it and returns its output.
 fn run_filter(command: &mut Command, input: &[u8]) -> Result<Vec<u8>> {
-    let mut child = command
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .spawn()
-        .context("ffmpeg; install it")?;
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().context("ffmpeg; install it")?;
     let mut stdin = child.stdin.take().context("a pipe")?;
     let output = std::thread::scope(|scope| {
         scope.spawn(move || stdin.write_all(input));

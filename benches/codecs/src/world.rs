@@ -25,17 +25,10 @@ pub fn sample_poses(map: &Picture, count: usize) -> Vec<Pose> {
     let mut noise = Noise(42);
     let mut poses = Vec::new();
     while poses.len() < count {
-        let (x, y) = (
-            noise.next() as usize % map.width,
-            noise.next() as usize % map.height,
-        );
+        let (x, y) = (noise.next() as usize % map.width, noise.next() as usize % map.height);
         if free(x, y) {
             let heading = noise.unit() * std::f64::consts::TAU;
-            poses.push(Pose {
-                x: (x + 4) as f64 * CELL,
-                y: (y + 4) as f64 * CELL,
-                heading,
-            });
+            poses.push(Pose { x: (x + 4) as f64 * CELL, y: (y + 4) as f64 * CELL, heading });
         }
     }
     poses
@@ -47,10 +40,7 @@ pub fn cast_ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
     let mut distance = 0.0;
     while distance < 30.0 {
         distance += CELL / 10.0;
-        let (x, y) = (
-            (pose.x + cos * distance) / CELL,
-            (pose.y + sin * distance) / CELL,
-        );
+        let (x, y) = ((pose.x + cos * distance) / CELL, (pose.y + sin * distance) / CELL);
         if x < 0.0 || y < 0.0 || x as usize >= map.width || y as usize >= map.height {
             return None;
         }
@@ -72,12 +62,9 @@ pub fn laser_scans(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool)
             let mut echoes = Vec::new();
             for beam in 0..1081 {
                 let angle = (f64::from(beam) - 540.0) * 0.25_f64.to_radians();
-                let distance =
-                    cast_ray(map, pose, angle).map(|distance| distance + 0.01 * noise.normal());
+                let distance = cast_ray(map, pose, angle).map(|distance| distance + 0.01 * noise.normal());
                 ranges.push(float(distance.unwrap_or(f64::INFINITY)));
-                let echo = distance.map_or(0.0, |distance| {
-                    3000.0 / (1.0 + distance) + 20.0 * noise.normal()
-                });
+                let echo = distance.map_or(0.0, |distance| 3000.0 / (1.0 + distance) + 20.0 * noise.normal());
                 echoes.push(echo.round().max(0.0) as f32);
             }
             scan(&ranges, if intensities { &echoes } else { &[] })
@@ -111,12 +98,7 @@ fn depth_metres(depth: &Picture, u: usize, v: usize) -> f32 {
 
 /// Coloured point clouds of a depth camera, as `depth_image_proc` produces them: `step` bytes per point, padded as PCL
 /// does. With `organised` the image layout is kept, with NaN for missing points; otherwise those points are dropped.
-pub fn camera_clouds(
-    colours: &[Picture],
-    depths: &[Picture],
-    step: usize,
-    organised: bool,
-) -> Vec<Vec<u8>> {
+pub fn camera_clouds(colours: &[Picture], depths: &[Picture], step: usize, organised: bool) -> Vec<Vec<u8>> {
     let pairs = colours
         .iter()
         .zip(depths)
@@ -136,10 +118,7 @@ pub fn camera_clouds(
                         continue;
                     }
                     let constant = 1.0f32 / 525.0;
-                    let (x, y) = (
-                        (u as f32 - 319.5) * z * constant,
-                        (v as f32 - 239.5) * z * constant,
-                    );
+                    let (x, y) = ((u as f32 - 319.5) * z * constant, (v as f32 - 239.5) * z * constant);
                     let point = if missing { [f32::NAN; 3] } else { [x, y, z] };
                     let start = data.len();
                     data.resize(start + step, 0);
@@ -157,11 +136,7 @@ pub fn camera_clouds(
                 ("rgb", rgb, PointFieldType::F32),
             ];
             let count = data.len() / step;
-            let (width, height) = if organised {
-                (depth.width, depth.height)
-            } else {
-                (count, 1)
-            };
+            let (width, height) = if organised { (depth.width, depth.height) } else { (count, 1) };
             cloud(width, height, step, &fields, &data)
         })
         .collect()
@@ -180,11 +155,7 @@ pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
                 let wall = cast_ray(map, pose, -azimuth);
                 for laser in 0..16u32 {
                     // The lasers fire in the order -15, 1, -13, 3, … degrees.
-                    let degrees = if laser % 2 == 0 {
-                        f64::from(laser) - 15.0
-                    } else {
-                        f64::from(laser)
-                    };
+                    let degrees = if laser % 2 == 0 { f64::from(laser) - 15.0 } else { f64::from(laser) };
                     let (sin, cos) = degrees.to_radians().sin_cos();
                     let floor = if sin < 0.0 { -1.2 / sin } else { 1.8 / sin };
                     let range = wall.map_or(f64::INFINITY, |wall| wall / cos).min(floor);
@@ -192,16 +163,12 @@ pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
                         continue;
                     }
                     let range = ((range + 0.02 * noise.normal()) / 0.002).round() as f32 * 0.002;
-                    let turned =
-                        azimuth + f64::from(laser) * 2.304e-6 * std::f64::consts::TAU * 10.0;
+                    let turned = azimuth + f64::from(laser) * 2.304e-6 * std::f64::consts::TAU * 10.0;
                     let (turn_sin, turn_cos) = (turned.sin() as f32, turned.cos() as f32);
                     let flat = range * cos as f32;
                     let point = [flat * turn_cos, -(flat * turn_sin), range * sin as f32];
-                    point
-                        .iter()
-                        .for_each(|value| data.extend_from_slice(&value.to_le_bytes()));
-                    let intensity = (20.0 + 60.0 / (1.0 + f64::from(range)) + 4.0 * noise.normal())
-                        .clamp(0.0, 255.0);
+                    point.iter().for_each(|value| data.extend_from_slice(&value.to_le_bytes()));
+                    let intensity = (20.0 + 60.0 / (1.0 + f64::from(range)) + 4.0 * noise.normal()).clamp(0.0, 255.0);
                     data.extend_from_slice(&(intensity.round() as f32).to_le_bytes());
                     let ring = ((degrees + 15.0) / 2.0) as u16;
                     data.extend_from_slice(&ring.to_le_bytes());
@@ -231,8 +198,7 @@ pub fn maps_in_progress(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>
     for index in 1..stops.len() {
         let (x, y) = (stops[index - 1].x, stops[index - 1].y);
         let distance = |pose: &Pose| (pose.x - x).powi(2) + (pose.y - y).powi(2);
-        let nearest = (index..stops.len())
-            .min_by(|&a, &b| distance(&stops[a]).total_cmp(&distance(&stops[b])));
+        let nearest = (index..stops.len()).min_by(|&a, &b| distance(&stops[a]).total_cmp(&distance(&stops[b])));
         stops.swap(index, nearest.unwrap_or(index));
     }
     let mut grids = Vec::new();
@@ -243,10 +209,7 @@ pub fn maps_in_progress(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>
             let (sin, cos) = (pose.heading + angle).sin_cos();
             let mut distance = 0.0;
             while distance < end.unwrap_or(12.0).min(12.0) {
-                let (x, y) = (
-                    (pose.x + cos * distance) / CELL,
-                    (pose.y + sin * distance) / CELL,
-                );
+                let (x, y) = ((pose.x + cos * distance) / CELL, (pose.y + sin * distance) / CELL);
                 if x < 0.0 || y < 0.0 || x as usize >= map.width || y as usize >= map.height {
                     break;
                 }

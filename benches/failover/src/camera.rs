@@ -13,8 +13,8 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, Bus, GoalEnd, GoalError, GoalEvents, GoalOutcome, Publisher, QosProfile,
-    RosVersion, SerializedMessage, Subscription, WireType,
+    ActionClient, Bus, GoalEnd, GoalError, GoalEvents, GoalOutcome, Publisher, QosProfile, RosVersion,
+    SerializedMessage, Subscription, WireType,
 };
 use ros::schema::Registry;
 use support::cable::{Cable, NetworkImpairment, run_in_namespace};
@@ -49,46 +49,20 @@ struct NetworkPhase {
 }
 
 const fn lossy(delay: u32, jitter: u32, loss: f64, rate: u32) -> Option<NetworkImpairment> {
-    Some(NetworkImpairment {
-        rate,
-        delay,
-        jitter,
-        loss,
-        limit: 1000,
-    })
+    Some(NetworkImpairment { rate, delay, jitter, loss, limit: 1000 })
 }
 
-const GOOD: NetworkPhase = NetworkPhase {
-    name: "good",
-    impairment: None,
-    seconds: 8,
-};
+const GOOD: NetworkPhase = NetworkPhase { name: "good", impairment: None, seconds: 8 };
 /// Begins with a good network, which follows each bad one as well.
 const PHASES: [NetworkPhase; 8] = [
     GOOD,
-    NetworkPhase {
-        name: "80±20 ms, 2 % lost",
-        impairment: lossy(80, 20, 0.02, 100_000),
-        seconds: 15,
-    },
+    NetworkPhase { name: "80±20 ms, 2 % lost", impairment: lossy(80, 20, 0.02, 100_000), seconds: 15 },
     GOOD,
-    NetworkPhase {
-        name: "150±50 ms, 5 % lost",
-        impairment: lossy(150, 50, 0.05, 100_000),
-        seconds: 15,
-    },
+    NetworkPhase { name: "150±50 ms, 5 % lost", impairment: lossy(150, 50, 0.05, 100_000), seconds: 15 },
     GOOD,
-    NetworkPhase {
-        name: "300±100 ms, 10 % lost, 500 kbit/s",
-        impairment: lossy(300, 100, 0.1, 500),
-        seconds: 15,
-    },
+    NetworkPhase { name: "300±100 ms, 10 % lost, 500 kbit/s", impairment: lossy(300, 100, 0.1, 500), seconds: 15 },
     GOOD,
-    NetworkPhase {
-        name: "cut",
-        impairment: lossy(0, 0, 1.0, 100_000),
-        seconds: 10,
-    },
+    NetworkPhase { name: "cut", impairment: lossy(0, 0, 1.0, 100_000), seconds: 10 },
 ];
 
 /// One run.
@@ -120,13 +94,7 @@ const PLANS: [CameraPlan; 7] = [
 ];
 
 const fn plan(name: &'static str, answers: &'static str, local: &'static str) -> CameraPlan {
-    CameraPlan {
-        name,
-        answers,
-        local,
-        is_busy: false,
-        rounds: 1,
-    }
+    CameraPlan { name, answers, local, is_busy: false, rounds: 1 }
 }
 
 #[derive(Clone, Copy)]
@@ -163,19 +131,12 @@ impl CameraRecord {
 
     /// Returns, for each onset of a phase, the seconds until an answer arrived to a picture sent after the onset.
     fn seconds_to_answer(&self, phase: &str) -> Vec<f64> {
-        let onsets = self
-            .phases
-            .iter()
-            .filter(|(_, index)| PHASES[*index].name == phase);
+        let onsets = self.phases.iter().filter(|(_, index)| PHASES[*index].name == phase);
         onsets
             .map(|(onset, _)| {
-                let first = self
-                    .pictures
-                    .partition_point(|picture| picture.sent < *onset);
+                let first = self.pictures.partition_point(|picture| picture.sent < *onset);
                 let answer = self.answered.iter().find(|(_, picture)| *picture >= first);
-                answer.map_or(f64::INFINITY, |(at, _)| {
-                    at.duration_since(*onset).as_secs_f64()
-                })
+                answer.map_or(f64::INFINITY, |(at, _)| at.duration_since(*onset).as_secs_f64())
             })
             .collect()
     }
@@ -185,9 +146,7 @@ impl CameraRecord {
         let is_wrong = |stop: &&Instant| {
             let earlier = self.answered.iter().rev().find(|(at, _)| at <= *stop);
             earlier.is_some_and(|(at, picture)| {
-                let response = at
-                    .duration_since(self.pictures[*picture].sent)
-                    .as_secs_f64();
+                let response = at.duration_since(self.pictures[*picture].sent).as_secs_f64();
                 response <= T_MAX && stop.duration_since(*at).as_secs_f64() < T_MAX
             })
         };
@@ -217,17 +176,11 @@ impl EchoFloor {
         let mut stream = TcpStream::connect(server)?;
         stream.set_nodelay(true)?;
         let mut answers = stream.try_clone()?;
-        let (trips, over) = (
-            Arc::new(Mutex::new(Vec::new())),
-            Arc::new(AtomicBool::new(false)),
-        );
+        let (trips, over) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
         let (sent, ending) = (Arc::clone(&trips), Arc::clone(&over));
         std::thread::spawn(move || {
             while !ending.load(Ordering::Relaxed) {
-                let trip = RoundTrip {
-                    sent: Instant::now(),
-                    after: None,
-                };
+                let trip = RoundTrip { sent: Instant::now(), after: None };
                 sent.lock().push(trip);
                 if stream.write_all(&[0; 4]).is_err() {
                     return;
@@ -298,32 +251,17 @@ impl CameraRobot {
         let image = advertise("/image", picture, 1)?;
         let integer = type_of(RosVersion::One, "std_msgs/UInt32", "uint32 data\n")?;
         let command = advertise("/command", integer, 100)?;
-        let (found, echo) = (
-            site.subscribe(&node, plan.answers)?,
-            site.subscribe(&node, "/echo")?,
-        );
+        let (found, echo) = (site.subscribe(&node, plan.answers)?, site.subscribe(&node, "/echo")?);
         let stops = site.subscribe(&wheels, "/cmd_vel")?;
         site.wait_for_subscribers(&*image, 1)?;
         site.wait_for_subscribers(&*command, 1)?;
-        Ok(Self {
-            found,
-            echo,
-            stops,
-            image,
-            command,
-            node,
-            _wheels: wheels,
-        })
+        Ok(Self { found, echo, stops, image, command, node, _wheels: wheels })
     }
 
     fn publish_picture(&self, number: u32) {
         let mut out = MessageLayout::new(RosVersion::One);
         let pixels = [0x5a; PICTURE];
-        let message = out
-            .header(number, "camera")
-            .text("jpeg")
-            .bytes(&pixels)
-            .finish();
+        let message = out.header(number, "camera").text("jpeg").bytes(&pixels).finish();
         self.image.publish(message);
     }
 
@@ -332,10 +270,7 @@ impl CameraRobot {
         let (begun, mut in_time) = (Instant::now(), 0);
         let mut number = 1;
         while in_time < 10 {
-            ensure!(
-                begun.elapsed() < PATIENCE,
-                "the first pictures are not answered in time"
-            );
+            ensure!(begun.elapsed() < PATIENCE, "the first pictures are not answered in time");
             self.publish_picture(number);
             let asked = Instant::now();
             let answer = timeout(Duration::from_secs(2), self.found.messages.recv()).await;
@@ -397,11 +332,7 @@ fn read_integer(message: &SerializedMessage) -> Option<u32> {
 }
 
 fn record_answer(record: &mut CameraRecord, plan: &CameraPlan, answer: &SerializedMessage) {
-    let number = if plan.answers == "/found" {
-        number(answer)
-    } else {
-        read_integer(answer)
-    };
+    let number = if plan.answers == "/found" { number(answer) } else { read_integer(answer) };
     let index = number.and_then(|number| number.checked_sub(FIRST));
     let Some(index) = index.map(|index| index as usize) else {
         return;
@@ -440,10 +371,7 @@ fn run(report: &mut BenchReport, daemon: &Daemon, cable: &Cable, plan: &CameraPl
     let mut robot = CameraRobot::new(&site, plan).with_context(|| stub.output())?;
     let floor = EchoFloor::start(cable)?;
     let goal = Arc::new(GoalRecord::default());
-    let client = plan
-        .is_busy
-        .then(|| send_goal(&site, &robot, &goal))
-        .transpose()?;
+    let client = plan.is_busy.then(|| send_goal(&site, &robot, &goal)).transpose()?;
     let measured = site.runtime.block_on(async {
         robot.warm_up().await?;
         let before = resident_kilobytes(stub.pid())?;
@@ -461,43 +389,23 @@ fn run(report: &mut BenchReport, daemon: &Daemon, cable: &Cable, plan: &CameraPl
     let trips = floor.trips.lock().clone();
     report_figures(report, plan, &record, &trips, &stub.output());
     let growth = after as f64 / before as f64;
-    report.figure(
-        format!("{}: stub's memory, end / begin", plan.name),
-        "",
-        growth,
-    );
+    report.figure(format!("{}: stub's memory, end / begin", plan.name), "", growth);
     if plan.is_busy {
         let ends = goal.ends.lock().clone();
         let succeeded = ends == [Some(GoalOutcome::Succeeded)];
         report
-            .figure(
-                format!("{}: goal ended once, by success", plan.name),
-                "",
-                f64::from(succeeded),
-            )
+            .figure(format!("{}: goal ended once, by success", plan.name), "", f64::from(succeeded))
             .require(Target::AtLeast(1.0))
-            .note(format!(
-                "{ends:?}, {} of {GOAL} times feedback",
-                goal.feedback.load(Ordering::Relaxed)
-            ));
+            .note(format!("{ends:?}, {} of {GOAL} times feedback", goal.feedback.load(Ordering::Relaxed)));
     }
     Ok(())
 }
 
-fn start_stub(
-    site: &Site,
-    daemon: &Daemon,
-    cable: &Cable,
-    plan: &CameraPlan,
-) -> Result<NodeProcess> {
+fn start_stub(site: &Site, daemon: &Daemon, cable: &Cable, plan: &CameraPlan) -> Result<NodeProcess> {
     let names = ("camera_node", "camera_node.py");
     let workspace = site.install_original(daemon, "camera_node", names, PROGRAM)?;
     let workspace = workspace.to_string_lossy();
-    let variables = [
-        ("CMAKE_PREFIX_PATH", &*workspace),
-        ("NO_COLOR", "1"),
-        ("CLOUDROID_LOG", "info,requests=debug"),
-    ];
+    let variables = [("CMAKE_PREFIX_PATH", &*workspace), ("NO_COLOR", "1"), ("CLOUDROID_LOG", "info,requests=debug")];
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"camera_node\"\nrobot = \"camera-{}\"\nlocal = \"{}\"\n\
          desire = {:?}\nmax = {T_MAX:?}\nrequest = \"/image -> {}\"\n\
@@ -508,20 +416,12 @@ fn start_stub(
         T_MAX / 2.0,
         plan.answers,
     );
-    let busy: &[&str] = if plan.is_busy {
-        &["_lines:=10000", "_topics:=200"]
-    } else {
-        &[]
-    };
+    let busy: &[&str] = if plan.is_busy { &["_lines:=10000", "_topics:=200"] } else { &[] };
     let argv = [&["__name:=camera_node"], busy].concat();
     site.start_stub_with_environment(&variables, &toml, names.0, names.1, &argv)
 }
 
-fn send_goal(
-    site: &Site,
-    robot: &CameraRobot,
-    record: &Arc<GoalRecord>,
-) -> Result<Box<dyn ActionClient>> {
+fn send_goal(site: &Site, robot: &CameraRobot, record: &Arc<GoalRecord>) -> Result<Box<dyn ActionClient>> {
     let registry = Registry::for_version(RosVersion::One);
     let parts = "int32 goal\n---\nint32 result\n---\nint32 feedback\n";
     registry.insert("actionlib/action/Test", parts)?;
@@ -530,11 +430,7 @@ fn send_goal(
     let client = robot.node.action_client("/work", &of)?;
     site.runtime.block_on(client.wait_for_server(PATIENCE))?;
     let goal = MessageLayout::new(RosVersion::One).u32(GOAL).finish();
-    client.send_goal(
-        "bench-goal",
-        goal,
-        Arc::clone(record) as Arc<dyn GoalEvents>,
-    );
+    client.send_goal("bench-goal", goal, Arc::clone(record) as Arc<dyn GoalEvents>);
     Ok(client)
 }
 
@@ -546,73 +442,33 @@ fn resident_kilobytes(pid: u32) -> Result<u64> {
     Ok(value.context("VmRSS")?.parse()?)
 }
 
-fn report_figures(
-    report: &mut BenchReport,
-    plan: &CameraPlan,
-    record: &CameraRecord,
-    floor: &[RoundTrip],
-    log: &str,
-) {
+fn report_figures(report: &mut BenchReport, plan: &CameraPlan, record: &CameraRecord, floor: &[RoundTrip], log: &str) {
     let name = plan.name;
-    let onsets = record
-        .phases
-        .iter()
-        .filter(|(_, index)| PHASES[*index].impairment.is_some());
+    let onsets = record.phases.iter().filter(|(_, index)| PHASES[*index].impairment.is_some());
     let onsets = onsets.count();
     let sent = record.pictures.len();
-    let answered = record
-        .pictures
-        .iter()
-        .filter(|picture| picture.answers > 0)
-        .count();
+    let answered = record.pictures.iter().filter(|picture| picture.answers > 0).count();
     report
-        .figure(
-            format!("{name}: pictures answered"),
-            "%",
-            100.0 * answered as f64 / sent as f64,
-        )
-        .note(format!(
-            "of {sent}, in {:.0} s",
-            (record.end - record.phases[0].0).as_secs_f64()
-        ));
-    let twice = record
-        .pictures
-        .iter()
-        .filter(|picture| picture.answers > 1)
-        .count();
-    report
-        .figure(format!("{name}: pictures answered twice"), "", twice as f64)
-        .require(Target::AtMost(0.0));
+        .figure(format!("{name}: pictures answered"), "%", 100.0 * answered as f64 / sent as f64)
+        .note(format!("of {sent}, in {:.0} s", (record.end - record.phases[0].0).as_secs_f64()));
+    let twice = record.pictures.iter().filter(|picture| picture.answers > 1).count();
+    report.figure(format!("{name}: pictures answered twice"), "", twice as f64).require(Target::AtMost(0.0));
     let wrong = record.count_wrong_stops();
     report
-        .figure(
-            format!("{name}: safe stops while answers came in time"),
-            "",
-            wrong as f64,
-        )
+        .figure(format!("{name}: safe stops while answers came in time"), "", wrong as f64)
         .require(Target::AtMost(0.0))
         .note(format!("of {} safe stops", record.stops.len()));
     // Judged as late: a satisfaction without an answer.
-    let late = log
-        .lines()
-        .filter(|line| line.contains("answer=None") && line.contains(" q="));
+    let late = log.lines().filter(|line| line.contains("answer=None") && line.contains(" q="));
     let late = late.count();
-    let figure = report.figure(
-        format!("{name}: late requests per onset"),
-        "",
-        late as f64 / onsets as f64,
-    );
+    let figure = report.figure(format!("{name}: late requests per onset"), "", late as f64 / onsets as f64);
     if plan.local == "warm" {
         figure.require(Target::AtMost(1.0));
     }
     let cuts = record.seconds_to_answer("cut");
     if plan.local != "none" {
         let slowest = quantile(&cuts, 0.95).unwrap_or(f64::NAN);
-        let figure = report.figure(
-            format!("{name}: hand-over after a cut, p95"),
-            "T_max",
-            slowest / T_MAX,
-        );
+        let figure = report.figure(format!("{name}: hand-over after a cut, p95"), "T_max", slowest / T_MAX);
         figure.note(format!("of {}", cuts.len()));
         if plan.local == "warm" {
             figure.require(Target::AtMost(1.2));
@@ -625,24 +481,14 @@ fn report_figures(
             continue;
         }
         let in_phase = |trips: &[RoundTrip]| -> Vec<f64> {
-            let these = trips
-                .iter()
-                .filter(|trip| record.phase_at(trip.sent) == Some(index));
-            these
-                .map(|trip| {
-                    trip.after
-                        .map_or(f64::INFINITY, |after| after.as_secs_f64() * 1e3)
-                })
-                .collect()
+            let these = trips.iter().filter(|trip| record.phase_at(trip.sent) == Some(index));
+            these.map(|trip| trip.after.map_or(f64::INFINITY, |after| after.as_secs_f64() * 1e3)).collect()
         };
         let (ours, plain) = (in_phase(&record.commands), in_phase(floor));
         for (percentile, fraction) in [("p50", 0.5), ("p99", 0.99)] {
             let value = |times: &[f64]| quantile(times, fraction).unwrap_or(f64::NAN);
-            let figure = report.figure(
-                format!("{name}: command and echo, {}, {percentile}", phase.name),
-                "ms",
-                value(&ours),
-            );
+            let figure =
+                report.figure(format!("{name}: command and echo, {}, {percentile}", phase.name), "ms", value(&ours));
             figure.relative_to("the same bytes by an idle TCP connection", value(&plain));
             if percentile == "p99" && phase.impairment.is_some() && plan.local == "none" {
                 figure.require(Target::RatioAtMost(2.0));

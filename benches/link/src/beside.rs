@@ -18,13 +18,7 @@ use support::site::{Site, string};
 use crate::people::next_noise;
 
 /// Properties of the network.
-const NETWORK: NetworkImpairment = NetworkImpairment {
-    rate: 20_000,
-    delay: 5,
-    jitter: 0,
-    loss: 0.0,
-    limit: 1000,
-};
+const NETWORK: NetworkImpairment = NetworkImpairment { rate: 20_000, delay: 5, jitter: 0, loss: 0.0, limit: 1000 };
 /// Size of a picture of 900 kB; its content cannot be compressed.
 const SIZE: (u32, u32) = (600, 500);
 /// Intervals between two pictures and between two small messages.
@@ -74,22 +68,16 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         "server = \"ws://{}\"\nservice = \"meter\"\nrobot = \"bench-beside\"\nlocal = \"none\"\n",
         cable.server
     );
-    let stub =
-        site.start_stub_with_config(&toml, "rosbridge_fixture", "meter", &["__name:=meter"])?;
+    let stub = site.start_stub_with_config(&toml, "rosbridge_fixture", "meter", &["__name:=meter"])?;
     let pings = site.advertise_strings(&app, "/meter/ping", false)?;
-    site.wait_for_subscribers(&*pings, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*pings, 1).with_context(|| stub.output())?;
     let mut pongs = site.subscribe(&app, "/meter/pong")?;
     site.runtime.block_on(async {
         let mut connected = pongs.matched.clone();
-        connected
-            .wait_for(|now| now.connected_count() == 1)
-            .await
-            .map(drop)
+        connected.wait_for(|now| now.connected_count() == 1).await.map(drop)
     })?;
     let pictures: Arc<dyn Publisher> = advertise_images(&site, &app)?.into();
-    site.wait_for_subscribers(&*pictures, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*pictures, 1).with_context(|| stub.output())?;
     cable.degrade(NETWORK)?;
     let alone = time_link_trips(&site, &*pings, &mut pongs, trips)?;
     let over = Arc::new(AtomicBool::new(false));
@@ -120,10 +108,7 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         report
             .figure(title, "ms", beside)
             .relative_to("the same without pictures", alone)
-            .note(format!(
-                "a picture takes {picture:.0} ms; {}",
-                cable.mechanism()
-            ));
+            .note(format!("a picture takes {picture:.0} ms; {}", cable.mechanism()));
     }
     Ok(())
 }

@@ -29,14 +29,10 @@ fn measure(all: bool) -> Result<()> {
     eprintln!("pushing people_detect and a relay: what they need is made now, if it is not cached");
     let deployer = daemon.deployer();
     if all {
-        deployer
-            .run(&[&["push"], PEOPLE.arguments].concat())?
-            .expect_success()?;
+        deployer.run(&[&["push"], PEOPLE.arguments].concat())?.expect_success()?;
     }
     let relay = ["--name", "meter", "--node", "rosbridge_fixture/meter"];
-    deployer
-        .push(FIXTURE.package.unwrap_or_default(), &relay)?
-        .expect_success()?;
+    deployer.push(FIXTURE.package.unwrap_or_default(), &relay)?.expect_success()?;
     let mut report = BenchReport::new("link");
     if all {
         people::measure(&mut report, &daemon)?;

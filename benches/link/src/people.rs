@@ -25,18 +25,9 @@ impl MessagePath {
     fn new(site: &Site, app: &Ros1Bus, node: &str) -> Result<Self> {
         let found = site.subscribe(app, &format!("/{node}/found"))?;
         let topic = format!("/{node}_camera");
-        let pictures = site.runtime.block_on(app.advertise(
-            &topic,
-            people::image_type(),
-            QosProfile::keep_last(10),
-        ))?;
+        let pictures = site.runtime.block_on(app.advertise(&topic, people::image_type(), QosProfile::keep_last(10)))?;
         site.wait_for_subscribers(&*pictures, 1)?;
-        Ok(Self {
-            pictures,
-            found,
-            times: Vec::new(),
-            asked: 0,
-        })
+        Ok(Self { pictures, found, times: Vec::new(), asked: 0 })
     }
 
     /// Publishes one image and returns the time until its answer.
@@ -82,26 +73,15 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         daemon,
         "opencv_apps",
         "/usr/lib/opencv_apps/people_detect",
-        &[
-            "__name:=native",
-            "_debug_view:=false",
-            "image:=/native_camera",
-        ],
+        &["__name:=native", "_debug_view:=false", "image:=/native_camera"],
     )?;
     let stub = site.start_stub(
         daemon,
         ("opencv_apps", "opencv_apps", "people_detect"),
         "bench-link",
-        &[
-            "__name:=linked",
-            "_debug_view:=false",
-            "image:=/linked_camera",
-        ],
+        &["__name:=linked", "_debug_view:=false", "image:=/linked_camera"],
     )?;
-    let mut ways = [
-        MessagePath::new(&site, &app, "native")?,
-        MessagePath::new(&site, &app, "linked")?,
-    ];
+    let mut ways = [MessagePath::new(&site, &app, "native")?, MessagePath::new(&site, &app, "linked")?];
     for way in &mut ways {
         // The first image may be lost while connections are being established.
         way.pictures.publish(camera_image(0));
@@ -118,20 +98,15 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
         }
     }
     let [native_way, linked_way] = &mut ways;
-    let (alone, linked) = (
-        quantile_seconds(&native_way.times, 0.5) * 1e3,
-        quantile_seconds(&linked_way.times, 0.5) * 1e3,
-    );
+    let (alone, linked) =
+        (quantile_seconds(&native_way.times, 0.5) * 1e3, quantile_seconds(&linked_way.times, 0.5) * 1e3);
     report
         .figure("people_detect, picture in, found out: median", "ms", linked)
         .relative_to("the same on the robot", alone)
         .require(Target::RatioAtMost(1.05))
         .note(format!("640x480, {rounds} pictures each, in turns"));
     let memory = Process::from_pid(stub.pid()).proportional()?;
-    report
-        .figure("memory of its stub, after that", "MB", memory)
-        .require(Target::AtMost(15.0))
-        .note("PSS");
+    report.figure("memory of its stub, after that", "MB", memory).require(Target::AtMost(15.0)).note("PSS");
     drop((ways, native));
     crate::idle::measure(report, &stub)?;
     Ok(())

@@ -21,21 +21,15 @@ pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     let rounds = if is_full_run() { 15 } else { 5 };
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let stub = site.start_stub(
-        daemon,
-        ("meter", "rosbridge_fixture", "meter"),
-        "bench-strings",
-        &["__name:=meter"],
-    )?;
+    let stub = site.start_stub(daemon, ("meter", "rosbridge_fixture", "meter"), "bench-strings", &["__name:=meter"])?;
     let pings = site.advertise_strings(&app, "/meter/ping", false)?;
-    site.wait_for_subscribers(&*pings, 1)
-        .with_context(|| stub.output())?;
+    site.wait_for_subscribers(&*pings, 1).with_context(|| stub.output())?;
     let mut pongs = site.subscribe(&app, "/meter/pong")?;
     loop {
         pings.publish(string("first"));
-        let came = site.runtime.block_on(async {
-            tokio::time::timeout(Duration::from_millis(200), pongs.messages.recv()).await
-        });
+        let came = site
+            .runtime
+            .block_on(async { tokio::time::timeout(Duration::from_millis(200), pongs.messages.recv()).await });
         if came.is_ok() {
             break;
         }

@@ -27,8 +27,7 @@ fn connect(to: SocketAddr) -> Result<TcpStream> {
 
 /// Builds an XML-RPC call to the Master with string arguments.
 fn xml_rpc_request(method: &str, arguments: &[&str]) -> String {
-    let mut body =
-        format!("<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>");
+    let mut body = format!("<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>");
     for argument in arguments {
         body += &format!("<param><value><string>{argument}</string></value></param>");
     }
@@ -93,9 +92,7 @@ pub(crate) fn flood_parameters(network: &NetNs) -> Result<String> {
         }
         std::thread::sleep(Duration::from_secs(3));
         let count = unread.iter().filter(|stream| answered(stream)).count();
-        Ok(format!(
-            "{refused} of {PARAMETERS} parameters were refused, {count} of {READERS} answers begun"
-        ))
+        Ok(format!("{refused} of {PARAMETERS} parameters were refused, {count} of {READERS} answers begun"))
     })?
 }
 
@@ -110,9 +107,7 @@ pub(crate) fn send_unfinished_requests(network: &NetNs, robot: &mut Robot) -> Re
     network.run(|| {
         let told = call_master("lookupService", &["/attacker", "/attacked"])?;
         // The response contains the URI twice, the first time within a sentence.
-        let (_, rest) = told
-            .rsplit_once("rosrpc://")
-            .with_context(|| told.clone())?;
+        let (_, rest) = told.rsplit_once("rosrpc://").with_context(|| told.clone())?;
         let address = rest.split(['/', '<']).next().unwrap_or_default();
         let (_, port) = address.rsplit_once(':').context("a port")?;
         let to = SocketAddr::from((Ipv4Addr::LOCALHOST, port.parse()?));
@@ -126,10 +121,7 @@ pub(crate) fn send_unfinished_requests(network: &NetNs, robot: &mut Robot) -> Re
             sent.push(result.map_err(|_| anyhow::anyhow!("an attacker panicked"))??);
         }
         let whole = sent.iter().filter(|(sent, _)| *sent == FRAME - 1).count();
-        Ok(format!(
-            "{} of {FRAMES} connections were closed",
-            FRAMES - whole
-        ))
+        Ok(format!("{} of {FRAMES} connections were closed", FRAMES - whole))
     })?
 }
 
@@ -174,8 +166,7 @@ pub(crate) fn drive_master(network: &NetNs, time: Duration) -> Result<()> {
         std::thread::scope(|scope| {
             let all: Vec<_> = (0..4).map(|_| scope.spawn(asks)).collect();
             for one in all {
-                one.join()
-                    .map_err(|_| anyhow::anyhow!("an attacker panicked"))??;
+                one.join().map_err(|_| anyhow::anyhow!("an attacker panicked"))??;
             }
             Ok(())
         })

@@ -42,10 +42,7 @@ impl Victim {
         let path = daemon.home.join("servants").join(id).join(launch::RUNTIME);
         let runtime: RuntimeRecord = launch::read_record(&path)?.context("a running servant")?;
         let node = servant["pids"][0].as_i64().context("a node")?;
-        Ok(Self {
-            network: NetNs::from_pid(i32::try_from(node)?)?,
-            shim: Process::from_pid(runtime.shim.pid),
-        })
+        Ok(Self { network: NetNs::from_pid(i32::try_from(node)?)?, shim: Process::from_pid(runtime.shim.pid) })
     }
 }
 
@@ -112,28 +109,16 @@ fn main() -> Result<()> {
     let mut other = daemon.robot("adder_py?robot=other")?;
     other.call("/add_two", json!({"a": 1, "b": 1}))?;
     let other = Victim::for_robot(&daemon, "adder_py", "other")?;
-    attack(&mut report, name, &other.shim, first(3300.0), || {
-        inside::flood_parameters(&other.network)
-    })?;
+    attack(&mut report, name, &other.shim, first(3300.0), || inside::flood_parameters(&other.network))?;
     answered()?;
     let name = "daemon: 8 unfinished TCPROS frames of 250 MB";
-    attack(&mut report, name, whole, first(2100.0), || {
-        inside::send_unfinished_requests(&victim.network, &mut robot)
-    })?;
+    attack(&mut report, name, whole, first(2100.0), || inside::send_unfinished_requests(&victim.network, &mut robot))?;
     answered()?;
     /// Begins an attack; returns what it did.
     type Attack = fn(&Daemon) -> Result<String>;
     let attacks: [(&str, (&str, f64), Attack); 4] = [
-        (
-            "daemon: 20 unfinished WebSocket messages of 63 MB",
-            first(1300.0),
-            outside::hold_unfinished_messages,
-        ),
-        (
-            "daemon: 4 unfinished bodies of trials of 330 MB",
-            first(1300.0),
-            outside::hold_unfinished_trials,
-        ),
+        ("daemon: 20 unfinished WebSocket messages of 63 MB", first(1300.0), outside::hold_unfinished_messages),
+        ("daemon: 4 unfinished bodies of trials of 330 MB", first(1300.0), outside::hold_unfinished_trials),
         (
             "daemon: a message of 60 MB that is 300 MB as JSON",
             ("limit of a servant", LIMIT),
@@ -155,8 +140,7 @@ fn main() -> Result<()> {
     let small = Victim::for_robot(&daemon, "small", "small")?;
     let (began, before) = (Instant::now(), small.shim.total_processor_time()?);
     inside::drive_master(&small.network, DRIVEN)?;
-    let cores =
-        (small.shim.total_processor_time()? - before).as_secs_f64() / began.elapsed().as_secs_f64();
+    let cores = (small.shim.total_processor_time()? - before).as_secs_f64() / began.elapsed().as_secs_f64();
     let title = "shim of a servant with 0.1 cores, asked all the time";
     report
         .figure(title, "cores", cores)

@@ -31,9 +31,7 @@ fn run_concurrently<T: Send>(count: usize, work: impl Fn() -> Result<T> + Sync) 
 /// Starts messages that never end.
 pub(crate) fn hold_unfinished_messages(daemon: &Daemon) -> Result<String> {
     // Makes sure that the servant is running.
-    daemon
-        .robot("adder_py?robot=greedy")?
-        .call("/rosapi/get_time", json!({}))?;
+    daemon.robot("adder_py?robot=greedy")?.call("/rosapi/get_time", json!({}))?;
     let held = run_concurrently(MESSAGES, || {
         let mut robot = daemon.robot("adder_py?robot=greedy")?;
         let frame = Frame::message(vec![7; MESSAGE], OpCode::Data(Data::Binary), false);
@@ -106,9 +104,7 @@ pub(crate) fn subscribe_to_oversized_json(daemon: &Daemon) -> Result<String> {
     reader.subscribe("/big")?;
     reader.call("/rosapi/get_time", json!({}))?;
     publish_array(&mut publisher, "/big", 60_000_000, -100)?;
-    let heard = reader.wait_for("what became of it", |heard| {
-        heard["op"] == "publish" || heard["op"] == "status"
-    })?;
+    let heard = reader.wait_for("what became of it", |heard| heard["op"] == "publish" || heard["op"] == "status")?;
     Ok(match heard["op"].as_str() {
         Some("status") => "it was left out, with a status".to_owned(),
         _ => "it came".to_owned(),
@@ -120,10 +116,7 @@ pub(crate) fn leave_messages_unread(daemon: &Daemon) -> Result<String> {
     let mut publisher = daemon.robot("adder_py?robot=victim")?;
     advertise_array(&mut publisher, "/unread")?;
     let value = Value::from("x".repeat(5_000_000)).to_string();
-    let set = publisher.call(
-        "/rosapi/set_param",
-        json!({"name": "/unread", "value": value}),
-    )?;
+    let set = publisher.call("/rosapi/set_param", json!({"name": "/unread", "value": value}))?;
     anyhow::ensure!(set["result"] == true, "{set}");
     let url = daemon.url("adder_py?robot=victim");
     let mut slow = Vec::new();
@@ -149,12 +142,7 @@ pub(crate) fn leave_messages_unread(daemon: &Daemon) -> Result<String> {
     }
     std::thread::sleep(Duration::from_secs(3));
     let (_, metrics) = daemon.get("/metrics")?;
-    let held = metrics
-        .lines()
-        .find_map(|line| line.strip_prefix("cloudroid_memory_bytes{what=\"held\"}"));
+    let held = metrics.lines().find_map(|line| line.strip_prefix("cloudroid_memory_bytes{what=\"held\"}"));
     let held: f64 = held.context("what is held is told")?.trim().parse()?;
-    Ok(format!(
-        "{published} of 10 messages were taken, {:.0} MB were counted in the end",
-        held / 1e6
-    ))
+    Ok(format!("{published} of 10 messages were taken, {:.0} MB were counted in the end", held / 1e6))
 }

@@ -84,9 +84,7 @@ impl PathTarget<'_> {
             ClientPath::Daemon(encoding) => self.open_daemon(encoding)?,
             ClientPath::Bytes | ClientPath::Values => self.open_relay(way == ClientPath::Values)?,
             ClientPath::Direct => self.open_direct()?,
-            ClientPath::Suite => {
-                self.open_rosbridge(suite::connect_client(self.node)?, Encoding::Json)?
-            }
+            ClientPath::Suite => self.open_rosbridge(suite::connect_client(self.node)?, Encoding::Json)?,
         };
         for topic in topics.into_iter().flatten() {
             self.node.wait_until_connected(topic, 1)?;
@@ -122,39 +120,21 @@ impl PathTarget<'_> {
         if let Some(service) = self.hops.service {
             message = line::frame(line::TEXT, call_op(service).as_bytes());
         }
-        Ok(OpenPath {
-            line,
-            message,
-            _relay: None,
-            raw: None,
-        })
+        Ok(OpenPath { line, message, _relay: None, raw: None })
     }
 
     fn open_relay(&self, values: bool) -> Result<OpenPath> {
-        let hops = RelayHops {
-            values,
-            ..self.hops
-        };
+        let hops = RelayHops { values, ..self.hops };
         let relay = Relay::start(self.node.pid, hops)?;
         let (line, message) = if values {
             let line = BenchConnection::connect_websocket(&relay.address, "")?;
-            let message = hops.inward.map_or_else(Vec::new, |topic| {
-                publish_op(topic, hops.images, Encoding::Json)
-            });
+            let message = hops.inward.map_or_else(Vec::new, |topic| publish_op(topic, hops.images, Encoding::Json));
             (line, message)
         } else {
             let stream = std::net::TcpStream::connect(&relay.address)?;
-            (
-                BenchConnection::new(stream, self.framing())?,
-                self.framed_message(),
-            )
+            (BenchConnection::new(stream, self.framing())?, self.framed_message())
         };
-        Ok(OpenPath {
-            line,
-            message,
-            _relay: Some(relay),
-            raw: None,
-        })
+        Ok(OpenPath { line, message, _relay: Some(relay), raw: None })
     }
 
     fn open_direct(&self) -> Result<OpenPath> {
@@ -215,19 +195,11 @@ pub(crate) fn check_message(way: ClientPath, images: bool, message: &[u8]) -> Re
         ClientPath::Daemon(Encoding::Json) | ClientPath::Values | ClientPath::Suite => {
             let op: Value = serde_json::from_slice(message)?;
             let data = op["msg"]["data"].as_str().context("data")?;
-            let length = if images {
-                BASE64_STANDARD.decode(data)?.len()
-            } else {
-                data.len()
-            };
+            let length = if images { BASE64_STANDARD.decode(data)?.len() } else { data.len() };
             let least = if images { 921_600 } else { TEXT.len() };
             ensure!(length == least, "{way}: data of {length} bytes");
         }
-        _ => ensure!(
-            message.len() >= expected.len(),
-            "{way}: {} bytes",
-            message.len()
-        ),
+        _ => ensure!(message.len() >= expected.len(), "{way}: {} bytes", message.len()),
     }
     Ok(())
 }

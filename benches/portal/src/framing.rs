@@ -25,11 +25,7 @@ use tokio_tungstenite::tungstenite::protocol::{self, WebSocketConfig};
 const ROUNDS: usize = 7;
 
 /// Name, size in bytes and number of messages of a round: a state, a scan, and a 640x480 RGB image.
-const SIZES: [(&str, usize, usize); 3] = [
-    ("64 B", 64, 40_000),
-    ("4 KiB", 4096, 10_000),
-    ("0.9 MB", 921_600, 100),
-];
+const SIZES: [(&str, usize, usize); 3] = [("64 B", 64, 40_000), ("4 KiB", 4096, 10_000), ("0.9 MB", 921_600, 100)];
 
 /// Bytes that are collected before a write; tokio-tungstenite's default buffer size.
 const BATCH: usize = 128 * 1024;
@@ -49,12 +45,8 @@ enum WebSocketLibrary {
     Socket,
 }
 
-const FRAMINGS: [WebSocketLibrary; 4] = [
-    WebSocketLibrary::Ours,
-    WebSocketLibrary::Tungstenite,
-    WebSocketLibrary::Fast,
-    WebSocketLibrary::Socket,
-];
+const FRAMINGS: [WebSocketLibrary; 4] =
+    [WebSocketLibrary::Ours, WebSocketLibrary::Tungstenite, WebSocketLibrary::Fast, WebSocketLibrary::Socket];
 
 /// Messages of one size, from the client to the server (`inward`) or the other way.
 #[derive(Clone, Copy)]
@@ -73,11 +65,7 @@ pub fn measure(report: &mut BenchReport, only: &str) -> Result<()> {
             if !name.contains(only) {
                 continue;
             }
-            let load = FramingLoad {
-                inward,
-                bytes,
-                count,
-            };
+            let load = FramingLoad { inward, bytes, count };
             let mut best = [Duration::MAX; FRAMINGS.len()];
             for number in 0..=ROUNDS {
                 for (framing, best) in FRAMINGS.into_iter().zip(&mut best) {
@@ -85,8 +73,7 @@ pub fn measure(report: &mut BenchReport, only: &str) -> Result<()> {
                     *best = if number == 0 { *best } else { took.min(*best) };
                 }
             }
-            let [ours, tungstenite, fast, socket] =
-                best.map(|best| best.as_secs_f64() * 1e6 / count as f64);
+            let [ours, tungstenite, fast, socket] = best.map(|best| best.as_secs_f64() * 1e6 / count as f64);
             report
                 .figure(name, "µs", ours)
                 .relative_to("tokio-tungstenite", tungstenite)
@@ -109,10 +96,7 @@ fn measure_round(framing: WebSocketLibrary, load: FramingLoad) -> Result<Duratio
     server.set_nodelay(true)?;
     server.set_nonblocking(true)?;
     let other = thread::spawn(move || run_client(client, load));
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_io()
-        .enable_time()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
     let start = thread_processor_time();
     runtime.block_on(async {
         let server = tokio::net::TcpStream::from_std(server)?;
@@ -128,15 +112,9 @@ fn measure_round(framing: WebSocketLibrary, load: FramingLoad) -> Result<Duratio
         }
     })?;
     let took = thread_processor_time() - start;
-    let transferred = other
-        .join()
-        .ok()
-        .context("the client's thread panicked")??;
+    let transferred = other.join().ok().context("the client's thread panicked")??;
     let expected = load.count * (load.bytes + header(load).len());
-    ensure!(
-        transferred == expected,
-        "{transferred} bytes passed, not {expected}"
-    );
+    ensure!(transferred == expected, "{transferred} bytes passed, not {expected}");
     Ok(took)
 }
 
@@ -215,9 +193,7 @@ async fn write_with_ws(server: tokio::net::TcpStream, load: FramingLoad) -> Resu
     Ok(())
 }
 
-async fn tungstenite_socket(
-    server: tokio::net::TcpStream,
-) -> WebSocketStream<tokio::net::TcpStream> {
+async fn tungstenite_socket(server: tokio::net::TcpStream) -> WebSocketStream<tokio::net::TcpStream> {
     let config = WebSocketConfig::default()
         .read_buffer_size(BATCH)
         .write_buffer_size(BATCH)
@@ -253,10 +229,7 @@ async fn read_with_fastwebsockets(server: tokio::net::TcpStream, load: FramingLo
     let mut socket = FragmentCollector::new(socket);
     for _ in 0..load.count {
         let frame = socket.read_frame().await?;
-        ensure!(
-            frame.opcode == OpCode::Binary && frame.payload.len() == load.bytes,
-            "not the message that was sent"
-        );
+        ensure!(frame.opcode == OpCode::Binary && frame.payload.len() == load.bytes, "not the message that was sent");
     }
     Ok(())
 }
@@ -266,9 +239,7 @@ async fn write_with_fastwebsockets(server: tokio::net::TcpStream, load: FramingL
     socket.set_writev(true);
     let payload = payload(load);
     for _ in 0..load.count {
-        socket
-            .write_frame(Frame::binary(Payload::Borrowed(&payload)))
-            .await?;
+        socket.write_frame(Frame::binary(Payload::Borrowed(&payload))).await?;
     }
     socket.flush().await?;
     Ok(())

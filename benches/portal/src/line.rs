@@ -54,15 +54,7 @@ impl BenchConnection {
     }
 
     fn with_stream(stream: LineStream, framing: Framing) -> Self {
-        Self {
-            sender: None,
-            stream,
-            framing,
-            buffer: vec![0; 256 << 10],
-            at: 0,
-            filled: 0,
-            missing: None,
-        }
+        Self { sender: None, stream, framing, buffer: vec![0; 256 << 10], at: 0, filled: 0, missing: None }
     }
 
     /// Connects as the robot to a daemon, through TLS if the daemon uses it.
@@ -191,11 +183,7 @@ impl BenchConnection {
         };
         let big = |count: usize| {
             let digits = bytes.get(2..2 + count)?;
-            Some(
-                digits
-                    .iter()
-                    .fold(0, |sum, &byte| sum << 8 | u64::from(byte)),
-            )
+            Some(digits.iter().fold(0, |sum, &byte| sum << 8 | u64::from(byte)))
         };
         match self.framing {
             Framing::Tcpros => Some((4, little(0)?.into())),

@@ -40,9 +40,7 @@ fn main() -> Result<()> {
         ["relay", rest @ ..] => relay::run(rest),
         [] => measure(""),
         [only] => measure(only),
-        _ => bail!(
-            "it takes a part of a figure's name, or nothing; CLOUDROID_BENCH_FULL=1 measures longer"
-        ),
+        _ => bail!("it takes a part of a figure's name, or nothing; CLOUDROID_BENCH_FULL=1 measures longer"),
     }
 }
 
@@ -78,10 +76,7 @@ fn measure(only: &str) -> Result<()> {
     report
         .figure("memory of the daemon, at its peak", "MB", memory.resident)
         .require(Target::AtMost(MEMORY))
-        .note(format!(
-            "resident, during all this; {:.1} MB of it in proportion (PSS)",
-            memory.proportional
-        ));
+        .note(format!("resident, during all this; {:.1} MB of it in proportion (PSS)", memory.proportional));
     report.finish()?;
     Ok(())
 }

@@ -54,15 +54,9 @@ impl Sockets for MeterSockets {
 /// Returns the address of a node's XML-RPC server.
 pub(crate) async fn look_up_node(inside: &MeterSockets, name: &str) -> Result<String> {
     let master = XmlRpcClient::new(Arc::new(inside.clone()), &format!("http://{MASTER}/"))?;
-    let found = master
-        .call("lookupNode", &["/bench".into(), name.into()], PATIENCE)
-        .await?;
+    let found = master.call("lookupNode", &["/bench".into(), name.into()], PATIENCE).await?;
     let found = found.as_array().context("an answer")?;
-    Ok(found
-        .get(2)
-        .and_then(Value::as_str)
-        .with_context(|| format!("{name} in {found:?}"))?
-        .to_owned())
+    Ok(found.get(2).and_then(Value::as_str).with_context(|| format!("{name} in {found:?}"))?.to_owned())
 }
 
 /// The node under measurement.
@@ -83,25 +77,14 @@ impl MeterNode {
         let path = daemon.home.join("servants").join(id).join(launch::RUNTIME);
         let record: RuntimeRecord = launch::read_record(&path)?.context("its record")?;
         let pid = first_child(record.shim.pid)?;
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
         let inside = MeterSockets::for_process(pid)?;
         let (bus, slave) = runtime.block_on(async {
             let bus = Ros1Bus::connect(Arc::new(inside.clone()), MASTER, "/bench_control").await?;
-            let slave = XmlRpcClient::new(
-                Arc::new(inside.clone()),
-                &look_up_node(&inside, NODE).await?,
-            )?;
+            let slave = XmlRpcClient::new(Arc::new(inside.clone()), &look_up_node(&inside, NODE).await?)?;
             anyhow::Ok((bus, slave))
         })?;
-        Ok(Self {
-            pid,
-            runtime,
-            slave,
-            bus,
-        })
+        Ok(Self { pid, runtime, slave, bus })
     }
 
     /// Waits until the node has `count` connections for a topic.
@@ -112,10 +95,7 @@ impl MeterNode {
             if found == count {
                 return Ok(());
             }
-            ensure!(
-                Instant::now() < deadline,
-                "{topic} has {found} connections and not {count}"
-            );
+            ensure!(Instant::now() < deadline, "{topic} has {found} connections and not {count}");
             std::thread::sleep(Duration::from_millis(2));
         }
     }
@@ -124,25 +104,17 @@ impl MeterNode {
         let caller = ["/bench".into()];
         let call = self.slave.call("getBusInfo", &caller, PATIENCE);
         let answer = self.runtime.block_on(call)?;
-        let rows = answer
-            .as_array()
-            .and_then(|answer| answer.get(2)?.as_array());
-        let about = |row: &&Value| {
-            row.as_array()
-                .and_then(|row| row.get(4)?.as_str())
-                .is_some_and(|found| found == topic)
-        };
+        let rows = answer.as_array().and_then(|answer| answer.get(2)?.as_array());
+        let about =
+            |row: &&Value| row.as_array().and_then(|row| row.get(4)?.as_str()).is_some_and(|found| found == topic);
         Ok(rows.context("rows")?.iter().filter(about).count())
     }
 
     /// Returns the credit of one of the node's sources: the source publishes as many messages as it is granted.
     pub(crate) fn credit(&self, topic: &str) -> Result<PublishCredit> {
         let topic = format!("{topic}_credit");
-        let publisher = self.runtime.block_on(self.bus.advertise(
-            &topic,
-            UINT32.into(),
-            QosProfile::keep_last(1000),
-        ))?;
+        let publisher =
+            self.runtime.block_on(self.bus.advertise(&topic, UINT32.into(), QosProfile::keep_last(1000)))?;
         self.wait_until_connected(&topic, 1)?;
         Ok(PublishCredit(publisher))
     }
@@ -153,11 +125,8 @@ impl MeterNode {
         let counted = count.clone();
         let asking = std::thread::current();
         let topic = format!("{topic}_count");
-        let mut subscription = self.runtime.block_on(self.bus.subscribe(
-            &topic,
-            UINT32.into(),
-            QosProfile::keep_last(1000),
-        ))?;
+        let mut subscription =
+            self.runtime.block_on(self.bus.subscribe(&topic, UINT32.into(), QosProfile::keep_last(1000)))?;
         self.runtime.spawn(async move {
             let _subscribed = &subscription.guard;
             while let Some(message) = subscription.messages.recv().await {
@@ -172,11 +141,8 @@ impl MeterNode {
     }
 }
 
-const UINT32: TypeDescription = TypeDescription {
-    name: "std_msgs/UInt32",
-    md5: "304a39449588c7f8ce2df6e8001c5fce",
-    definition: "uint32 data\n",
-};
+const UINT32: TypeDescription =
+    TypeDescription { name: "std_msgs/UInt32", md5: "304a39449588c7f8ce2df6e8001c5fce", definition: "uint32 data\n" };
 
 /// A message type, as connection headers describe it.
 #[derive(Debug, Clone, Copy)]
@@ -187,11 +153,8 @@ pub(crate) struct TypeDescription {
 }
 
 /// Type of the small message.
-pub(crate) const STRING: TypeDescription = TypeDescription {
-    name: "std_msgs/String",
-    md5: "992ce8a1687cec8c8bd883ec73ca41d1",
-    definition: "string data\n",
-};
+pub(crate) const STRING: TypeDescription =
+    TypeDescription { name: "std_msgs/String", md5: "992ce8a1687cec8c8bd883ec73ca41d1", definition: "string data\n" };
 
 /// Type of the large message.
 pub(crate) const IMAGE: TypeDescription = TypeDescription {
@@ -215,8 +178,7 @@ pub(crate) struct PublishCredit(Box<dyn Publisher>);
 
 impl PublishCredit {
     pub(crate) fn grant(&self, messages: u32) {
-        self.0
-            .publish(Bytes::copy_from_slice(&messages.to_le_bytes()));
+        self.0.publish(Bytes::copy_from_slice(&messages.to_le_bytes()));
     }
 }
 

@@ -43,72 +43,36 @@ struct RateTarget {
 
 impl RateTarget {
     fn share_of_floor(way: ClientPath, share: f64, floor: ClientPath) -> Self {
-        Self {
-            way,
-            floor,
-            share,
-            times_rosbridge: None,
-            per_processor: false,
-        }
+        Self { way, floor, share, times_rosbridge: None, per_processor: false }
     }
 }
 
 /// Measures all rates.
-pub(crate) fn measure(
-    report: &mut BenchReport,
-    daemon: &BenchDaemon,
-    node: &MeterNode,
-    only: &str,
-) -> Result<()> {
-    let topic = |images, inward, outward| RelayHops {
-        images,
-        inward,
-        outward,
-        ..RelayHops::default()
-    };
+pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, node: &MeterNode, only: &str) -> Result<()> {
+    let topic = |images, inward, outward| RelayHops { images, inward, outward, ..RelayHops::default() };
     let tenfold = |share| RateTarget {
         times_rosbridge: Some(10.0),
         per_processor: true,
         ..RateTarget::share_of_floor(JSON, share, ClientPath::Direct)
     };
-    let many = RateTarget {
-        times_rosbridge: Some(25.0),
-        ..RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes)
-    };
+    let many = RateTarget { times_rosbridge: Some(25.0), ..RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes) };
     for (what, hops, ways, goals) in [
         (
             "small messages out",
             topic(false, None, Some("/meter/small_out")),
-            vec![
-                JSON,
-                ClientPath::Direct,
-                ClientPath::Bytes,
-                ClientPath::Values,
-            ],
+            vec![JSON, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
             vec![tenfold(0.7)],
         ),
         (
             "small messages in",
             topic(false, Some("/meter/small_in"), None),
-            vec![
-                JSON,
-                ClientPath::Direct,
-                ClientPath::Bytes,
-                ClientPath::Values,
-            ],
+            vec![JSON, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
             vec![tenfold(0.7)],
         ),
         (
             "640x480 RGB out",
             topic(true, None, Some("/meter/image_out")),
-            vec![
-                JSON,
-                CBOR,
-                RAW,
-                ClientPath::Direct,
-                ClientPath::Bytes,
-                ClientPath::Values,
-            ],
+            vec![JSON, CBOR, RAW, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
             vec![
                 RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes),
                 RateTarget::share_of_floor(CBOR, 0.5, ClientPath::Bytes),
@@ -118,18 +82,8 @@ pub(crate) fn measure(
         (
             "640x480 RGB in",
             topic(true, Some("/meter/image_in"), None),
-            vec![
-                JSON,
-                CBOR,
-                RAW,
-                ClientPath::Direct,
-                ClientPath::Bytes,
-                ClientPath::Values,
-            ],
-            vec![
-                many,
-                RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes),
-            ],
+            vec![JSON, CBOR, RAW, ClientPath::Direct, ClientPath::Bytes, ClientPath::Values],
+            vec![many, RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes)],
         ),
     ] {
         if what.contains(only) {
@@ -149,11 +103,7 @@ struct MessageRate {
     processor: Duration,
 }
 
-fn measure_in_turns(
-    course: &PathTarget<'_>,
-    ways: &[ClientPath],
-    what: &str,
-) -> Result<Vec<MessageRate>> {
+fn measure_in_turns(course: &PathTarget<'_>, ways: &[ClientPath], what: &str) -> Result<Vec<MessageRate>> {
     let rounds = if is_full_run() { 20 } else { 6 };
     let mut found = vec![MessageRate::default(); ways.len()];
     let process = Process::from_pid(course.daemon.pid());
@@ -197,10 +147,7 @@ struct RateTimer {
 
 impl RateTimer {
     fn start() -> Self {
-        Self {
-            begun: Instant::now(),
-            counted: None,
-        }
+        Self { begun: Instant::now(), counted: None }
     }
 
     /// Returns the rate once the turn is over.
@@ -215,11 +162,7 @@ impl RateTimer {
 }
 
 /// Measures messages from the node, which publishes as many as it has credit for.
-pub(crate) fn measure_outward(
-    course: &PathTarget<'_>,
-    way: ClientPath,
-    credit: &PublishCredit,
-) -> Result<(f64, u64)> {
+pub(crate) fn measure_outward(course: &PathTarget<'_>, way: ClientPath, credit: &PublishCredit) -> Result<(f64, u64)> {
     let mut open = course.open(way)?;
     credit.grant(1);
     check_message(way, course.hops.images, &open.line.read_message()?)?;
@@ -252,11 +195,7 @@ pub(crate) fn measure_outward(
 }
 
 /// Measures messages to the node, which reports how many it has received.
-fn measure_inward(
-    course: &PathTarget<'_>,
-    way: ClientPath,
-    count: &MessageCount,
-) -> Result<(f64, u64)> {
+fn measure_inward(course: &PathTarget<'_>, way: ClientPath, count: &MessageCount) -> Result<(f64, u64)> {
     let mut open = course.open(way)?;
     let window = window_size(course);
     // The node keeps counting across turns: its first report shows where this turn starts, to the precision of its
@@ -282,10 +221,7 @@ fn measure_inward(
             sent += batch;
         } else {
             std::thread::park_timeout(Duration::from_millis(100));
-            ensure!(
-                clock.begun.elapsed() < PATIENCE,
-                "{way}: messages were lost"
-            );
+            ensure!(clock.begun.elapsed() < PATIENCE, "{way}: messages were lost");
         }
     }
 }
@@ -297,10 +233,7 @@ fn wait_for_change(count: &MessageCount, before: u64) -> Result<u64> {
         if now != before {
             return Ok(now);
         }
-        ensure!(
-            begun.elapsed() < PATIENCE,
-            "the node counts no more than {now}"
-        );
+        ensure!(begun.elapsed() < PATIENCE, "the node counts no more than {now}");
         std::thread::park_timeout(Duration::from_millis(100));
     }
 }
@@ -316,17 +249,11 @@ fn report_rates(
         let at = ways.iter().position(|other| *other == way);
         at.map_or_else(MessageRate::default, |at| found[at])
     };
-    for way in ways
-        .iter()
-        .filter(|way| matches!(way, ClientPath::Daemon(_)))
-    {
+    for way in ways.iter().filter(|way| matches!(way, ClientPath::Daemon(_))) {
         let ours = rate(*way);
         let goal = goals.iter().find(|goal| goal.way == *way);
         let name = format!("{what}, {way}");
-        for floor in ways
-            .iter()
-            .filter(|way| !matches!(way, ClientPath::Daemon(_)))
-        {
+        for floor in ways.iter().filter(|way| !matches!(way, ClientPath::Daemon(_))) {
             let figure = report.figure(name.clone(), "/s", ours.best);
             figure.relative_to(floor.to_string(), rate(*floor).best);
             if let Some(goal) = goal.filter(|goal| goal.floor == *floor) {
@@ -336,9 +263,7 @@ fn report_rates(
         let per_processor = ours.messages as f64 / ours.processor.as_secs_f64().max(0.01);
         let mut per_second = format!("{name}, per s of the daemon's processor time");
         let mut value = per_processor;
-        let suite = ROSBRIDGE
-            .iter()
-            .find(|(title, encoding, _)| *title == what && encoding == way);
+        let suite = ROSBRIDGE.iter().find(|(title, encoding, _)| *title == what && encoding == way);
         if goal.is_some_and(|goal| !goal.per_processor && goal.times_rosbridge.is_some()) {
             report.figure(per_second, "/s", per_processor);
             (per_second, value) = (name, ours.best);

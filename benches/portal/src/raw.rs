@@ -35,11 +35,9 @@ impl XmlRpcHandler for Slave {
         let topic = params.get(1).and_then(Value::as_str).unwrap_or_default();
         let ports = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let value = match (method, ports.get(topic)) {
-            ("requestTopic", Some(port)) => Value::Array(vec![
-                "TCPROS".into(),
-                "127.0.0.1".into(),
-                Value::Int(i32::from(*port)),
-            ]),
+            ("requestTopic", Some(port)) => {
+                Value::Array(vec!["TCPROS".into(), "127.0.0.1".into(), Value::Int(i32::from(*port))])
+            }
             _ => Value::Int(0),
         };
         Ok(Value::Array(vec![Value::Int(1), "".into(), value]))
@@ -70,12 +68,8 @@ impl RawNode {
         let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
         let arguments = [self.name.as_str().into(), topic.into(), protocols];
         let answer = slave.call("requestTopic", &arguments, PATIENCE).await?;
-        let place = answer
-            .as_array()
-            .and_then(|answer| answer.get(2)?.as_array());
-        let port = place
-            .and_then(|place| place.get(2)?.as_int())
-            .with_context(|| format!("{topic} in {answer:?}"))?;
+        let place = answer.as_array().and_then(|answer| answer.get(2)?.as_array());
+        let port = place.and_then(|place| place.get(2)?.as_int()).with_context(|| format!("{topic} in {answer:?}"))?;
         let header = Header::new([
             ("callerid", self.name.as_str()),
             ("topic", topic),
@@ -90,25 +84,14 @@ impl RawNode {
     pub(crate) async fn connect_service(&self, service: &str) -> Result<TcpStream> {
         let answer = self.call_master("lookupService", &[service.into()]).await?;
         let uri = answer.as_str().context("an address")?;
-        let port = uri
-            .trim_end_matches('/')
-            .rsplit(':')
-            .next()
-            .context("a port")?;
-        let header = Header::new([
-            ("callerid", self.name.as_str()),
-            ("service", service),
-            ("md5sum", "*"),
-            ("persistent", "1"),
-        ]);
+        let port = uri.trim_end_matches('/').rsplit(':').next().context("a port")?;
+        let header =
+            Header::new([("callerid", self.name.as_str()), ("service", service), ("md5sum", "*"), ("persistent", "1")]);
         self.connect(port.parse()?, &header).await
     }
 
     async fn connect(&self, port: u16, header: &Header) -> Result<TcpStream> {
-        let mut stream = self
-            .inside
-            .connect(SocketAddr::from(([127, 0, 0, 1], port)))
-            .await?;
+        let mut stream = self.inside.connect(SocketAddr::from(([127, 0, 0, 1], port))).await?;
         let mut buffer = BytesMut::new();
         header.exchange(&mut stream, &mut buffer).await?;
         ensure!(buffer.is_empty(), "nothing was asked for yet");
@@ -119,10 +102,7 @@ impl RawNode {
     pub(crate) async fn publish(&self, topic: &str, kind: TypeDescription) -> Result<TcpStream> {
         let listener = self.inside.listen("127.0.0.1:0".parse()?).await?;
         let port = listener.local_addr()?.port();
-        self.ports
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .insert(topic.to_owned(), port);
+        self.ports.lock().unwrap_or_else(PoisonError::into_inner).insert(topic.to_owned(), port);
         let registration = [topic.into(), kind.name.into(), self.uri.as_str().into()];
         self.call_master("registerPublisher", &registration).await?;
         let (mut stream, _) = timeout(PATIENCE, listener.accept()).await??;
@@ -148,15 +128,11 @@ impl RawNode {
     }
 
     async fn call_master(&self, method: &str, arguments: &[Value]) -> Result<Value> {
-        let master =
-            XmlRpcClient::new(Arc::new(self.inside.clone()), &format!("http://{MASTER}/"))?;
+        let master = XmlRpcClient::new(Arc::new(self.inside.clone()), &format!("http://{MASTER}/"))?;
         let arguments = [&[self.name.as_str().into()], arguments].concat();
         let answer = master.call(method, &arguments, PATIENCE).await?;
         let answer = answer.as_array().context("an answer")?;
-        ensure!(
-            answer.first().and_then(Value::as_int) == Some(1),
-            "{method}: {answer:?}"
-        );
+        ensure!(answer.first().and_then(Value::as_int) == Some(1), "{method}: {answer:?}");
         Ok(answer.get(2).cloned().unwrap_or(Value::Int(0)))
     }
 }

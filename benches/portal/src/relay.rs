@@ -43,20 +43,13 @@ impl Relay {
         command.arg("relay").arg(pid.to_string());
         command.arg(if hops.values { "values" } else { "bytes" });
         command.arg(if hops.images { "images" } else { "strings" });
-        for (flag, topic) in [
-            ("in", hops.inward),
-            ("out", hops.outward),
-            ("call", hops.service),
-        ] {
+        for (flag, topic) in [("in", hops.inward), ("out", hops.outward), ("call", hops.service)] {
             command.args(topic.map(|topic| format!("{flag}={topic}")));
         }
         let mut child = command.stdout(Stdio::piped()).spawn()?;
         let mut address = String::new();
         BufReader::new(child.stdout.take().context("piped")?).read_line(&mut address)?;
-        Ok(Self {
-            child,
-            address: address.trim().to_owned(),
-        })
+        Ok(Self { child, address: address.trim().to_owned() })
     }
 }
 
@@ -80,19 +73,11 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     let kind = if *messages == "images" { IMAGE } else { STRING };
     let find = |flag: &str| {
         let mut found = connections.iter().filter_map(|word| word.split_once('='));
-        found
-            .find(|(name, _)| *name == flag)
-            .map(|(_, topic)| topic)
+        found.find(|(name, _)| *name == flag).map(|(_, topic)| topic)
     };
     let (inward, outward, service) = (find("in"), find("out"), find("call"));
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()?;
-    let (inside, name) = (
-        MeterSockets::for_process(pid.parse()?)?,
-        format!("/relay_{}", std::process::id()),
-    );
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let (inside, name) = (MeterSockets::for_process(pid.parse()?)?, format!("/relay_{}", std::process::id()));
     let raw = runtime.block_on(RawNode::start(inside, &name))?;
     let (mut there, mut back) = (None, None);
     if let Some(service) = service {
@@ -120,11 +105,7 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     Ok(())
 }
 
-fn relay_client(
-    client: &TcpStream,
-    there: Option<TcpStream>,
-    back: Option<TcpStream>,
-) -> Result<()> {
+fn relay_client(client: &TcpStream, there: Option<TcpStream>, back: Option<TcpStream>) -> Result<()> {
     let (reader, writer) = (client.try_clone()?, client.try_clone()?);
     let answering = back.map(|back| {
         let kept = back.try_clone();

@@ -23,9 +23,7 @@ fn start_tls_daemon() -> Result<(BenchDaemon, MeterNode)> {
     push_meter(&daemon)?;
     let create = ["token", "create", "bench", "--role", "robot"];
     let rights = ["--robot", "bench", "--service", "meter"];
-    let answer = daemon
-        .deployer()
-        .run_json(&[&create[..], &rights].concat())?;
+    let answer = daemon.deployer().run_json(&[&create[..], &rights].concat())?;
     let token = answer["secret"].as_str().context("a secret")?;
     std::fs::write(daemon.directory().join("token"), token)?;
     let node = MeterNode::find(&daemon)?;
@@ -33,12 +31,7 @@ fn start_tls_daemon() -> Result<(BenchDaemon, MeterNode)> {
 }
 
 /// Measures both figures.
-pub(crate) fn measure(
-    report: &mut BenchReport,
-    plain: &BenchDaemon,
-    node: &MeterNode,
-    only: &str,
-) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport, plain: &BenchDaemon, node: &MeterNode, only: &str) -> Result<()> {
     let (strings, pictures) = (STRING.contains(only), PICTURES.contains(only));
     if !strings && !pictures {
         return Ok(());
@@ -65,11 +58,7 @@ fn negotiated_suite(daemon: &BenchDaemon) -> Result<String> {
 type DaemonPair<'a> = [(&'a BenchDaemon, &'a MeterNode); 2];
 
 fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
-    let hops = RelayHops {
-        inward: Some("/meter/ping"),
-        outward: Some("/meter/pong"),
-        ..RelayHops::default()
-    };
+    let hops = RelayHops { inward: Some("/meter/ping"), outward: Some("/meter/pong"), ..RelayHops::default() };
     let mut best = [[f64::MAX; 2]; 2];
     let rounds = if is_full_run() { 30 } else { 10 };
     for round in 1..=rounds {
@@ -95,11 +84,7 @@ fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) ->
 
 fn measure_rate(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
     let topic = "/meter/image_out";
-    let hops = RelayHops {
-        images: true,
-        outward: Some(topic),
-        ..RelayHops::default()
-    };
+    let hops = RelayHops { images: true, outward: Some(topic), ..RelayHops::default() };
     let credits = [ends[0].1.credit(topic)?, ends[1].1.credit(topic)?];
     let mut best = [0.0_f64; 2];
     let rounds = if is_full_run() { 20 } else { 6 };
@@ -109,8 +94,7 @@ fn measure_rate(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> 
         limit = limit.max(openssl_speed(suite)?);
         for (((daemon, node), credit), best) in ends.iter().zip(&credits).zip(&mut best) {
             let course = PathTarget { daemon, node, hops };
-            let (rate, _) =
-                rates::measure_outward(&course, ClientPath::Daemon(Encoding::Raw), credit)?;
+            let (rate, _) = rates::measure_outward(&course, ClientPath::Daemon(Encoding::Raw), credit)?;
             *best = best.max(rate);
         }
     }
@@ -120,10 +104,7 @@ fn measure_rate(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> 
     let ciphers = 2e6 * serialize_message(true).len() as f64 / limit;
     let added = 1e6 / best[1] - 1e6 / best[0];
     let figure = report.figure(format!("{PICTURES}, added to each"), "µs", added);
-    figure.relative_to(
-        format!("openssl speed, {}, twice", openssl_cipher(suite)),
-        ciphers,
-    );
+    figure.relative_to(format!("openssl speed, {}, twice", openssl_cipher(suite)), ciphers);
     figure.note(format!("both ends are on this machine; {suite}"));
     figure.require(Target::RatioAtMost(1.0));
     Ok(())
@@ -145,11 +126,7 @@ fn openssl_speed(suite: &str) -> Result<f64> {
         .args(["-evp", openssl_cipher(suite)])
         .output()
         .context("openssl speed")?;
-    ensure!(
-        said.status.success(),
-        "{}",
-        String::from_utf8_lossy(&said.stderr)
-    );
+    ensure!(said.status.success(), "{}", String::from_utf8_lossy(&said.stderr));
     let text = String::from_utf8_lossy(&said.stdout);
     let thousands = text
         .split_whitespace()

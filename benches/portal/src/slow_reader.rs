@@ -18,21 +18,12 @@ const PICTURES: &str = "/meter/image_out";
 const PER_SECOND: u32 = 108;
 
 /// Measures the same load with and without a slow reader.
-pub(crate) fn measure(
-    report: &mut BenchReport,
-    daemon: &BenchDaemon,
-    node: &MeterNode,
-    only: &str,
-) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, node: &MeterNode, only: &str) -> Result<()> {
     if !"slow reader".contains(only) {
         return Ok(());
     }
     let time = Duration::from_secs(if is_full_run() { 60 } else { 8 });
-    let hops = RelayHops {
-        inward: Some("/meter/ping"),
-        outward: Some("/meter/pong"),
-        ..RelayHops::default()
-    };
+    let hops = RelayHops { inward: Some("/meter/ping"), outward: Some("/meter/pong"), ..RelayHops::default() };
     let course = PathTarget { daemon, node, hops };
     let credit = node.credit(PICTURES)?;
     eprintln!("slow reader: {} s without, {0} s with", time.as_secs());
@@ -45,9 +36,7 @@ pub(crate) fn measure(
     });
     let without = measure_under_load(&course, &credit, time)?;
     reading.store(false, Ordering::Relaxed);
-    thread
-        .join()
-        .map_err(|_| anyhow!("the reader panicked"))??;
+    thread.join().map_err(|_| anyhow!("the reader panicked"))??;
     let slow = subscribe_to_pictures(daemon)?;
     let process = Process::from_pid(daemon.pid());
     let before = process.resident()?;
@@ -70,9 +59,7 @@ pub(crate) fn measure(
 
 fn subscribe_to_pictures(daemon: &BenchDaemon) -> Result<BenchConnection> {
     let mut line = BenchConnection::connect_robot(daemon)?;
-    line.send_text(&format!(
-        r#"{{"op":"subscribe","topic":"{PICTURES}","type":"sensor_msgs/Image"}}"#
-    ))?;
+    line.send_text(&format!(r#"{{"op":"subscribe","topic":"{PICTURES}","type":"sensor_msgs/Image"}}"#))?;
     Ok(line)
 }
 
@@ -85,11 +72,7 @@ fn drain(mut line: BenchConnection, reading: &AtomicBool) -> Result<()> {
 
 /// Returns p50 and p99 of the round trip of a String in µs, with one String every few milliseconds while images are
 /// published.
-fn measure_under_load(
-    course: &PathTarget<'_>,
-    credit: &PublishCredit,
-    time: Duration,
-) -> Result<[f64; 2]> {
+fn measure_under_load(course: &PathTarget<'_>, credit: &PublishCredit, time: Duration) -> Result<[f64; 2]> {
     let mut open = course.open(ClientPath::Daemon(Encoding::Json))?;
     let (begun, mut paid, mut times) = (Instant::now(), 0, Vec::new());
     while begun.elapsed() < time {

@@ -35,10 +35,7 @@ pub(crate) fn push_with_fixture(daemon: &BenchDaemon, fixture: &Path) -> Result<
     std::fs::create_dir_all(&packages)?;
     for from in [&fixture.join("src"), &sources] {
         // Copies the directory's content without the directory itself.
-        let status = Command::new("cp")
-            .arg("-rT")
-            .args([from, &packages])
-            .status()?;
+        let status = Command::new("cp").arg("-rT").args([from, &packages]).status()?;
         ensure!(status.success(), "{} cannot be copied", from.display());
     }
     daemon.push(&[

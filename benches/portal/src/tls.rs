@@ -33,10 +33,7 @@ pub(crate) fn connect(daemon: &BenchDaemon) -> Result<BenchTlsStream> {
     let own = daemon.home.join("tls/own.pem");
     roots.add(CertificateDer::from_pem_file(own)?)?;
     let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
-    let config = builder
-        .with_safe_default_protocol_versions()?
-        .with_root_certificates(roots)
-        .with_no_client_auth();
+    let config = builder.with_safe_default_protocol_versions()?.with_root_certificates(roots).with_no_client_auth();
     let connection = ClientConnection::new(Arc::new(config), "localhost".try_into()?)?;
     Ok(StreamOwned::new(connection, stream))
 }

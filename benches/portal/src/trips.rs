@@ -20,29 +20,16 @@ pub(crate) fn measure(
     only: &str,
     suite: bool,
 ) -> Result<()> {
-    let string = RelayHops {
-        inward: Some("/meter/ping"),
-        outward: Some("/meter/pong"),
-        ..RelayHops::default()
-    };
-    let call = RelayHops {
-        service: Some("/meter/add"),
-        ..RelayHops::default()
-    };
+    let string = RelayHops { inward: Some("/meter/ping"), outward: Some("/meter/pong"), ..RelayHops::default() };
+    let call = RelayHops { service: Some("/meter/add"), ..RelayHops::default() };
     let daemons = ClientPath::Daemon(Encoding::Json);
-    let mut all = vec![
-        daemons,
-        ClientPath::Bytes,
-        ClientPath::Values,
-        ClientPath::Direct,
-    ];
+    let mut all = vec![daemons, ClientPath::Bytes, ClientPath::Values, ClientPath::Direct];
     all.extend(suite.then_some(ClientPath::Suite));
     // Calls through trees of values would need a service implementation of their own.
     let calling = [daemons, ClientPath::Bytes, ClientPath::Direct];
-    for (what, hops, ways, targets) in [
-        ("String there and back", string, &all[..], [1.3, 2.0]),
-        ("service call", call, &calling[..], [1.5, f64::NAN]),
-    ] {
+    for (what, hops, ways, targets) in
+        [("String there and back", string, &all[..], [1.3, 2.0]), ("service call", call, &calling[..], [1.5, f64::NAN])]
+    {
         if !what.contains(only) {
             continue;
         }
@@ -79,11 +66,7 @@ pub(crate) fn measure_turn(course: &PathTarget<'_>, way: ClientPath) -> Result<[
 }
 
 /// Returns the best p50 and the best p99 of each path's turns.
-fn measure_in_turns(
-    course: &PathTarget<'_>,
-    ways: &[ClientPath],
-    what: &str,
-) -> Result<Vec<[Duration; 2]>> {
+fn measure_in_turns(course: &PathTarget<'_>, ways: &[ClientPath], what: &str) -> Result<Vec<[Duration; 2]>> {
     let rounds = if is_full_run() { 30 } else { 10 };
     let mut best = vec![[Duration::MAX; 2]; ways.len()];
     for round in 1..=rounds {

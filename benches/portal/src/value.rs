@@ -97,17 +97,14 @@ fn decode_one(base: &Base, bytes: &mut &[u8]) -> Result<Value> {
             Primitive::Time => json!({
                 "secs": u32::from_le_bytes(take(bytes)?), "nsecs": u32::from_le_bytes(take(bytes)?),
             }),
-            Primitive::Float64 => Number::from_f64(f64::from_le_bytes(take(bytes)?))
-                .map_or(Value::Null, Value::Number),
+            Primitive::Float64 => Number::from_f64(f64::from_le_bytes(take(bytes)?)).map_or(Value::Null, Value::Number),
             other => bail!("{other:?} is not in the messages measured here"),
         },
     })
 }
 
 fn encode(kind: &MessageType, value: Value, out: &mut Vec<u8>) -> Result<()> {
-    let Value::Object(mut map) = value else {
-        bail!("{} takes an object", kind.name())
-    };
+    let Value::Object(mut map) = value else { bail!("{} takes an object", kind.name()) };
     for field in kind.fields() {
         let value = map.remove(&field.name).unwrap_or_default();
         match (&field.arity, &field.base) {
@@ -134,9 +131,7 @@ fn encode_one(base: &Base, value: Value, out: &mut Vec<u8>) -> Result<()> {
             out.extend_from_slice(text.as_bytes());
         }
         Base::Primitive(Primitive::Uint8) => out.push(number(&value)?.try_into()?),
-        Base::Primitive(Primitive::Uint32) => {
-            out.extend_from_slice(&u32::try_from(number(&value)?)?.to_le_bytes())
-        }
+        Base::Primitive(Primitive::Uint32) => out.extend_from_slice(&u32::try_from(number(&value)?)?.to_le_bytes()),
         Base::Primitive(Primitive::Time) => {
             for part in ["secs", "nsecs"] {
                 out.extend_from_slice(&u32::try_from(number(&value[part])?)?.to_le_bytes());

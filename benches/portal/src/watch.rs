@@ -48,8 +48,6 @@ impl MemoryWatch {
     /// Stops watching and returns the peak since the start.
     pub(crate) fn stop(self) -> Result<PeakMemory> {
         self.over.store(true, Ordering::Relaxed);
-        self.thread
-            .join()
-            .map_err(|_| anyhow!("the memory's watch panicked"))?
+        self.thread.join().map_err(|_| anyhow!("the memory's watch panicked"))?
     }
 }

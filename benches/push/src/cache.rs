@@ -7,16 +7,9 @@ use anyhow::{Context, Result};
 
 /// Fills `place/cache` with the user's cached layers, notes and lists; returns its path for `XDG_CACHE_HOME`.
 pub(crate) fn copy_user_cache(place: &Path) -> Result<PathBuf> {
-    let variable = |name| {
-        std::env::var_os(name)
-            .filter(|value| !value.is_empty())
-            .map(PathBuf::from)
-    };
-    let users =
-        variable("XDG_CACHE_HOME").or_else(|| variable("HOME").map(|home| home.join(".cache")));
-    let users = users
-        .context("neither XDG_CACHE_HOME nor HOME is set")?
-        .join("cloudroid");
+    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let users = variable("XDG_CACHE_HOME").or_else(|| variable("HOME").map(|home| home.join(".cache")));
+    let users = users.context("neither XDG_CACHE_HOME nor HOME is set")?.join("cloudroid");
     let cache = place.join("cache");
     for part in ["layers", "chains", "notes", "apt"] {
         copy_tree(&users.join(part), &cache.join("cloudroid").join(part))?;
@@ -68,8 +61,7 @@ fn copy_tree(from: &Path, to: &Path) -> Result<()> {
             fs::copy(&source, &target).with_context(copying)?;
             let time = source.metadata().and_then(|about| about.modified());
             let file = File::options().write(true).open(&target);
-            file.and_then(|file| file.set_modified(time?))
-                .with_context(copying)?;
+            file.and_then(|file| file.set_modified(time?)).with_context(copying)?;
         }
     }
     Ok(())

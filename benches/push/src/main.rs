@@ -14,8 +14,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use bench_report::{
-    BenchDaemon, BenchReport, Target, TimedPush, create_directory, is_full_run, quantile_seconds,
-    write_install_space,
+    BenchDaemon, BenchReport, Target, TimedPush, create_directory, is_full_run, quantile_seconds, write_install_space,
 };
 use rand::{RngCore, SeedableRng, rngs::StdRng};
 
@@ -39,10 +38,7 @@ fn main() -> Result<()> {
     let relay = find_relay(&daemon)?;
     let mut report = BenchReport::new("push");
     workspace::measure(&mut report, &daemon)?;
-    for (package, size, data) in [
-        ("small_space", "one node", 0),
-        ("big_space", "one node and 64 MiB of data", MODEL),
-    ] {
+    for (package, size, data) in [("small_space", "one node", 0), ("big_space", "one node and 64 MiB of data", MODEL)] {
         let space = write_install_space(daemon.directory(), package, Some(&relay))?;
         if data > 0 {
             let mut model = vec![0; data];
@@ -64,43 +60,31 @@ fn push_launch_file(daemon: &BenchDaemon, space: &Path) -> Result<TimedPush> {
 /// Returns the node's executable from the image.
 fn find_relay(daemon: &BenchDaemon) -> Result<PathBuf> {
     let layers = fs::read_dir(daemon.home.join("layers"))?;
-    let mut found =
-        layers.filter_map(|layer| Some(layer.ok()?.path().join("usr/lib/topic_tools/relay")));
-    found
-        .find(|path| path.exists())
-        .context("topic_tools/relay in a layer")
+    let mut found = layers.filter_map(|layer| Some(layer.ok()?.path().join("usr/lib/topic_tools/relay")));
+    found.find(|path| path.exists()).context("topic_tools/relay in a layer")
 }
 
 fn measure(report: &mut BenchReport, daemon: &BenchDaemon, space: &Path, size: &str) -> Result<()> {
     eprintln!("pushing {size}");
     let first = push_launch_file(daemon, space)?;
     let made = first.built_layers()?;
-    ensure!(
-        made == ["package"],
-        "only the package is new at the first push, and not {made:?}"
-    );
+    ensure!(made == ["package"], "only the package is new at the first push, and not {made:?}");
     let rounds = if is_full_run() { 15 } else { 5 };
     let (mut rebuilt, mut rests, mut probes, mut totals) = (0, vec![], vec![], vec![]);
     for round in 1..=rounds {
         eprintln!("again, {round} of {rounds}");
         let again = push_launch_file(daemon, space)?;
-        let probe = again
-            .step_duration(PROBE)
-            .context("a push tells of its probe")?;
+        let probe = again.step_duration(PROBE).context("a push tells of its probe")?;
         rebuilt += again.built_layers()?.len();
         rests.push(again.total - probe);
         probes.push(probe);
         totals.push(again.total);
     }
     let median = |times: &[Duration]| quantile_seconds(times, 0.5);
-    let first_probe = first
-        .step_duration(PROBE)
-        .context("a push tells of its probe")?;
+    let first_probe = first.step_duration(PROBE).context("a push tells of its probe")?;
     let probe = median(&probes);
     let title = format!("{size}, again: layers made");
-    report
-        .figure(title, "layers", rebuilt as f64)
-        .require(Target::AtMost(0.0));
+    report.figure(title, "layers", rebuilt as f64).require(Target::AtMost(0.0));
     let title = format!("{size}, again: without the probe");
     report
         .figure(title, "s", median(&rests))
@@ -108,8 +92,6 @@ fn measure(report: &mut BenchReport, daemon: &BenchDaemon, space: &Path, size: &
         .require(Target::AtMost(BOUND))
         .note(format!("median of {rounds}; the probe {probe:.2} s"));
     let title = format!("{size}, again: with the probe");
-    report
-        .figure(title, "s", median(&totals))
-        .relative_to("first push", first.total.as_secs_f64());
+    report.figure(title, "s", median(&totals)).relative_to("first push", first.total.as_secs_f64());
     Ok(())
 }

@@ -35,9 +35,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         eprintln!("pushing {package} with the base and all downloads in the cache");
         let pushed = push_package(&daemon, package)?;
         steps::report_steps(report, package, &pushed);
-        let probe = pushed
-            .step_duration(PROBE)
-            .context("a push tells of its probe")?;
+        let probe = pushed.step_duration(PROBE).context("a push tells of its probe")?;
         costs.push((
             (pushed.total - probe - pushed.time_to_first_step()).as_secs_f64(),
             pushed.total.as_secs_f64(),
@@ -54,9 +52,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         .require(Target::RatioAtMost(BOUND))
         .note(format!("layers made: {} and {}", second.2, first.2));
     let title = "stereo_image_proc after image_proc: with the probe";
-    report
-        .figure(title, "s", second.1)
-        .relative_to("image_proc", first.1);
+    report.figure(title, "s", second.1).relative_to("image_proc", first.1);
     Ok(())
 }
 
@@ -66,9 +62,7 @@ fn push_package(daemon: &BenchDaemon, package: &str) -> Result<TimedPush> {
 
 /// Returns the digest of the base layer.
 fn base_digest(pushed: &TimedPush) -> Result<String> {
-    let layers = pushed.done_event()?["layers"]
-        .as_array()
-        .context("done names the layers")?;
+    let layers = pushed.done_event()?["layers"].as_array().context("done names the layers")?;
     let base = layers.iter().find(|layer| layer["name"] == "base");
     let digest = base.and_then(|layer| layer["digest"].as_str());
     Ok(digest.context("an image has a base")?.to_owned())
@@ -76,8 +70,6 @@ fn base_digest(pushed: &TimedPush) -> Result<String> {
 
 /// Returns whether a record of the cache belongs to the layer with this digest.
 pub(crate) fn is_record_of_layer(record: &Path, digest: &str) -> bool {
-    let record: Option<Value> = fs::read(record)
-        .ok()
-        .and_then(|text| serde_json::from_slice(&text).ok());
+    let record: Option<Value> = fs::read(record).ok().and_then(|text| serde_json::from_slice(&text).ok());
     record.is_some_and(|record| record["layer"]["digest"] == digest)
 }

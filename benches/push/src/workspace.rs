@@ -21,10 +21,7 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<
     let app = workspace.join("src/bench_app/src/app.cpp");
     let good = fs::read_to_string(&app)?;
     fs::write(&app, good.replace("ros::spin()", "ros::no_such_function()"))?;
-    ensure!(
-        push_workspace(daemon, &workspace).is_err(),
-        "a push that cannot be compiled fails"
-    );
+    ensure!(push_workspace(daemon, &workspace).is_err(), "a push that cannot be compiled fails");
     fs::write(&app, &good)?;
     eprintln!("pushing it fixed");
     let fixed = push_workspace(daemon, &workspace)?;
@@ -37,15 +34,10 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<
     let all = push_workspace(daemon, &workspace)?;
     steps::report_steps(report, "workspace of three", &all);
     let cost = |pushed: &TimedPush| -> Result<f64> {
-        let probe = pushed
-            .step_duration(PROBE)
-            .context("a push tells of its probe")?;
+        let probe = pushed.step_duration(PROBE).context("a push tells of its probe")?;
         Ok((pushed.total - probe).as_secs_f64())
     };
-    for (name, pushed) in [
-        ("the last one fixed after it failed", &fixed),
-        ("nothing changed", &unchanged),
-    ] {
+    for (name, pushed) in [("the last one fixed after it failed", &fixed), ("nothing changed", &unchanged)] {
         let title = format!("workspace of three, {name}: without the probe");
         report
             .figure(title, "s", cost(pushed)?)
@@ -58,10 +50,7 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon) -> Result<
     fs::write(&list, text.replace("roscpp", "roscpp no_such_package"))?;
     fs::write(workspace.join("src/bench_lib/NOTE"), "changed again")?;
     let begun = std::time::Instant::now();
-    ensure!(
-        push_workspace(daemon, &workspace).is_err(),
-        "a push that cannot be configured fails"
-    );
+    ensure!(push_workspace(daemon, &workspace).is_err(), "a push that cannot be configured fails");
     let title = "workspace of three: until a mistake in the last CMakeLists.txt is told";
     report
         .figure(title, "s", begun.elapsed().as_secs_f64())
@@ -90,10 +79,7 @@ fn write_workspace(workspace: &Path) -> Result<()> {
         )
     };
     write("bench_msgs/package.xml", &manifest("bench_msgs", ""))?;
-    write(
-        "bench_msgs/msg/Part.msg",
-        "std_msgs/Header header\nstring text\n",
-    )?;
+    write("bench_msgs/msg/Part.msg", "std_msgs/Header header\nstring text\n")?;
     write(
         "bench_msgs/CMakeLists.txt",
         "cmake_minimum_required(VERSION 3.0.2)\nproject(bench_msgs)\n\

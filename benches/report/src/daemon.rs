@@ -35,10 +35,7 @@ impl BenchDaemon {
         for (key, value) in environment {
             setup = setup.environment(key, value.to_str().context("UTF-8")?);
         }
-        Ok(Self {
-            daemon: setup.start()?,
-            place,
-        })
+        Ok(Self { daemon: setup.start()?, place })
     }
 
     /// Returns a directory for other files, which is removed together with the daemon.
@@ -58,9 +55,7 @@ impl BenchDaemon {
     pub fn wait_for_servants(&self, count: usize) -> Result<()> {
         support::wait_until(&format!("a daemon with {count} servants"), || {
             let found = self.servants()?.len();
-            Ok((found == count)
-                .then_some(())
-                .ok_or_else(|| format!("{found}:\n{}", self.log_tail())))
+            Ok((found == count).then_some(()).ok_or_else(|| format!("{found}:\n{}", self.log_tail())))
         })
     }
 
@@ -74,9 +69,7 @@ impl BenchDaemon {
 
 /// Creates a temporary directory. Containers reach their root file systems through it, so everybody may enter it.
 pub fn create_directory() -> Result<TempDir> {
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-bench-")
-        .tempdir()?;
+    let place = tempfile::Builder::new().prefix("cloudroid-bench-").tempdir()?;
     fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755))?;
     Ok(place)
 }

@@ -214,10 +214,7 @@ impl BenchReport {
 /// Returns the repository: the nearest ancestor directory with a `Cargo.lock`, or else the current directory.
 pub fn root() -> PathBuf {
     let here = std::env::current_dir().unwrap_or_default();
-    here.ancestors()
-        .find(|path| path.join("Cargo.lock").exists())
-        .unwrap_or(&here)
-        .to_owned()
+    here.ancestors().find(|path| path.join("Cargo.lock").exists()).unwrap_or(&here).to_owned()
 }
 
 #[cfg(test)]
@@ -227,23 +224,11 @@ mod tests {
     #[test]
     fn a_figure_knows_whether_it_was_met() {
         let mut report = BenchReport::new("test");
-        report
-            .figure("speed", "MB/s", 30.0)
-            .relative_to("peer", 100.0)
-            .require(Target::RatioAtLeast(0.3));
-        report
-            .figure("size", "B", 120.0)
-            .relative_to("peer", 100.0)
-            .require(Target::RatioAtMost(1.2));
-        report
-            .figure("saved", "%", 50.0)
-            .require(Target::AtMost(40.0));
+        report.figure("speed", "MB/s", 30.0).relative_to("peer", 100.0).require(Target::RatioAtLeast(0.3));
+        report.figure("size", "B", 120.0).relative_to("peer", 100.0).require(Target::RatioAtMost(1.2));
+        report.figure("saved", "%", 50.0).require(Target::AtMost(40.0));
         assert_eq!(
-            report
-                .figures
-                .iter()
-                .map(|figure| figure.met)
-                .collect::<Vec<_>>(),
+            report.figures.iter().map(|figure| figure.met).collect::<Vec<_>>(),
             [Some(true), Some(true), Some(false)]
         );
         assert_eq!(report.figures[0].ratio, Some(0.3));
@@ -252,25 +237,16 @@ mod tests {
     #[test]
     fn a_target_without_its_floor_is_not_met() {
         let mut report = BenchReport::new("test");
-        report
-            .figure("speed", "MB/s", 30.0)
-            .require(Target::RatioAtLeast(0.3));
+        report.figure("speed", "MB/s", 30.0).require(Target::RatioAtLeast(0.3));
         assert_eq!(report.figures[0].met, Some(false));
     }
 
     #[test]
     fn the_table_shows_every_figure() {
         let mut report = BenchReport::new("test");
-        report
-            .figure("speed", "MB/s", 30.0)
-            .relative_to("peer", 100.0)
-            .require(Target::AboveFloor)
-            .note("cold");
+        report.figure("speed", "MB/s", 30.0).relative_to("peer", 100.0).require(Target::AboveFloor).note("cold");
         let table = table::render(&report);
-        assert!(
-            table.contains("speed") && table.contains("NOT MET") && table.contains("cold"),
-            "{table}"
-        );
+        assert!(table.contains("speed") && table.contains("NOT MET") && table.contains("cold"), "{table}");
     }
 
     #[test]
@@ -279,9 +255,6 @@ mod tests {
         report.skip("a peer", "it is not installed");
         assert!(table::render(&report).contains("a peer is left out: it is not installed"));
         let text = serde_json::to_string(&report).expect("JSON");
-        assert!(
-            text.contains(r#""left_out":[{"what":"a peer","why":"it is not installed"}]"#),
-            "{text}"
-        );
+        assert!(text.contains(r#""left_out":[{"what":"a peer","why":"it is not installed"}]"#), "{text}");
     }
 }

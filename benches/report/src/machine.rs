@@ -26,14 +26,8 @@ impl MachineDescription {
         let read = |path: &str| fs::read_to_string(path).unwrap_or_default();
         let field = |text: &str, key: &str, separator: char| -> String {
             let line = text.lines().find(|line| line.starts_with(key));
-            let value = line
-                .and_then(|line| line.split_once(separator))
-                .map(|(_, value)| value);
-            value
-                .unwrap_or_default()
-                .trim()
-                .trim_matches('"')
-                .to_owned()
+            let value = line.and_then(|line| line.split_once(separator)).map(|(_, value)| value);
+            value.unwrap_or_default().trim().trim_matches('"').to_owned()
         };
         let memory = field(&read("/proc/meminfo"), "MemTotal", ':');
         let kilobytes: f64 = memory.trim_end_matches("kB").trim().parse().unwrap_or(0.0);
@@ -43,11 +37,7 @@ impl MachineDescription {
             memory_gib: (kilobytes / 1024.0 / 102.4).round() / 10.0,
             kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
             system: field(&read("/etc/os-release"), "PRETTY_NAME", '='),
-            load: read("/proc/loadavg")
-                .split(' ')
-                .next()
-                .and_then(|load| load.parse().ok())
-                .unwrap_or(0.0),
+            load: read("/proc/loadavg").split(' ').next().and_then(|load| load.parse().ok()).unwrap_or(0.0),
         }
     }
 }

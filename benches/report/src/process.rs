@@ -95,9 +95,7 @@ impl Process {
 pub fn first_child(pid: i32) -> Result<i32> {
     let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children"))?;
     let child = children.split_whitespace().next();
-    Ok(child
-        .with_context(|| format!("{pid} has no child"))?
-        .parse()?)
+    Ok(child.with_context(|| format!("{pid} has no child"))?.parse()?)
 }
 
 /// Returns the processor time of the child processes that have ended and been waited for.

@@ -24,35 +24,21 @@ impl BenchDaemon {
     pub fn push(&self, arguments: &[&str]) -> Result<TimedPush> {
         let mut command = Command::new(binaries::path("cloudroidctl"));
         command.args(["--format", "json", "push"]).args(arguments);
-        command
-            .env("CLOUDROID_HOME", &self.home)
-            .env_remove("CLOUDROID_SERVER");
+        command.env("CLOUDROID_HOME", &self.home).env_remove("CLOUDROID_SERVER");
         let begun = Instant::now();
-        let mut child = command
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()?;
+        let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
         let mut events = Vec::new();
         for line in BufReader::new(child.stdout.take().context("piped")?).lines() {
             let event: Value = serde_json::from_str(&line?)?;
             if event["type"] == "error" {
                 let _ = child.wait();
-                bail!(
-                    "the push of {} failed: {}",
-                    arguments.join(" "),
-                    event["problem"]
-                );
+                bail!("the push of {} failed: {}", arguments.join(" "), event["problem"]);
             }
             events.push((begun.elapsed(), event));
         }
         let status = child.wait()?;
         let total = begun.elapsed();
-        ensure!(
-            status.success(),
-            "the push of {} ended with {status}",
-            arguments.join(" ")
-        );
+        ensure!(status.success(), "the push of {} ended with {status}", arguments.join(" "));
         Ok(TimedPush { events, total })
     }
 }
@@ -60,32 +46,21 @@ impl BenchDaemon {
 impl TimedPush {
     /// Returns the final event.
     pub fn done_event(&self) -> Result<&Value> {
-        let done = self
-            .events
-            .iter()
-            .map(|(_, event)| event)
-            .find(|event| event["type"] == "done");
+        let done = self.events.iter().map(|(_, event)| event).find(|event| event["type"] == "done");
         done.context("a push that succeeded ends with done")
     }
 
     /// Returns the names of the layers that were built rather than taken from the cache.
     pub fn built_layers(&self) -> Result<Vec<String>> {
-        let layers = self.done_event()?["layers"]
-            .as_array()
-            .context("done names the layers")?;
+        let layers = self.done_event()?["layers"].as_array().context("done names the layers")?;
         ensure!(!layers.is_empty(), "an image has layers");
         let made = layers.iter().filter(|layer| layer["cached"] != true);
-        Ok(made
-            .map(|layer| layer["name"].as_str().unwrap_or_default().to_owned())
-            .collect())
+        Ok(made.map(|layer| layer["name"].as_str().unwrap_or_default().to_owned()).collect())
     }
 
     /// Returns the time until the first step began: the daemon opens the archive's index and the base, once.
     pub fn time_to_first_step(&self) -> Duration {
-        let first = self
-            .events
-            .iter()
-            .find(|(_, event)| event["type"] == "step");
+        let first = self.events.iter().find(|(_, event)| event["type"] == "step");
         first.map_or(Duration::ZERO, |(time, _)| *time)
     }
 
@@ -93,16 +68,9 @@ impl TimedPush {
     /// the end.
     pub fn step_duration(&self, title: &str) -> Option<Duration> {
         let ends = |event: &Value| event["type"] == "step" || event["type"] == "done";
-        let marks: Vec<_> = self
-            .events
-            .iter()
-            .filter(|(_, event)| ends(event))
-            .collect();
-        let spans = marks.windows(2).filter(|pair| {
-            pair[0].1["title"]
-                .as_str()
-                .is_some_and(|found| found.starts_with(title))
-        });
+        let marks: Vec<_> = self.events.iter().filter(|(_, event)| ends(event)).collect();
+        let spans =
+            marks.windows(2).filter(|pair| pair[0].1["title"].as_str().is_some_and(|found| found.starts_with(title)));
         let spans: Vec<Duration> = spans.map(|pair| pair[1].0 - pair[0].0).collect();
         (!spans.is_empty()).then(|| spans.iter().sum())
     }

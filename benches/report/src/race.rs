@@ -56,10 +56,7 @@ pub struct Race<'a> {
 impl<'a> Race<'a> {
     /// Creates a race of `rounds` counted rounds, preceded by one warm-up round.
     pub fn new(rounds: usize) -> Self {
-        Self {
-            rounds,
-            runners: Vec::new(),
-        }
+        Self { rounds, runners: Vec::new() }
     }
 
     /// Adds a runner. Results of the computation should go through [`std::hint::black_box`].
@@ -70,14 +67,8 @@ impl<'a> Race<'a> {
 
     /// Runs all runners; returns their times in the order in which they were added.
     pub fn run(mut self) -> Vec<Times> {
-        let mut times: Vec<Times> = self
-            .runners
-            .iter()
-            .map(|(name, _)| Times {
-                name: name.clone(),
-                sorted: Vec::new(),
-            })
-            .collect();
+        let mut times: Vec<Times> =
+            self.runners.iter().map(|(name, _)| Times { name: name.clone(), sorted: Vec::new() }).collect();
         for round in 0..=self.rounds {
             for ((_, runner), times) in self.runners.iter_mut().zip(&mut times) {
                 let start = thread_processor_time();
@@ -88,9 +79,7 @@ impl<'a> Race<'a> {
                 }
             }
         }
-        times
-            .iter_mut()
-            .for_each(|times| times.sorted.sort_unstable());
+        times.iter_mut().for_each(|times| times.sorted.sort_unstable());
         times
     }
 }
@@ -103,17 +92,10 @@ mod tests {
     fn runners_take_turns() {
         let order = std::cell::RefCell::new(String::new());
         let mut race = Race::new(2);
-        race.add("a", || order.borrow_mut().push('a'))
-            .add("b", || order.borrow_mut().push('b'));
+        race.add("a", || order.borrow_mut().push('a')).add("b", || order.borrow_mut().push('b'));
         let times = race.run();
         assert_eq!(order.into_inner(), "ababab");
-        assert_eq!(
-            times
-                .iter()
-                .map(|times| times.sorted.len())
-                .collect::<Vec<_>>(),
-            [2, 2]
-        );
+        assert_eq!(times.iter().map(|times| times.sorted.len()).collect::<Vec<_>>(), [2, 2]);
         assert!(times[0].best() <= times[0].longest());
     }
 }

@@ -8,11 +8,7 @@ use anyhow::{Context, Result};
 
 /// Writes the install space of `package` in `place`. The node is `executable`, which is copied into the space, or that
 /// of `topic_tools`.
-pub fn write_install_space(
-    place: &Path,
-    package: &str,
-    executable: Option<&Path>,
-) -> Result<PathBuf> {
+pub fn write_install_space(place: &Path, package: &str, executable: Option<&Path>) -> Result<PathBuf> {
     let space = place.join(package);
     let share = space.join("share").join(package);
     fs::create_dir_all(share.join("launch"))?;
@@ -22,14 +18,8 @@ pub fn write_install_space(
          <license>Apache-2.0</license><buildtool_depend>catkin</buildtool_depend>\
          <exec_depend>topic_tools</exec_depend></package>\n"
     );
-    let holder = if executable.is_some() {
-        package
-    } else {
-        "topic_tools"
-    };
-    let launch = format!(
-        "<launch><node name=\"relay\" pkg=\"{holder}\" type=\"relay\" args=\"/in /out\"/></launch>\n"
-    );
+    let holder = if executable.is_some() { package } else { "topic_tools" };
+    let launch = format!("<launch><node name=\"relay\" pkg=\"{holder}\" type=\"relay\" args=\"/in /out\"/></launch>\n");
     for (path, text) in [
         (space.join(".catkin"), ""),
         (space.join("setup.sh"), "# It runs wherever it is put.\n"),
@@ -41,8 +31,7 @@ pub fn write_install_space(
     if let Some(executable) = executable {
         let directory = space.join("lib").join(package);
         fs::create_dir_all(&directory)?;
-        fs::copy(executable, directory.join("relay"))
-            .with_context(|| format!("copying {}", executable.display()))?;
+        fs::copy(executable, directory.join("relay")).with_context(|| format!("copying {}", executable.display()))?;
     }
     Ok(space)
 }

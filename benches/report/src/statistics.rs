@@ -34,11 +34,7 @@ pub fn quantile_of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
     let lower = *sorted.get(place.floor() as usize)?;
     let upper = *sorted.get(place.ceil() as usize)?;
     // The difference of two infinite values would be NaN.
-    Some(if lower == upper || place.fract() == 0.0 {
-        lower
-    } else {
-        lower + (upper - lower) * place.fract()
-    })
+    Some(if lower == upper || place.fract() == 0.0 { lower } else { lower + (upper - lower) * place.fract() })
 }
 
 #[cfg(test)]

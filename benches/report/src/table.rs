@@ -14,11 +14,7 @@ pub fn format_number(value: f64) -> String {
 
 /// Formats the value of a figure; percentages get two decimals, because those near a hundred differ only there.
 fn format_value(figure: &Figure) -> String {
-    if figure.unit == "%" {
-        format!("{:.2}", figure.value)
-    } else {
-        format_number(figure.value)
-    }
+    if figure.unit == "%" { format!("{:.2}", figure.value) } else { format_number(figure.value) }
 }
 
 fn verdict(figure: &Figure) -> &'static str {
@@ -53,10 +49,7 @@ pub(crate) fn render(report: &BenchReport) -> String {
                 figure.figure.clone(),
                 format!("{} {}", format_value(figure), figure.unit),
                 floor,
-                figure
-                    .ratio
-                    .map(|ratio| format!("{ratio:.2}x"))
-                    .unwrap_or_default(),
+                figure.ratio.map(|ratio| format!("{ratio:.2}x")).unwrap_or_default(),
                 figure.to_reach.clone().unwrap_or_default(),
                 verdict(figure).to_owned(),
                 figure.note.clone().unwrap_or_default(),
@@ -64,13 +57,7 @@ pub(crate) fn render(report: &BenchReport) -> String {
         })
         .collect();
     let titles = ["figure", "value", "beside", "ratio", "to reach", "", ""].map(str::to_owned);
-    let width = |column: usize| {
-        rows.iter()
-            .chain([&titles])
-            .map(|row| row[column].chars().count())
-            .max()
-            .unwrap_or(0)
-    };
+    let width = |column: usize| rows.iter().chain([&titles]).map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: [usize; 7] = std::array::from_fn(width);
     for row in [&titles].into_iter().chain(&rows) {
         let mut line = String::new();

@@ -21,10 +21,7 @@ impl AwakeCores {
         let cores = std::thread::available_parallelism()?.get();
         let one = |core: usize| {
             let mut command = Command::new("chrt");
-            command
-                .args(["--idle", "0"])
-                .arg(std::env::current_exe()?)
-                .args(["inside", "awake"]);
+            command.args(["--idle", "0"]).arg(std::env::current_exe()?).args(["inside", "awake"]);
             BenchProgram::start_quietly(command, &format!("what keeps core {core} awake"))
         };
         let loops = (0..cores).map(one).collect::<Result<_>>()?;

@@ -9,9 +9,8 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, Publisher,
-    QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
-    wait_for_connected,
+    ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, Publisher, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType, wait_for_connected,
 };
 use ros::net::HostSockets;
 use ros::schema::ActionDef;
@@ -74,9 +73,7 @@ struct GoalQueue(UnboundedSender<String>);
 
 impl ActionHandler for GoalQueue {
     fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), FailureReason> {
-        self.0
-            .send(id.to_owned())
-            .map_err(|_| FailureReason::new("nobody carries it out"))
+        self.0.send(id.to_owned()).map_err(|_| FailureReason::new("nobody carries it out"))
     }
 
     fn on_cancel(&self, _id: &str) {}
@@ -89,13 +86,9 @@ impl ActionHandler for GoalQueue {
 /// Runs the role `relay`: returns every ping, answers calls, and ends each goal after one feedback.
 async fn run_relay() -> Result<()> {
     let (types, bus) = (BenchTypes::new()?, join_bus("/relay").await?);
-    let mut pings = bus
-        .subscribe("/ping", types.string.clone(), QUALITY)
-        .await?;
+    let mut pings = bus.subscribe("/ping", types.string.clone(), QUALITY).await?;
     let pong = bus.advertise("/pong", types.string, QUALITY).await?;
-    let _served = bus
-        .serve("/setbool", types.call, Arc::new(EchoService))
-        .await?;
+    let _served = bus.serve("/setbool", types.call, Arc::new(EchoService)).await?;
     let (sender, mut ids) = unbounded_channel();
     let server = bus.serve_action("/fibonacci", &types.goal, Arc::new(GoalQueue(sender)))?;
     print_json(&json!({}));
@@ -130,9 +123,7 @@ async fn connect_topics(bus: &dyn Bus, of: WireType) -> Result<(Box<dyn Publishe
         wait_for_connected(pings.matched_subscribers(), 1).await;
         wait_for_connected(pongs.matched.clone(), 1).await;
     };
-    tokio::time::timeout(LONG, both)
-        .await
-        .context("nobody is at the other end")?;
+    tokio::time::timeout(LONG, both).await.context("nobody is at the other end")?;
     Ok((pings, pongs))
 }
 
@@ -162,18 +153,14 @@ async fn time_calls(count: usize) -> Result<()> {
     let bus = join_bus("/asks").await?;
     let mut graph = bus.graph();
     let known = graph.wait_for(|graph| graph.services.contains_key("/setbool"));
-    tokio::time::timeout(LONG, known)
-        .await
-        .context("no server")??;
+    tokio::time::timeout(LONG, known).await.context("no server")??;
     // The first call waits until the server has discovered our endpoints.
-    bus.call("/setbool", message::set_bool_request(true), LONG)
-        .await?;
+    bus.call("/setbool", message::set_bool_request(true), LONG).await?;
     print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
-        bus.call("/setbool", message::set_bool_request(true), PATIENCE)
-            .await?;
+        bus.call("/setbool", message::set_bool_request(true), PATIENCE).await?;
         if number >= WARM {
             times.push(begun.elapsed());
         }
@@ -210,11 +197,7 @@ async fn time_goals(count: usize) -> Result<()> {
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
-        client.send_goal(
-            &number.to_string(),
-            message::fibonacci_goal(),
-            events.clone(),
-        );
+        client.send_goal(&number.to_string(), message::fibonacci_goal(), events.clone());
         let end = next_event(&mut ended).await??;
         ensure!(end.outcome == GoalOutcome::Succeeded, "{end:?}");
         if number >= WARM {
@@ -230,7 +213,5 @@ async fn time_goals(count: usize) -> Result<()> {
 }
 
 async fn next_event<T>(events: &mut UnboundedReceiver<T>) -> Result<T> {
-    tokio::time::timeout(PATIENCE, events.recv())
-        .await?
-        .context("the bus is closed")
+    tokio::time::timeout(PATIENCE, events.recv()).await?.context("the bus is closed")
 }

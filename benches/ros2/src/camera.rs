@@ -23,10 +23,7 @@ pub(crate) async fn send_pictures(words: &[&str]) -> Result<()> {
     let [width, height, frames, reliable] = words else {
         anyhow::bail!("it takes width, height, frames, reliable");
     };
-    let size = Size {
-        width: width.parse()?,
-        height: height.parse()?,
-    };
+    let size = Size { width: width.parse()?, height: height.parse()? };
     let frames: u32 = frames.parse()?;
     let participant = join().await?;
     let writer = create_writer(&participant, PICTURES, qos_profile(*reliable == "1"));
@@ -111,12 +108,7 @@ impl FrameStatistics {
 /// Width, height, number of frames and reliability as arguments of the role of either side.
 pub(crate) fn role_arguments(size: Size, frames: u32, reliable: bool) -> [String; 4] {
     let reliable = u8::from(reliable).to_string();
-    [
-        size.width.to_string(),
-        size.height.to_string(),
-        frames.to_string(),
-        reliable,
-    ]
+    [size.width.to_string(), size.height.to_string(), frames.to_string(), reliable]
 }
 
 /// Maximum duration of a transfer of `frames` frames, including retransmissions.
@@ -132,14 +124,7 @@ mod tests {
     fn what_comes_after_a_later_one_is_out_of_order() {
         let mut seen = FrameStatistics::default();
         for number in [0, 1, 3, 2, 4] {
-            seen.record(&message::picture(
-                number,
-                Size {
-                    width: 2,
-                    height: 2,
-                },
-            ))
-            .expect("a picture");
+            seen.record(&message::picture(number, Size { width: 2, height: 2 })).expect("a picture");
         }
         assert_eq!((seen.came, seen.reordered), (5, 1));
         assert!(seen.record(b"no picture").is_none());

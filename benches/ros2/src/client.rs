@@ -64,9 +64,7 @@ impl BenchClient {
             }
         };
         stream.set_nodelay(true)?;
-        let config = WebSocketConfig::default()
-            .max_message_size(Some(LARGEST))
-            .max_frame_size(Some(LARGEST));
+        let config = WebSocketConfig::default().max_message_size(Some(LARGEST)).max_frame_size(Some(LARGEST));
         let url = format!("ws://{ADDRESS}/");
         match tungstenite::client::client_with_config(url, stream, Some(config)) {
             Ok((socket, _)) => Ok(Self(socket)),
@@ -90,9 +88,7 @@ impl BenchClient {
                 Ok(message @ (Message::Text(_) | Message::Binary(_))) => return Ok(Some(message)),
                 Ok(Message::Close(why)) => bail!("the server closed the connection: {why:?}"),
                 Ok(_) => {}
-                Err(Error::Io(error))
-                    if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) =>
-                {
+                Err(Error::Io(error)) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
                     return Ok(None);
                 }
                 Err(error) => return Err(error).context("the connection is gone"),
@@ -183,11 +179,7 @@ fn time_trips(count: usize) -> Result<()> {
     client.send_op(&json!({"op": "subscribe", "topic": "/pong", "type": types::STRING}))?;
     client.send_op(&json!({"op": "advertise", "topic": "/ping", "type": types::STRING}))?;
     let publish = |text: &str| json!({"op": "publish", "topic": "/ping", "msg": {"data": text}});
-    client.repeat_until(
-        |_| publish("first"),
-        AGAIN,
-        |heard| heard["msg"]["data"] == "first",
-    )?;
+    client.repeat_until(|_| publish("first"), AGAIN, |heard| heard["msg"]["data"] == "first")?;
     print_json(&json!({}));
     let op = |number| {
         let text = format!("{TEXT}, {number}");
@@ -251,20 +243,15 @@ fn time_join() -> Result<()> {
 /// reported, because a robot is not part of the server.
 fn send_pictures(size: Size, frames: u32, reliable: &str) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    client.send_op(&json!({"op": "advertise", "topic": "/pictures", "type": types::IMAGE, "qos": qos_json(reliable)}))?;
+    client
+        .send_op(&json!({"op": "advertise", "topic": "/pictures", "type": types::IMAGE, "qos": qos_json(reliable)}))?;
     print_json(&json!({}));
     let asks = json!({"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": "/pictures"}});
-    client.repeat_until(
-        |_| asks.clone(),
-        AGAIN,
-        |heard| heard["values"]["subscribers"][0].is_string(),
-    )?;
+    client.repeat_until(|_| asks.clone(), AGAIN, |heard| heard["values"]["subscribers"][0].is_string())?;
     std::thread::sleep(camera::SETTLED);
     let (mut due, mut late) = (Instant::now(), 0);
     for number in 0..frames {
-        client.send(Message::binary(encode_picture(&message::picture(
-            number, size,
-        ))))?;
+        client.send(Message::binary(encode_picture(&message::picture(number, size))))?;
         due += Duration::from_secs_f64(1.0 / RATE);
         let now = Instant::now();
         late += u32::from(now > due);
@@ -292,10 +279,8 @@ fn encode_picture(picture: &[u8]) -> Vec<u8> {
 /// Receives images; prints what was received when asked.
 fn receive_pictures(reliable: &str) -> Result<()> {
     let mut client = BenchClient::connect()?;
-    client.send_op(
-        &json!({"op": "subscribe", "topic": "/pictures", "type": types::IMAGE,
-        "compression": "cbor-raw", "qos": qos_json(reliable)}),
-    )?;
+    client.send_op(&json!({"op": "subscribe", "topic": "/pictures", "type": types::IMAGE,
+        "compression": "cbor-raw", "qos": qos_json(reliable)}))?;
     // Once the server answers this call, it has processed the subscription.
     let asks = json!({"op": "call_service", "service": "/rosapi/get_time"});
     client.repeat_until(|_| asks.clone(), AGAIN, |heard| heard["result"] == true)?;

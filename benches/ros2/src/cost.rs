@@ -25,10 +25,7 @@ fn core_share(program: &BenchProgram, time: Duration) -> Result<f64> {
     let process = Process::from_pid(program.pid());
     let (before, begun) = (process.live_thread_time("")?, Instant::now());
     std::thread::sleep(time);
-    let spent = process
-        .live_thread_time("")?
-        .checked_sub(before)
-        .context("a thread has ended")?;
+    let spent = process.live_thread_time("")?.checked_sub(before).context("a thread has ended")?;
     Ok(spent.as_secs_f64() / begun.elapsed().as_secs_f64() * 100.0)
 }
 
@@ -55,28 +52,18 @@ fn measure_one(report: &mut BenchReport) -> Result<()> {
         .figure(title, "MB", json_number(&found, "memory")?)
         .relative_to("that node", resident)
         .require(Target::AtMost(MEMORY))
-        .note(format!(
-            "resident, beyond its process without it; {:.1} with it",
-            json_number(&found, "process")?
-        ));
+        .note(format!("resident, beyond its process without it; {:.1} with it", json_number(&found, "process")?));
     let title = "descriptors of that participant";
     report
         .figure(title, "", json_number(&found, "descriptors")?)
-        .relative_to(
-            "that node",
-            Process::from_pid(node.pid()).descriptors()? as f64,
-        )
+        .relative_to("that node", Process::from_pid(node.pid()).descriptors()? as f64)
         .note(format!("and {} threads", json_number(&found, "threads")?));
     Ok(())
 }
 
 /// Kinds of crowds: the role, its name in figures, and a note.
 const CROWDS: [(&str, &str, &str); 2] = [
-    (
-        "participants",
-        "participants",
-        "each in a namespace with a node of our making",
-    ),
+    ("participants", "participants", "each in a namespace with a node of our making"),
     (
         "servants",
         "servants, each with bus, bridge and a robot's session",
@@ -90,8 +77,7 @@ fn measure_many(report: &mut BenchReport) -> Result<()> {
     for (role, what, note) in CROWDS {
         eprintln!("{count} {role} at rest, for {seconds} s");
         let world = BenchNetwork::new()?;
-        let mut crowd =
-            world.start_role(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
+        let mut crowd = world.start_role(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
         let found = crowd.answer_within(Duration::from_secs(seconds + 60))?;
         let title = format!("each of {count} {what}, at rest");
         report
@@ -99,14 +85,11 @@ fn measure_many(report: &mut BenchReport) -> Result<()> {
             .require(Target::AtMost(IDLE))
             .note(format!("over {seconds} s, {note}"));
         let title = format!("memory of each of {count} {what}");
-        report
-            .figure(title, "MB", json_number(&found, "memory")?)
-            .require(Target::AtMost(MEMORY))
-            .note(format!(
-                "resident; {:.1} descriptors each, {} threads in all",
-                json_number(&found, "descriptors")?,
-                json_number(&found, "threads")?
-            ));
+        report.figure(title, "MB", json_number(&found, "memory")?).require(Target::AtMost(MEMORY)).note(format!(
+            "resident; {:.1} descriptors each, {} threads in all",
+            json_number(&found, "descriptors")?,
+            json_number(&found, "threads")?
+        ));
     }
     Ok(())
 }

@@ -20,9 +20,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
 
-use crate::ends::{
-    create_listener, create_reader, create_writer, join_namespace, wait_until_matched,
-};
+use crate::ends::{create_listener, create_reader, create_writer, join_namespace, wait_until_matched};
 use crate::measuring::print_json;
 use crate::message::{self, STRING};
 use crate::portal;
@@ -66,9 +64,7 @@ pub(crate) fn run(what: &str, count: usize, seconds: u64) -> Result<()> {
     // Shared by servants of the same revision.
     let known = Arc::new(types::registry()?);
     let (nodes, ours) = (build_runtime(NODES)?, build_runtime(OURS)?);
-    let networks = (0..count)
-        .map(|_| NetNs::create())
-        .collect::<Result<Vec<_>, _>>()?;
+    let networks = (0..count).map(|_| NetNs::create()).collect::<Result<Vec<_>, _>>()?;
     let same = |network: &NetNs| anyhow::Ok(network.run(NetNs::current)??);
     let mut held: Vec<OpenEndpoints> = Vec::new();
     for network in &networks {
@@ -83,10 +79,7 @@ pub(crate) fn run(what: &str, count: usize, seconds: u64) -> Result<()> {
     let all = networks.iter().map(same).collect::<Result<Vec<_>>>()?;
     held.extend(if servants {
         // Concurrently, because a bus waits a moment for the name of a node that sends its first message.
-        ours.block_on(try_join_all(
-            all.into_iter()
-                .map(|network| open_session(network, &known, nodes.handle())),
-        ))?
+        ours.block_on(try_join_all(all.into_iter().map(|network| open_session(network, &known, nodes.handle()))))?
     } else {
         ours.block_on(try_join_all(all.into_iter().map(open_client)))?
     });
@@ -111,12 +104,8 @@ async fn open_node(network: NetNs) -> Result<OpenEndpoints> {
     let ends: Vec<_> = (0..TOPICS)
         .map(|number| {
             let (asked, told) = (format!("rt/asked_{number}"), format!("rt/told_{number}"));
-            let reader =
-                create_listener(&participant, (&asked, STRING), EndpointQos::default(), drop);
-            (
-                reader,
-                create_writer(&participant, (&told, STRING), EndpointQos::default()),
-            )
+            let reader = create_listener(&participant, (&asked, STRING), EndpointQos::default(), drop);
+            (reader, create_writer(&participant, (&told, STRING), EndpointQos::default()))
         })
         .collect();
     Ok(Box::new((participant, ends)))
@@ -125,8 +114,7 @@ async fn open_node(network: NetNs) -> Result<OpenEndpoints> {
 /// Opens a participant like a portal's: it reads one topic of the node and writes another.
 async fn open_client(network: NetNs) -> Result<OpenEndpoints> {
     let participant: Participant = join_namespace(network).await?;
-    let (reader, samples) =
-        create_reader(&participant, ("rt/told_0", STRING), EndpointQos::default());
+    let (reader, samples) = create_reader(&participant, ("rt/told_0", STRING), EndpointQos::default());
     let writer = create_writer(&participant, ("rt/asked_0", STRING), EndpointQos::default());
     wait_until_matched(reader.watch_matches()).await?;
     wait_until_matched(writer.watch_matches()).await?;
@@ -135,11 +123,7 @@ async fn open_client(network: NetNs) -> Result<OpenEndpoints> {
 
 /// Opens everything that a daemon has for a servant: a bus, a bridge, and a robot that subscribes to one topic of the
 /// node and advertises another.
-async fn open_session(
-    network: NetNs,
-    known: &Arc<Registry>,
-    nodes: &Handle,
-) -> Result<OpenEndpoints> {
+async fn open_session(network: NetNs, known: &Arc<Registry>, nodes: &Handle) -> Result<OpenEndpoints> {
     let same = network.run(NetNs::current)??;
     let bridge = portal::join_bridge(network, known).await?;
     let (end, served) = tokio::io::duplex(PIPE);
@@ -166,12 +150,7 @@ async fn connect_robot(network: NetNs, end: DuplexStream) -> Result<WebSocketStr
     wait_until_matched(told.watch_matches()).await?;
     told.write(message::string("heard"));
     let heard = tokio::time::timeout(LONG, robot.next()).await;
-    let heard = heard
-        .context("the robot hears nothing")?
-        .context("the session has ended")??;
-    ensure!(
-        heard.to_text()?.contains("heard"),
-        "the robot hears {heard}"
-    );
+    let heard = heard.context("the robot hears nothing")?.context("the session has ended")??;
+    ensure!(heard.to_text()?.contains("heard"), "the robot hears {heard}");
     Ok(robot)
 }

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use rtps::{
-    Config, DataReader, DataWriter, EndpointMatches, EndpointQos, Participant, ReceivedSample,
-    ReliabilityKind, Sink, TopicDescription,
+    Config, DataReader, DataWriter, EndpointMatches, EndpointQos, Participant, ReceivedSample, ReliabilityKind, Sink,
+    TopicDescription,
 };
 use servant::netns::NetNs;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
@@ -31,24 +31,12 @@ pub(crate) async fn join_namespace(network: NetNs) -> Result<Participant> {
 
 /// Returns the quality of service that a ROS node requests with `QoSProfile(depth=5)`.
 pub(crate) fn qos_profile(reliable: bool) -> EndpointQos {
-    let reliability = if reliable {
-        ReliabilityKind::Reliable
-    } else {
-        ReliabilityKind::BestEffort
-    };
-    EndpointQos {
-        reliability,
-        history: rtps::HistoryKind::KeepLast(5),
-        ..EndpointQos::default()
-    }
+    let reliability = if reliable { ReliabilityKind::Reliable } else { ReliabilityKind::BestEffort };
+    EndpointQos { reliability, history: rtps::HistoryKind::KeepLast(5), ..EndpointQos::default() }
 }
 
 fn topic(name: &str, kind: &str) -> TopicDescription {
-    TopicDescription {
-        name: name.to_owned(),
-        type_name: kind.to_owned(),
-        ..TopicDescription::default()
-    }
+    TopicDescription { name: name.to_owned(), type_name: kind.to_owned(), ..TopicDescription::default() }
 }
 
 struct CallbackSink<F>(F);
@@ -84,21 +72,13 @@ pub(crate) fn create_reader(
 }
 
 /// Creates a writer.
-pub(crate) fn create_writer(
-    participant: &Participant,
-    (name, kind): (&str, &str),
-    qos: EndpointQos,
-) -> DataWriter {
+pub(crate) fn create_writer(participant: &Participant, (name, kind): (&str, &str), qos: EndpointQos) -> DataWriter {
     participant.writer(topic(name, kind), qos)
 }
 
 /// Waits until an endpoint is matched, so that samples pass.
-pub(crate) async fn wait_until_matched(
-    mut ends: watch::Receiver<Arc<EndpointMatches>>,
-) -> Result<()> {
+pub(crate) async fn wait_until_matched(mut ends: watch::Receiver<Arc<EndpointMatches>>) -> Result<()> {
     let some = ends.wait_for(|ends| !ends.matched.is_empty());
-    tokio::time::timeout(PATIENCE, some)
-        .await
-        .context("nobody is at the other end")??;
+    tokio::time::timeout(PATIENCE, some).await.context("nobody is at the other end")??;
     Ok(())
 }

@@ -50,12 +50,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     eprintln!("joining: {rounds} times each");
     let world = BenchNetwork::new()?;
     let _node = world.start_rclpy(Transport::Udp, &["relay", BEATS])?;
-    let newcomers = [
-        Newcomer::Ours,
-        Newcomer::Robot,
-        Newcomer::AnotherRobot,
-        Newcomer::Rclpy,
-    ];
+    let newcomers = [Newcomer::Ours, Newcomer::Robot, Newcomer::AnotherRobot, Newcomer::Rclpy];
     let mut found = vec![(Vec::new(), Vec::new()); newcomers.len()];
     for _ in 0..rounds {
         for (newcomer, (beats, pongs)) in newcomers.iter().zip(&mut found) {
@@ -68,11 +63,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         unreachable!("one for each newcomer");
     };
     for (what, times, floor) in [
-        (
-            "joining a running node to its first message",
-            &ours.0,
-            &theirs.0,
-        ),
+        ("joining a running node to its first message", &ours.0, &theirs.0),
         ("joining it to an answer of its", &ours.1, &theirs.1),
         (
             "a robot's connecting to the first message of a running node, before which the portal is not",
@@ -88,15 +79,9 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         let of = |share| quantile(times, share).unwrap_or(f64::NAN);
         let figure = report.figure(what, "ms", of(0.5));
         figure
-            .relative_to(
-                "a participant of rclpy that joins",
-                quantile(floor, 0.5).unwrap_or(f64::NAN),
-            )
+            .relative_to("a participant of rclpy that joins", quantile(floor, 0.5).unwrap_or(f64::NAN))
             .require(Target::AtMost(JOINED));
-        figure.note(format!(
-            "median of {rounds}, at most {:.0}; rclpy is imported already",
-            of(1.0)
-        ));
+        figure.note(format!("median of {rounds}, at most {:.0}; rclpy is imported already", of(1.0)));
     }
     Ok(())
 }

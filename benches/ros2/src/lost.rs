@@ -33,10 +33,7 @@ impl PictureLosses {
         Ok(Self {
             portal: bus + queue,
             places: vec![
-                (
-                    "the node's writer or the way to the portal",
-                    i64::from(sent) - heard - bus,
-                ),
+                ("the node's writer or the way to the portal", i64::from(sent) - heard - bus),
                 ("the bus's queue", bus),
                 ("the robot's queue in the portal", queue),
                 ("the robot", heard - queue - came as i64),
@@ -53,10 +50,7 @@ impl PictureLosses {
             portal: written_off,
             places: vec![
                 ("the robot", i64::from(sent) - read),
-                (
-                    "the portal's writer, which the node did not follow",
-                    written_off,
-                ),
+                ("the portal's writer, which the node did not follow", written_off),
                 ("the node", read - written_off - came as i64),
             ],
         })

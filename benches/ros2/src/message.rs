@@ -22,14 +22,8 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    pub(crate) const SMALL: Self = Self {
-        width: 640,
-        height: 480,
-    };
-    pub(crate) const LARGE: Self = Self {
-        width: 1920,
-        height: 1080,
-    };
+    pub(crate) const SMALL: Self = Self { width: 640, height: 480 };
+    pub(crate) const LARGE: Self = Self { width: 1920, height: 1080 };
 
     pub(crate) fn byte_count(self) -> u32 {
         self.width * self.height * 3
@@ -113,9 +107,7 @@ pub(crate) fn parse_picture(payload: &[u8]) -> Option<(u32, Duration)> {
 }
 
 fn unix_time() -> Duration {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default()
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -129,18 +121,12 @@ mod tests {
         assert_eq!(number, 1234);
         assert!(age < Duration::from_secs(10));
         // Header, stamp, frame id, height and width, encoding, byte order, step, length, pixels, with padding.
-        assert_eq!(
-            picture.len(),
-            4 + 8 + (4 + 5 + 3) + 8 + (4 + 5 + 1 + 2) + 4 + 4 + 921_600
-        );
+        assert_eq!(picture.len(), 4 + 8 + (4 + 5 + 3) + 8 + (4 + 5 + 1 + 2) + 4 + 4 + 921_600);
         assert!(parse_picture(&picture[..17]).is_none());
     }
 
     #[test]
     fn a_response_repeats_the_request() {
-        assert_eq!(
-            &set_bool_response(&set_bool_request(true))[..],
-            [0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
-        );
+        assert_eq!(&set_bool_response(&set_bool_request(true))[..], [0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
     }
 }

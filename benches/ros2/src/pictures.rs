@@ -76,9 +76,7 @@ impl TransferResult {
     fn peak_memory(&self) -> Option<f64> {
         let of = |side: &Value| side["peak"].as_f64();
         let portal = self.portal.as_ref().map(|portal| portal.peak);
-        portal
-            .or_else(|| of(&self.sender))
-            .or_else(|| of(&self.taker))
+        portal.or_else(|| of(&self.sender)).or_else(|| of(&self.taker))
     }
 
     /// Returns whether enough images arrived to compare the resources.
@@ -87,12 +85,7 @@ impl TransferResult {
     }
 }
 
-fn run_transfer(
-    way: PicturePath,
-    size: Size,
-    reliable: bool,
-    seconds: u32,
-) -> Result<TransferResult> {
+fn run_transfer(way: PicturePath, size: Size, reliable: bool, seconds: u32) -> Result<TransferResult> {
     let frames = seconds * RATE as u32;
     let words = camera::role_arguments(size, frames, reliable);
     let [width, height, count, quality] = words.each_ref().map(String::as_str);
@@ -103,36 +96,26 @@ fn run_transfer(
         _ => Transport::Stock,
     };
     let mut portal = match way {
-        PicturePath::ToRobot | PicturePath::FromRobot => {
-            Some(world.start_role(&["portal", "kept"])?)
-        }
+        PicturePath::ToRobot | PicturePath::FromRobot => Some(world.start_role(&["portal", "kept"])?),
         _ => None,
     };
     let as_client = |words: &[&str]| world.start_role(&[&["client"], words].concat());
     let mut taker: BenchProgram = match way {
         PicturePath::In => world.start_role(&taking)?,
         PicturePath::ToRobot => as_client(&taking)?,
-        PicturePath::Out | PicturePath::FromRobot | PicturePath::Rclpy(_) => {
-            world.start_rclpy(of_rclpy, &taking)?
-        }
+        PicturePath::Out | PicturePath::FromRobot | PicturePath::Rclpy(_) => world.start_rclpy(of_rclpy, &taking)?,
     };
-    let process = portal
-        .as_ref()
-        .map(|portal| Process::from_pid(portal.pid()));
+    let process = portal.as_ref().map(|portal| Process::from_pid(portal.pid()));
     let before = process.as_ref().map(Process::total_processor_time);
     let mut sender: BenchProgram = match way {
         PicturePath::Out => world.start_role(&sending)?,
         PicturePath::FromRobot => as_client(&sending)?,
-        PicturePath::In | PicturePath::ToRobot | PicturePath::Rclpy(_) => {
-            world.start_rclpy(of_rclpy, &sending)?
-        }
+        PicturePath::In | PicturePath::ToRobot | PicturePath::Rclpy(_) => world.start_rclpy(of_rclpy, &sending)?,
     };
     let told = sender.answer_within(camera::transfer_timeout(frames))?;
     let took = taker.request_answer()?;
     let lost = |counts: &Value| match way {
-        PicturePath::ToRobot => {
-            PictureLosses::to_robot(frames, json_number(&took, "came")?, counts)
-        }
+        PicturePath::ToRobot => PictureLosses::to_robot(frames, json_number(&took, "came")?, counts),
         _ => PictureLosses::from_robot(frames, json_number(&took, "came")?, counts),
     };
     let portal = match (&mut portal, process, before) {
@@ -143,22 +126,14 @@ fn run_transfer(
         }),
         _ => None,
     };
-    Ok(TransferResult {
-        sent: frames,
-        sender: told,
-        taker: took,
-        portal,
-    })
+    Ok(TransferResult { sent: frames, sender: told, taker: took, portal })
 }
 
 /// Returns the duration in seconds of reliable transfers and of the others.
 fn transfer_seconds() -> Result<(u32, u32)> {
     let brief = if is_full_run() { 60 } else { 20 };
     match std::env::var("CLOUDROID_BENCH_SECONDS") {
-        Ok(all) => all
-            .parse()
-            .map(|all| (all, all))
-            .context("CLOUDROID_BENCH_SECONDS is no number of seconds"),
+        Ok(all) => all.parse().map(|all| (all, all)).context("CLOUDROID_BENCH_SECONDS is no number of seconds"),
         Err(_) => Ok((60, brief)),
     }
 }
@@ -171,10 +146,7 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
         for reliable in [true, false] {
             let seconds = if reliable { long } else { brief };
             let quality = if reliable { "reliable" } else { "best effort" };
-            let what = format!(
-                "{:.1} MB pictures, {quality}",
-                f64::from(size.byte_count()) / 1e6
-            );
+            let what = format!("{:.1} MB pictures, {quality}", f64::from(size.byte_count()) / 1e6);
             let peers = [Transport::Stock, Transport::Udp].map(PicturePath::Rclpy);
             let mut floors = Vec::new();
             for peer in peers {
@@ -185,13 +157,8 @@ pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
                     Err(why) => report.skip(format!("{what}, {peer}"), format!("{why:#}")),
                 }
             }
-            let robots = [PicturePath::FromRobot, PicturePath::ToRobot]
-                .into_iter()
-                .filter(|_| reliable);
-            for way in [PicturePath::Out, PicturePath::In]
-                .into_iter()
-                .chain(robots)
-            {
+            let robots = [PicturePath::FromRobot, PicturePath::ToRobot].into_iter().filter(|_| reliable);
+            for way in [PicturePath::Out, PicturePath::In].into_iter().chain(robots) {
                 eprintln!("{what}, {way}: {seconds} s");
                 let of = format!("{what}, {way}");
                 let told = run_transfer(way, size, reliable, seconds)
@@ -213,10 +180,7 @@ fn report_transfer(
     found: &TransferResult,
     floors: &[(PicturePath, TransferResult)],
 ) -> Result<()> {
-    let mut note = format!(
-        "of {}, {} late to be sent",
-        found.sent, found.sender["late"]
-    );
+    let mut note = format!("of {}, {} late to be sent", found.sent, found.sender["late"]);
     if let Some(overflows) = found.taker["overflows"].as_u64() {
         note += &format!("; {overflows} datagrams found the buffer full");
     }
@@ -230,33 +194,23 @@ fn report_transfer(
     for (peer, floor) in floors {
         note += &format!("; {peer} lost {} of {}", floor.lost_count()?, floor.sent);
     }
-    report
-        .figure(format!("{what}: lost"), "", found.lost_count()?)
-        .require(Target::AtMost(0.0))
-        .note(note);
+    report.figure(format!("{what}: lost"), "", found.lost_count()?).require(Target::AtMost(0.0)).note(note);
     if let Some(portal) = &found.portal {
         let title = format!("{what}: lost by the portal");
-        report
-            .figure(title, "", portal.lost.portal as f64)
-            .require(Target::AtMost(0.0));
+        report.figure(title, "", portal.lost.portal as f64).require(Target::AtMost(0.0));
     }
     let title = format!("{what}: reordered");
-    report
-        .figure(title, "", json_number(&found.taker, "reordered")?)
-        .require(Target::AtMost(0.0));
+    report.figure(title, "", json_number(&found.taker, "reordered")?).require(Target::AtMost(0.0));
     for (peer, floor) in floors {
         if !floor.is_comparable()? {
             continue;
         }
-        let ([sender, taker], [sends, takes]) =
-            (found.processor_per_frame()?, floor.processor_per_frame()?);
+        let ([sender, taker], [sends, takes]) = (found.processor_per_frame()?, floor.processor_per_frame()?);
         let title = format!("{what}: processor for a frame, both sides");
         report
             .figure(title, "ms", sender + taker)
             .relative_to(peer.to_string(), sends + takes)
-            .note(format!(
-                "sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"
-            ));
+            .note(format!("sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"));
         let title = format!("{what}: age when taken, p50");
         report
             .figure(title, "ms", json_number(&found.taker, "p50")?)

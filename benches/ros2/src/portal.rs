@@ -34,26 +34,15 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
         _ => bail!("a portal is kept or fresh, not {words:?}"),
     };
     // The same threads as in a daemon's portal.
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .thread_name("portal")
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().thread_name("portal").build()?;
     let served = runtime.block_on(async {
         let known = Arc::new(types::registry()?);
-        let bridge = if kept {
-            Some(join_bridge(NetNs::current()?, &known).await?)
-        } else {
-            None
-        };
+        let bridge = if kept { Some(join_bridge(NetNs::current()?, &known).await?) } else { None };
         let listener = TcpListener::bind(ADDRESS).await?;
         print_json(&json!({}));
         tokio::spawn(accept_clients(listener, bridge.clone(), known));
         while wait_for_request().await? {
-            print_json(
-                &bridge
-                    .as_ref()
-                    .map_or(json!({}), |bridge| lost::metrics_json(bridge.metrics())),
-            );
+            print_json(&bridge.as_ref().map_or(json!({}), |bridge| lost::metrics_json(bridge.metrics())));
         }
         anyhow::Ok(())
     });
@@ -65,12 +54,7 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
 /// Creates a bridge to the nodes of this network, as a daemon does for a servant.
 pub(crate) async fn join_bridge(network: NetNs, known: &Arc<Registry>) -> Result<Arc<Bridge>> {
     let options = JoinOptions::in_domain(0, NODE);
-    let bus = ros::connect(
-        RosVersion::Two,
-        Arc::new(NamespaceSockets(network)),
-        options,
-    )
-    .await?;
+    let bus = ros::connect(RosVersion::Two, Arc::new(NamespaceSockets(network)), options).await?;
     let bus = Arc::new(Tap::default()).wrap(bus);
     Ok(Bridge::new(bus, known.clone(), BridgeOptions::default()))
 }
@@ -97,17 +81,12 @@ async fn serve_client(
     known: &Arc<Registry>,
 ) -> Result<SessionEnd> {
     stream.set_nodelay(true)?;
-    let socket = tokio_tungstenite::accept_async(stream)
-        .await
-        .context("the client's handshake")?;
+    let socket = tokio_tungstenite::accept_async(stream).await.context("the client's handshake")?;
     let bridge = match bridge {
         Some(bridge) => bridge,
         None => join_bridge(NetNs::current()?, known).await?,
     };
-    let options = SessionOptions {
-        client: from.to_string(),
-        ..SessionOptions::default()
-    };
+    let options = SessionOptions { client: from.to_string(), ..SessionOptions::default() };
     // A client sends nothing before it has read the handshake's response, so nothing was read ahead.
     Ok(bridge.serve(socket.into_inner(), options).await)
 }

@@ -42,10 +42,7 @@ impl Rival {
     /// Returns the available servers; the others are reported as skipped, with the reason.
     pub(crate) fn find_available(report: &mut BenchReport) -> Vec<Self> {
         let mut all = Vec::new();
-        for (name, found) in [
-            ("rosbridge-server-rs", install_server_rs()),
-            ("rosbridge_suite", find_suite()),
-        ] {
+        for (name, found) in [("rosbridge-server-rs", install_server_rs()), ("rosbridge_suite", find_suite())] {
             match found {
                 Ok(rival) => all.push(rival),
                 Err(why) => report.skip(name, format!("{why:#}")),
@@ -59,19 +56,10 @@ impl Rival {
         let prefix = world::wheels_prefix()?;
         let mut command = world.command();
         // Its home directory is private to this network.
-        command.args([
-            "env",
-            "HOME=/dev/shm",
-            "ROS_DOMAIN_ID=0",
-            "ROS_DISTRO=jazzy",
-        ]);
+        command.args(["env", "HOME=/dev/shm", "ROS_DOMAIN_ID=0", "ROS_DISTRO=jazzy"]);
         match self {
             Self::ServerRs(place) => {
-                let libraries = format!(
-                    "{}:{}",
-                    place.join("lib").display(),
-                    library_paths(&prefix)?
-                );
+                let libraries = format!("{}:{}", place.join("lib").display(), library_paths(&prefix)?);
                 command
                     .arg(format!("LD_LIBRARY_PATH={libraries}"))
                     .arg(format!("AMENT_PREFIX_PATH={}", prefix.display()))
@@ -103,10 +91,7 @@ fn library_paths(prefix: &Path) -> Result<String> {
     let mut all = vec![prefix.join("lib")];
     for entry in std::fs::read_dir(prefix.join("lib/python3.11/site-packages"))? {
         let path = entry?.path();
-        if path
-            .extension()
-            .is_some_and(|extension| extension == "libs")
-        {
+        if path.extension().is_some_and(|extension| extension == "libs") {
             all.push(path);
         }
     }
@@ -123,33 +108,18 @@ fn install_server_rs() -> Result<Rival> {
         std::fs::create_dir_all(place.join("lib"))?;
         let output = Command::new(world::python_path()?)
             .args(["-m", "pip", "install", "--quiet", "--no-deps"])
-            .args([
-                "--disable-pip-version-check",
-                "--require-hashes",
-                "--upgrade",
-            ])
+            .args(["--disable-pip-version-check", "--require-hashes", "--upgrade"])
             .args(["--only-binary", ":all:", "--target"])
             .arg(&place)
             .arg("--requirement")
             .arg(&list)
             .output()?;
-        ensure!(
-            output.status.success(),
-            "its wheel cannot be had: {}",
-            String::from_utf8_lossy(&output.stderr).trim()
-        );
-        ensure!(
-            program.exists(),
-            "{} is not in its wheel",
-            program.display()
-        );
+        ensure!(output.status.success(), "its wheel cannot be had: {}", String::from_utf8_lossy(&output.stderr).trim());
+        ensure!(program.exists(), "{} is not in its wheel", program.display());
         // It needs the library that selects an rmw implementation; the wheels contain the selected one.
         let library = place.join("lib/librmw_implementation.so");
         if !library.is_symlink() {
-            symlink(
-                world::wheels_prefix()?.join("lib/librmw_fastrtps_cpp.so"),
-                &library,
-            )?;
+            symlink(world::wheels_prefix()?.join("lib/librmw_fastrtps_cpp.so"), &library)?;
         }
         let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
         std::fs::set_permissions(&program, mode)?;

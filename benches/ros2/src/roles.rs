@@ -36,9 +36,7 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
         ["client", rest @ ..] => return client::run(rest),
         _ => {}
     }
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         match words {
             ["relay"] => run_relay().await,
@@ -65,13 +63,8 @@ async fn run_relay() -> Result<()> {
     let answers = create_writer(&participant, ANSWERED, qos);
     let _requests = create_listener(&participant, ASKED, qos, move |request| {
         // Clients of Fast DDS request the answer at their reader.
-        let to = request
-            .related
-            .map_or(request.writer, |related| related.writer);
-        let related = SampleIdentity {
-            writer: to,
-            number: request.number,
-        };
+        let to = request.related.map_or(request.writer, |related| related.writer);
+        let related = SampleIdentity { writer: to, number: request.number };
         answers.write_related(message::set_bool_response(&request.payload), related);
     });
     print_json(&json!({}));
@@ -79,14 +72,8 @@ async fn run_relay() -> Result<()> {
 }
 
 /// Returns the next sample, or `None` if none arrives in time.
-async fn next_sample(
-    samples: &mut UnboundedReceiver<ReceivedSample>,
-    patience: Duration,
-) -> Option<ReceivedSample> {
-    tokio::time::timeout(patience, samples.recv())
-        .await
-        .ok()
-        .flatten()
+async fn next_sample(samples: &mut UnboundedReceiver<ReceivedSample>, patience: Duration) -> Option<ReceivedSample> {
+    tokio::time::timeout(patience, samples.recv()).await.ok().flatten()
 }
 
 /// Measures round trips of Strings, one at a time.
@@ -112,12 +99,7 @@ async fn time_trips(count: usize) -> Result<()> {
         let begun = Instant::now();
         pings.write(text.clone());
         // Further copies of the first message may still be in flight.
-        while next_sample(&mut pongs, PATIENCE)
-            .await
-            .context("a pong")?
-            .payload
-            != text
-        {}
+        while next_sample(&mut pongs, PATIENCE).await.context("a pong")?.payload != text {}
         if number >= WARM {
             times.push(begun.elapsed());
         }
@@ -134,18 +116,12 @@ async fn time_calls(count: usize) -> Result<()> {
     let requests = create_writer(&participant, ASKED, qos);
     wait_until_matched(requests.watch_matches()).await?;
     wait_until_matched(reader.watch_matches()).await?;
-    let related = SampleIdentity {
-        writer: reader.guid(),
-        number: SequenceNumber::UNKNOWN,
-    };
+    let related = SampleIdentity { writer: reader.guid(), number: SequenceNumber::UNKNOWN };
     let mut call = async |patience| {
         let number = requests.write_related(message::set_bool_request(true), related);
         loop {
             let answer = next_sample(&mut answers, patience).await?;
-            if answer
-                .related
-                .is_some_and(|related| related.number == number)
-            {
+            if answer.related.is_some_and(|related| related.number == number) {
                 return Some(answer);
             }
         }

@@ -81,9 +81,7 @@ impl TripPath {
     fn start_answerer(&self, world: &BenchNetwork) -> Result<BenchProgram> {
         match self {
             Self::Ours => world.start_role(&["relay"]),
-            Self::Bus | Self::RclpyToBus | Self::Portal | Self::ByRival(_) => {
-                world.start_role(&["bus", "relay"])
-            }
+            Self::Bus | Self::RclpyToBus | Self::Portal | Self::ByRival(_) => world.start_role(&["bus", "relay"]),
             Self::BusToRclpy | Self::Rclpy => world.start_rclpy(Transport::Udp, &["relay"]),
             // Nodes with default settings, because another server may reach them through shared memory.
             Self::Stock | Self::PortalToRclpy | Self::ByRivalToRclpy(_) => {
@@ -117,11 +115,7 @@ impl TripPath {
         world.pin_to(Host::Robot)?;
         let found: Value = self.start_asker(&world, role)?.answer_within(PATIENCE)?;
         let times = [json_number(&found, "p50")?, json_number(&found, "p99")?];
-        ensure!(
-            times.iter().all(|time| time.is_finite()),
-            "{}: {found}",
-            self.name()
-        );
+        ensure!(times.iter().all(|time| time.is_finite()), "{}: {found}", self.name());
         Ok(times)
     }
 }
@@ -178,9 +172,7 @@ fn node_pairs(rivals: &[Rival]) -> Vec<PathPair> {
 /// Measures one message in each direction.
 fn measure_messages(report: &mut BenchReport, what: &str, role: &str) -> Result<()> {
     use TripPath::{Bus, Datagrams, Hop, Ours, Portal, Rclpy, Stock};
-    let mut pairs = [Datagrams, Rclpy, Stock]
-        .map(|floor| (Ours, floor))
-        .to_vec();
+    let mut pairs = [Datagrams, Rclpy, Stock].map(|floor| (Ours, floor)).to_vec();
     pairs.extend([(Bus, Ours), (Hop, Datagrams)]);
     pairs.extend(node_pairs(&Rival::find_available(report)));
     pairs.push((Portal, Hop));
@@ -202,20 +194,16 @@ pub(crate) fn measure_goals(report: &mut BenchReport) -> Result<()> {
     use TripPath::{Bus, Rclpy, Stock};
     let mut pairs = vec![(Bus, Rclpy), (Bus, Stock)];
     pairs.extend(node_pairs(&Rival::find_available(report)));
-    measure(
-        report,
-        "goal of an action until its result",
-        "goals",
-        &pairs,
-    )
+    measure(report, "goal of an action until its result", "goals", &pairs)
 }
 
 /// Returns the target of a path relative to another, if there is one.
 fn target(way: &TripPath, floor: &TripPath) -> Option<Target> {
     match (way, floor) {
         (TripPath::Portal, TripPath::Bus) => Some(THROUGH),
-        (TripPath::Portal, TripPath::ByRival(_))
-        | (TripPath::PortalToRclpy, TripPath::ByRivalToRclpy(_)) => Some(Target::BelowFloor),
+        (TripPath::Portal, TripPath::ByRival(_)) | (TripPath::PortalToRclpy, TripPath::ByRivalToRclpy(_)) => {
+            Some(Target::BelowFloor)
+        }
         _ => None,
     }
 }

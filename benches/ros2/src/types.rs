@@ -14,20 +14,14 @@ pub(crate) const GOAL: &str = "test_msgs/action/Fibonacci";
 const DEFINITIONS: [(&str, &str); 6] = [
     (STRING, "string data\n"),
     ("builtin_interfaces/msg/Time", "int32 sec\nuint32 nanosec\n"),
-    (
-        "std_msgs/msg/Header",
-        "builtin_interfaces/Time stamp\nstring frame_id\n",
-    ),
+    ("std_msgs/msg/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
     (
         IMAGE,
         "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 \
          step\nuint8[] data\n",
     ),
     (CALL, "bool data\n---\nbool success\nstring message\n"),
-    (
-        GOAL,
-        "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
-    ),
+    (GOAL, "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"),
 ];
 
 /// Returns a registry of all definitions.

@@ -63,10 +63,7 @@ impl BenchNetwork {
     pub(crate) fn new() -> Result<Self> {
         let mut holder = Command::new("unshare");
         holder.args(["--net", "--mount", "sh", "-c", HOLD]);
-        Ok(Self {
-            holder: BenchProgram::start(holder, "a network namespace")?,
-            cores: None,
-        })
+        Ok(Self { holder: BenchProgram::start(holder, "a network namespace")?, cores: None })
     }
 
     /// Selects the cores for the programs that are started from now on.
@@ -91,24 +88,16 @@ impl BenchNetwork {
     /// Starts a role of this program (see `roles.rs`).
     pub(crate) fn start_role(&self, words: &[&str]) -> Result<BenchProgram> {
         let mut command = self.command();
-        command
-            .arg(std::env::current_exe()?)
-            .arg("inside")
-            .args(words);
+        command.arg(std::env::current_exe()?).arg("inside").args(words);
         BenchProgram::start(command, &format!("ours, {}", words.join(" ")))
     }
 
     /// Starts a role of `peer.py`.
     pub(crate) fn start_rclpy(&self, transport: Transport, words: &[&str]) -> Result<BenchProgram> {
         let mut command = self.command();
-        command
-            .arg(python_path()?)
-            .arg(bench_report::root().join("benches/ros2/peer.py"))
-            .args(words);
+        command.arg(python_path()?).arg(bench_report::root().join("benches/ros2/peer.py")).args(words);
         // Errors only: a starting node warns about the leftovers of others.
-        command
-            .env("RCUTILS_LOGGING_SEVERITY_THRESHOLD", "40")
-            .env("ROS_DOMAIN_ID", "0");
+        command.env("RCUTILS_LOGGING_SEVERITY_THRESHOLD", "40").env("ROS_DOMAIN_ID", "0");
         if transport == Transport::Udp {
             command.env("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4");
         }
@@ -125,11 +114,7 @@ pub(crate) fn wheels_prefix() -> Result<PathBuf> {
 /// Returns the path of the Python that has rclpy.
 pub(crate) fn python_path() -> Result<PathBuf> {
     let python = wheels_prefix()?.join("bin/python");
-    ensure!(
-        python.exists(),
-        "{} is missing: run scripts/ros2-wheels",
-        python.display()
-    );
+    ensure!(python.exists(), "{} is missing: run scripts/ros2-wheels", python.display());
     Ok(python)
 }
 
@@ -143,9 +128,7 @@ pub(crate) struct BenchProgram {
 impl BenchProgram {
     fn start(mut command: Command, name: &str) -> Result<Self> {
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let mut child = command
-            .spawn()
-            .with_context(|| format!("starting {name}"))?;
+        let mut child = command.spawn().with_context(|| format!("starting {name}"))?;
         let (sender, lines) = channel();
         let output = child.stdout.take().context("its output")?;
         std::thread::spawn(move || {
@@ -155,11 +138,7 @@ impl BenchProgram {
                 }
             }
         });
-        let mut program = Self {
-            name: name.to_owned(),
-            child,
-            lines,
-        };
+        let mut program = Self { name: name.to_owned(), child, lines };
         program.answer()?;
         Ok(program)
     }
@@ -167,15 +146,9 @@ impl BenchProgram {
     /// Starts a program whose output is ignored.
     pub(crate) fn start_quietly(mut command: Command, name: &str) -> Result<Self> {
         command.stdin(Stdio::piped()).stdout(Stdio::null());
-        let child = command
-            .spawn()
-            .with_context(|| format!("starting {name}"))?;
+        let child = command.spawn().with_context(|| format!("starting {name}"))?;
         let (_, lines) = channel();
-        Ok(Self {
-            name: name.to_owned(),
-            child,
-            lines,
-        })
+        Ok(Self { name: name.to_owned(), child, lines })
     }
 
     pub(crate) fn pid(&self) -> u32 {
@@ -202,9 +175,7 @@ impl BenchProgram {
     /// Asks it for its results so far.
     pub(crate) fn request_answer(&mut self) -> Result<Value> {
         let input = self.child.stdin.as_mut().context("its input")?;
-        input
-            .write_all(b"\n")
-            .with_context(|| format!("asking {}", self.name))?;
+        input.write_all(b"\n").with_context(|| format!("asking {}", self.name))?;
         self.answer()
     }
 }
@@ -218,7 +189,5 @@ impl Drop for BenchProgram {
 
 /// Returns a number of an answer.
 pub(crate) fn json_number(answer: &Value, name: &str) -> Result<f64> {
-    answer[name]
-        .as_f64()
-        .with_context(|| format!("{name} is no number in {answer}"))
+    answer[name].as_f64().with_context(|| format!("{name} is no number in {answer}"))
 }

@@ -82,12 +82,7 @@ fn stage_root(place: &Path, spec: &ContainerSpec) -> Result<()> {
     let uid_range = (DEFAULT_UID_BASE, uids::RANGE);
     let skeleton = place.join("skeleton");
     make_skeleton(&skeleton, &spec.id, &spec.layers, &spec.mounts, &spec.hosts)?;
-    let rootfs = Rootfs {
-        layers: &spec.layers,
-        skeleton: &skeleton,
-        upper: None,
-        uid_range,
-    };
+    let rootfs = Rootfs { layers: &spec.layers, skeleton: &skeleton, upper: None, uid_range };
     let staged = rootfs.mount(&spec.mounts)?;
     let config = bundle::configuration(spec, &staged, uid_range)?;
     fs::write(place.join("config.json"), serde_json::to_vec(&config)?)?;

@@ -27,11 +27,7 @@ pub(crate) struct Bundle {
 
 impl Bundle {
     /// Creates a bundle in `place`, which is created.
-    pub(crate) fn make(
-        place: &Path,
-        spec: &ContainerSpec,
-        seccomp: fn(&mut Value),
-    ) -> Result<Self> {
+    pub(crate) fn make(place: &Path, spec: &ContainerSpec, seccomp: fn(&mut Value)) -> Result<Self> {
         fs::create_dir_all(place)?;
         let (root, cgroups) = (ImageRoot::mount(place, spec)?, BenchCgroup::reserve()?);
         let staged = StagedRoot {
@@ -50,29 +46,16 @@ impl Bundle {
         });
         seccomp(&mut config["linux"]["seccomp"]);
         fs::write(place.join("config.json"), serde_json::to_vec(&config)?)?;
-        Ok(Self {
-            _root: root,
-            _cgroups: cgroups,
-        })
+        Ok(Self { _root: root, _cgroups: cgroups })
     }
 }
 
 /// Returns the configuration of a servant, with a network namespace.
-pub(crate) fn configuration(
-    spec: &ContainerSpec,
-    staged: &StagedRoot,
-    uid_range: (u32, u32),
-) -> Result<Value> {
-    let mut config = serde_json::to_value(servant::bundle::config(
-        spec,
-        staged,
-        &servant::quotas::Quotas::default(),
-    )?)?;
+pub(crate) fn configuration(spec: &ContainerSpec, staged: &StagedRoot, uid_range: (u32, u32)) -> Result<Value> {
+    let mut config = serde_json::to_value(servant::bundle::config(spec, staged, &servant::quotas::Quotas::default())?)?;
     config["process"]["args"] = json!(PROGRAM);
     config["process"]["env"] = json!(["PATH=/usr/bin:/bin", "HOME=/"]);
-    let namespaces = config["linux"]["namespaces"]
-        .as_array_mut()
-        .context("namespaces")?;
+    let namespaces = config["linux"]["namespaces"].as_array_mut().context("namespaces")?;
     namespaces.push(json!({ "type": "network" }));
     // We create the user namespace before the container, limited by what the kernel counts per user; peers create it
     // from its mappings.

@@ -78,14 +78,10 @@ fn missing_directories(path: &Path) -> Result<Vec<PathBuf>> {
 /// Returns our own cgroup in the hierarchy of the memory controller.
 fn own_cgroup() -> Result<String> {
     let text = fs::read_to_string("/proc/self/cgroup")?;
-    let fields = text
-        .lines()
-        .filter_map(|line| line.split_once(':')?.1.split_once(':'));
+    let fields = text.lines().filter_map(|line| line.split_once(':')?.1.split_once(':'));
     let fields: Vec<_> = fields.collect();
     let of = |name: &str| {
-        let found = fields
-            .iter()
-            .find(|(controllers, _)| controllers.split(',').any(|one| one == name));
+        let found = fields.iter().find(|(controllers, _)| controllers.split(',').any(|one| one == name));
         found.map(|(_, path)| path.trim_end_matches('/').to_owned())
     };
     of("memory").or_else(|| of("")).context("no cgroup")

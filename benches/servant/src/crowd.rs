@@ -17,17 +17,11 @@ const MEMORY: f64 = 4.0;
 const IDLE: f64 = 0.1;
 
 /// Measures from one servant to many and back.
-pub(crate) fn measure(
-    report: &mut BenchReport,
-    daemon: &BenchDaemon,
-    image: &ServiceImage,
-) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &BenchDaemon, image: &ServiceImage) -> Result<()> {
     let (crowd, watch) = if is_full_run() { (100, 60) } else { (30, 35) };
     let starts = |what: &str| -> Result<Vec<Duration>> {
         eprintln!("{STARTS} starts {what}");
-        (0..STARTS)
-            .map(|_| time_robot_start(daemon, image))
-            .collect()
+        (0..STARTS).map(|_| time_robot_start(daemon, image)).collect()
     };
     let mut first = starts("on an idle host")?;
     for count in [1, 20] {
@@ -45,10 +39,7 @@ pub(crate) fn measure(
     let title = format!("start of servant {}", crowd + 1);
     report
         .figure(title, "ms", quantile_seconds(&last, 0.5) * 1e3)
-        .relative_to(
-            "the first, before and after",
-            quantile_seconds(&first, 0.5) * 1e3,
-        )
+        .relative_to("the first, before and after", quantile_seconds(&first, 0.5) * 1e3)
         .require(Target::RatioAtMost(1.5))
         .note(format!("medians of {STARTS} and {}", 2 * STARTS));
     Ok(())
@@ -75,33 +66,19 @@ fn settle() {
 /// Reports the memory of shim and init per servant.
 fn report_overhead(report: &mut BenchReport, daemon: &BenchDaemon, count: usize) -> Result<()> {
     let all = ServantOverhead::for_all_servants(daemon)?;
-    let costs = all
-        .iter()
-        .map(|one| one.memory())
-        .collect::<Result<Vec<_>>>()?;
+    let costs = all.iter().map(|one| one.memory()).collect::<Result<Vec<_>>>()?;
     let mean = costs.iter().sum::<f64>() / costs.len() as f64;
-    let inits = all
-        .iter()
-        .map(|one| Process::from_pid(one.init).proportional())
-        .collect::<Result<Vec<_>>>()?;
+    let inits = all.iter().map(|one| Process::from_pid(one.init).proportional()).collect::<Result<Vec<_>>>()?;
     let init = inits.iter().sum::<f64>() / inits.len() as f64;
     report
         .figure(format!("shim + init, each of {count} idle"), "MB", mean)
         .require(Target::AtMost(MEMORY))
-        .note(format!(
-            "PSS; most {:.2}, init {init:.2}",
-            costs.iter().copied().fold(0.0, f64::max)
-        ));
+        .note(format!("PSS; most {:.2}, init {init:.2}", costs.iter().copied().fold(0.0, f64::max)));
     Ok(())
 }
 
 /// Reports our processes together: memory per servant, and processor time while idle.
-fn report_total(
-    report: &mut BenchReport,
-    daemon: &BenchDaemon,
-    count: usize,
-    watch: Duration,
-) -> Result<()> {
+fn report_total(report: &mut BenchReport, daemon: &BenchDaemon, count: usize, watch: Duration) -> Result<()> {
     let all = ServantOverhead::for_all_servants(daemon)?;
     let of_daemon = Process::from_pid(daemon.pid()).proportional()?;
     let of_servants = all.iter().map(|one| one.memory()).sum::<Result<f64>>()?;
@@ -110,32 +87,20 @@ fn report_total(
         .figure(title, "MB", (of_daemon + of_servants) / count as f64)
         .require(Target::AtMost(MEMORY))
         .note(format!("PSS; the daemon {of_daemon:.1}"));
-    let sum = |pick: fn(&ServantOverhead) -> i32| {
-        all.iter()
-            .map(|one| processor_time(pick(one)))
-            .sum::<Result<Duration>>()
-    };
-    let used = || -> Result<[Duration; 3]> {
-        Ok([
-            processor_time(daemon.pid())?,
-            sum(|one| one.shim)?,
-            sum(|one| one.init)?,
-        ])
-    };
+    let sum =
+        |pick: fn(&ServantOverhead) -> i32| all.iter().map(|one| processor_time(pick(one))).sum::<Result<Duration>>();
+    let used =
+        || -> Result<[Duration; 3]> { Ok([processor_time(daemon.pid())?, sum(|one| one.shim)?, sum(|one| one.init)?]) };
     eprintln!("idle for {} s", watch.as_secs());
     let (before, begun) = (used()?, Instant::now());
     std::thread::sleep(watch);
     let (after, lasted) = (used()?, begun.elapsed());
-    let share =
-        |index: usize| (after[index] - before[index]).as_secs_f64() / lasted.as_secs_f64() * 100.0;
+    let share = |index: usize| (after[index] - before[index]).as_secs_f64() / lasted.as_secs_f64() * 100.0;
     let [daemon, shims, inits] = [share(0), share(1), share(2)];
     let title = format!("idle processor, all of ours, {count} servants");
     report
         .figure(title, "%", daemon + shims + inits)
         .require(Target::AtMost(IDLE))
-        .note(format!(
-            "of a core over {} s; daemon {daemon:.3}, shims {shims:.3}, inits {inits:.3}",
-            watch.as_secs()
-        ));
+        .note(format!("of a core over {} s; daemon {daemon:.3}, shims {shims:.3}, inits {inits:.3}", watch.as_secs()));
     Ok(())
 }

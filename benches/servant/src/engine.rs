@@ -20,11 +20,7 @@ impl<'a> BenchEngine<'a> {
     /// Creates an engine with its servants below `place`.
     pub(crate) fn prepare(place: &Path, runtime: &'a Handle) -> Result<Self> {
         let shim = vec![binaries::path("cloudroidd").into_os_string(), "shim".into()];
-        let mut config = LocalEngineConfig::new(
-            place.join("servants"),
-            shim,
-            binaries::path("cloudroid-init"),
-        );
+        let mut config = LocalEngineConfig::new(place.join("servants"), shim, binaries::path("cloudroid-init"));
         config.isolation = Isolation::BestEffort;
         let engine = runtime.block_on(async { LocalEngine::new(config) })?;
         engine.warm_up();

@@ -30,11 +30,7 @@ impl ServiceImage {
         robot.leave()?;
         daemon.wait_for_servants(0)?;
         let interface = daemon.api(&format!("/api/v1/services/{service}/interface"))?;
-        Ok(Self {
-            service: service.to_owned(),
-            spec: launch.spec,
-            interface: serde_json::from_value(interface)?,
-        })
+        Ok(Self { service: service.to_owned(), spec: launch.spec, interface: serde_json::from_value(interface)? })
     }
 
     /// Returns its node.
@@ -50,24 +46,12 @@ impl ServiceImage {
                 Direction::Input => &ends.subscribers,
                 Direction::Output => &ends.publishers,
             });
-            topic
-                .nodes
-                .iter()
-                .all(|node| there.is_some_and(|there| there.contains(node)))
+            topic.nodes.iter().all(|node| there.is_some_and(|there| there.contains(node)))
         };
         let name = self.spec.nodes.first().map(|node| &node.name);
         name.is_some_and(|name| graph.nodes.contains_key(name))
-            && self
-                .interface
-                .topics
-                .iter()
-                .filter(|topic| !topic.lazy)
-                .all(topic)
-            && self
-                .interface
-                .services
-                .iter()
-                .all(|service| graph.services.contains_key(&service.name))
+            && self.interface.topics.iter().filter(|topic| !topic.lazy).all(topic)
+            && self.interface.services.iter().all(|service| graph.services.contains_key(&service.name))
     }
 }
 

@@ -46,44 +46,24 @@ fn start_daemon(servants: &str) -> Result<BenchDaemon> {
     let daemon = BenchDaemon::start(&format!("{CONFIG}{servants}"))?;
     eprintln!("pushing a launch file for topic_tools/relay");
     let space = write_install_space(daemon.directory(), "relay_only", None)?;
-    daemon.push(&[
-        space.to_str().context("UTF-8")?,
-        "--name",
-        "relay",
-        "--launch",
-        "relay.launch",
-    ])?;
+    daemon.push(&[space.to_str().context("UTF-8")?, "--name", "relay", "--launch", "relay.launch"])?;
     Ok(daemon)
 }
 
 /// Measures how servants start and, with `crowd`, how many of them fit.
 fn measure(crowd: bool) -> Result<()> {
-    ensure!(
-        nix::unistd::geteuid().is_root(),
-        "servants are made by root: sudo make bench"
-    );
+    ensure!(nix::unistd::geteuid().is_root(), "servants are made by root: sudo make bench");
     // Before there are threads: mounts made from here on disappear with this process, however it ends.
     unshare(CloneFlags::CLONE_NEWNS).context("a mount namespace of our own")?;
     let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
-    mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
-        .context("making mounts private")?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .enable_all()
-        .build()?;
+    mount(None::<&str>, "/", None::<&str>, private, None::<&str>).context("making mounts private")?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let daemon = start_daemon("")?;
     let image = ServiceImage::inspect(&daemon, "relay")?;
     let mut report = BenchReport::new("servant");
     let without_warm_pool = start_daemon("warm_pool = 0\n")?;
     let warm_nodes = start_daemon("warm_nodes = 1\n")?;
-    starts::measure(
-        &mut report,
-        &daemon,
-        &without_warm_pool,
-        &warm_nodes,
-        &image,
-        runtime.handle(),
-    )?;
+    starts::measure(&mut report, &daemon, &without_warm_pool, &warm_nodes, &image, runtime.handle())?;
     drop(without_warm_pool);
     drop(warm_nodes);
     if crowd {

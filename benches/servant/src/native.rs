@@ -53,19 +53,10 @@ impl Sockets for NativeSockets {
 
 impl<'a> NativeNode<'a> {
     /// Mounts the image below `place`.
-    pub(crate) fn prepare(
-        place: &Path,
-        image: &'a ServiceImage,
-        runtime: &'a Handle,
-    ) -> Result<Self> {
+    pub(crate) fn prepare(place: &Path, image: &'a ServiceImage, runtime: &'a Handle) -> Result<Self> {
         let root = ImageRoot::mount(place, &image.spec)?;
         root.mount_system()?;
-        Ok(Self {
-            image,
-            root,
-            network: Arc::new(NetNs::create()?),
-            runtime,
-        })
+        Ok(Self { image, root, network: Arc::new(NetNs::create()?), runtime })
     }
 
     /// Measures the time from exec until the node has registered.
@@ -75,8 +66,7 @@ impl<'a> NativeNode<'a> {
         let sockets = Arc::new(NativeSockets(self.network.clone()));
         let serving = {
             let master = master.clone();
-            self.runtime
-                .spawn(async move { master.serve(listener, sockets).await })
+            self.runtime.spawn(async move { master.serve(listener, sockets).await })
         };
         let begun = Instant::now();
         let mut child = self.spawn()?;
@@ -88,9 +78,7 @@ impl<'a> NativeNode<'a> {
                 }
                 anyhow::Ok(begun.elapsed())
             };
-            tokio::time::timeout(PATIENCE, registered)
-                .await
-                .context("the node did not register")?
+            tokio::time::timeout(PATIENCE, registered).await.context("the node did not register")?
         });
         let _ = child.kill();
         child.wait()?;
@@ -104,22 +92,11 @@ impl<'a> NativeNode<'a> {
         let node = self.image.node()?;
         let (program, arguments) = node.argv.split_first().context("a program")?;
         let mut command = Command::new(program);
-        command
-            .args(arguments)
-            .env_clear()
-            .envs(&self.image.spec.environment)
-            .envs(&node.environment);
-        command
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null());
+        command.args(arguments).env_clear().envs(&self.image.spec.environment).envs(&node.environment);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let network = self.network.as_fd().try_clone_to_owned()?;
         let root = CString::new(self.root.path().to_str().context("UTF-8")?)?;
-        let directory = CString::new(if node.directory.is_empty() {
-            "/"
-        } else {
-            node.directory.as_str()
-        })?;
+        let directory = CString::new(if node.directory.is_empty() { "/" } else { node.directory.as_str() })?;
         let enter = move || {
             setns(&network, CloneFlags::CLONE_NEWNET)?;
             nix::unistd::chroot(root.as_c_str())?;
@@ -128,8 +105,6 @@ impl<'a> NativeNode<'a> {
         };
         // SAFETY: between fork and exec it makes three system calls and does not allocate.
         unsafe { command.pre_exec(enter) };
-        command
-            .spawn()
-            .with_context(|| format!("executing {program}"))
+        command.spawn().with_context(|| format!("executing {program}"))
     }
 }

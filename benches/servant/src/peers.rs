@@ -31,14 +31,9 @@ pub(crate) struct PeerRuntime {
 impl PeerRuntime {
     /// Returns all known peers, each with the reason if it is not available.
     pub(crate) fn find_peers() -> Result<Vec<(Self, Result<()>)>> {
-        let store = tempfile::Builder::new()
-            .prefix("peer-")
-            .tempdir_in("/tmp")?;
+        let store = tempfile::Builder::new().prefix("peer-").tempdir_in("/tmp")?;
         let runtimes = RUNTIMES.map(|name| Self { name, store: None });
-        let engine = Self {
-            name: ENGINE,
-            store: Some(store),
-        };
+        let engine = Self { name: ENGINE, store: Some(store) };
         let with = |peer: Self| {
             let there = check_installed(peer.name);
             (peer, there)
@@ -74,8 +69,7 @@ impl PeerRuntime {
     /// no network.
     fn time_engine(&self, place: &Path, store: &Path, spec: &ContainerSpec) -> Result<Duration> {
         let (root, cgroups) = (ImageRoot::mount(place, spec)?, BenchCgroup::reserve()?);
-        let [images, run, temporary] =
-            ["images", "run", "tmp"].map(|name| store.join(name).display().to_string());
+        let [images, run, temporary] = ["images", "run", "tmp"].map(|name| store.join(name).display().to_string());
         let global = [
             "--root",
             &images,
@@ -89,8 +83,7 @@ impl PeerRuntime {
             "cgroupfs",
         ];
         let limits = &spec.limits;
-        let number =
-            |option: &str, value: Option<String>| value.map(|value| format!("--{option}={value}"));
+        let number = |option: &str, value: Option<String>| value.map(|value| format!("--{option}={value}"));
         let mut words = vec![
             "run".to_owned(),
             "--detach".to_owned(),
@@ -104,15 +97,9 @@ impl PeerRuntime {
             "--ulimit=nofile=1024:1024".to_owned(),
             "--ulimit=nproc=4096:4096".to_owned(),
         ];
-        words.extend(number(
-            "memory",
-            limits.memory.map(|bytes| bytes.to_string()),
-        ));
+        words.extend(number("memory", limits.memory.map(|bytes| bytes.to_string())));
         words.extend(number("cpus", limits.cpus.map(|cpus| cpus.to_string())));
-        words.extend(number(
-            "pids-limit",
-            limits.pids.map(|pids| pids.to_string()),
-        ));
+        words.extend(number("pids-limit", limits.pids.map(|pids| pids.to_string())));
         words.push("--rootfs".to_owned());
         words.push(format!("{}:O", root.path().display()));
         words.extend(PROGRAM.map(str::to_owned));
@@ -129,19 +116,10 @@ impl PeerRuntime {
         let mut command = Command::new(self.name);
         command.args(global).args(words);
         // A file rather than a pipe, because the container inherits it.
-        command
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(File::create(&log)?);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(File::create(&log)?);
         let status = command.status()?;
         let said = || fs::read_to_string(&log).unwrap_or_default();
-        ensure!(
-            status.success(),
-            "{} {}: {}",
-            self.name,
-            words[0],
-            said().trim()
-        );
+        ensure!(status.success(), "{} {}: {}", self.name, words[0], said().trim());
         Ok(())
     }
 }
@@ -150,11 +128,7 @@ impl PeerRuntime {
 fn check_installed(name: &str) -> Result<()> {
     let version = Command::new(name).arg("--version").output();
     let output = version.context("it is not installed")?;
-    ensure!(
-        output.status.success(),
-        "--version ended with {}",
-        output.status
-    );
+    ensure!(output.status.success(), "--version ended with {}", output.status);
     Ok(())
 }
 

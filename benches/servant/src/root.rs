@@ -23,19 +23,10 @@ impl ImageRoot {
         // Without shifted ids it belongs to another user, and only a user who may enter it can mount on it.
         fs::set_permissions(skeleton.join("root"), fs::Permissions::from_mode(0o755))?;
         let lowers = [&skeleton].into_iter().chain(spec.layers.iter().rev());
-        let lowers: Vec<&str> = lowers
-            .map(|lower| lower.to_str())
-            .collect::<Option<_>>()
-            .context("UTF-8")?;
+        let lowers: Vec<&str> = lowers.map(|lower| lower.to_str()).collect::<Option<_>>().context("UTF-8")?;
         let options = format!("lowerdir={}", lowers.join(":"));
-        mount(
-            Some("overlay"),
-            &path,
-            Some("overlay"),
-            MsFlags::MS_RDONLY,
-            Some(options.as_str()),
-        )
-        .with_context(|| format!("mounting {options}"))?;
+        mount(Some("overlay"), &path, Some("overlay"), MsFlags::MS_RDONLY, Some(options.as_str()))
+            .with_context(|| format!("mounting {options}"))?;
         Ok(Self { path })
     }
 
@@ -48,31 +39,12 @@ impl ImageRoot {
     pub(crate) fn mount_system(&self) -> Result<()> {
         let place = |name: &str| self.path.join(name);
         let nothing = MsFlags::empty();
-        mount(
-            Some("proc"),
-            &place("proc"),
-            Some("proc"),
-            nothing,
-            None::<&str>,
-        )
-        .context("/proc")?;
-        mount(
-            Some("/dev"),
-            &place("dev"),
-            None::<&str>,
-            MsFlags::MS_BIND | MsFlags::MS_REC,
-            None::<&str>,
-        )
-        .context("/dev")?;
+        mount(Some("proc"), &place("proc"), Some("proc"), nothing, None::<&str>).context("/proc")?;
+        mount(Some("/dev"), &place("dev"), None::<&str>, MsFlags::MS_BIND | MsFlags::MS_REC, None::<&str>)
+            .context("/dev")?;
         for name in ["root", "run", "tmp", "var/tmp"] {
-            mount(
-                Some("tmpfs"),
-                &place(name),
-                Some("tmpfs"),
-                nothing,
-                Some("size=64m"),
-            )
-            .with_context(|| name.to_owned())?;
+            mount(Some("tmpfs"), &place(name), Some("tmpfs"), nothing, Some("size=64m"))
+                .with_context(|| name.to_owned())?;
         }
         Ok(())
     }

@@ -21,10 +21,7 @@ pub(crate) fn list_nodes(robot: &mut Robot) -> Result<Vec<String>> {
     let answer = robot.call("/rosapi/nodes", json!({}))?;
     let nodes = answer["values"]["nodes"].as_array();
     let nodes = nodes.with_context(|| format!("nodes in {answer}"))?;
-    Ok(nodes
-        .iter()
-        .filter_map(|node| Some(node.as_str()?.to_owned()))
-        .collect())
+    Ok(nodes.iter().filter_map(|node| Some(node.as_str()?.to_owned())).collect())
 }
 
 /// Measures from a robot's connection until rosapi reports its node. Then the robot leaves, and its servant ends.
@@ -35,10 +32,7 @@ pub(crate) fn time_robot_start(daemon: &BenchDaemon, image: &ServiceImage) -> Re
     let nodes = list_nodes(&mut robot)?;
     let took = begun.elapsed();
     let node = &image.node()?.name;
-    ensure!(
-        nodes.contains(node),
-        "the servant was there without {node}: {nodes:?}"
-    );
+    ensure!(nodes.contains(node), "the servant was there without {node}: {nodes:?}");
     robot.leave()?;
     daemon.wait_for_servants(before)?;
     Ok(took)
@@ -46,9 +40,7 @@ pub(crate) fn time_robot_start(daemon: &BenchDaemon, image: &ServiceImage) -> Re
 
 /// Waits until the nodes run in a container of the warm pool; they have registered long before the next turn.
 fn wait_until_warm(daemon: &BenchDaemon) -> Result<()> {
-    daemon.wait_for("/api/v1/status", "nodes that run ahead", |status| {
-        (status["warm_nodes"] != 0).then_some(())
-    })?;
+    daemon.wait_for("/api/v1/status", "nodes that run ahead", |status| (status["warm_nodes"] != 0).then_some(()))?;
     std::thread::sleep(SETTLES);
     Ok(())
 }
@@ -72,19 +64,11 @@ struct Contestant<'a> {
 
 impl<'a> Contestant<'a> {
     fn ours(name: &'static str, start: impl Fn(&ContainerSpec) -> Result<Duration> + 'a) -> Self {
-        Self {
-            name,
-            optional: false,
-            start: Box::new(start),
-            times: Vec::new(),
-        }
+        Self { name, optional: false, start: Box::new(start), times: Vec::new() }
     }
 
     fn peer(name: &'static str, start: impl Fn(&ContainerSpec) -> Result<Duration> + 'a) -> Self {
-        Self {
-            optional: true,
-            ..Self::ours(name, start)
-        }
+        Self { optional: true, ..Self::ours(name, start) }
     }
 }
 
@@ -132,9 +116,7 @@ pub(crate) fn measure(
             continue;
         }
         let bundle = place.join(peer.name);
-        contestants.push(Contestant::peer(peer.name, move |spec| {
-            peer.time_container(&bundle, spec)
-        }));
+        contestants.push(Contestant::peer(peer.name, move |spec| peer.time_container(&bundle, spec)));
     }
     // The first round is a warm-up.
     for round in 0..=rounds {
@@ -161,10 +143,7 @@ pub(crate) fn measure(
         .into_iter()
         .map(|mut one| {
             one.times.sort_unstable();
-            Times {
-                name: one.name.to_owned(),
-                sorted: one.times,
-            }
+            Times { name: one.name.to_owned(), sorted: one.times }
         })
         .collect();
     report_starts(report, &all, rounds)
@@ -181,22 +160,13 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
     let title = "robot connects → node registered, bridged";
     report
         .figure(title, "ms", robots.median_milliseconds())
-        .relative_to(
-            "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * bare.median_milliseconds(),
-        )
+        .relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds())
         .require(Target::RatioAtMost(1.0))
-        .note(format!(
-            "medians of {rounds}, in turns; best {:.1} ms",
-            robots.best().as_secs_f64() * 1e3
-        ));
+        .note(format!("medians of {rounds}, in turns; best {:.1} ms", robots.best().as_secs_f64() * 1e3));
     let title = "robot connects → node registered, bridged, without a container made ahead";
     report
         .figure(title, "ms", needed(COLD)?.median_milliseconds())
-        .relative_to(
-            "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * bare.median_milliseconds(),
-        )
+        .relative_to("node alone + 1.5 × libcontainer alone", node + 1.5 * bare.median_milliseconds())
         .note("the first robot of a service, and robots that come faster than containers are made");
     let title = "robot connects → node registered, bridged, in a container made ahead";
     report
@@ -209,10 +179,7 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
         .figure(title, "ms", ready.median_milliseconds())
         .relative_to(UPGRADE, needed(UPGRADE)?.median_milliseconds())
         .require(Target::RatioAtMost(10.0))
-        .note(format!(
-            "warm_nodes = 1; the answer names the node; best {:.2} ms",
-            ready.best().as_secs_f64() * 1e3
-        ));
+        .note(format!("warm_nodes = 1; the answer names the node; best {:.2} ms", ready.best().as_secs_f64() * 1e3));
     report
         .figure("node alone: exec → registered", "ms", node)
         .note("in a chroot of the same layers, namespaces ready, the same Master");
@@ -221,9 +188,7 @@ fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Resu
         .relative_to(bare.name.clone(), bare.median_milliseconds())
         .require(Target::RatioAtMost(1.5))
         .note("ours with limits read back, shim, Master and init");
-    for other in all
-        .iter()
-        .filter(|times| ![ROBOT, COLD, READY, UPGRADE, NODE, ENGINE].contains(&times.name.as_str()))
+    for other in all.iter().filter(|times| ![ROBOT, COLD, READY, UPGRADE, NODE, ENGINE].contains(&times.name.as_str()))
     {
         if other.name != bare.name {
             report

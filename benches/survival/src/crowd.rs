@@ -21,10 +21,7 @@ impl IdleCrowd {
         let (connected, are_connected) = std::sync::mpsc::channel();
         let url = url.to_owned();
         let thread = std::thread::spawn(move || {
-            let Ok(runtime) = tokio::runtime::Builder::new_current_thread()
-                .enable_all()
-                .build()
-            else {
+            let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() else {
                 return 0;
             };
             runtime.block_on(async {
@@ -36,11 +33,7 @@ impl IdleCrowd {
                     }
                 }
                 let _ = connected.send(());
-                all.join_all()
-                    .await
-                    .into_iter()
-                    .filter(|is_answered| *is_answered)
-                    .count()
+                all.join_all().await.into_iter().filter(|is_answered| *is_answered).count()
             })
         });
         support::patience::receive(&are_connected)?;
@@ -51,18 +44,14 @@ impl IdleCrowd {
     pub(crate) fn ask_and_leave(self) -> Result<usize> {
         // Fails if all connections have ended.
         let _ = self.ask.send(true);
-        self.thread
-            .join()
-            .map_err(|_| anyhow!("the crowd panicked"))
+        self.thread.join().map_err(|_| anyhow!("the crowd panicked"))
     }
 }
 
 type Socket = tokio_tungstenite::WebSocketStream<tokio::net::TcpStream>;
 
 async fn connect_client(url: &str) -> Result<Socket> {
-    let address = url
-        .strip_prefix("ws://")
-        .and_then(|rest| rest.split('/').next());
+    let address = url.strip_prefix("ws://").and_then(|rest| rest.split('/').next());
     let stream = tokio::net::TcpStream::connect(address.context("a ws:// address")?).await?;
     Ok(tokio_tungstenite::client_async(url, stream).await?.0)
 }

@@ -28,13 +28,7 @@ struct Disk(PathBuf);
 impl Disk {
     fn mount(place: &Path) -> Result<Self> {
         fs::create_dir_all(place)?;
-        mount(
-            Some("tmpfs"),
-            place,
-            Some("tmpfs"),
-            MsFlags::empty(),
-            Some(SIZE),
-        )?;
+        mount(Some("tmpfs"), place, Some("tmpfs"), MsFlags::empty(), Some(SIZE))?;
         Ok(Self(place.to_owned()))
     }
 
@@ -120,13 +114,9 @@ fn run_rounds(disk: &Disk, home: &Path, rounds: u32) -> Result<FullDiskResult> {
     greeters::stop_all(&daemon)?;
     daemon.stop()?;
     daemon = setup.start()?;
-    let kept =
-        daemon.api("/api/v1/policy")?.to_string() + &daemon.api("/api/v1/tokens")?.to_string();
+    let kept = daemon.api("/api/v1/policy")?.to_string() + &daemon.api("/api/v1/tokens")?.to_string();
     outcome.confirmed = confirmed.len();
-    outcome.gone = confirmed
-        .into_iter()
-        .filter(|name| !kept.contains(&format!("\"{name}\"")))
-        .collect();
+    outcome.gone = confirmed.into_iter().filter(|name| !kept.contains(&format!("\"{name}\""))).collect();
     daemon.stop()?;
     Ok(outcome)
 }
@@ -162,10 +152,7 @@ impl FullDiskResult {
         report
             .figure(title, "", self.failed as f64)
             .require(Target::AtMost(0.0))
-            .note(format!(
-                "of {}, by {ROBOTS} robots in {rounds} rounds",
-                self.asked
-            ));
+            .note(format!("of {}, by {ROBOTS} robots in {rounds} rounds", self.asked));
         let title = format!("new robots answered once there is room again, of {rounds}");
         report
             .figure(title, "", f64::from(self.recovered))
@@ -176,14 +163,11 @@ impl FullDiskResult {
             .relative_to("a robot's first answer", median(&self.first))
             .note(format!("medians; at worst {:.0} ms", worst(&self.again)));
         let title = "changes that were confirmed on a full disk and are gone after a restart";
-        report
-            .figure(title, "", self.gone.len() as f64)
-            .require(Target::AtMost(0.0))
-            .note(format!(
-                "of {} that were confirmed, of {} that were asked for; gone: {:?}",
-                self.confirmed,
-                2 * CHANGES,
-                self.gone
-            ));
+        report.figure(title, "", self.gone.len() as f64).require(Target::AtMost(0.0)).note(format!(
+            "of {} that were confirmed, of {} that were asked for; gone: {:?}",
+            self.confirmed,
+            2 * CHANGES,
+            self.gone
+        ));
     }
 }

@@ -28,15 +28,10 @@ pub(crate) const SILENCE: Duration = Duration::from_secs(10);
 pub(crate) fn publish(home: &Path) -> Result<DaemonSetup> {
     // The same address for all daemons of this home, because robots keep using it.
     let address = TcpListener::bind("127.0.0.1:0")?.local_addr()?;
-    let setup = DaemonSetup::new(home)
-        .config(CONFIG)
-        .listen(&address.to_string());
+    let setup = DaemonSetup::new(home).config(CONFIG).listen(&address.to_string());
     let daemon = setup.start()?;
     eprintln!("pushing {SERVICE}");
-    daemon
-        .deployer()
-        .push(SERVICE, &["--node", "greeter"])?
-        .expect_success()?;
+    daemon.deployer().push(SERVICE, &["--node", "greeter"])?.expect_success()?;
     daemon.stop()?;
     Ok(setup)
 }
@@ -55,9 +50,7 @@ pub(crate) fn robot_path(robot: &str) -> String {
 /// Calls the node; returns how many names it has greeted.
 pub(crate) fn greeting_count(robot: &mut Robot) -> Result<u64> {
     let answer = robot.call("/greeter/count", json!({"reset": false}))?;
-    answer["values"]["count"]
-        .as_u64()
-        .with_context(|| answer.to_string())
+    answer["values"]["count"].as_u64().with_context(|| answer.to_string())
 }
 
 /// Publishes a name until the node's count has grown; returns the count.
@@ -89,27 +82,18 @@ pub(crate) struct ServantIdentity {
 }
 
 /// Returns the servants of these robots with their process ids.
-pub(crate) fn servant_identities(
-    daemon: &Daemon,
-    robots: &[String],
-) -> Result<Vec<ServantIdentity>> {
+pub(crate) fn servant_identities(daemon: &Daemon, robots: &[String]) -> Result<Vec<ServantIdentity>> {
     let all = daemon.servants_of(SERVICE)?;
     let of = |robot: &String| {
         let servant = all.iter().find(|servant| servant["robot"] == **robot);
         let servant = servant.with_context(|| format!("{robot} has no servant"))?;
-        Ok(ServantIdentity {
-            id: servant["id"].clone(),
-            pids: servant["pids"].clone(),
-        })
+        Ok(ServantIdentity { id: servant["id"].clone(), pids: servant["pids"].clone() })
     };
     robots.iter().map(of).collect()
 }
 
 /// Counts the servants of `before` that differ in `after`; all of them if `after` is an error.
-pub(crate) fn count_lost(
-    before: &[ServantIdentity],
-    after: &Result<Vec<ServantIdentity>>,
-) -> usize {
+pub(crate) fn count_lost(before: &[ServantIdentity], after: &Result<Vec<ServantIdentity>>) -> usize {
     let Ok(after) = after else {
         return before.len();
     };
@@ -137,20 +121,13 @@ impl ServantProcesses {
         let runtime: RuntimeRecord = launch::read_record(&place)?.context("a running servant")?;
         let node = i32::try_from(servant["pids"][0].as_i64().context("a node")?)?;
         let parent = procfs::status(node).and_then(|status| status.get("PPid")?.parse().ok());
-        Ok(Self {
-            shim: runtime.shim.pid,
-            init: parent.context("the node's parent")?,
-            node,
-        })
+        Ok(Self { shim: runtime.shim.pid, init: parent.context("the node's parent")?, node })
     }
 }
 
 /// Stops all servants.
 pub(crate) fn stop_all(daemon: &Daemon) -> Result<()> {
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     support::wait_until("the end of all servants", || {
         let left = daemon.api("/api/v1/servants")?;
         let is_empty = left.as_array().is_some_and(Vec::is_empty);

@@ -38,22 +38,14 @@ pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon, rounds: u32) ->
     let title = format!("until {CLIENTS} half-open WebSockets are let go");
     report
         .figure(title, "s", let_go.as_secs_f64())
-        .relative_to(
-            "the time without data that is configured",
-            greeters::SILENCE.as_secs_f64(),
-        )
+        .relative_to("the time without data that is configured", greeters::SILENCE.as_secs_f64())
         .require(Target::RatioAtMost(1.5));
     let all = rounds as usize * LINKS;
     let title = format!("half-open links of {all} whose next call is answered");
-    report
-        .figure(title, "", links.silent.len() as f64)
-        .require(Target::AtLeast(all as f64));
+    report.figure(title, "", links.silent.len() as f64).require(Target::AtLeast(all as f64));
     report
         .figure("until that is answered", "ms", median(&links.silent))
-        .relative_to(
-            "what the robot accepts (T_max)",
-            ACCEPTED.as_secs_f64() * 1e3,
-        )
+        .relative_to("what the robot accepts (T_max)", ACCEPTED.as_secs_f64() * 1e3)
         .note(format!(
             "medians; at worst {:.0} ms; {:.0} ms by a link that stands",
             worst(&links.silent),
@@ -70,23 +62,14 @@ fn lose_clients(daemon: &Daemon) -> Result<Duration> {
     first.leave()?;
     let before = Resources::read(daemon.pid())?.descriptors;
     let freezer = Freezer::new(&daemon.address)?;
-    let url = format!(
-        "ws://{}/{}",
-        freezer.server,
-        greeters::robot_path("half-open")
-    );
+    let url = format!("ws://{}/{}", freezer.server, greeters::robot_path("half-open"));
     let crowd = IdleCrowd::connect(&url, CLIENTS)?;
     let silent = freezer.freeze();
-    ensure!(
-        silent == CLIENTS,
-        "{silent} of {CLIENTS} connections are there"
-    );
+    ensure!(silent == CLIENTS, "{silent} of {CLIENTS} connections are there");
     let began = Instant::now();
     support::wait_until("the end of connections that carry nothing", || {
         let now = Resources::read(daemon.pid())?.descriptors;
-        Ok((now <= before)
-            .then_some(())
-            .ok_or_else(|| format!("{now} descriptors, {before} before")))
+        Ok((now <= before).then_some(()).ok_or_else(|| format!("{now} descriptors, {before} before")))
     })?;
     let took = began.elapsed();
     drop(freezer);

@@ -19,11 +19,7 @@ use crate::milliseconds::{median, worst};
 const STARTS_ALONE: usize = 5;
 
 /// Kills daemons under load and starts new ones in their place.
-pub(crate) fn kill_daemons(
-    report: &mut BenchReport,
-    setup: &DaemonSetup,
-    rounds: u32,
-) -> Result<()> {
+pub(crate) fn kill_daemons(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32) -> Result<()> {
     let mut alone = Vec::new();
     for _ in 0..STARTS_ALONE {
         let (daemon, took) = greeters::start(setup)?;
@@ -65,18 +61,11 @@ pub(crate) fn kill_daemons(
     }
     greeters::stop_all(&daemon)?;
     daemon.stop()?;
-    report_recovered(report, "the daemon", recovered, rounds).note(format!(
-        "{lost} servants of {} lost, {forgotten} nodes that had forgotten what they knew",
-        robots.len()
-    ));
+    report_recovered(report, "the daemon", recovered, rounds)
+        .note(format!("{lost} servants of {} lost, {forgotten} nodes that had forgotten what they knew", robots.len()));
     let title = "until a daemon with servants to find answers";
-    report
-        .figure(title, "ms", median(&found))
-        .relative_to("with none", median(&alone))
-        .note("medians");
-    report
-        .figure("the same, the worst", "ms", worst(&found))
-        .relative_to("with none, the worst", worst(&alone));
+    report.figure(title, "ms", median(&found)).relative_to("with none", median(&alone)).note("medians");
+    report.figure("the same, the worst", "ms", worst(&found)).relative_to("with none, the worst", worst(&alone));
     Ok(())
 }
 
@@ -112,12 +101,7 @@ impl fmt::Display for Victim {
 
 /// Kills the process in servants of a new robot each time, because a robot whose servants fail repeatedly has to wait
 /// before the next start.
-pub(crate) fn kill_in_servants(
-    report: &mut BenchReport,
-    daemon: &Daemon,
-    victim: Victim,
-    rounds: u32,
-) -> Result<()> {
+pub(crate) fn kill_in_servants(report: &mut BenchReport, daemon: &Daemon, victim: Victim, rounds: u32) -> Result<()> {
     let (mut first, mut again) = (Vec::new(), Vec::new());
     for round in 0..rounds {
         let name = format!("{victim}-{round}");
@@ -131,9 +115,7 @@ pub(crate) fn kill_in_servants(
         // The node ends whichever of the processes is killed; until then it may still answer.
         support::wait_until("the end of the node", || {
             let is_there = procfs::is_running(processes.node);
-            Ok((!is_there)
-                .then_some(())
-                .ok_or_else(|| "it runs".to_owned()))
+            Ok((!is_there).then_some(()).ok_or_else(|| "it runs".to_owned()))
         })?;
         match greeters::ask_until_answered(daemon, &name) {
             Ok(_) => again.push(began.elapsed()),
@@ -145,14 +127,11 @@ pub(crate) fn kill_in_servants(
     let recovered = u32::try_from(again.len()).unwrap_or(u32::MAX);
     report_recovered(report, &format!("a servant's {victim}"), recovered, rounds);
     let title = format!("from kill -9 of the {victim} to the next answer");
-    report
-        .figure(title, "ms", median(&again))
-        .relative_to("a robot's first answer", median(&first))
-        .note(format!(
-            "medians; at worst {:.0} ms beside {:.0} ms",
-            worst(&again),
-            worst(&first)
-        ));
+    report.figure(title, "ms", median(&again)).relative_to("a robot's first answer", median(&first)).note(format!(
+        "medians; at worst {:.0} ms beside {:.0} ms",
+        worst(&again),
+        worst(&first)
+    ));
     Ok(())
 }
 
@@ -163,7 +142,5 @@ fn report_recovered<'a>(
     rounds: u32,
 ) -> &'a mut bench_report::Figure {
     let title = format!("kill -9 of {victim}, recovered of {rounds}");
-    report
-        .figure(title, "", f64::from(recovered))
-        .require(Target::AtLeast(f64::from(rounds)))
+    report.figure(title, "", f64::from(recovered)).require(Target::AtLeast(f64::from(rounds)))
 }

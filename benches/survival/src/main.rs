@@ -48,10 +48,7 @@ fn main() -> Result<()> {
     let parts: Vec<&str> = match words.as_slice() {
         [] => PARTS.to_vec(),
         [word] if PARTS.contains(&word.as_str()) => vec![word],
-        _ => bail!(
-            "it takes nothing, or one of these words: {}",
-            PARTS.join(", ")
-        ),
+        _ => bail!("it takes nothing, or one of these words: {}", PARTS.join(", ")),
     };
     let rounds = match std::env::var("CLOUDROID_BENCH_ROUNDS") {
         Ok(rounds) => rounds.parse().context("CLOUDROID_BENCH_ROUNDS")?,

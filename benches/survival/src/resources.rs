@@ -68,12 +68,7 @@ impl Resources {
     }
 
     /// Adds figures for the current values, after `what`, compared with those from `before`.
-    pub(crate) fn add_figures(
-        self,
-        report: &mut BenchReport,
-        what: &str,
-        (when, before): (&str, Self),
-    ) {
+    pub(crate) fn add_figures(self, report: &mut BenchReport, what: &str, (when, before): (&str, Self)) {
         let title = format!("memory of the daemon after {what}, resident");
         report
             .figure(title, "MB", self.resident)

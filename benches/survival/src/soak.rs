@@ -22,9 +22,9 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Returns the duration `CLOUDROID_BENCH_SOAK`, such as `90s`, `30m` or `1h`.
 pub(crate) fn duration() -> Result<Duration> {
     match std::env::var("CLOUDROID_BENCH_SOAK") {
-        Ok(text) => parse(&text).with_context(|| {
-            format!("CLOUDROID_BENCH_SOAK={text:?}: write a number with s, m or h")
-        }),
+        Ok(text) => {
+            parse(&text).with_context(|| format!("CLOUDROID_BENCH_SOAK={text:?}: write a number with s, m or h"))
+        }
         Err(_) => Ok(USUALLY),
     }
 }
@@ -72,19 +72,11 @@ fn sample_resources(pid: i32, time: Duration, looks: &mut Vec<(Instant, Resource
     Ok(())
 }
 
-fn report_soak(
-    report: &mut BenchReport,
-    tally: &Tally,
-    looks: &[(Instant, Resources)],
-    time: Duration,
-) {
+fn report_soak(report: &mut BenchReport, tally: &Tally, looks: &[(Instant, Resources)], time: Duration) {
     let first = tally.failures.first().map_or("none", String::as_str);
     report
         .figure(
-            format!(
-                "{:.0} s of work by 20 robots, what failed",
-                time.as_secs_f64()
-            ),
+            format!("{:.0} s of work by 20 robots, what failed", time.as_secs_f64()),
             "",
             tally.failures.len() as f64,
         )
@@ -111,9 +103,5 @@ fn report_soak(
     report
         .figure(title, "ms", quantile(&last, 0.99))
         .relative_to("in its second quarter", quantile(&second, 0.99))
-        .note(format!(
-            "p50 {:.2} ms beside {:.2} ms",
-            quantile(&last, 0.5),
-            quantile(&second, 0.5)
-        ));
+        .note(format!("p50 {:.2} ms beside {:.2} ms", quantile(&last, 0.5), quantile(&second, 0.5)));
 }

@@ -29,9 +29,7 @@ pub(crate) fn measure(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32
         daemon.stop()?;
     }
     let mut daemon = setup.start()?;
-    let robots: Vec<String> = (0..SERVANTS)
-        .map(|number| format!("upgraded-{number}"))
-        .collect();
+    let robots: Vec<String> = (0..SERVANTS).map(|number| format!("upgraded-{number}")).collect();
     for robot in &robots {
         greeters::greet(&mut daemon.robot(&greeters::robot_path(robot))?)?;
     }
@@ -42,10 +40,7 @@ pub(crate) fn measure(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32
         let over = AtomicBool::new(false);
         daemon = std::thread::scope(|scope| -> Result<_> {
             let work = |robot: &String| {
-                let (url, over) = (
-                    format!("ws://{address}/{}", greeters::robot_path(robot)),
-                    &over,
-                );
+                let (url, over) = (format!("ws://{address}/{}", greeters::robot_path(robot)), &over);
                 scope.spawn(move || work_until(&url, over))
             };
             let at_work: Vec<_> = robots.iter().map(work).collect();
@@ -69,22 +64,14 @@ pub(crate) fn measure(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32
     greeters::stop_all(&daemon)?;
     daemon.stop()?;
     let title = format!("{rounds} upgrades with {SERVANTS} servants at work, servants lost");
-    report
-        .figure(title, "", lost as f64)
-        .require(Target::AtMost(0.0));
+    report.figure(title, "", lost as f64).require(Target::AtMost(0.0));
     let title = "nodes that had forgotten what they knew by then";
-    report
-        .figure(title, "", f64::from(forgotten))
-        .require(Target::AtMost(0.0));
+    report.figure(title, "", f64::from(forgotten)).require(Target::AtMost(0.0));
     let title = "longest time between two answers to a robot";
     report
         .figure(title, "ms", median(&gaps))
         .relative_to("end and start of a daemon with no servants", median(&alone))
-        .note(format!(
-            "medians; at worst {:.0} ms beside {:.0} ms",
-            worst(&gaps),
-            worst(&alone)
-        ));
+        .note(format!("medians; at worst {:.0} ms beside {:.0} ms", worst(&gaps), worst(&alone)));
     Ok(())
 }
 
@@ -99,10 +86,7 @@ fn work_until(url: &str, over: &AtomicBool) -> Duration {
         if connection.is_none() {
             connection = Robot::connect(url).ok();
         }
-        if connection
-            .as_mut()
-            .is_some_and(|robot| greeters::greeting_count(robot).is_ok())
-        {
+        if connection.as_mut().is_some_and(|robot| greeters::greeting_count(robot).is_ok()) {
             longest = longest.max(answered.elapsed());
             answered = Instant::now();
             if is_last {

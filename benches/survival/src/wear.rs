@@ -11,12 +11,7 @@ use crate::resources::Resources;
 use crate::{crowds, half_open};
 
 /// Makes both passes, the second with `kills` kills of each kind; kinds that take longer are limited to `few`.
-pub(crate) fn measure(
-    report: &mut BenchReport,
-    daemon: &Daemon,
-    kills: u32,
-    few: u32,
-) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon, kills: u32, few: u32) -> Result<()> {
     // The figures of the first pass are nobody's.
     make_pass(&mut BenchReport::new("first"), daemon, few, few)?;
     let before = Resources::read_at_rest(daemon.pid())?;

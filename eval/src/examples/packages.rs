@@ -132,12 +132,8 @@ pub const DETECTOR: EvalPackage = EvalPackage {
 };
 
 /// The first 78 s of the simulated drive: 80 m that end close to their start.
-pub const LASER_SLAM_SIMULATED: EvalPackage = EvalPackage {
-    parameters: &["_laser_x:=0.2"],
-    input: InputRecording::Simulated,
-    requests: 760,
-    ..LASER_SLAM
-};
+pub const LASER_SLAM_SIMULATED: EvalPackage =
+    EvalPackage { parameters: &["_laser_x:=0.2"], input: InputRecording::Simulated, requests: 760, ..LASER_SLAM };
 
 /// Finds pedestrians by histograms of gradients (OpenCV), as Debian packages the node.
 pub const PEOPLE: EvalPackage = EvalPackage {

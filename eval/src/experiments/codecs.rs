@@ -163,12 +163,7 @@ pub struct CodecRuns {
 /// Measures all streams; a quick evaluation sends a video over the LAN, without a codec and as JPEG.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<CodecRuns> {
     let sources = StreamSources { cells, workshop };
-    let mut runs = CodecRuns {
-        streams: Vec::new(),
-        received: Vec::new(),
-        alone: Vec::new(),
-        quick,
-    };
+    let mut runs = CodecRuns { streams: Vec::new(), received: Vec::new(), alone: Vec::new(), quick };
     for what in streams_to_measure(quick) {
         // A codec that is not built into the programs is missing on every network.
         let lacks = |(other, sent): &(StreamSpec, CachedResult<StreamResult>)| {
@@ -198,9 +193,7 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result
         runs.streams.push((what, sent));
         if what.setting.is_lossy() && what.network == NetworkProfile::Lan && !lacks {
             let name = format!("codecs received {}", stream_title(&what));
-            let received = cells.measure(&name, &(&what, CLASS), || {
-                received::measure(&sources, &what)
-            })?;
+            let received = cells.measure(&name, &(&what, CLASS), || received::measure(&sources, &what))?;
             runs.received.push((what, received));
         }
     }
@@ -215,12 +208,7 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result
 }
 
 fn stream_title(what: &StreamSpec) -> String {
-    format!(
-        "{} {} {}",
-        what.kind.name(),
-        what.setting.name(),
-        what.network.name()
-    )
+    format!("{} {} {}", what.kind.name(), what.setting.name(), what.network.name())
 }
 
 /// Streams in the order of the published table.
@@ -251,11 +239,7 @@ fn streams_to_measure(quick: bool) -> Vec<StreamSpec> {
 }
 
 /// Returns the robot's plan for a stream.
-fn robot_plan(
-    sources: &StreamSources,
-    what: &StreamSpec,
-    directory: &std::path::Path,
-) -> Result<RobotPlan> {
+fn robot_plan(sources: &StreamSources, what: &StreamSpec, directory: &std::path::Path) -> Result<RobotPlan> {
     let workshop = sources.workshop;
     publish_receipts(workshop)?;
     let (topic, answer) = (what.kind.topic(), format!("/{PACKAGE}/receipt"));
@@ -288,9 +272,7 @@ fn robot_plan(
 /// Publishes the node that sends receipts, unless it has been published, or has failed, before.
 fn publish_receipts(workshop: &EvalFixtures) -> Result<()> {
     let services = workshop.daemon.deployer().run_json(&["services"])?;
-    let known = services
-        .as_array()
-        .is_some_and(|all| all.iter().any(|service| service["name"] == PACKAGE));
+    let known = services.as_array().is_some_and(|all| all.iter().any(|service| service["name"] == PACKAGE));
     if known {
         return Ok(());
     }
@@ -298,9 +280,7 @@ fn publish_receipts(workshop: &EvalFixtures) -> Result<()> {
         eprintln!("pushing {PACKAGE}");
         let with = ["--node", EXECUTABLE, "--cpus", "1", "--memory", "1G"];
         let pushed = workshop.daemon.deployer().push(PACKAGE, &with);
-        pushed?
-            .expect_success()
-            .context("pushing the node that answers")?;
+        pushed?.expect_success().context("pushing the node that answers")?;
         Ok(())
     })
 }
@@ -340,18 +320,10 @@ mod tests {
             response: carried.map(|_| 0.1),
             ..RequestSample::default()
         };
-        let requests = [
-            one(Some([900, 90])),
-            one(Some([1000, 100])),
-            one(Some([1300, 110])),
-            one(None),
-            one(Some([1900, 130])),
-        ];
+        let requests =
+            [one(Some([900, 90])), one(Some([1000, 100])), one(Some([1300, 110])), one(None), one(Some([1900, 130]))];
         assert_eq!(bytes_per_message(&requests, 2), [300]);
-        let trace = |requests: &[RequestSample]| Trace {
-            requests: requests.to_vec(),
-            ..Trace::default()
-        };
+        let trace = |requests: &[RequestSample]| Trace { requests: requests.to_vec(), ..Trace::default() };
         assert_eq!(trace(&requests).bytes_per_request(2), Some([300.0, 10.0]));
         assert_eq!(trace(&requests).bytes_per_request(0), None);
         assert_eq!(trace(&requests[..2]).bytes_per_request(2), None);
@@ -365,9 +337,7 @@ mod tests {
             let all = streams_to_measure(quick);
             for what in &all {
                 let base = all.iter().any(|base| {
-                    base.setting == Setting::None
-                        && base.kind == what.kind
-                        && base.network == what.network
+                    base.setting == Setting::None && base.kind == what.kind && base.network == what.network
                 });
                 assert!(base, "{what:?}");
             }

@@ -67,12 +67,7 @@ const SUBJECTS: [Subject; 3] = [
 ];
 
 /// Program of a quick evaluation.
-const QUICK: Subject = Subject {
-    fitted: &[0.25, 0.5, 1.0],
-    held_back: &[0.75],
-    requests: 6,
-    ..SUBJECTS[0]
-};
+const QUICK: Subject = Subject { fitted: &[0.25, 0.5, 1.0], held_back: &[0.75], requests: 6, ..SUBJECTS[0] };
 
 /// One run in the cloud.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -93,46 +88,24 @@ pub struct ProgramStudy {
 }
 
 /// Measures all programs; a quick evaluation measures one at few limits.
-pub fn measure(
-    cells: &RunCache,
-    workshop: &EvalFixtures,
-    quick: bool,
-) -> Result<Vec<ProgramStudy>> {
-    let subjects = if quick {
-        vec![QUICK]
-    } else {
-        SUBJECTS.to_vec()
-    };
-    subjects
-        .into_iter()
-        .map(|subject| measure_study(cells, workshop, subject))
-        .collect()
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<Vec<ProgramStudy>> {
+    let subjects = if quick { vec![QUICK] } else { SUBJECTS.to_vec() };
+    subjects.into_iter().map(|subject| measure_study(cells, workshop, subject)).collect()
 }
 
-fn measure_study(
-    cells: &RunCache,
-    workshop: &EvalFixtures,
-    subject: Subject,
-) -> Result<ProgramStudy> {
+fn measure_study(cells: &RunCache, workshop: &EvalFixtures, subject: Subject) -> Result<ProgramStudy> {
     let name = format!("cores {}", subject.name);
-    let native = cells.measure(&format!("{name} native"), &subject.requests, || {
-        measure_native(workshop, &subject)
-    })?;
+    let native = cells.measure(&format!("{name} native"), &subject.requests, || measure_native(workshop, &subject))?;
     let mut limits = [subject.fitted, subject.held_back].concat();
     limits.sort_by(f64::total_cmp);
     let mut runs = Vec::new();
     for cores in limits {
         let of = (cores, subject.requests, subject.arguments);
-        let measured = cells.measure(&format!("{name} {cores}"), &of, || {
-            measure_outsourced(workshop, &subject, cores)
-        })?;
+        let measured =
+            cells.measure(&format!("{name} {cores}"), &of, || measure_outsourced(workshop, &subject, cores))?;
         runs.push((cores, measured));
     }
-    Ok(ProgramStudy {
-        subject,
-        native,
-        runs,
-    })
+    Ok(ProgramStudy { subject, native, runs })
 }
 
 fn measure_native(workshop: &EvalFixtures, subject: &Subject) -> Result<Trace> {
@@ -145,11 +118,7 @@ fn measure_native(workshop: &EvalFixtures, subject: &Subject) -> Result<Trace> {
 
 /// Measures in the cloud. The robot's stub states the servant's cores; the enforced limit is read from the daemon while
 /// the servant is kept for the robot.
-fn measure_outsourced(
-    workshop: &EvalFixtures,
-    subject: &Subject,
-    cores: f64,
-) -> Result<CoreLimitRun> {
+fn measure_outsourced(workshop: &EvalFixtures, subject: &Subject, cores: f64) -> Result<CoreLimitRun> {
     let robot = format!("cores-{}-{cores}-{}", subject.threads, std::process::id());
     let (at, place) = (ExecutionSite::Outsourced, (RobotHardware::PI, NETWORK));
     let (trace, cost) = workshop.run(&subject.example, at, place, |plan| {
@@ -164,21 +133,10 @@ fn measure_outsourced(
     let enforced = enforced.context("the servant's cores are not limited")?;
     let id = servant["id"].as_str().context("a servant's id")?;
     // The servant's cores stay promised until it ends.
-    workshop
-        .daemon
-        .deployer()
-        .run(&["stop", id])?
-        .expect_success()?;
-    ensure!(
-        (enforced - cores).abs() < 0.01,
-        "the servant was to have {cores} cores and had {enforced}"
-    );
+    workshop.daemon.deployer().run(&["stop", id])?.expect_success()?;
+    ensure!((enforced - cores).abs() < 0.01, "the servant was to have {cores} cores and had {enforced}");
     ensure!(trace.answered_count() > 0, "no request was answered");
-    Ok(CoreLimitRun {
-        enforced,
-        trace,
-        cost,
-    })
+    Ok(CoreLimitRun { enforced, trace, cost })
 }
 
 /// Use of a limit in the model.
@@ -234,15 +192,9 @@ impl<'a> ProgramFit<'a> {
             points.extend(parts.map(|parts| (*cores, parts, of)));
         }
         let fitted = points.iter().filter(|point| point.2 == LimitUse::Fitted);
-        let fitted: Vec<(f64, ResponseParts)> =
-            fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
+        let fitted: Vec<(f64, ResponseParts)> = fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
         let native = study.native.value().and_then(mean_parts);
-        Self {
-            study,
-            points,
-            model: Model::fit(&fitted, study.subject.threads),
-            native: native.map(total_time),
-        }
+        Self { study, points, model: Model::fit(&fitted, study.subject.threads), native: native.map(total_time) }
     }
 
     fn name(&self) -> &'static str {

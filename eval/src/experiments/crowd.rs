@@ -30,20 +30,11 @@ pub struct WorkerService {
 }
 
 /// A service with short calls.
-pub const SHORT: WorkerService = WorkerService {
-    name: "short_work",
-    milliseconds: 8,
-};
+pub const SHORT: WorkerService = WorkerService { name: "short_work", milliseconds: 8 };
 /// A service whose calls are as long as a detector's.
-pub const LONG: WorkerService = WorkerService {
-    name: "long_work",
-    milliseconds: 50,
-};
+pub const LONG: WorkerService = WorkerService { name: "long_work", milliseconds: 50 };
 /// A service whose call lasts longer than any measurement: its robot uses all the core time that it can get.
-pub const ENDLESS: WorkerService = WorkerService {
-    name: "endless_work",
-    milliseconds: 3_600_000,
-};
+pub const ENDLESS: WorkerService = WorkerService { name: "endless_work", milliseconds: 3_600_000 };
 
 /// True if cores are moved to robots that stated which response time they accept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -75,10 +66,7 @@ pub struct CrowdDaemon {
 impl CrowdDaemon {
     /// Keeps its state below `place`.
     pub fn new(place: &Path) -> Self {
-        Self {
-            setup: DaemonSetup::new(&place.join("yard")).config(CONFIG),
-            open: None,
-        }
+        Self { setup: DaemonSetup::new(&place.join("yard")).config(CONFIG), open: None }
     }
 
     /// Returns the daemon with this configuration and without servants.
@@ -86,10 +74,7 @@ impl CrowdDaemon {
         let daemon = self.open(controller)?;
         let nobody = |all: &Value| all.as_array().is_some_and(Vec::is_empty).then_some(());
         if nobody(&daemon.api("/api/v1/servants")?).is_none() {
-            daemon
-                .deployer()
-                .run(&["stop", "--all"])?
-                .expect_success()?;
+            daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
             daemon.wait_for("/api/v1/servants", "the end of all servants", nobody)?;
         }
         Ok(daemon)
@@ -124,14 +109,7 @@ fn push(daemon: &Daemon, service: WorkerService) -> Result<()> {
     let package = binaries::checkout().join(PACKAGE);
     let package = package.to_str().context("a path of UTF-8")?;
     let milliseconds = format!("milliseconds={}", service.milliseconds);
-    let push = [
-        "push",
-        package,
-        "--name",
-        service.name,
-        "--node",
-        EXECUTABLE,
-    ];
+    let push = ["push", package, "--name", service.name, "--node", EXECUTABLE];
     let push = [&push[..], &["--param", &milliseconds]].concat();
     daemon.deployer().run(&push)?.expect_success()?;
     Ok(())

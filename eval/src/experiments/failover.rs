@@ -41,30 +41,17 @@ pub struct FaultSchedule {
 impl FaultSchedule {
     /// Schedule of the publication.
     pub fn from_publication() -> Self {
-        Self {
-            requests: 130,
-            bad: vec![(24, 45), (75, 96), (111, 122)],
-            stragglers: 10.0,
-        }
+        Self { requests: 130, bad: vec![(24, 45), (75, 96), (111, 122)], stragglers: 10.0 }
     }
 
     /// Schedule with a single phase.
     pub fn quick() -> Self {
-        Self {
-            requests: 18,
-            bad: vec![(5, 12)],
-            stragglers: 2.0,
-        }
+        Self { requests: 18, bad: vec![(5, 12)], stragglers: 2.0 }
     }
 
     /// Requests before which the network changes.
     fn network_changes(&self) -> Vec<(usize, NetworkProfile)> {
-        let both = |(first, last): &(usize, usize)| {
-            [
-                (*first, NetworkProfile::Bad),
-                (last + 1, NetworkProfile::Lan),
-            ]
-        };
+        let both = |(first, last): &(usize, usize)| [(*first, NetworkProfile::Bad), (last + 1, NetworkProfile::Lan)];
         self.bad.iter().flat_map(both).collect()
     }
 }
@@ -109,17 +96,9 @@ pub struct FailoverRuns {
 /// Measures all set-ups; a quick evaluation has one degraded phase, and neither a cold original nor one alone.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<FailoverRuns> {
     let (course, set_ups) = if quick {
-        (
-            FaultSchedule::quick(),
-            &[FailoverSetUp::Stub, FailoverSetUp::Cloud][..],
-        )
+        (FaultSchedule::quick(), &[FailoverSetUp::Stub, FailoverSetUp::Cloud][..])
     } else {
-        let all = &[
-            FailoverSetUp::Stub,
-            FailoverSetUp::Cold,
-            FailoverSetUp::Cloud,
-            FailoverSetUp::Local,
-        ][..];
+        let all = &[FailoverSetUp::Stub, FailoverSetUp::Cold, FailoverSetUp::Cloud, FailoverSetUp::Local][..];
         (FaultSchedule::from_publication(), all)
     };
     let mut runs = Vec::new();
@@ -127,19 +106,12 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result
         let name = format!("failover {}", set_up.name());
         let of = (&course, CLASS, HERTZ, TIMES);
         let measured = cells.measure(&name, &of, || run_once(workshop, *set_up, &course))?;
-        runs.push(FailoverRun {
-            set_up: *set_up,
-            measured,
-        });
+        runs.push(FailoverRun { set_up: *set_up, measured });
     }
     Ok(FailoverRuns { course, runs })
 }
 
-fn run_once(
-    workshop: &EvalFixtures,
-    set_up: FailoverSetUp,
-    course: &FaultSchedule,
-) -> Result<(Trace, RunCost)> {
+fn run_once(workshop: &EvalFixtures, set_up: FailoverSetUp, course: &FaultSchedule) -> Result<(Trace, RunCost)> {
     workshop.publish(&DETECTOR)?;
     let directory = workshop.directory()?;
     let native = workshop.plan(&DETECTOR, ExecutionSite::Native, directory.path())?;
@@ -149,10 +121,7 @@ fn run_once(
         FailoverSetUp::Cold => stub_plan(workshop, "cold", Some(&native), directory.path())?,
         FailoverSetUp::Cloud => stub_plan(workshop, "none", None, directory.path())?,
     };
-    plan.pace = RequestPacing::Rate {
-        hertz: HERTZ,
-        in_time: 2.0 * TIMES.1,
-    };
+    plan.pace = RequestPacing::Rate { hertz: HERTZ, in_time: 2.0 * TIMES.1 };
     plan.most = course.requests;
     plan.give_up = course.stragglers;
     plan.changes = course.network_changes();
@@ -162,19 +131,9 @@ fn run_once(
 }
 
 /// Returns the plan of the stub; the original of `native` is installed on the robot.
-fn stub_plan(
-    workshop: &EvalFixtures,
-    local: &str,
-    native: Option<&RobotPlan>,
-    directory: &Path,
-) -> Result<RobotPlan> {
+fn stub_plan(workshop: &EvalFixtures, local: &str, native: Option<&RobotPlan>, directory: &Path) -> Result<RobotPlan> {
     let mut plan = workshop.plan(&DETECTOR, ExecutionSite::Outsourced, directory)?;
-    if let NodeUnderTest::Stub {
-        settings,
-        environment,
-        ..
-    } = &mut plan.node
-    {
+    if let NodeUnderTest::Stub { settings, environment, .. } = &mut plan.node {
         *settings = format!(
             "service = \"{}\"\nrequest = \"{} -> {}\"\nlocal = \"{local}\"\ndesire = {:?}\nmax = {:?}\nthreshold = \
              {:?}\ninitial = {:?}\ncap = {:?}\nfallback_after = 300.0",
@@ -190,25 +149,15 @@ fn stub_plan(
 
 /// Creates a workspace whose program runs the original in its image's file system; returns its path.
 fn install_original(native: &RobotPlan, directory: &Path) -> Result<String> {
-    let NodeUnderTest::Native {
-        script,
-        program,
-        argv,
-    } = &native.node
-    else {
+    let NodeUnderTest::Native { script, program, argv } = &native.node else {
         anyhow::bail!("the plan of the original runs a stub");
     };
     // Arguments after the node's program come from the stub.
-    let ends = argv
-        .iter()
-        .position(|word| word.ends_with(DETECTOR.executable));
+    let ends = argv.iter().position(|word| word.ends_with(DETECTOR.executable));
     let words = &argv[..=ends.context("the node's program is among the words")?];
     let quoted: Vec<String> = words.iter().map(|word| format!("'{word}'")).collect();
     let workspace = directory.join("workspace");
-    let launcher = workspace
-        .join("lib")
-        .join(DETECTOR.name)
-        .join(DETECTOR.executable);
+    let launcher = workspace.join("lib").join(DETECTOR.name).join(DETECTOR.executable);
     std::fs::create_dir_all(launcher.parent().context("a directory")?)?;
     std::fs::write(workspace.join(".catkin"), "")?;
     // The stub sets the Master's address in environment variables, which `env` extends.
@@ -255,10 +204,7 @@ mod tests {
     use super::*;
 
     fn test_requests(responses: &[Option<f64>]) -> Vec<RequestSample> {
-        let one = |response: &Option<f64>| RequestSample {
-            response: *response,
-            ..RequestSample::default()
-        };
+        let one = |response: &Option<f64>| RequestSample { response: *response, ..RequestSample::default() };
         responses.iter().map(one).collect()
     }
 
@@ -270,41 +216,28 @@ mod tests {
 
     #[test]
     fn late_requests_are_counted_from_onset_to_onset() {
-        let course = FaultSchedule {
-            requests: 6,
-            bad: vec![(2, 3), (5, 5)],
-            stragglers: 1.0,
-        };
+        let course = FaultSchedule { requests: 6, bad: vec![(2, 3), (5, 5)], stragglers: 1.0 };
         let all = test_requests(&[None, Some(0.9), Some(0.1), None, Some(0.1), Some(2.0)]);
         assert_eq!(count_late(&course, &all), [2, 1]);
     }
 
     #[test]
     fn the_network_is_good_again_after_the_last_bad_request() {
-        assert_eq!(
-            FaultSchedule::quick().network_changes(),
-            [(5, NetworkProfile::Bad), (13, NetworkProfile::Lan)]
-        );
+        assert_eq!(FaultSchedule::quick().network_changes(), [(5, NetworkProfile::Bad), (13, NetworkProfile::Lan)]);
         assert_eq!(FaultSchedule::from_publication().network_changes().len(), 6);
     }
 
     #[test]
     fn the_original_is_installed_without_its_arguments() {
         let place = tempfile::tempdir().expect("a directory");
-        let words = [
-            "A=b c",
-            "/opt/lib/object_detector/object_detector_node",
-            "__name:=x",
-        ];
+        let words = ["A=b c", "/opt/lib/object_detector/object_detector_node", "__name:=x"];
         let node = NodeUnderTest::Native {
             script: "exec chroot /root \"$@\"".to_owned(),
             program: "/usr/bin/env".to_owned(),
             argv: words.map(str::to_owned).to_vec(),
         };
         let workspace = launcher(node, place.path()).expect("it is written");
-        assert!(
-            workspace.contains("'A=b c' '/opt/lib/object_detector/object_detector_node' \"$@\"")
-        );
+        assert!(workspace.contains("'A=b c' '/opt/lib/object_detector/object_detector_node' \"$@\""));
         assert!(!workspace.contains("__name"), "{workspace}");
     }
 

@@ -7,9 +7,7 @@ use anyhow::{Result, anyhow};
 use serde::{Deserialize, Serialize};
 
 use crate::cells::{CachedResult, RunCache};
-use crate::examples::{
-    EvalFixtures, EvalPackage, ExecutionSite, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED,
-};
+use crate::examples::{EvalFixtures, EvalPackage, ExecutionSite, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED};
 use crate::place::{NetworkProfile, RobotHardware, RunCost};
 use crate::plots::{self, Series};
 use crate::recording::Recording;
@@ -82,15 +80,10 @@ pub struct MapRuns {
 
 impl MapRuns {
     /// Returns the plays of one drive that were attempted.
-    fn for_drive<'a>(
-        &'a self,
-        drive: &Drive,
-    ) -> impl Iterator<Item = &'a (String, CachedResult<MapPlay>)> {
+    fn for_drive<'a>(&'a self, drive: &Drive) -> impl Iterator<Item = &'a (String, CachedResult<MapPlay>)> {
         let plays = drive.plays;
         self.plays.iter().filter(move |(name, _)| {
-            plays
-                .iter()
-                .any(|(_, native, stub)| [native, stub].iter().any(|one| *one == name))
+            plays.iter().any(|(_, native, stub)| [native, stub].iter().any(|one| *one == name))
         })
     }
 }
@@ -98,36 +91,24 @@ impl MapRuns {
 /// Measures all drives; a quick evaluation plays the real drive at its own rate, at most `most` scans of it.
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -> Result<MapRuns> {
     let mut plays = Vec::new();
-    let drives = if most.is_some() {
-        &DRIVES[..1]
-    } else {
-        &DRIVES
-    };
+    let drives = if most.is_some() { &DRIVES[..1] } else { &DRIVES };
     for drive in drives {
         // Created first, because both runs need it at the same time.
         if let Err(error) = workshop.recording(drive.example.input) {
             let why = format!("{error:#}");
-            let names = drive
-                .plays
-                .iter()
-                .flat_map(|(_, native, stub)| [native, stub]);
-            plays
-                .extend(names.map(|name| ((*name).to_owned(), CachedResult::Missing(why.clone()))));
+            let names = drive.plays.iter().flat_map(|(_, native, stub)| [native, stub]);
+            plays.extend(names.map(|name| ((*name).to_owned(), CachedResult::Missing(why.clone()))));
             continue;
         }
         let all = if most.is_some() { 1 } else { drive.plays.len() };
         for (speed, native, stub) in &drive.plays[..all] {
             // Both robots drive at the same time: each has its own share of the processor, and together with the cloud
             // they need less than two cores.
-            let play = |name: &str, at: ExecutionSite| {
-                measure_play(cells, workshop, drive, (name, at), *speed, most)
-            };
+            let play = |name: &str, at: ExecutionSite| measure_play(cells, workshop, drive, (name, at), *speed, most);
             let both = std::thread::scope(|scope| {
                 let beside = scope.spawn(|| play(stub, ExecutionSite::Outsourced));
                 let native = play(native, ExecutionSite::Native);
-                let stub = beside
-                    .join()
-                    .unwrap_or_else(|_| Err(anyhow!("the stub's robot panicked")));
+                let stub = beside.join().unwrap_or_else(|_| Err(anyhow!("the stub's robot panicked")));
                 [native, stub]
             });
             for (name, play) in [native, stub].into_iter().zip(both) {
@@ -146,31 +127,28 @@ fn measure_play(
     speed: f64,
     most: Option<usize>,
 ) -> Result<CachedResult<MapPlay>> {
-    cells.measure(
-        &format!("map {name}"),
-        &(RobotHardware::PI, speed, most),
-        || {
-            let input = drive.example.input;
-            let truth = Recording::read(&workshop.recording(input)?)?.positions(REFERENCE);
-            let robot = (RobotHardware::PI, NetworkProfile::Wifi);
-            let (trace, cost) = workshop.run(&drive.example, at, robot, |plan| {
-                plan.pace = RequestPacing::Recorded(speed);
-                plan.most = most.unwrap_or(match input {
-                    InputRecording::Simulated => drive.example.requests,
-                    _ => usize::MAX,
-                });
-                plan.patience = 1200.0;
-            })?;
-            Ok(MapPlay { trace, cost, truth })
-        },
-    )
+    cells.measure(&format!("map {name}"), &(RobotHardware::PI, speed, most), || {
+        let input = drive.example.input;
+        let truth = Recording::read(&workshop.recording(input)?)?.positions(REFERENCE);
+        let robot = (RobotHardware::PI, NetworkProfile::Wifi);
+        let (trace, cost) = workshop.run(&drive.example, at, robot, |plan| {
+            plan.pace = RequestPacing::Recorded(speed);
+            plan.most = most.unwrap_or(match input {
+                InputRecording::Simulated => drive.example.requests,
+                _ => usize::MAX,
+            });
+            plan.patience = 1200.0;
+        })?;
+        Ok(MapPlay { trace, cost, truth })
+    })
 }
 
 /// Creates the section of the report.
 pub fn section(runs: &MapRuns) -> Result<Section> {
     let mut section = Section::new(7, "map", "The map of a drive");
     section.published = "Fig. 8 of the publication: a real robot drives, and its map is made on the robot and in the \
-        cloud; the recording was also played at 0.33 of its rate.".to_owned();
+        cloud; the recording was also played at 0.33 of its rate."
+        .to_owned();
     section.differs = vec![
         format!("The reference of all errors of the real drive is the path by {}, of the same recording: there is no \
             independent ground truth of this drive, so that what both get wrong is not seen.", DRIVES[0].whose),
@@ -229,10 +207,7 @@ fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()>
         if paths.is_empty() && !play.truth.is_empty() {
             let last = trace.requests.last().map_or(0.0, |last| last.stamp);
             let driven = play.truth.iter().filter(|(at, _, _)| *at <= last);
-            paths.push(path_series(
-                drive.whose,
-                &driven.copied().collect::<Vec<_>>(),
-            ));
+            paths.push(path_series(drive.whose, &driven.copied().collect::<Vec<_>>()));
         }
         paths.push(path_series(name, &estimate));
         maps.extend(trace.map.as_ref().map(|map| (name.as_str(), map)));
@@ -252,11 +227,7 @@ fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()>
             picture::BAR
         );
         match picture::draw_maps(&grids) {
-            Ok(drawn) => {
-                section
-                    .figures
-                    .push(Figure::png(format!("maps-{}", drive.id), caption, drawn))
-            }
+            Ok(drawn) => section.figures.push(Figure::png(format!("maps-{}", drive.id), caption, drawn)),
             Err(error) => section.missing.push(MissingMeasurement::new(
                 format!("the maps of {}", drive.title),
                 format!("{error:#}"),
@@ -284,9 +255,7 @@ fn add_findings(section: &mut Section, runs: &MapRuns, drive: &Drive) {
         let (Some((alone, error)), Some((through, stubs_error))) = (of(native), of(stub)) else {
             continue;
         };
-        let farther = error
-            .zip(stubs_error)
-            .is_some_and(|(alone, stub)| stub > alone * ALIKE);
+        let farther = error.zip(stubs_error).is_some_and(|(alone, stub)| stub > alone * ALIKE);
         let worse = if has_fewer_scans(through, alone) {
             "; fewer through the stub is worse than hoped: what the network loses and delays comes to more than what \
              its processor saves"
@@ -322,10 +291,7 @@ fn has_fewer_scans(through: &Trace, alone: &Trace) -> bool {
 }
 
 fn path_series(name: &str, path: &[(f64, f64, f64)]) -> Series {
-    Series {
-        name: name.to_owned(),
-        points: path.iter().map(|(_, x, y)| (*x, *y)).collect(),
-    }
+    Series { name: name.to_owned(), points: path.iter().map(|(_, x, y)| (*x, *y)).collect() }
 }
 
 #[cfg(test)]
@@ -342,28 +308,18 @@ mod tests {
             ..RequestSample::default()
         };
         MapPlay {
-            trace: Trace {
-                requests: (0..).zip(poses).map(request).collect(),
-                ..Trace::default()
-            },
+            trace: Trace { requests: (0..).zip(poses).map(request).collect(), ..Trace::default() },
             cost: RunCost::default(),
-            truth: (0..4)
-                .map(|at| (f64::from(at), f64::from(at), 0.0))
-                .collect(),
+            truth: (0..4).map(|at| (f64::from(at), f64::from(at), 0.0)).collect(),
         }
     }
 
     #[test]
     fn scans_that_were_not_worked_at_are_counted() {
         let half = play(&[Some([0.0, 0.0, 0.0]), None, Some([2.0, 0.0, 0.0]), None]);
-        let runs = MapRuns {
-            plays: vec![("native, own rate".to_owned(), CachedResult::Done(half))],
-        };
+        let runs = MapRuns { plays: vec![("native, own rate".to_owned(), CachedResult::Done(half))] };
         let section = section(&runs).expect("a section");
-        assert_eq!(
-            section.tables[0].rows[0][1..4],
-            ["4", "2", "50.0 %"].map(str::to_owned)
-        );
+        assert_eq!(section.tables[0].rows[0][1..4], ["4", "2", "50.0 %"].map(str::to_owned));
     }
 
     #[test]
@@ -372,21 +328,11 @@ mod tests {
         let whole = play(&[here, Some([1.0, 0.0, 0.0]), here, here]);
         let half = play(&[here, None, here, None]);
         let [native, stub] = [DRIVES[0].plays[1].1, DRIVES[0].plays[1].2].map(str::to_owned);
-        let runs = MapRuns {
-            plays: vec![
-                (native, CachedResult::Done(whole)),
-                (stub, CachedResult::Done(half)),
-            ],
-        };
+        let runs = MapRuns { plays: vec![(native, CachedResult::Done(whole)), (stub, CachedResult::Done(half))] };
         let section = section(&runs).expect("a section");
         assert_eq!(section.findings.len(), 1);
         let told = &section.findings[0];
-        for words in [
-            "at 0.33",
-            "100.0 % of the scans by itself (",
-            "50.0 % through the stub (",
-            "worse than hoped",
-        ] {
+        for words in ["at 0.33", "100.0 % of the scans by itself (", "50.0 % through the stub (", "worse than hoped"] {
             assert_tells(told, words);
         }
     }
@@ -425,20 +371,14 @@ mod tests {
     fn an_error_against_a_true_path_is_told_as_such() {
         let whole = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
         let (_, native, stub) = DRIVES[1].plays[0];
-        let runs = MapRuns {
-            plays: [native, stub]
-                .map(|name| (name.to_owned(), CachedResult::Done(whole.clone())))
-                .to_vec(),
-        };
+        let runs =
+            MapRuns { plays: [native, stub].map(|name| (name.to_owned(), CachedResult::Done(whole.clone()))).to_vec() };
         let section = section(&runs).expect("a section");
         // A drive that was not played does not appear.
         assert_eq!(section.tables.len(), 1);
         assert_eq!(section.tables[0].rows.len(), 2);
         let told = &section.findings[0];
-        for words in [
-            "a simulated drive, at its own rate,",
-            "(0.00 m from the truth, RMS)",
-        ] {
+        for words in ["a simulated drive, at its own rate,", "(0.00 m from the truth, RMS)"] {
             assert_tells(told, words);
         }
     }

@@ -28,10 +28,7 @@ pub struct MemoryRuns {
 pub fn measure(cells: &RunCache, workshop: &EvalFixtures) -> Result<MemoryRuns> {
     let run = |name: &str, at: ExecutionSite| {
         cells.measure(name, &(RobotHardware::PI, LARGE, REQUESTS), || {
-            let detector = EvalPackage {
-                parameters: &LARGE,
-                ..DETECTOR
-            };
+            let detector = EvalPackage { parameters: &LARGE, ..DETECTOR };
             workshop.publish(&detector)?;
             let directory = workshop.directory()?;
             let mut plan = workshop.plan(&detector, at, directory.path())?;
@@ -42,22 +39,12 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures) -> Result<MemoryRuns> 
             }
             plan.most = REQUESTS;
             plan.patience = 240.0;
-            let place = RobotSandbox::new(
-                &workshop.daemon.address,
-                RobotHardware::PI,
-                NetworkProfile::Lan,
-            )?;
+            let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NetworkProfile::Lan)?;
             match place.run(&plan, directory.path()) {
                 // The expected result, not a failed measurement.
                 Err(error) if place.killed_for_memory() > 0 => {
-                    let trace = Trace {
-                        node_ended: Some(format!("{error:#}")),
-                        ..Trace::default()
-                    };
-                    let cost = RunCost {
-                        killed_for_memory: place.killed_for_memory(),
-                        ..RunCost::default()
-                    };
+                    let trace = Trace { node_ended: Some(format!("{error:#}")), ..Trace::default() };
+                    let cost = RunCost { killed_for_memory: place.killed_for_memory(), ..RunCost::default() };
                     Ok((trace, cost))
                 }
                 run => run,
@@ -72,15 +59,10 @@ pub fn measure(cells: &RunCache, workshop: &EvalFixtures) -> Result<MemoryRuns> 
 
 /// Creates the section of the report.
 pub fn section(runs: &MemoryRuns) -> Section {
-    let mut section = Section::new(
-        3,
-        "memory",
-        "A package that needs more memory than the robot has",
-    );
-    section.published =
-        "The publication could not run SSD on the Raspberry Pi, whose memory does not hold it; \
+    let mut section = Section::new(3, "memory", "A package that needs more memory than the robot has");
+    section.published = "The publication could not run SSD on the Raspberry Pi, whose memory does not hold it; \
         outsourced it answered."
-            .to_owned();
+        .to_owned();
     section.differs = vec![
         "object_detector with pictures of 2048x2048 in its network stands in for SSD; the robot has 1 GiB. The limit \
          is the kernel's, as on a robot without swap."
@@ -90,10 +72,9 @@ pub fn section(runs: &MemoryRuns) -> Section {
         "object_detector on a robot of the class Pi",
         "where | requests answered | published | processes ended for want of memory | median (ms)",
     );
-    for (name, published, run) in [
-        ("native", "SSD could not be run", &runs.native),
-        ("outsourced, LAN", "SSD answered", &runs.outsourced),
-    ] {
+    for (name, published, run) in
+        [("native", "SSD could not be run", &runs.native), ("outsourced, LAN", "SSD answered", &runs.outsourced)]
+    {
         if let Some((trace, cost)) = run.require(&mut section, name, AGAIN) {
             table.push([
                 name.to_owned(),
@@ -105,9 +86,7 @@ pub fn section(runs: &MemoryRuns) -> Section {
         }
     }
     section.tables.push(table);
-    if let (Some((native, cost)), Some((outsourced, _))) =
-        (runs.native.value(), runs.outsourced.value())
-    {
+    if let (Some((native, cost)), Some((outsourced, _))) = (runs.native.value(), runs.outsourced.value()) {
         let killed = if cost.killed_for_memory > 0 {
             "is ended by the kernel for want of memory"
         } else if native.answered_count() == 0 {
@@ -131,26 +110,14 @@ mod tests {
 
     #[test]
     fn who_was_killed_is_told() {
-        let killed = RunCost {
-            killed_for_memory: 1,
-            ..RunCost::default()
-        };
-        let answer = RequestSample {
-            response: Some(0.2),
-            ..RequestSample::default()
-        };
-        let outsourced = Trace {
-            requests: vec![answer; REQUESTS],
-            ..Trace::default()
-        };
+        let killed = RunCost { killed_for_memory: 1, ..RunCost::default() };
+        let answer = RequestSample { response: Some(0.2), ..RequestSample::default() };
+        let outsourced = Trace { requests: vec![answer; REQUESTS], ..Trace::default() };
         let section = section(&MemoryRuns {
             native: CachedResult::Done((Trace::default(), killed)),
             outsourced: CachedResult::Done((outsourced, RunCost::default())),
         });
-        assert_eq!(
-            section.tables[0].rows[0][1..4],
-            ["0 of 5", "SSD could not be run", "1"].map(str::to_owned)
-        );
+        assert_eq!(section.tables[0].rows[0][1..4], ["0 of 5", "SSD could not be run", "1"].map(str::to_owned));
         assert_tells(&section.findings[0], "want of memory");
         assert_tells(&section.findings[0], "5 of 5");
     }

@@ -28,10 +28,11 @@ pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<
 /// Creates the section of the report.
 pub fn section(runs: &NeighbourRuns) -> Result<Section> {
     let mut section = Section::new(9, "neighbours", "Robots beside each other");
-    section.published = "Robots have servants of their own in the publication, which are isolated from one another; no \
+    section.published =
+        "Robots have servants of their own in the publication, which are isolated from one another; no \
         published figure is \
                          repeated here."
-        .to_owned();
+            .to_owned();
     section.differs = vec![
         "The services compute for a known time of a core at each call (eval/packages/worker_cpp), so that what is \
          beyond it is waiting. \

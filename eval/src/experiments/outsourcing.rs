@@ -57,11 +57,7 @@ pub struct OutsourcingRun {
 }
 
 /// Measures all runs with `most` requests each, or as many as the example specifies.
-pub fn measure(
-    cells: &RunCache,
-    workshop: &EvalFixtures,
-    most: Option<usize>,
-) -> Result<Vec<OutsourcingRun>> {
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -> Result<Vec<OutsourcingRun>> {
     // A quick evaluation shows that everything works, for which one package on one kind of robot suffices.
     let (examples, classes) = if most.is_some() {
         (&[LASER_SLAM][..], &[RobotHardware::PI][..])
@@ -81,12 +77,7 @@ pub fn measure(
                     };
                     workshop.run(&example, at, (class, network), |plan| plan.most = most)
                 })?;
-                runs.push(OutsourcingRun {
-                    example,
-                    class,
-                    set_up,
-                    measured,
-                });
+                runs.push(OutsourcingRun { example, class, set_up, measured });
             }
         }
     }
@@ -100,9 +91,7 @@ fn find_run<'a>(
     class: RobotHardware,
     set_up: OutsourcingSetUp,
 ) -> Option<&'a (Trace, RunCost)> {
-    let wanted = |run: &&OutsourcingRun| {
-        run.example.name == example && run.class == class && run.set_up == set_up
-    };
+    let wanted = |run: &&OutsourcingRun| run.example.name == example && run.class == class && run.set_up == set_up;
     runs.iter().find(wanted)?.measured.value()
 }
 
@@ -115,12 +104,7 @@ fn examples(runs: &[OutsourcingRun]) -> impl Iterator<Item = EvalPackage> {
 /// Lists the runs without a result.
 fn add_missing<R: std::borrow::Borrow<OutsourcingRun>>(section: &mut Section, runs: &[R]) {
     for run in runs.iter().map(std::borrow::Borrow::borrow) {
-        let what = format!(
-            "{}, {}, {}",
-            run.example.name,
-            run.class.name(),
-            run.set_up.name()
-        );
+        let what = format!("{}, {}, {}", run.example.name, run.class.name(), run.set_up.name());
         if let Some((trace, _)) = run.measured.require(section, &what, AGAIN) {
             let answered = trace.requests.len();
             section.note_early_end(format!("{what}: after request {answered}"), trace);
@@ -145,10 +129,7 @@ mod tests {
             }),
             ..RequestSample::default()
         };
-        let trace = Trace {
-            requests: responses.iter().map(request).collect(),
-            ..Trace::default()
-        };
+        let trace = Trace { requests: responses.iter().map(request).collect(), ..Trace::default() };
         OutsourcingRun {
             example: LASER_SLAM,
             class: RobotHardware::PI,

@@ -38,9 +38,10 @@ pub fn measure(cells: &RunCache) -> Result<OverheadRuns> {
 /// Creates the section of the report.
 pub fn section(runs: &OverheadRuns) -> Result<Section> {
     let mut section = Section::new(11, "overhead", "What the system itself adds");
-    section.published = "Starting a servant took over 5 s in the publication. It has no figure of what its portal adds \
+    section.published =
+        "Starting a servant took over 5 s in the publication. It has no figure of what its portal adds \
         to a message's way."
-        .to_owned();
+            .to_owned();
     section.differs = [
         "Start times: cloudroid, libcontainer called from a bare program, and what Debian has (crun, runc, podman) \
          start containers of the same root file system with the same limits, in turns in the same run; the peers run \
@@ -68,11 +69,7 @@ fn require_measured<'a>(
 ) -> Option<&'a BenchReport> {
     let written = measured.require(section, what, AGAIN)?;
     for one in written.left_out.iter().filter(|one| one.what != SUITE) {
-        section.missing.push(MissingMeasurement::new(
-            &one.what,
-            &one.why,
-            "scripts/deps engines installs it",
-        ));
+        section.missing.push(MissingMeasurement::new(&one.what, &one.why, "scripts/deps engines installs it"));
     }
     section.findings.extend(unmet_targets(written));
     Some(written)
@@ -84,31 +81,16 @@ fn find_value(written: &BenchReport, figure: &str) -> Option<f64> {
 }
 
 /// Returns the peers of a figure with their values.
-fn find_floors<'a>(
-    written: &'a BenchReport,
-    figure: &'a str,
-) -> impl Iterator<Item = (&'a str, f64)> + 'a {
-    let all = written
-        .figures
-        .iter()
-        .filter(move |one| one.figure == figure);
+fn find_floors<'a>(written: &'a BenchReport, figure: &'a str) -> impl Iterator<Item = (&'a str, f64)> + 'a {
+    let all = written.figures.iter().filter(move |one| one.figure == figure);
     all.filter_map(|one| Some((one.peer.as_deref()?, one.floor?)))
 }
 
 /// Names of the benchmark for the time until a robot is served, and their names in this report.
 const SERVED: [(&str, &str); 3] = [
-    (
-        "robot connects → node registered, bridged",
-        "cloudroid, a container made ahead",
-    ),
-    (
-        "robot connects → node registered, bridged, without a container made ahead",
-        "cloudroid, no container made ahead",
-    ),
-    (
-        "robot connects → first answer, nodes running already",
-        "cloudroid, nodes running already",
-    ),
+    ("robot connects → node registered, bridged", "cloudroid, a container made ahead"),
+    ("robot connects → node registered, bridged, without a container made ahead", "cloudroid, no container made ahead"),
+    ("robot connects → first answer, nodes running already", "cloudroid, nodes running already"),
 ];
 const NODE: &str = "node alone: exec → registered";
 const RUNNING: &str = "create → running";
@@ -117,18 +99,11 @@ fn add_start_times(section: &mut Section, measured: &CachedResult<BenchReport>) 
     let Some(written) = require_measured(section, "start times", measured) else {
         return Ok(());
     };
-    let mut table = Table::new(
-        "Start times, medians (milliseconds)",
-        "from, to | what starts | time | published | times as fast",
-    );
+    let mut table =
+        Table::new("Start times, medians (milliseconds)", "from, to | what starts | time | published | times as fast");
     let mut bars = Vec::new();
     let mut bar = |group: &str, name: &str, value| {
-        bars.push(Bar {
-            group: group.to_owned(),
-            name: name.to_owned(),
-            value,
-            spread: None,
-        });
+        bars.push(Bar { group: group.to_owned(), name: name.to_owned(), value, spread: None });
     };
     let served = "a robot connects, its node is registered and bridged";
     for (figure, name) in SERVED {
@@ -161,10 +136,7 @@ fn add_start_times(section: &mut Section, measured: &CachedResult<BenchReport>) 
     }
     section.tables.push(table);
     // Two figures, because one would need more colours than there are.
-    for (id, group) in [
-        ("overhead-served", "robot served"),
-        ("overhead-starts", "container runs"),
-    ] {
+    for (id, group) in [("overhead-served", "robot served"), ("overhead-starts", "container runs")] {
         let of = bars.iter().filter(|bar| bar.group == group);
         let of: Vec<Bar> = of.cloned().collect();
         section.add_drawing(
@@ -177,11 +149,7 @@ fn add_start_times(section: &mut Section, measured: &CachedResult<BenchReport>) 
 }
 
 fn add_missing_figure(section: &mut Section, figure: &str) {
-    section.missing.push(MissingMeasurement::new(
-        figure,
-        "the benchmark did not write it",
-        "look at what it printed",
-    ));
+    section.missing.push(MissingMeasurement::new(figure, "the benchmark did not write it", "look at what it printed"));
 }
 
 fn comparison_finding(peer: &str, ours: f64, theirs: f64) -> String {
@@ -203,11 +171,7 @@ const LINK: &str = "String there and back over the link: p50";
 const SECURE: &str = "String there and back, TLS and policy";
 const DIRECT: &str = "TCPROS, no hop between";
 
-fn add_round_trips(
-    section: &mut Section,
-    portal: &CachedResult<BenchReport>,
-    link: &CachedResult<BenchReport>,
-) {
+fn add_round_trips(section: &mut Section, portal: &CachedResult<BenchReport>, link: &CachedResult<BenchReport>) {
     let portal = require_measured(section, "round trips by the portal", portal);
     let link = require_measured(section, "round trips by the link", link);
     let [p50, p99] = ["p50", "p99"].map(|quantile| format!("{TRIP}, {quantile}"));
@@ -237,29 +201,18 @@ fn add_round_trips(
         row("raw TCPROS", direct, other(&p99, DIRECT));
         for (way, name) in [
             ("byte relay", "a process that moves bytes, the floor"),
-            (
-                "serde_json::Value",
-                "a process that converts by trees of values",
-            ),
+            ("serde_json::Value", "a process that converts by trees of values"),
         ] {
             row(name, other(&p50, way), other(&p99, way));
         }
-        row(
-            "portal, JSON",
-            find_value(written, &p50),
-            find_value(written, &p99),
-        );
+        row("portal, JSON", find_value(written, &p50), find_value(written, &p99));
         let secure = ["p50", "p99"].map(|quantile| format!("{SECURE}, {quantile}"));
         row(
             "portal, JSON, TLS, a robot's token and its rights",
             find_value(written, &secure[0]),
             find_value(written, &secure[1]),
         );
-        row(
-            "rosbridge_suite, JSON",
-            other(&p50, SUITE),
-            other(&p99, SUITE),
-        );
+        row("rosbridge_suite, JSON", other(&p50, SUITE), other(&p99, SUITE));
     }
     if let Some(link) = link {
         row("stub and link", find_value(link, LINK), None);
@@ -269,16 +222,11 @@ fn add_round_trips(
     }
     section.tables.push(table);
     for one in written.left_out.iter().filter(|one| one.what == SUITE) {
-        section
-            .differs
-            .push(format!("{SUITE} was not measured: {}.", one.why));
+        section.differs.push(format!("{SUITE} was not measured: {}.", one.why));
     }
     if let Some((ours, direct)) = find_value(written, &p50).zip(direct) {
         let relay = other(&p50, "byte relay").map_or_else(String::new, |relay| {
-            format!(
-                "; a process that only moves the bytes adds {} µs",
-                digits(relay - direct)
-            )
+            format!("; a process that only moves the bytes adds {} µs", digits(relay - direct))
         });
         section.findings.push(format!(
             "The portal adds {} µs to the {} µs of raw TCPROS{relay}.",
@@ -316,20 +264,14 @@ mod tests {
         let mut portal = BenchReport::new("portal");
         for (quantile, time) in [("p50", 60.0), ("p99", 90.0)] {
             let name = format!("{TRIP}, {quantile}");
-            portal
-                .figure(&name, "µs", time)
-                .relative_to("byte relay", 50.0);
+            portal.figure(&name, "µs", time).relative_to("byte relay", 50.0);
             portal.figure(&name, "µs", time).relative_to(DIRECT, 40.0);
         }
         portal.skip(SUITE, "it is not packaged");
         let mut link = BenchReport::new("link");
         let portals = "a client of the portal, JSON";
         link.figure(LINK, "µs", 80.0).relative_to(portals, 64.0);
-        OverheadRuns {
-            starts: bench_output(&starts),
-            portal: bench_output(&portal),
-            link: bench_output(&link),
-        }
+        OverheadRuns { starts: bench_output(&starts), portal: bench_output(&portal), link: bench_output(&link) }
     }
 
     #[test]
@@ -339,10 +281,7 @@ mod tests {
         let rows = &section.tables[0].rows;
         assert_eq!(rows[0][2..], ["10.0", "> 5000", "more than 500"]);
         assert_eq!(rows[6][1..3], ["podman", "100"]);
-        assert!(
-            section.findings[0]
-                .contains("in 25.0 ms, 1.2 times as long as crun (20.0 ms): it also")
-        );
+        assert!(section.findings[0].contains("in 25.0 ms, 1.2 times as long as crun (20.0 ms): it also"));
         assert!(section.findings[1].contains("0.25 times as long as podman (100 ms)."));
     }
 
@@ -367,11 +306,7 @@ mod tests {
         link.skip("a part", "no time");
         runs.link = bench_output(&link);
         let section = section(&runs).expect("it is drawn");
-        let missing: Vec<&str> = section
-            .missing
-            .iter()
-            .map(|one| one.what.as_str())
-            .collect();
+        let missing: Vec<&str> = section.missing.iter().map(|one| one.what.as_str()).collect();
         assert_eq!(missing, ["start times", "a part"]);
     }
 }

@@ -68,23 +68,12 @@ struct ConnectedRobots {
 
 /// Measures all points; with `quick`, few robots for a short time.
 pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<ScaleRuns> {
-    let numbers: &[usize] = if quick {
-        &[1, 2, 4]
-    } else {
-        &[1, 2, 4, 8, 16, 32, 64, 100]
-    };
+    let numbers: &[usize] = if quick { &[1, 2, 4] } else { &[1, 2, 4, 8, 16, 32, 64, 100] };
     let (settles, lasts) = if quick { (0.3, 2.0) } else { (1.0, 8.0) };
     let mut crowd = None;
     let mut points = Vec::new();
     for robots in numbers.iter().copied() {
-        let plan = ScalePlan {
-            robots,
-            settles,
-            lasts,
-            think: THINK,
-            work: SHORT.milliseconds,
-            cores: crowd::cores(),
-        };
+        let plan = ScalePlan { robots, settles, lasts, think: THINK, work: SHORT.milliseconds, cores: crowd::cores() };
         let measured = cells.measure(&format!("scale {robots}"), &plan, || {
             // Robots of the previous point stay; after a failure all of them reconnect.
             let mut here = match crowd.take() {
@@ -103,17 +92,10 @@ pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<
 fn gather(yard: &mut CrowdDaemon) -> Result<ConnectedRobots> {
     let daemon = yard.without_servants(Controller::Off)?;
     crowd::publish(daemon, SHORT)?;
-    Ok(ConnectedRobots {
-        robots: Vec::new(),
-        available: available_memory()?.0,
-    })
+    Ok(ConnectedRobots { robots: Vec::new(), available: available_memory()?.0 })
 }
 
-fn measure_point(
-    daemon: &Daemon,
-    crowd: &mut ConnectedRobots,
-    plan: &ScalePlan,
-) -> Result<ScalePoint> {
+fn measure_point(daemon: &Daemon, crowd: &mut ConnectedRobots, plan: &ScalePlan) -> Result<ScalePoint> {
     let mut starts = Vec::new();
     while crowd.robots.len() < plan.robots {
         let number = crowd.robots.len() + 1;
@@ -145,11 +127,7 @@ fn measure_point(
 
 /// Has all robots make calls, each on a thread that mostly sleeps; returns the response times, the cores used, and the
 /// duration in seconds.
-fn ask(
-    daemon: &Daemon,
-    robots: &mut [Robot],
-    plan: &ScalePlan,
-) -> Result<(Vec<f64>, CoreUsage, f64)> {
+fn ask(daemon: &Daemon, robots: &mut [Robot], plan: &ScalePlan) -> Result<(Vec<f64>, CoreUsage, f64)> {
     let from = Instant::now() + Duration::from_secs_f64(plan.settles);
     let to = from + Duration::from_secs_f64(plan.lasts);
     std::thread::scope(|scope| {

@@ -9,9 +9,7 @@ use sha2::{Digest, Sha256};
 
 use crate::application;
 use crate::cells::{CachedResult, RunCache};
-use crate::examples::{
-    ALL, DISPARITY, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM, Origin, PEOPLE,
-};
+use crate::examples::{ALL, DISPARITY, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM, Origin, PEOPLE};
 use crate::place::{NetworkProfile, RobotHardware};
 use crate::robot::RequestPacing;
 use crate::section::{AGAIN, Section, Table};
@@ -19,10 +17,7 @@ use crate::trace::{MapGrid, Trace};
 use crate::words::{digits, or_dash};
 
 /// A fast robot, because answers are compared and not times.
-const FAST: RobotHardware = RobotHardware {
-    cores: 1.0,
-    memory: 4 << 30,
-};
+const FAST: RobotHardware = RobotHardware { cores: 1.0, memory: 4 << 30 };
 /// Number of runs on the robot, which show the variation of a package between its own runs; and that of a quick
 /// evaluation.
 const NATIVES: [usize; 2] = [3, 2];
@@ -81,25 +76,16 @@ impl RobotApplication {
 }
 
 /// Measures all packages; a quick evaluation measures two, with at most `most` requests each.
-pub fn measure(
-    cells: &RunCache,
-    workshop: &EvalFixtures,
-    most: Option<usize>,
-) -> Result<TransparencyRuns> {
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -> Result<TransparencyRuns> {
     let mut compared = Vec::new();
     // One package of each origin shows that everything works.
     let own = match most {
         Some(_) => vec![LASER_SLAM, DISPARITY],
         None => [&ALL[..], &[PEOPLE, DISPARITY]].concat(),
     };
-    let own = own
-        .into_iter()
-        .map(|example| (example, RobotApplication::Own));
+    let own = own.into_iter().map(|example| (example, RobotApplication::Own));
     for (example, application) in own.chain([(LASER_SLAM, RobotApplication::Rosbag)]) {
-        let pair = ComparedPair {
-            package: package_title(&example),
-            application,
-        };
+        let pair = ComparedPair { package: package_title(&example), application };
         let name = format!("transparency {} {}", example.name, application.name());
         let requests = most.unwrap_or(example.requests).min(example.requests);
         let seconds = PLAYED[usize::from(most.is_some())];
@@ -125,9 +111,7 @@ pub fn measure(
             Ok(ComparedRuns {
                 natives,
                 outsourced,
-                application: application
-                    .map(|((file, before), (_, after))| (file, before, after))
-                    .collect(),
+                application: application.map(|((file, before), (_, after))| (file, before, after)).collect(),
             })
         })?;
         compared.push((pair, measured));
@@ -162,19 +146,8 @@ impl Difference {
     fn compare(one: &Trace, other: &Trace) -> Self {
         // Matched by stamp, because a robot that plays at its own rate may not get every answer.
         let key = |stamp: f64| (stamp * 1e6).round() as i64;
-        let others: BTreeMap<i64, _> = other
-            .requests
-            .iter()
-            .map(|one| (key(one.stamp), one))
-            .collect();
-        let mut found = Self {
-            map: one
-                .map
-                .as_ref()
-                .zip(other.map.as_ref())
-                .map(differing_cells),
-            ..Self::default()
-        };
+        let others: BTreeMap<i64, _> = other.requests.iter().map(|one| (key(one.stamp), one)).collect();
+        let mut found = Self { map: one.map.as_ref().zip(other.map.as_ref()).map(differing_cells), ..Self::default() };
         for one in &one.requests {
             let Some(other) = others.get(&key(one.stamp)) else {
                 continue;
@@ -212,11 +185,7 @@ impl Difference {
     /// Compares all pairs of runs.
     fn compare_pairs(runs: &[Trace]) -> Self {
         let pairs = runs.iter().enumerate();
-        Self::combine(pairs.flat_map(|(at, one)| {
-            runs[at + 1..]
-                .iter()
-                .map(move |other| Self::compare(one, other))
-        }))
+        Self::combine(pairs.flat_map(|(at, one)| runs[at + 1..].iter().map(move |other| Self::compare(one, other))))
     }
 
     /// Returns whether these differences do not exceed `own`.
@@ -250,16 +219,12 @@ fn differing_cells((one, other): (&MapGrid, &MapGrid)) -> f64 {
 pub fn section(runs: &TransparencyRuns) -> Section {
     let mut section = Section::new(1, "transparency", "Unmodified packages answer the same");
     section.published = "The publication's packages and robot applications were not modified; their results are said \
-        to be the same.".to_owned();
-    let done = runs
-        .compared
-        .iter()
-        .filter_map(|(_, compared)| compared.value());
-    let times = done
-        .map(|compared| compared.natives.len())
-        .max()
-        .unwrap_or(0);
-    section.differs = vec![
+        to be the same."
+        .to_owned();
+    let done = runs.compared.iter().filter_map(|(_, compared)| compared.value());
+    let times = done.map(|compared| compared.natives.len()).max().unwrap_or(0);
+    section.differs =
+        vec![
         format!("Each package is asked the same requests {times} times on the robot, and through the stub: what the \
             runs on the robot differ by is the package's own difference from run to run."),
         "Two packages are Debian's own, as they are installed from there: people_detect of opencv_apps looks for \
@@ -292,9 +257,7 @@ pub fn section(runs: &TransparencyRuns) -> Section {
         }
         let own = Difference::compare_pairs(&compared.natives);
         let natives = compared.natives.iter();
-        let through = Difference::combine(
-            natives.map(|native| Difference::compare(native, &compared.outsourced)),
-        );
+        let through = Difference::combine(natives.map(|native| Difference::compare(native, &compared.outsourced)));
         let published = "published: the same, without figures".to_owned();
         for (name, difference) in [("native runs", own), ("native and stub", through)] {
             let said = |value| or_dash(value, digits);
@@ -322,18 +285,11 @@ pub fn section(runs: &TransparencyRuns) -> Section {
             )
         }));
         for (file, before, after) in &compared.application {
-            files.push([
-                pair.package.clone(),
-                file.clone(),
-                before.clone(),
-                after.clone(),
-            ]);
+            files.push([pair.package.clone(), file.clone(), before.clone(), after.clone()]);
         }
         let changed = compared.application.iter();
-        let changed: Vec<&str> = changed
-            .filter(|(_, before, after)| before != after)
-            .map(|(file, _, _)| file.as_str())
-            .collect();
+        let changed: Vec<&str> =
+            changed.filter(|(_, before, after)| before != after).map(|(file, _, _)| file.as_str()).collect();
         section.findings.push(if changed.is_empty() {
             format!(
                 "Not one byte of the robot's application ({}) differs between the set-ups of {}.",
@@ -341,11 +297,7 @@ pub fn section(runs: &TransparencyRuns) -> Section {
                 pair.package
             )
         } else {
-            format!(
-                "The robot's application CHANGED while {} was compared: {}.",
-                pair.package,
-                changed.join(", ")
-            )
+            format!("The robot's application CHANGED while {} was compared: {}.", pair.package, changed.join(", "))
         });
     }
     section.tables.extend([answers, files]);
@@ -359,9 +311,7 @@ fn count_late_answers(native: &Trace, outsourced: &Trace) -> usize {
         return 0;
     };
     let before = native.requests.iter();
-    before
-        .filter(|one| one.digest.is_some() && one.stamp + 1e-6 < first)
-        .count()
+    before.filter(|one| one.digest.is_some() && one.stamp + 1e-6 < first).count()
 }
 
 fn finding(pair: &ComparedPair, own: Difference, through: Difference) -> String {
@@ -384,11 +334,7 @@ fn finding(pair: &ComparedPair, own: Difference, through: Difference) -> String 
             through.both, through.equal, own.equal, own.both
         );
     }
-    let words = if through.is_within(own) {
-        "within"
-    } else {
-        "NOT within"
-    };
+    let words = if through.is_within(own) { "within" } else { "NOT within" };
     format!(
         "{name}: {} of {} answers through the stub are equal to the byte, which is {words} what runs on the robot \
          differ by ({} of {}).",
@@ -408,27 +354,15 @@ mod tests {
             pose: Some([*x, 0.0, 0.0]),
             ..RequestSample::default()
         };
-        Trace {
-            requests: (0..).zip(answers).map(request).collect(),
-            ..Trace::default()
-        }
+        Trace { requests: (0..).zip(answers).map(request).collect(), ..Trace::default() }
     }
 
     fn difference(both: usize, equal: usize, distance: f64) -> Difference {
-        Difference {
-            both,
-            equal,
-            boxes: None,
-            distance: Some(distance),
-            map: None,
-        }
+        Difference { both, equal, boxes: None, distance: Some(distance), map: None }
     }
 
     fn pair() -> ComparedPair {
-        ComparedPair {
-            package: "a".to_owned(),
-            application: RobotApplication::Rosbag,
-        }
+        ComparedPair { package: "a".to_owned(), application: RobotApplication::Rosbag }
     }
 
     #[test]
@@ -477,19 +411,11 @@ mod tests {
 
     #[test]
     fn cells_that_differ_are_a_share_of_all() {
-        let map = |cells: &[i8]| MapGrid {
-            width: 2,
-            height: 2,
-            resolution: 0.1,
-            origin: [0.0, 0.0],
-            cells: cells.to_vec(),
-        };
+        let map =
+            |cells: &[i8]| MapGrid { width: 2, height: 2, resolution: 0.1, origin: [0.0, 0.0], cells: cells.to_vec() };
         let (one, other) = (map(&[0, 100, -1, 0]), map(&[0, 100, 0, 0]));
         assert_eq!(differing_cells((&one, &other)), 0.25);
-        let elsewhere = MapGrid {
-            origin: [1.0, 0.0],
-            ..one.clone()
-        };
+        let elsewhere = MapGrid { origin: [1.0, 0.0], ..one.clone() };
         assert_eq!(differing_cells((&one, &elsewhere)), 1.0);
     }
 
@@ -502,10 +428,7 @@ mod tests {
         assert!(finding(&pair(), own, difference(9, 3, 0.9)).contains("is within"));
         assert!(finding(&pair(), own, difference(3, 1, 1.1)).contains("NOT within"));
         assert!(finding(&pair(), own, Difference::default()).contains("nothing"));
-        let boxes = |boxes: usize| Difference {
-            boxes: Some(boxes),
-            ..difference(3, 1, 0.0)
-        };
+        let boxes = |boxes: usize| Difference { boxes: Some(boxes), ..difference(3, 1, 0.0) };
         assert!(finding(&pair(), alike, boxes(3)).contains("hold the same boxes"));
         assert!(finding(&pair(), alike, boxes(2)).contains("NOT within"));
     }

@@ -19,21 +19,12 @@ pub(super) fn render_figure(page: &mut String, figure: &Figure) {
         // Drawings of ours consist of shapes and text, which is escaped.
         FigureImage::Svg(svg) => append(
             page,
-            format_args!(
-                "<div class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{}</div>\n",
-                svg.trim()
-            ),
+            format_args!("<div class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{}</div>\n", svg.trim()),
         ),
         FigureImage::Png(bytes) => append(
             page,
-            format_args!(
-                "<img src=\"data:image/png;base64,{}\" alt=\"{caption}\">\n",
-                STANDARD.encode(bytes)
-            ),
+            format_args!("<img src=\"data:image/png;base64,{}\" alt=\"{caption}\">\n", STANDARD.encode(bytes)),
         ),
     }
-    append(
-        page,
-        format_args!("<figcaption>{caption}</figcaption>\n</figure>\n"),
-    );
+    append(page, format_args!("<figcaption>{caption}</figcaption>\n</figure>\n"));
 }

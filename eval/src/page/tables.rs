@@ -32,10 +32,7 @@ pub(super) fn render_table(page: &mut String, table: &Table) {
         _ => "",
     };
     for (column, name) in table.head.iter().enumerate() {
-        append(
-            page,
-            format_args!("<th scope=\"col\"{}>{}</th>", class(column), escape(name)),
-        );
+        append(page, format_args!("<th scope=\"col\"{}>{}</th>", class(column), escape(name)));
     }
     page.push_str("</tr></thead>\n<tbody>\n");
     for row in &table.rows {
@@ -51,13 +48,7 @@ pub(super) fn render_table(page: &mut String, table: &Table) {
         page.push_str("</tr>\n");
     }
     if table.rows.is_empty() {
-        append(
-            page,
-            format_args!(
-                "<tr><td colspan=\"{}\">nothing was measured</td></tr>\n",
-                table.head.len().max(1)
-            ),
-        );
+        append(page, format_args!("<tr><td colspan=\"{}\">nothing was measured</td></tr>\n", table.head.len().max(1)));
     }
     page.push_str("</tbody>\n</table>\n</div>\n");
 }

@@ -25,13 +25,7 @@ pub(super) struct Axis {
 impl Axis {
     /// Creates an axis for these values; `None` if it can show none of them.
     pub fn for_values(values: impl IntoIterator<Item = f64>, log: bool) -> Option<Self> {
-        let mut axis = Self {
-            log,
-            low: f64::INFINITY,
-            high: f64::NEG_INFINITY,
-            marks: Vec::new(),
-            decimals: 0,
-        };
+        let mut axis = Self { log, low: f64::INFINITY, high: f64::NEG_INFINITY, marks: Vec::new(), decimals: 0 };
         for value in values {
             if let Some(position) = axis.position(value) {
                 axis.low = axis.low.min(position);
@@ -47,14 +41,7 @@ impl Axis {
 
     /// Creates a linear axis exactly from `low` to `high`, with marks.
     pub fn with_bounds(low: f64, high: f64) -> Self {
-        Self {
-            log: false,
-            low,
-            high,
-            marks: Vec::new(),
-            decimals: 0,
-        }
-        .with_marks()
+        Self { log: false, low, high, marks: Vec::new(), decimals: 0 }.with_marks()
     }
 
     /// Returns the position of a value; `None` if the axis cannot show it, or if it is so large that differences would
@@ -83,11 +70,7 @@ impl Axis {
             (size * 0.1).max(least)
         };
         // An axis of non-negative values starts at zero if that is near.
-        self.low = if !self.log && self.low >= 0.0 && self.low < span * 0.3 {
-            0.0
-        } else {
-            self.low - by
-        };
+        self.low = if !self.log && self.low >= 0.0 && self.low < span * 0.3 { 0.0 } else { self.low - by };
         self.high += by;
     }
 
@@ -125,12 +108,7 @@ impl Axis {
             }
             // Less than a decade: the marks of a linear axis, at their logarithms.
             let (low, high) = (10f64.powf(self.low), 10f64.powf(self.high));
-            self.marks = even_marks(low, high)
-                .0
-                .into_iter()
-                .filter(|mark| *mark > 0.0)
-                .map(f64::log10)
-                .collect();
+            self.marks = even_marks(low, high).0.into_iter().filter(|mark| *mark > 0.0).map(f64::log10).collect();
         } else {
             (self.marks, self.decimals) = even_marks(self.low, self.high);
         }
@@ -140,11 +118,7 @@ impl Axis {
     /// Returns powers of ten and, if there is room, their multiples by two and five.
     fn decades(&self, span: f64) -> Vec<f64> {
         let every = (span / (MARKS + 2.0)).ceil().max(1.0);
-        let between: &[f64] = if span <= 3.0 {
-            &[1.0, 2.0, 5.0]
-        } else {
-            &[1.0]
-        };
+        let between: &[f64] = if span <= 3.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
         let first = (self.low / every).floor() * every;
         let mut marks = Vec::new();
         let mut decade = first;
@@ -170,19 +144,12 @@ impl Axis {
         }
         let text = format!("{position:.*}", self.decimals);
         // Zero except for rounding errors.
-        if text.trim_start_matches('-').parse() == Ok(0.0) {
-            text.trim_start_matches('-').to_owned()
-        } else {
-            text
-        }
+        if text.trim_start_matches('-').parse() == Ok(0.0) { text.trim_start_matches('-').to_owned() } else { text }
     }
 
     /// Returns the length of the longest label in characters.
     pub fn longest_label(&self) -> usize {
-        let lengths = self
-            .marks
-            .iter()
-            .map(|mark| self.label(*mark).chars().count());
+        let lengths = self.marks.iter().map(|mark| self.label(*mark).chars().count());
         lengths.max().unwrap_or(0)
     }
 }
@@ -198,11 +165,7 @@ impl Ranged for Axis {
 
     fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
         // Grid lines at marks only.
-        if hint.weight().allow_light_points() {
-            Vec::new()
-        } else {
-            self.marks.clone()
-        }
+        if hint.weight().allow_light_points() { Vec::new() } else { self.marks.clone() }
     }
 
     fn range(&self) -> Range<f64> {
@@ -247,17 +210,9 @@ fn format_plain(value: f64) -> String {
         let digits = digits.trim_end_matches('0').trim_end_matches('.');
         return format!("{digits}e{power}");
     }
-    let whole = if size >= 1.0 {
-        size.log10().floor() + 1.0
-    } else {
-        0.0
-    };
+    let whole = if size >= 1.0 { size.log10().floor() + 1.0 } else { 0.0 };
     let text = format!("{value:.*}", (4.0 - whole).max(0.0) as usize);
-    if text.contains('.') {
-        text.trim_end_matches('0').trim_end_matches('.').to_owned()
-    } else {
-        text
-    }
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
 /// Formats with three significant digits, as for the value of a bar.
@@ -283,14 +238,8 @@ mod tests {
 
     #[test]
     fn a_linear_axis_has_round_marks() {
-        assert_eq!(
-            labels(&Axis::with_bounds(0.0, 10.0)),
-            ["0", "2", "4", "6", "8", "10"]
-        );
-        assert_eq!(
-            labels(&Axis::with_bounds(-0.3, 0.3)),
-            ["-0.3", "-0.2", "-0.1", "0.0", "0.1", "0.2", "0.3"]
-        );
+        assert_eq!(labels(&Axis::with_bounds(0.0, 10.0)), ["0", "2", "4", "6", "8", "10"]);
+        assert_eq!(labels(&Axis::with_bounds(-0.3, 0.3)), ["-0.3", "-0.2", "-0.1", "0.0", "0.1", "0.2", "0.3"]);
     }
 
     #[test]
@@ -318,10 +267,7 @@ mod tests {
 
     #[test]
     fn values_have_three_digits() {
-        let texts: Vec<String> = [0.0, 0.012_345, 1.0, 12.34, 123.4, 12_345.0]
-            .into_iter()
-            .map(three_digits)
-            .collect();
+        let texts: Vec<String> = [0.0, 0.012_345, 1.0, 12.34, 123.4, 12_345.0].into_iter().map(three_digits).collect();
         assert_eq!(texts, ["0", "0.0123", "1.00", "12.3", "123", "12345"]);
     }
 }

@@ -63,14 +63,9 @@ pub(super) struct LegendEntry<'a> {
 }
 
 /// Returns legend entries for series in their order.
-pub(super) fn entries<'a>(
-    names: impl IntoIterator<Item = &'a str>,
-    sign: LegendSymbol,
-) -> Vec<LegendEntry<'a>> {
+pub(super) fn entries<'a>(names: impl IntoIterator<Item = &'a str>, sign: LegendSymbol) -> Vec<LegendEntry<'a>> {
     let numbered = names.into_iter().enumerate();
-    numbered
-        .map(|(index, name)| LegendEntry { index, name, sign })
-        .collect()
+    numbered.map(|(index, name)| LegendEntry { index, name, sign }).collect()
 }
 
 pub(super) fn colour(index: usize) -> RGBColor {
@@ -106,13 +101,7 @@ pub(super) enum Anchor {
 }
 
 /// Writes a text at a drawn pixel.
-pub(super) fn write_text(
-    area: &Area,
-    text: &str,
-    at: (i32, i32),
-    size: i32,
-    anchor: Anchor,
-) -> Result<()> {
+pub(super) fn write_text(area: &Area, text: &str, at: (i32, i32), size: i32, anchor: Anchor) -> Result<()> {
     let (h, v) = match anchor {
         Anchor::Left | Anchor::Upwards => (HPos::Left, VPos::Center),
         Anchor::Above => (HPos::Center, VPos::Bottom),
@@ -153,10 +142,7 @@ pub(super) struct PlotHeader<'a> {
 
 impl<'a> PlotHeader<'a> {
     pub fn new(title: &str, legend: Vec<LegendEntry<'a>>, width: u32) -> Self {
-        let title = wrap(
-            title,
-            (f64::from(width) / (f64::from(TITLE) * 0.6)) as usize,
-        );
+        let title = wrap(title, (f64::from(width) / (f64::from(TITLE) * 0.6)) as usize);
         let mut rows: Vec<Vec<(i32, LegendEntry)>> = Vec::new();
         let mut next = LEGEND_LEFT;
         for entry in legend {
@@ -171,11 +157,7 @@ impl<'a> PlotHeader<'a> {
             next += wide;
         }
         let height = 14 + (TITLE + 6) * title.len() as i32 + LEGEND_ROW * rows.len() as i32;
-        Self {
-            title,
-            legend: rows,
-            height: height as u32,
-        }
+        Self { title, legend: rows, height: height as u32 }
     }
 
     fn draw(&self, area: &Area) -> Result<()> {
@@ -237,9 +219,7 @@ pub(super) fn document(
         head.draw(&area)?;
         draw(&area)?;
         if let Some(note) = note {
-            let style = TextStyle::from(font(SMALL - 1))
-                .color(&GREY)
-                .pos(Pos::new(HPos::Right, VPos::Bottom));
+            let style = TextStyle::from(font(SMALL - 1)).color(&GREY).pos(Pos::new(HPos::Right, VPos::Bottom));
             let at = ((width as i32 - 8) * SCALE, (height as i32 - 4) * SCALE);
             area.draw(&Text::new(note, at, style))?;
         }
@@ -257,9 +237,7 @@ pub(super) fn omission_note(count: usize) -> Option<String> {
     match count {
         0 => None,
         1 => Some("1 value is left out: not finite, or no place on the axis".to_owned()),
-        more => Some(format!(
-            "{more} values are left out: not finite, or no place on the axis"
-        )),
+        more => Some(format!("{more} values are left out: not finite, or no place on the axis")),
     }
 }
 
@@ -284,11 +262,7 @@ pub(super) struct PlotMargins {
 impl PlotMargins {
     /// Leaves room for the labels and the name of the vertical axis.
     pub fn for_axis(y: &Axis) -> Self {
-        Self {
-            left: (text_width(y.longest_label(), TEXT) + 36) as u32 + EDGE,
-            right: 24,
-            below: true,
-        }
+        Self { left: (text_width(y.longest_label(), TEXT) + 36) as u32 + EDGE, right: 24, below: true }
     }
 }
 
@@ -331,12 +305,7 @@ pub(super) fn chart<'a, 'b>(
 }
 
 /// Draws a line through drawn pixels; `width` is in shown pixels.
-pub(super) fn draw_line(
-    area: &Area,
-    path: &[(i32, i32)],
-    colour: RGBColor,
-    width: u32,
-) -> Result<()> {
+pub(super) fn draw_line(area: &Area, path: &[(i32, i32)], colour: RGBColor, width: u32) -> Result<()> {
     if path.len() > 1 {
         let style = colour.stroke_width(width * SCALE as u32);
         area.draw(&PathElement::new(path.to_vec(), style))?;
@@ -354,14 +323,8 @@ pub(super) fn draw_marker(area: &Area, (x, y): (i32, i32), index: usize, size: i
     };
     let cross = |a: (i32, i32), b: (i32, i32)| {
         let style = colour.stroke_width(2 * SCALE as u32);
-        area.draw(&PathElement::new(
-            vec![(x - a.0, y - a.1), (x + a.0, y + a.1)],
-            style,
-        ))?;
-        area.draw(&PathElement::new(
-            vec![(x - b.0, y - b.1), (x + b.0, y + b.1)],
-            style,
-        ))
+        area.draw(&PathElement::new(vec![(x - a.0, y - a.1), (x + a.0, y + a.1)], style))?;
+        area.draw(&PathElement::new(vec![(x - b.0, y - b.1), (x + b.0, y + b.1)], style))
     };
     let s = r * 4 / 5;
     // When colours repeat, the markers differ.
@@ -373,11 +336,7 @@ pub(super) fn draw_marker(area: &Area, (x, y): (i32, i32), index: usize, size: i
         4 => cross((s, s), (s, -s))?,
         5 => polygon(&[(0, r), (r, -s), (-r, -s)])?,
         6 => cross((r, 0), (0, r))?,
-        _ => area.draw(&Circle::new(
-            (x, y),
-            s,
-            colour.stroke_width(2 * SCALE as u32),
-        ))?,
+        _ => area.draw(&Circle::new((x, y), s, colour.stroke_width(2 * SCALE as u32)))?,
     }
     Ok(())
 }

@@ -3,8 +3,8 @@
 use super::Series;
 use super::axis::Axis;
 use super::canvas::{
-    Area, Chart, HEIGHT, LegendEntry, LegendSymbol, PlotHeader, PlotMargins, WIDTH, chart, colour,
-    document, draw_line, draw_marker, empty_plot, entries, omission_note,
+    Area, Chart, HEIGHT, LegendEntry, LegendSymbol, PlotHeader, PlotMargins, WIDTH, chart, colour, document, draw_line,
+    draw_marker, empty_plot, entries, omission_note,
 };
 use anyhow::Result;
 use std::collections::HashSet;
@@ -51,10 +51,7 @@ pub fn curves(
     };
     let placed = to_positions(&series, &x, &y);
     let mut legend = legend(&series);
-    for entry in legend
-        .iter_mut()
-        .filter(|entry| entry.index >= curves.len())
-    {
+    for entry in legend.iter_mut().filter(|entry| entry.index >= curves.len()) {
         entry.sign = LegendSymbol::Point;
     }
     let head = PlotHeader::new(title, legend, WIDTH);
@@ -82,10 +79,7 @@ pub fn map(title: &str, x_name: &str, y_name: &str, series: &[Series]) -> Result
     let metres = ((x.high - x.low) / width).max((y.high - y.low) / height);
     let around = |axis: &Axis, pixels: f64| {
         let middle = axis.low / 2.0 + axis.high / 2.0;
-        Axis::with_bounds(
-            middle - metres * pixels / 2.0,
-            middle + metres * pixels / 2.0,
-        )
+        Axis::with_bounds(middle - metres * pixels / 2.0, middle + metres * pixels / 2.0)
     };
     let (x, y) = (around(&x, width), around(&y, height));
     let placed = to_positions(series, &x, &y);
@@ -101,12 +95,7 @@ pub fn map(title: &str, x_name: &str, y_name: &str, series: &[Series]) -> Result
 /// Draws the empirical cumulative distribution of each series: for each value, the percentage of the series that is at
 /// most as large. `x` is the label of the axis, with its unit. Values that the axis cannot show, such as infinite ones,
 /// still count in the percentages; NaN does not.
-pub fn distribution(
-    title: &str,
-    x_name: &str,
-    series: &[(String, Vec<f64>)],
-    log_x: bool,
-) -> Result<String> {
+pub fn distribution(title: &str, x_name: &str, series: &[(String, Vec<f64>)], log_x: bool) -> Result<String> {
     let values = || series.iter().flat_map(|one| one.1.iter().copied());
     let y = Axis::with_bounds(0.0, 102.0);
     let Some(x) = Axis::for_values(values(), log_x) else {
@@ -115,33 +104,23 @@ pub fn distribution(
     let omitted = values().filter(|value| x.position(*value).is_none());
     let omitted = omitted.count();
     let unknown = values().filter(|value| value.is_nan()).count();
-    let note = omission_note(unknown).or((omitted > 0).then(|| {
-        format!("{omitted} of the values have no place on the axis, but count in the shares")
-    }));
+    let note = omission_note(unknown)
+        .or((omitted > 0)
+            .then(|| format!("{omitted} of the values have no place on the axis, but count in the shares")));
     let placed: Vec<AxisPositions> = series.iter().map(|one| steps(&one.1, &x)).collect();
     let names = series.iter().map(|one| one.0.as_str());
     let head = PlotHeader::new(title, entries(names, LegendSymbol::Line), WIDTH);
     document(&head, (WIDTH, HEIGHT), note, |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
         let vertical = (&y, "share of values at most as large (%)");
-        let chart = chart(
-            area,
-            rows,
-            &PlotMargins::for_axis(&y),
-            (&x, x_name),
-            vertical,
-        )?;
+        let chart = chart(area, rows, &PlotMargins::for_axis(&y), (&x, x_name), vertical)?;
         draw(area, &chart, &placed, placed.len())
     })
 }
 
 /// Returns each finite value once, with the percentage of all numbers that is at most as large.
 pub(super) fn cumulative_shares(values: &[f64]) -> Vec<(f64, f64)> {
-    let mut sorted: Vec<f64> = values
-        .iter()
-        .copied()
-        .filter(|value| !value.is_nan())
-        .collect();
+    let mut sorted: Vec<f64> = values.iter().copied().filter(|value| !value.is_nan()).collect();
     sorted.sort_by(f64::total_cmp);
     let all = sorted.len() as f64;
     let mut shares: Vec<(f64, f64)> = Vec::new();
@@ -201,10 +180,8 @@ fn to_positions(series: &[Series], x: &Axis, y: &Axis) -> Vec<AxisPositions> {
 /// Draws the first `lines` series as lines, the others as points.
 fn draw(area: &Area, chart: &Chart, placed: &[AxisPositions], lines: usize) -> Result<()> {
     for (index, points) in placed.iter().enumerate() {
-        let pixels: Vec<Option<(i32, i32)>> = points
-            .iter()
-            .map(|point| point.map(|at| chart.backend_coord(&at)))
-            .collect();
+        let pixels: Vec<Option<(i32, i32)>> =
+            points.iter().map(|point| point.map(|at| chart.backend_coord(&at))).collect();
         if index < lines {
             draw_series_line(area, &pixels, index, placed.len())?;
             continue;
@@ -219,12 +196,7 @@ fn draw(area: &Area, chart: &Chart, placed: &[AxisPositions], lines: usize) -> R
     Ok(())
 }
 
-fn draw_series_line(
-    area: &Area,
-    pixels: &[Option<(i32, i32)>],
-    index: usize,
-    of: usize,
-) -> Result<()> {
+fn draw_series_line(area: &Area, pixels: &[Option<(i32, i32)>], index: usize, of: usize) -> Result<()> {
     for part in pixels.split(Option::is_none) {
         let mut path: Vec<(i32, i32)> = part.iter().copied().flatten().collect();
         path.dedup();

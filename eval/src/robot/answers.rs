@@ -15,11 +15,7 @@ pub(super) fn request_number(message: &SerializedMessage) -> Option<u32> {
     read_header(&message.bytes).map(|header| header.stamp.0)
 }
 
-pub(super) fn fill_answer(
-    request: &mut RequestSample,
-    message: &SerializedMessage,
-    after: Duration,
-) {
+pub(super) fn fill_answer(request: &mut RequestSample, message: &SerializedMessage, after: Duration) {
     request.response = Some(after.as_secs_f64());
     request.digest = Some(digest_message(&message.bytes));
     request.boxes = boxes::digest_sorted(message);
@@ -27,11 +23,7 @@ pub(super) fn fill_answer(
 }
 
 /// Assigns an answer to its request, given the times at which requests were `sent`; the first answer counts.
-pub(super) fn record_answer(
-    requests: &mut [RequestSample],
-    sent: &[At],
-    message: &SerializedMessage,
-) {
+pub(super) fn record_answer(requests: &mut [RequestSample], sent: &[At], message: &SerializedMessage) {
     let index = request_number(message).and_then(|number| number.checked_sub(FIRST));
     let index = index.map_or(usize::MAX, |index| index as usize);
     if let (Some(request), Some(sent)) = (requests.get_mut(index), sent.get(index)) {
@@ -75,17 +67,11 @@ mod tests {
     #[test]
     fn a_map_is_read_by_rows() {
         let mut bytes = Vec::new();
-        [1_u32, 2, 3, 0]
-            .iter()
-            .for_each(|word| bytes.extend(word.to_le_bytes()));
+        [1_u32, 2, 3, 0].iter().for_each(|word| bytes.extend(word.to_le_bytes()));
         bytes.extend([0; 8]);
         bytes.extend(0.05_f32.to_le_bytes());
-        [2_u32, 3]
-            .iter()
-            .for_each(|word| bytes.extend(word.to_le_bytes()));
-        [-1.0_f64, -2.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-            .iter()
-            .for_each(|number| bytes.extend(number.to_le_bytes()));
+        [2_u32, 3].iter().for_each(|word| bytes.extend(word.to_le_bytes()));
+        [-1.0_f64, -2.0, 0.0, 0.0, 0.0, 0.0, 1.0].iter().for_each(|number| bytes.extend(number.to_le_bytes()));
         bytes.extend(6_u32.to_le_bytes());
         bytes.extend([255, 0, 100, 0, 0, 0]);
         let map = read_grid(&bytes).expect("a map");

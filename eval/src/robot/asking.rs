@@ -39,10 +39,7 @@ pub(super) fn ask(
     let request = ends.inputs.iter().find(|(name, _)| **name == *plan.request);
     let (_, publisher) = request.context("the topic of requests is recorded")?;
     // Messages published before the other end is connected are lost, and answers would differ between runs.
-    let connects = (
-        publisher.matched_subscribers(),
-        ends.answers.matched.clone(),
-    );
+    let connects = (publisher.matched_subscribers(), ends.answers.matched.clone());
     let mut ended = Trace::default();
     if !wait_until_connected(site, connects, node, &mut ended)? {
         return Ok(ended);
@@ -51,9 +48,7 @@ pub(super) fn ask(
         let mut now = publisher.matched_subscribers();
         let others = now.wait_for(|now| now.connected_count() > 0);
         // A package need not subscribe to everything that was recorded.
-        let _ = site
-            .runtime
-            .block_on(async { timeout(OTHERS, others).await.is_ok() });
+        let _ = site.runtime.block_on(async { timeout(OTHERS, others).await.is_ok() });
     }
     site.runtime.block_on(async {
         let (warm_up, measured) = steps.split_at(WARM_UP);
@@ -62,9 +57,7 @@ pub(super) fn ask(
             ends.publish(step, number)?;
             // Warm-up requests do not count, answered or not.
             let mut ended = Trace::default();
-            if ends.wait_for_answer(number, BEGINNING).await.is_none()
-                && note_node_exit(node, &mut ended)?
-            {
+            if ends.wait_for_answer(number, BEGINNING).await.is_none() && note_node_exit(node, &mut ended)? {
                 return Ok(ended);
             }
         }
@@ -76,8 +69,7 @@ pub(super) fn ask(
             RequestPacing::Played(_) => bail!("rosbag plays by itself"),
             RequestPacing::Rate { hertz, in_time } => {
                 let cycle: Vec<&RecordedStep> = measured.iter().cycle().take(plan.most).collect();
-                ends.ask_at_rate(plan, (hertz, in_time), &cycle, node)
-                    .await?
+                ends.ask_at_rate(plan, (hertz, in_time), &cycle, node).await?
             }
         };
         // Messages of other topics arrive on other connections, possibly a little later than the last answer.
@@ -109,11 +101,8 @@ impl RobotEndpoints {
             let sent = Instant::now();
             self.publish(step, number)?;
             let until = At::now() + Duration::from_secs_f64(plan.give_up);
-            let mut request = RequestSample {
-                at: (sent - begun).as_secs_f64(),
-                stamp: step.at,
-                ..RequestSample::default()
-            };
+            let mut request =
+                RequestSample { at: (sent - begun).as_secs_f64(), stamp: step.at, ..RequestSample::default() };
             if let Some(message) = self.wait_while_running(number, until, node).await {
                 fill_answer(&mut request, &message, sent.elapsed());
                 request.pose = request.pose.filter(|_| plan.tells_pose);
@@ -155,12 +144,8 @@ impl RobotEndpoints {
         let until = At::now() + STRAGGLERS;
         loop {
             // The last answer ends the wait: earlier ones will not arrive any more, and its map is on the way.
-            let all = trace
-                .requests
-                .last()
-                .is_none_or(|last| last.response.is_some());
-            self.collect_answers(&mut trace.requests, &sent, At::now() + LOOK)
-                .await;
+            let all = trace.requests.last().is_none_or(|last| last.response.is_some());
+            self.collect_answers(&mut trace.requests, &sent, At::now() + LOOK).await;
             if all || At::now() > until {
                 break;
             }

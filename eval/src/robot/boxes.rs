@@ -14,9 +14,7 @@ const BOX: usize = 32;
 
 /// Hashes the header without its sequence number and the sorted boxes; `None` for other answers.
 pub fn digest_sorted(message: &SerializedMessage) -> Option<u64> {
-    (message.wire_type.name == LIST)
-        .then(|| digest_boxes(&message.bytes))
-        .flatten()
+    (message.wire_type.name == LIST).then(|| digest_boxes(&message.bytes)).flatten()
 }
 
 fn digest_boxes(bytes: &[u8]) -> Option<u64> {

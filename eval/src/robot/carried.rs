@@ -14,10 +14,7 @@ pub(super) fn read_counters() -> Result<Option<[u64; 2]>> {
 fn sum_devices(text: &str) -> Option<[u64; 2]> {
     let devices = text.lines().filter_map(|line| line.split_once(':'));
     let counted = devices.filter_map(|(name, columns)| {
-        let columns: Vec<u64> = columns
-            .split_whitespace()
-            .filter_map(|word| word.parse().ok())
-            .collect();
+        let columns: Vec<u64> = columns.split_whitespace().filter_map(|word| word.parse().ok()).collect();
         let counts = [*columns.get(8)?, *columns.first()?];
         (name.trim() != "lo").then_some(counts)
     });

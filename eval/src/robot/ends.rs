@@ -13,9 +13,7 @@ use super::RobotPlan;
 use super::answers::{read_grid, record_answer, request_number};
 use super::asking::{LOOK, has_ended};
 use super::numbers::FIRST;
-use crate::recording::{
-    RecordedStep, Recording, read_floats, read_header, with_relative_stamp, with_stamp,
-};
+use crate::recording::{RecordedStep, Recording, read_floats, read_header, with_relative_stamp, with_stamp};
 use crate::trace::{ComputationPhases, RequestSample, Trace};
 
 /// Publishers and subscriptions of the robot's node.
@@ -27,11 +25,7 @@ pub(super) struct RobotEndpoints {
     _node: Arc<Ros1Bus>,
 }
 
-pub(super) fn create_endpoints(
-    site: &Site,
-    plan: &RobotPlan,
-    recording: &Recording,
-) -> Result<RobotEndpoints> {
+pub(super) fn create_endpoints(site: &Site, plan: &RobotPlan, recording: &Recording) -> Result<RobotEndpoints> {
     let node = site.node("/robot")?;
     let mut inputs = Vec::new();
     for one in recording.topics(&plan.left_out) {
@@ -61,24 +55,16 @@ impl RobotEndpoints {
             }
         };
         for message in &step.before {
-            send(
-                &message.topic,
-                with_relative_stamp(message, step.request, number),
-            );
+            send(&message.topic, with_relative_stamp(message, step.request, number));
         }
         let request = with_stamp(&step.request.bytes, number);
-        let request = request
-            .with_context(|| format!("messages of {} have no header", step.request.topic))?;
+        let request = request.with_context(|| format!("messages of {} have no header", step.request.topic))?;
         send(&step.request.topic, request);
         Ok(())
     }
 
     /// Waits for the first answer to a request.
-    pub(super) async fn wait_for_answer(
-        &mut self,
-        number: u32,
-        give_up: Duration,
-    ) -> Option<SerializedMessage> {
+    pub(super) async fn wait_for_answer(&mut self, number: u32, give_up: Duration) -> Option<SerializedMessage> {
         let waited = timeout(give_up, async {
             loop {
                 let message = self.answers.messages.recv().await?;
@@ -107,12 +93,7 @@ impl RobotEndpoints {
     }
 
     /// Records answers until `until`, or until the last request is answered.
-    pub(super) async fn collect_answers(
-        &mut self,
-        requests: &mut [RequestSample],
-        sent: &[At],
-        until: At,
-    ) {
+    pub(super) async fn collect_answers(&mut self, requests: &mut [RequestSample], sent: &[At], until: At) {
         loop {
             let message = tokio::select! {
                 biased;
@@ -138,8 +119,7 @@ impl RobotEndpoints {
             return;
         };
         while let Some(message) = timing.messages.try_recv() {
-            let Some(index) = request_number(&message).and_then(|number| number.checked_sub(FIRST))
-            else {
+            let Some(index) = request_number(&message).and_then(|number| number.checked_sub(FIRST)) else {
                 continue;
             };
             let from = read_header(&message.bytes).map_or(0, |header| header.end);
@@ -149,11 +129,8 @@ impl RobotEndpoints {
             else {
                 continue;
             };
-            request.phases = Some(ComputationPhases {
-                acquisition: *acquisition,
-                computation: *computation,
-                rendering: *rendering,
-            });
+            request.phases =
+                Some(ComputationPhases { acquisition: *acquisition, computation: *computation, rendering: *rendering });
         }
     }
 }

@@ -29,10 +29,7 @@ impl RobotEndpoints {
         steps: &[&RecordedStep<'_>],
         node: &mut NodeProcess,
     ) -> Result<Trace> {
-        let mut trace = Trace {
-            late_before: !self.warm_up(steps, (hertz, in_time)).await?,
-            ..Trace::default()
-        };
+        let mut trace = Trace { late_before: !self.warm_up(steps, (hertz, in_time)).await?, ..Trace::default() };
         let begun = At::now();
         let mut sent: Vec<At> = Vec::new();
         for (index, step) in steps.iter().enumerate() {
@@ -51,8 +48,7 @@ impl RobotEndpoints {
             self.collect_other_topics(&mut trace);
         }
         let until = At::now() + Duration::from_secs_f64(plan.give_up);
-        self.collect_until_answered(&mut trace.requests, &sent, until)
-            .await;
+        self.collect_until_answered(&mut trace.requests, &sent, until).await;
         note_node_exit(node, &mut trace)?;
         trace.lasted = begun.elapsed().as_secs_f64();
         Ok(trace)
@@ -60,11 +56,7 @@ impl RobotEndpoints {
 
     /// Sends requests at that rate until enough answers in a row are in time, which shows that everything is warmed up;
     /// returns whether that happened.
-    async fn warm_up(
-        &mut self,
-        steps: &[&RecordedStep<'_>],
-        (hertz, in_time): (f64, f64),
-    ) -> Result<bool> {
+    async fn warm_up(&mut self, steps: &[&RecordedStep<'_>], (hertz, in_time): (f64, f64)) -> Result<bool> {
         let begun = Instant::now();
         let (mut awake, mut number) = (0, WARM_UP as u32);
         while awake < AWAKE {
@@ -74,9 +66,7 @@ impl RobotEndpoints {
             number += 1;
             let (step, asked) = (steps[number as usize % steps.len()], At::now());
             self.publish(step, number)?;
-            let came = self
-                .wait_for_answer(number, Duration::from_secs_f64(in_time))
-                .await;
+            let came = self.wait_for_answer(number, Duration::from_secs_f64(in_time)).await;
             awake = if came.is_some() { awake + 1 } else { 0 };
             tokio::time::sleep_until(asked + Duration::from_secs_f64(1.0 / hertz)).await;
         }
@@ -84,12 +74,7 @@ impl RobotEndpoints {
     }
 
     /// Records answers until `until`, or until none is missing.
-    async fn collect_until_answered(
-        &mut self,
-        requests: &mut [RequestSample],
-        sent: &[At],
-        until: At,
-    ) {
+    async fn collect_until_answered(&mut self, requests: &mut [RequestSample], sent: &[At], until: At) {
         while requests.iter().any(|request| request.response.is_none()) {
             let waited = tokio::time::timeout_at(until, self.answers.messages.recv());
             let Ok(Some(message)) = waited.await else {

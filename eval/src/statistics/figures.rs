@@ -36,16 +36,11 @@ pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
             drawn[random.random_range(0..values.len())] += 1;
         }
         let times = values.iter().zip(drawn);
-        let resample: Vec<f64> = times
-            .flat_map(|(value, times)| repeat_n(*value, times))
-            .collect();
+        let resample: Vec<f64> = times.flat_map(|(value, times)| repeat_n(*value, times)).collect();
         medians.push(quantile_of_sorted(&resample, 0.5)?);
     }
     let outside = (1.0 - confidence) / 2.0;
-    Some((
-        quantile(&medians, outside)?,
-        quantile(&medians, 1.0 - outside)?,
-    ))
+    Some((quantile(&medians, outside)?, quantile(&medians, 1.0 - outside)?))
 }
 
 /// A straight line.
@@ -61,17 +56,10 @@ pub struct FittedLine {
 pub fn least_squares(points: &[(f64, f64)]) -> Option<FittedLine> {
     let of = |which: fn(&(f64, f64)) -> f64| mean(&points.iter().map(which).collect::<Vec<_>>());
     let (x, y) = (of(|point| point.0)?, of(|point| point.1)?);
-    let sum = |term: &dyn Fn(f64, f64) -> f64| -> f64 {
-        points
-            .iter()
-            .map(|point| term(point.0 - x, point.1 - y))
-            .sum()
-    };
+    let sum =
+        |term: &dyn Fn(f64, f64) -> f64| -> f64 { points.iter().map(|point| term(point.0 - x, point.1 - y)).sum() };
     let (xx, xy) = (sum(&|dx, _| dx * dx), sum(&|dx, dy| dx * dy));
-    (xx > 0.0 && xy.is_finite()).then(|| FittedLine {
-        slope: xy / xx,
-        intercept: y - xy / xx * x,
-    })
+    (xx > 0.0 && xy.is_finite()).then(|| FittedLine { slope: xy / xx, intercept: y - xy / xx * x })
 }
 
 /// Root mean square difference of pairs, such as (predicted, measured), in their unit.
@@ -90,10 +78,7 @@ mod tests {
         // 2, 4, 4, 4, 5, 5, 7, 9: mean 5, sum of squares 32.
         let values = [2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0];
         assert_eq!(mean(&values), Some(5.0));
-        assert_near(
-            standard_deviation(&values).expect("values"),
-            (32.0f64 / 7.0).sqrt(),
-        );
+        assert_near(standard_deviation(&values).expect("values"), (32.0f64 / 7.0).sqrt());
         assert_eq!(mean(&[]), None);
         assert_eq!(mean(&[1.0, f64::NAN]), None);
         assert_eq!(standard_deviation(&[1.0]), None);

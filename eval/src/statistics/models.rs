@@ -35,27 +35,17 @@ impl RrtModel {
         if usable.len() < 3 || least == most {
             return None;
         }
-        let steps = (0..STEPS)
-            .map(|step| least * (most / least).powf(f64::from(STEPS - step) / f64::from(STEPS)));
+        let steps = (0..STEPS).map(|step| least * (most / least).powf(f64::from(STEPS - step) / f64::from(STEPS)));
         let mut grid: Vec<f64> = steps.chain(cores).filter(|cores| *cores > least).collect();
         grid.sort_by(|one, other| other.total_cmp(one));
         let scale: f64 = usable.iter().map(|point| point.1.powi(2)).sum();
         let mut best: Option<(f64, Self)> = None;
         for parallel in grid {
-            let samples = usable
-                .iter()
-                .map(|(cores, time)| (1.0 / cores.min(parallel), *time));
+            let samples = usable.iter().map(|(cores, time)| (1.0 / cores.min(parallel), *time));
             let samples: Vec<(f64, f64)> = samples.collect();
             let (overhead, work) = not_negative(&samples)?;
-            let model = Self {
-                overhead,
-                work,
-                parallel,
-            };
-            let error: f64 = usable
-                .iter()
-                .map(|(cores, time)| (model.predict(*cores) - time).powi(2))
-                .sum();
+            let model = Self { overhead, work, parallel };
+            let error: f64 = usable.iter().map(|(cores, time)| (model.predict(*cores) - time).powi(2)).sum();
             if best.is_none_or(|(least, _)| error < least - 1e-12 * scale) {
                 best = Some((error, model));
             }
@@ -80,11 +70,8 @@ fn not_negative(samples: &[(f64, f64)]) -> Option<(f64, f64)> {
     let squares: f64 = samples.iter().map(|(x, _)| x * x).sum();
     let mean = mean(&samples.iter().map(|sample| sample.1).collect::<Vec<_>>())?;
     let edges = [(0.0, (products / squares).max(0.0)), (mean.max(0.0), 0.0)];
-    let error =
-        |(a, b): (f64, f64)| -> f64 { samples.iter().map(|(x, y)| (a + b * x - y).powi(2)).sum() };
-    edges
-        .into_iter()
-        .min_by(|one, other| error(*one).total_cmp(&error(*other)))
+    let error = |(a, b): (f64, f64)| -> f64 { samples.iter().map(|(x, y)| (a + b * x - y).powi(2)).sum() };
+    edges.into_iter().min_by(|one, other| error(*one).total_cmp(&error(*other)))
 }
 
 #[cfg(test)]
@@ -95,14 +82,9 @@ mod tests {
     /// 0.05 s + 2 core seconds / min(cores, 3).
     #[test]
     fn the_models_parameters_are_found() {
-        let true_model = RrtModel {
-            overhead: 0.05,
-            work: 2.0,
-            parallel: 3.0,
-        };
+        let true_model = RrtModel { overhead: 0.05, work: 2.0, parallel: 3.0 };
         assert_near(true_model.predict(1.0), 2.05);
-        let points =
-            [0.25, 0.5, 1.0, 2.0, 4.0, 8.0].map(|cores| (cores, true_model.predict(cores)));
+        let points = [0.25, 0.5, 1.0, 2.0, 4.0, 8.0].map(|cores| (cores, true_model.predict(cores)));
         let model = RrtModel::fit(&points).expect("six numbers of cores");
         assert!((model.parallel - 3.0).abs() < 0.03, "{model:?}");
         assert!((model.work - 2.0).abs() < 0.01, "{model:?}");

@@ -18,12 +18,8 @@ pub struct TrajectoryError {
 /// outside its time range are not compared. The estimate is then rotated and translated, without scaling, so that the
 /// sum of squared distances is minimal (Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two
 /// Point Patterns", IEEE PAMI 13, 1991, in the plane). `None` for fewer than two poses.
-pub fn trajectory_error(
-    estimate: &[(f64, f64, f64)],
-    truth: &[(f64, f64, f64)],
-) -> Option<TrajectoryError> {
-    let finite =
-        |pose: &&(f64, f64, f64)| pose.0.is_finite() && pose.1.is_finite() && pose.2.is_finite();
+pub fn trajectory_error(estimate: &[(f64, f64, f64)], truth: &[(f64, f64, f64)]) -> Option<TrajectoryError> {
+    let finite = |pose: &&(f64, f64, f64)| pose.0.is_finite() && pose.1.is_finite() && pose.2.is_finite();
     let mut truth: Vec<(f64, f64, f64)> = truth.iter().filter(finite).copied().collect();
     truth.sort_by(|one, other| one.0.total_cmp(&other.0));
     let pairs: Vec<[(f64, f64); 2]> = estimate
@@ -35,18 +31,13 @@ pub fn trajectory_error(
         return None;
     }
     let centre = |which: usize| {
-        let sum = pairs.iter().fold((0.0, 0.0), |sum, pair| {
-            (sum.0 + pair[which].0, sum.1 + pair[which].1)
-        });
+        let sum = pairs.iter().fold((0.0, 0.0), |sum, pair| (sum.0 + pair[which].0, sum.1 + pair[which].1));
         (sum.0 / pairs.len() as f64, sum.1 / pairs.len() as f64)
     };
     let (from, to) = (centre(0), centre(1));
     let centred = |pair: &[(f64, f64); 2]| {
         let [one, other] = *pair;
-        (
-            (one.0 - from.0, one.1 - from.1),
-            (other.0 - to.0, other.1 - to.1),
-        )
+        ((one.0 - from.0, one.1 - from.1), (other.0 - to.0, other.1 - to.1))
     };
     let (mut dot, mut cross) = (0.0, 0.0);
     for (one, other) in pairs.iter().map(centred) {
@@ -79,10 +70,7 @@ fn interpolate(truth: &[(f64, f64, f64)], time: f64) -> Option<(f64, f64)> {
     }
     let last = truth.get(after.checked_sub(1)?)?;
     let share = (time - last.0) / (next.0 - last.0);
-    Some((
-        last.1 + share * (next.1 - last.1),
-        last.2 + share * (next.2 - last.2),
-    ))
+    Some((last.1 + share * (next.1 - last.1), last.2 + share * (next.2 - last.2)))
 }
 
 #[cfg(test)]
@@ -104,10 +92,8 @@ mod tests {
     fn a_turned_and_moved_path_has_no_error() {
         for angle in [0.0f64, 0.7, 2.5, -3.0] {
             let (sin, cos) = angle.sin_cos();
-            let moved: Vec<_> = path()
-                .into_iter()
-                .map(|(t, x, y)| (t, cos * x - sin * y + 12.0, sin * x + cos * y - 7.0))
-                .collect();
+            let moved: Vec<_> =
+                path().into_iter().map(|(t, x, y)| (t, cos * x - sin * y + 12.0, sin * x + cos * y - 7.0)).collect();
             let error = trajectory_error(&moved, &path()).expect("poses");
             assert!(error.rmse < 1e-9 && error.max < 1e-9, "{error:?}");
             assert_eq!(error.count, 200);
@@ -117,14 +103,7 @@ mod tests {
     /// A square of 2 m whose estimate is a square of 4 m: no rotation or translation helps, each corner is √2 m away.
     #[test]
     fn scale_is_an_error() {
-        let square = |half: f64| {
-            [
-                (0.0, -half, -half),
-                (1.0, half, -half),
-                (2.0, half, half),
-                (3.0, -half, half),
-            ]
-        };
+        let square = |half: f64| [(0.0, -half, -half), (1.0, half, -half), (2.0, half, half), (3.0, -half, half)];
         let error = trajectory_error(&square(2.0), &square(1.0)).expect("poses");
         assert_near(error.rmse, 2.0f64.sqrt());
         assert_near(error.max, 2.0f64.sqrt());

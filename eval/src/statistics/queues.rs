@@ -22,11 +22,7 @@ pub struct QueuePrediction {
 /// Network with Generalized Processor Sharing", Acta Informatica 12, 1979).
 pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> QueuePrediction {
     if robots == 0 {
-        return QueuePrediction {
-            response: service / cores.min(1.0),
-            throughput: 0.0,
-            busy: 0.0,
-        };
+        return QueuePrediction { response: service / cores.min(1.0), throughput: 0.0, busy: 0.0 };
     }
     // Logarithms of the weights of 0, 1, 2, ... requests at the node, because the weights themselves would overflow.
     let think = think.max(1e-12);
@@ -46,11 +42,7 @@ pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> Queu
     }
     let used = used / all;
     let throughput = used / service;
-    QueuePrediction {
-        response: robots as f64 / throughput - think,
-        throughput,
-        busy: used / cores,
-    }
+    QueuePrediction { response: robots as f64 / throughput - think, throughput, busy: used / cores }
 }
 
 /// Returns the response time of [`machine_repair`], in seconds.
@@ -113,19 +105,13 @@ impl NodeModel {
     /// ratios is minimal. `None` if an observation is not positive, or for fewer than two observations.
     pub fn fit(observed: &[QueueObservation], cores: f64, think: f64) -> Option<Self> {
         let positive = |value: f64| value.is_finite() && value > 0.0;
-        let usable =
-            |one: &QueueObservation| one.robots > 0 && positive(one.response) && positive(one.busy);
+        let usable = |one: &QueueObservation| one.robots > 0 && positive(one.response) && positive(one.busy);
         if observed.len() < 2 || !observed.iter().all(usable) {
             return None;
         }
         let quickest = observed.iter().map(|one| one.response);
         let quickest = quickest.fold(f64::INFINITY, f64::min);
-        let node = |service: f64, delay: f64| Self {
-            cores,
-            think,
-            service,
-            delay,
-        };
+        let node = |service: f64, delay: f64| Self { cores, think, service, delay };
         // Starts from the logarithm of the service time and the delay, with half the width of their possible range.
         let (mut service, mut width) = ((quickest * 0.05).ln(), 40f64.ln());
         let (mut delay, mut height) = (quickest / 2.0, quickest / 2.0);
@@ -135,10 +121,7 @@ impl NodeModel {
             for across in -GRID.0..=GRID.0 {
                 for up in -GRID.0..=GRID.0 {
                     let at = |step: i32| f64::from(step) / f64::from(GRID.0);
-                    let there = (
-                        middle.0 + width * at(across),
-                        (middle.1 + height * at(up)).max(0.0),
-                    );
+                    let there = (middle.0 + width * at(across), (middle.1 + height * at(up)).max(0.0));
                     let error = node(there.0.exp(), there.1).distance(observed);
                     if error < least {
                         least = error;
@@ -165,21 +148,12 @@ impl NodeModel {
     /// Predicts the state with `robots` robots; the response time includes the delay.
     pub fn predict(&self, robots: u64) -> QueuePrediction {
         let closed = machine_repair(robots, self.cores, self.service, self.think + self.delay);
-        QueuePrediction {
-            response: closed.response + self.delay,
-            ..closed
-        }
+        QueuePrediction { response: closed.response + self.delay, ..closed }
     }
 
     /// Returns how many of `robots` it serves with a mean response time of at most `t_max` seconds.
     pub fn robots_served(&self, robots: u64, t_max: f64) -> u64 {
-        robots_per_node(
-            robots,
-            self.cores,
-            self.service,
-            self.think + self.delay,
-            t_max - self.delay,
-        )
+        robots_per_node(robots, self.cores, self.service, self.think + self.delay, t_max - self.delay)
     }
 
     /// Returns the number of robots above which they wait for one another rather than for their own requests: the
@@ -215,10 +189,7 @@ mod tests {
         assert_near(closed.throughput, 0.8);
         assert_near(closed.busy, 0.8);
         for robots in [1, 3, 10, 40] {
-            assert_near(
-                response_time(robots, 1.0, 0.2, 3.0),
-                one_core(robots, 0.2, 3.0),
-            );
+            assert_near(response_time(robots, 1.0, 0.2, 3.0), one_core(robots, 0.2, 3.0));
         }
     }
 
@@ -247,29 +218,19 @@ mod tests {
         assert_eq!(robots_per_node(100, 1.0, 1.0, 1.0, 1.6), 2);
     }
 
-    const NODE: NodeModel = NodeModel {
-        cores: 2.0,
-        think: 0.2,
-        service: 0.01,
-        delay: 0.003,
-    };
+    const NODE: NodeModel = NodeModel { cores: 2.0, think: 0.2, service: 0.01, delay: 0.003 };
 
     fn observations(robots: &[u64], as_if: impl Fn(u64) -> f64) -> Vec<QueueObservation> {
         let all = robots.iter().map(|robots| {
             let closed = NODE.predict(*robots);
-            QueueObservation {
-                robots: *robots,
-                response: closed.response * as_if(*robots),
-                busy: closed.busy,
-            }
+            QueueObservation { robots: *robots, response: closed.response * as_if(*robots), busy: closed.busy }
         });
         all.collect()
     }
 
     #[test]
     fn a_nodes_parameters_are_found() {
-        let node =
-            NodeModel::fit(&observations(&[1, 4, 16, 64], |_| 1.0), 2.0, 0.2).expect("four points");
+        let node = NodeModel::fit(&observations(&[1, 4, 16, 64], |_| 1.0), 2.0, 0.2).expect("four points");
         assert!((node.service / 0.01 - 1.0).abs() < 0.01, "{node:?}");
         assert!((node.delay - 0.003).abs() < 0.0003, "{node:?}");
         for robots in [2, 8, 32, 100] {
@@ -277,10 +238,7 @@ mod tests {
             assert!((predicted / real - 1.0).abs() < 0.03, "{predicted} {real}");
         }
         // Observations that are a tenth too long or too short.
-        let noisy = observations(
-            &[1, 4, 16, 64],
-            |robots| if robots == 4 { 1.1 } else { 0.9 },
-        );
+        let noisy = observations(&[1, 4, 16, 64], |robots| if robots == 4 { 1.1 } else { 0.9 });
         let node = NodeModel::fit(&noisy, 2.0, 0.2).expect("four points");
         assert!((node.service / 0.01 - 1.0).abs() < 0.1, "{node:?}");
     }
@@ -288,10 +246,7 @@ mod tests {
     #[test]
     fn nothing_is_fitted_to_what_is_not_there() {
         assert_eq!(NodeModel::fit(&observations(&[4], |_| 1.0), 2.0, 0.2), None);
-        assert_eq!(
-            NodeModel::fit(&observations(&[1, 4], |_| f64::NAN), 2.0, 0.2),
-            None
-        );
+        assert_eq!(NodeModel::fit(&observations(&[1, 4], |_| f64::NAN), 2.0, 0.2), None);
         assert_eq!(NodeModel::fit(&[], 2.0, 0.2), None);
     }
 

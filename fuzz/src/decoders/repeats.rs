@@ -12,11 +12,7 @@ pub struct Repeat {
 }
 
 const fn repeat(before: &'static str, part: &'static str, after: &'static str) -> Repeat {
-    Repeat {
-        before,
-        part,
-        after,
-    }
+    Repeat { before, part, after }
 }
 
 impl Repeat {
@@ -52,84 +48,42 @@ macro_rules! values {
             repeat(concat!($before, "["), "{},", concat!("{}]", $after)),
             repeat(concat!($before, "["), "\"\",", concat!("1]", $after)),
             repeat(concat!($before, "["), "{\"\":1},", concat!("1]", $after)),
-            repeat(
-                concat!($before, "{"),
-                "\"{n}\":1,",
-                concat!("\"\":1}", $after),
-            ),
-            repeat(
-                concat!($before, "{"),
-                "\"{n}\":[],",
-                concat!("\"\":1}", $after),
-            ),
+            repeat(concat!($before, "{"), "\"{n}\":1,", concat!("\"\":1}", $after)),
+            repeat(concat!($before, "{"), "\"{n}\":[],", concat!("\"\":1}", $after)),
             repeat(concat!($before, "\""), "\\n", concat!("\"", $after)),
-            repeat(
-                concat!($before, fifty!("["), "["),
-                "1,",
-                concat!("1]", fifty!("]"), $after),
-            ),
-            repeat(
-                concat!($before, fifty!("["), "["),
-                "{\"\":1},",
-                concat!("1]", fifty!("]"), $after),
-            ),
+            repeat(concat!($before, fifty!("["), "["), "1,", concat!("1]", fifty!("]"), $after)),
+            repeat(concat!($before, fifty!("["), "["), "{\"\":1},", concat!("1]", fifty!("]"), $after)),
         ]
     };
 }
 
 pub(super) const VALUES: &[Repeat] = values!("", "");
 pub(super) const HELLO: &[Repeat] = values!("{\"parameters\":{\"a\":", "}}");
-pub(super) const VIEWER: &[Repeat] = values!(
-    "{\"op\":\"setParameters\",\"parameters\":[{\"name\":\"a\",\"value\":",
-    "}]}"
-);
+pub(super) const VIEWER: &[Repeat] =
+    values!("{\"op\":\"setParameters\",\"parameters\":[{\"name\":\"a\",\"value\":", "}]}");
 pub(super) const ORDERS: &[Repeat] = &[
     repeat("{\"requests\":[", "{},", "{}]}"),
     repeat("{\"decided\":[", "{},", "{}]}"),
     repeat("{\"refused\":[", "{},", "{}]}"),
-    repeat(
-        "{\"dropped\":[",
-        "{\"topic\":\"\",\"cause\":\"stale\",\"count\":1},",
-        "]}",
-    ),
+    repeat("{\"dropped\":[", "{\"topic\":\"\",\"cause\":\"stale\",\"count\":1},", "]}"),
     repeat("{\"graph\":{\"outputs\":[", "{},", "{}]}}"),
     repeat("{\"graph\":{\"inputs\":[", "{},", "{}]}}"),
     repeat("{\"graph\":{\"services\":[", "{},", "{}]}}"),
     repeat("{\"graph\":{\"siblings\":[", "\"\",", "\"\"]}}"),
     repeat("{\"graph\":{\"nodes\":{", "\"{n}\":{},", "\"\":{}}}}"),
-    repeat(
-        "{\"graph\":{\"nodes\":{\"\":{\"inputs\":[",
-        "\"{n}\",",
-        "\"\"]}}}}",
-    ),
+    repeat("{\"graph\":{\"nodes\":{\"\":{\"inputs\":[", "\"{n}\",", "\"\"]}}}}"),
     repeat("{\"parameters\":[", "[\"\",null],", "[\"\",null]]}"),
     repeat("{\"parameters\":[", "[\"\",{\"\":1}],", "[\"\",null]]}"),
     repeat("{\"parameters\":[[\"\",[", "{\"\":1},", "1]]]}"),
-    repeat(
-        "{\"lent\":{\"service\":\"\",\"of\":{\"halves\":[",
-        "\"\",",
-        "\"\"]}}}",
-    ),
+    repeat("{\"lent\":{\"service\":\"\",\"of\":{\"halves\":[", "\"\",", "\"\"]}}}"),
     repeat("{\"line\":{\"error\":false,\"text\":\"", "\\n", "\"}}"),
     repeat("{\"later\":[", "{},", "{}]}"),
 ];
 pub(super) const ROSBRIDGE: &[Repeat] = &[
-    repeat(
-        "{\"op\":\"publish\",\"topic\":\"/t\",\"msg\":[",
-        "{},",
-        "{}]}",
-    ),
-    repeat(
-        "{\"op\":\"publish\",\"topic\":\"/t\",",
-        "\"{n}\":1,",
-        "\"msg\":{}}",
-    ),
+    repeat("{\"op\":\"publish\",\"topic\":\"/t\",\"msg\":[", "{},", "{}]}"),
+    repeat("{\"op\":\"publish\",\"topic\":\"/t\",", "\"{n}\":1,", "\"msg\":{}}"),
     repeat("{\"op\":\"", "\\n", "\"}"),
-    repeat(
-        "{\"op\":\"fragment\",\"id\":\"1\",\"num\":0,\"total\":2,\"data\":\"",
-        "\\n",
-        "\"}",
-    ),
+    repeat("{\"op\":\"fragment\",\"id\":\"1\",\"num\":0,\"total\":2,\"data\":\"", "\\n", "\"}"),
 ];
 pub(super) const XML_RPC: &[Repeat] = &[
     repeat(
@@ -147,16 +101,8 @@ pub(super) const XML_RPC: &[Repeat] = &[
         "<member><name>{n}</name><value/></member>",
         "</struct></value></param></params></methodResponse>",
     ),
-    repeat(
-        "<methodCall><methodName>x</methodName><params>",
-        "<param><value/></param>",
-        "</params></methodCall>",
-    ),
-    repeat(
-        "<methodCall><methodName>",
-        "&lt;",
-        "</methodName></methodCall>",
-    ),
+    repeat("<methodCall><methodName>x</methodName><params>", "<param><value/></param>", "</params></methodCall>"),
+    repeat("<methodCall><methodName>", "&lt;", "</methodName></methodCall>"),
 ];
 pub(super) const DEFINITIONS: &[Repeat] = &[
     repeat("", "a{n}\n", ""),

@@ -17,11 +17,7 @@ pub(super) fn parse_uri(line: &str) -> Option<Deb> {
 }
 
 pub(super) fn field(stanza: &str, name: &str) -> Option<String> {
-    stanza.lines().find_map(|line| {
-        line.strip_prefix(name)?
-            .strip_prefix(": ")
-            .map(str::to_owned)
-    })
+    stanza.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(": ").map(str::to_owned))
 }
 
 /// Parses the name and the relations of a stanza.
@@ -30,18 +26,14 @@ pub(super) fn parse_relations(stanza: &str) -> Option<(String, Relations)> {
         let text = field(stanza, name).unwrap_or_default();
         let items = text.split([',', '|']);
         // `libfoo:any (>= 1.0)`
-        let names =
-            items.filter_map(|item| item.split([' ', ':', '(']).find(|name| !name.is_empty()));
+        let names = items.filter_map(|item| item.split([' ', ':', '(']).find(|name| !name.is_empty()));
         names.map(str::to_owned).collect()
     };
     let name = field(stanza, "Package")?;
     let source = field(stanza, "Source").unwrap_or_else(|| name.clone());
     let about = Relations {
         source: source.split(' ').next().unwrap_or_default().to_owned(),
-        needs: names("Depends")
-            .into_iter()
-            .chain(names("Pre-Depends"))
-            .collect(),
+        needs: names("Depends").into_iter().chain(names("Pre-Depends")).collect(),
         before: names("Pre-Depends"),
         provides: names("Provides"),
     };
@@ -54,11 +46,7 @@ pub(super) const NAMING: [&str; 3] = ["Package: ", "Version: ", "Architecture: "
 /// Parses a stanza of `apt-cache dumpavail`.
 pub(super) fn parse_stanza(stanza: &str) -> Option<Deb> {
     let field = |name: &str| field(stanza, name);
-    Some(Deb {
-        name: field("Package")?,
-        version: field("Version")?,
-        architecture: field("Architecture")?,
-    })
+    Some(Deb { name: field("Package")?, version: field("Version")?, architecture: field("Architecture")? })
 }
 
 /// Extracts the explanation from a failure of apt: its errors, signature problems, and the table of unmet dependencies.
@@ -75,11 +63,7 @@ pub(super) fn extract_errors(lines: &str) -> String {
             words.push(line.trim());
         }
     }
-    if words.is_empty() {
-        lines.to_owned()
-    } else {
-        words.join("; ")
-    }
+    if words.is_empty() { lines.to_owned() } else { words.join("; ") }
 }
 
 /// Returns the next step after a failure to fetch or verify the lists.
@@ -90,10 +74,7 @@ pub(super) fn suggest_next_step(words: &str) -> &'static str {
             "the archive is signed by an unknown key: if the key is right, save its key ring as a file and name it \
                 with [signed-by=FILE] under [archives] in the configuration",
         ),
-        (
-            "is not signed",
-            "unsigned packages are not installed: take a mirror that has the distribution's InRelease",
-        ),
+        ("is not signed", "unsigned packages are not installed: take a mirror that has the distribution's InRelease"),
         (
             "Hash Sum mismatch",
             "the lists do not match their signature: the mirror is being updated, or they were tampered with; push \
@@ -101,8 +82,5 @@ pub(super) fn suggest_next_step(words: &str) -> &'static str {
         ),
     ];
     let known = reasons.iter().find(|(part, _)| words.contains(part));
-    known.map_or(
-        "push again when this host can reach the archive",
-        |(_, next)| next,
-    )
+    known.map_or("push again when this host can reach the archive", |(_, next)| next)
 }

@@ -43,11 +43,7 @@ impl Key {
 impl Drop for Key {
     /// gpg leaves an agent process behind.
     fn drop(&mut self) {
-        let _ = Command::new("gpgconf")
-            .arg("--homedir")
-            .arg(self.home.path())
-            .args(["--kill", "all"])
-            .status();
+        let _ = Command::new("gpgconf").arg("--homedir").arg(self.home.path()).args(["--kill", "all"]).status();
     }
 }
 
@@ -66,10 +62,7 @@ impl Mirror {
         let lists = mirror.lists();
         fs::create_dir_all(lists.parent().expect("a parent")).expect("made");
         fs::write(&lists, PACKAGES).expect("written");
-        let hash: String = Sha256::digest(PACKAGES)
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect();
+        let hash: String = Sha256::digest(PACKAGES).iter().map(|byte| format!("{byte:02x}")).collect();
         let release = format!(
             "Origin: Lab\nSuite: lab\nCodename: lab\nArchitectures: all amd64 arm64\nComponents: main\n\
              Date: Sat, 01 Jan 2022 00:00:00 UTC\nSHA256:\n {hash} {} main/binary-all/Packages\n",

@@ -7,16 +7,9 @@ fn what_apt_would_fetch_is_understood() {
     let deb = parse_uri(line).expect("a package");
     assert_eq!(deb.to_string(), "libssl3=1:3.0.17-1~deb12u2:amd64");
     let quoted = "'file:/srv/it's' x/a_1_all.deb' a_1_all.deb 1 ";
-    assert_eq!(
-        parse_uri(quoted),
-        None,
-        "an address that ends early names no package"
-    );
+    assert_eq!(parse_uri(quoted), None, "an address that ends early names no package");
     assert_eq!(parse_uri("Reading package lists..."), None);
-    assert_eq!(
-        parse_uri("'https://m.invalid/dists/stable/InRelease' m.invalid_InRelease 0 "),
-        None
-    );
+    assert_eq!(parse_uri("'https://m.invalid/dists/stable/InRelease' m.invalid_InRelease 0 "), None);
 }
 
 /// Creates the lists of an archive that is never contacted.
@@ -51,10 +44,7 @@ async fn lists_are_plain_whatever_the_hosts_apt_does() {
     let root = tempfile::tempdir().expect("a directory");
     let apt = apt_with_lists(root.path(), LAB);
     let before = apt.stamp();
-    let warning = apt
-        .refresh(false, &progress())
-        .await
-        .expect("nothing is fetched");
+    let warning = apt.refresh(false, &progress()).await.expect("nothing is fetched");
     assert_eq!(warning, None);
     assert_eq!(apt.compressed_lists().expect("read"), Vec::<PathBuf>::new());
     let lists = root.path().join("state/lists");
@@ -84,10 +74,7 @@ async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
     let there = "Package: bolt\nStatus: install ok installed\nVersion: 4\nArchitecture: all\n";
     fs::write(&status, there).expect("written");
     let debs = apt.resolve(Some(&status), &names).await.expect("resolved");
-    assert!(
-        debs.len() == 3 && debs.iter().all(|deb| deb.name != "bolt"),
-        "{debs:?}"
-    );
+    assert!(debs.len() == 3 && debs.iter().all(|deb| deb.name != "bolt"), "{debs:?}");
 }
 
 #[tokio::test]
@@ -97,16 +84,11 @@ async fn relations_are_those_of_the_lists() {
     let asked = ["robot=1:2.0-1", "arm=1.5"].map(str::to_owned);
     let relations = apt.relations(asked).await.expect("told");
     let names = |names: &BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(" ");
-    let told: Vec<_> = relations
-        .iter()
-        .map(|(name, about)| (name.as_str(), names(&about.needs), names(&about.before)))
-        .collect();
+    let told: Vec<_> =
+        relations.iter().map(|(name, about)| (name.as_str(), names(&about.needs), names(&about.before))).collect();
     assert_eq!(
         told,
-        [
-            ("arm", "bolt".to_owned(), "bolt".to_owned()),
-            ("robot", "arm leg wheel".to_owned(), String::new()),
-        ]
+        [("arm", "bolt".to_owned(), "bolt".to_owned()), ("robot", "arm leg wheel".to_owned(), String::new()),]
     );
     // For a part that only adds files: its packages are already installed.
     assert_eq!(apt.relations([]).await.expect("nothing asked").len(), 0);
@@ -131,20 +113,11 @@ fn what_a_package_says_of_others_is_understood() {
                   Pre-Depends: init-system-helpers\nDepends: libc6 (>= 2.14), python3:any, a | b (= 1), x [amd64]\n\
                   Provides: cv-plugin (= 1), other\nSuggests: not-this";
     let (name, about) = parse_relations(stanza).expect("a stanza");
-    assert_eq!(
-        (name.as_str(), about.source.as_str()),
-        ("libcv-bridge1d", "ros-vision-opencv")
-    );
+    assert_eq!((name.as_str(), about.source.as_str()), ("libcv-bridge1d", "ros-vision-opencv"));
     let names: Vec<&str> = about.needs.iter().map(String::as_str).collect();
-    assert_eq!(
-        names,
-        ["a", "b", "init-system-helpers", "libc6", "python3", "x"]
-    );
+    assert_eq!(names, ["a", "b", "init-system-helpers", "libc6", "python3", "x"]);
     assert_eq!(about.before, ["init-system-helpers".to_owned()].into());
-    assert_eq!(
-        about.provides,
-        ["cv-plugin".to_owned(), "other".to_owned()].into()
-    );
+    assert_eq!(about.provides, ["cv-plugin".to_owned(), "other".to_owned()].into());
     // A source package of the same name is not listed.
     let (_, about) = parse_relations("Package: zlib1g\nVersion: 1").expect("a stanza");
     assert_eq!((about.source.as_str(), about.needs.len()), ("zlib1g", 0));
@@ -153,21 +126,14 @@ fn what_a_package_says_of_others_is_understood() {
 
 #[test]
 fn epochs_are_escaped_in_file_names() {
-    let deb = Deb {
-        name: "login".into(),
-        version: "1:4.13+dfsg1-1".into(),
-        architecture: "amd64".into(),
-    };
+    let deb = Deb { name: "login".into(), version: "1:4.13+dfsg1-1".into(), architecture: "amd64".into() };
     assert_eq!(deb.file_name(), "login_1%3a4.13+dfsg1-1_amd64.deb");
 }
 
 #[test]
 fn the_reason_is_taken_from_apts_refusal() {
     let lines = "Reading package lists...\nE: Unable to locate package nonesuch\nBuilding dependency tree...";
-    assert_eq!(
-        extract_errors(lines),
-        "E: Unable to locate package nonesuch"
-    );
+    assert_eq!(extract_errors(lines), "E: Unable to locate package nonesuch");
     let lines = "Some packages could not be installed.\n\nThe following packages have unmet dependencies:\n \
                  a : Depends: b but it is not installable\nE: Unable to correct problems";
     assert_eq!(
@@ -181,16 +147,9 @@ fn the_reason_is_taken_from_apts_refusal() {
 #[test]
 fn the_state_directory_is_its_own() {
     let root = tempfile::tempdir().expect("a directory");
-    Apt::open(
-        root.path(),
-        "deb http://example.invalid/debian bookworm main",
-    )
-    .expect("prepared");
+    Apt::open(root.path(), "deb http://example.invalid/debian bookworm main").expect("prepared");
     let conf = fs::read_to_string(root.path().join("apt.conf")).expect("written");
-    assert!(
-        conf.contains(&format!("Dir::State \"{}/state\"", root.path().display())),
-        "{conf}"
-    );
+    assert!(conf.contains(&format!("Dir::State \"{}/state\"", root.path().display())), "{conf}");
     assert!(conf.contains("sources.list"), "{conf}");
 }
 
@@ -204,21 +163,9 @@ async fn what_the_archive_does_not_have_is_said_in_apts_words() {
     let root = tempfile::tempdir().expect("a directory");
     let apt = Apt::open(root.path(), "").expect("prepared");
     let names = BTreeSet::from(["nonesuch".to_owned()]);
-    let error = apt
-        .resolve(None, &names)
-        .await
-        .expect_err("an empty archive")
-        .to_string();
-    assert_eq!(
-        error,
-        "apt cannot install nonesuch: E: Unable to locate package nonesuch"
-    );
-    assert_eq!(
-        apt.resolve(None, &BTreeSet::new())
-            .await
-            .expect("nothing asked"),
-        []
-    );
+    let error = apt.resolve(None, &names).await.expect_err("an empty archive").to_string();
+    assert_eq!(error, "apt cannot install nonesuch: E: Unable to locate package nonesuch");
+    assert_eq!(apt.resolve(None, &BTreeSet::new()).await.expect("nothing asked"), []);
 }
 
 #[tokio::test]
@@ -227,24 +174,11 @@ async fn after_a_failed_download_the_lists_count_as_old() {
     let apt = Apt::open(root.path(), "").expect("prepared");
     fs::write(root.path().join("updated"), "").expect("written");
     assert!(apt.is_fresh());
-    let deb = Deb {
-        name: "nonesuch".into(),
-        version: "1".into(),
-        architecture: "all".into(),
-    };
-    let error = apt
-        .download(&[deb], &progress())
-        .await
-        .expect_err("an empty archive")
-        .to_string();
-    assert!(
-        error.contains("Unable to locate package nonesuch") && error.contains("push again"),
-        "{error}"
-    );
+    let deb = Deb { name: "nonesuch".into(), version: "1".into(), architecture: "all".into() };
+    let error = apt.download(&[deb], &progress()).await.expect_err("an empty archive").to_string();
+    assert!(error.contains("Unable to locate package nonesuch") && error.contains("push again"), "{error}");
     assert!(!apt.is_fresh());
-    let left = fs::read_dir(root.path().join("archives"))
-        .expect("there")
-        .count();
+    let left = fs::read_dir(root.path().join("archives")).expect("there").count();
     assert_eq!(left, 0, "nothing half-made is left");
 }
 
@@ -254,42 +188,18 @@ async fn packages_in_the_cache_are_not_fetched_again() {
     let apt = Apt::open(root.path(), "").expect("prepared");
     let file = root.path().join("archives/x_1_all.deb");
     fs::write(&file, "").expect("written");
-    let deb = Deb {
-        name: "x".into(),
-        version: "1".into(),
-        architecture: "all".into(),
-    };
-    assert_eq!(
-        apt.download(&[deb], &progress()).await.expect("there"),
-        [file]
-    );
+    let deb = Deb { name: "x".into(), version: "1".into(), architecture: "all".into() };
+    assert_eq!(apt.download(&[deb], &progress()).await.expect("there"), [file]);
 }
 
 #[tokio::test]
 async fn apt_is_asked_for_names_alone() {
     let place = tempfile::tempdir().expect("a directory");
     let apt = Apt::open(place.path(), "").expect("prepared");
-    for wrong in [
-        "./own.deb",
-        "/tmp/own.deb",
-        "a/sid",
-        "a=1",
-        "a:armhf",
-        "~na",
-        "?true",
-        "-o",
-        "",
-    ] {
+    for wrong in ["./own.deb", "/tmp/own.deb", "a/sid", "a=1", "a:armhf", "~na", "?true", "-o", ""] {
         let names = BTreeSet::from([wrong.to_owned()]);
-        let error = apt
-            .resolve(None, &names)
-            .await
-            .expect_err(wrong)
-            .to_string();
-        assert!(
-            error.contains("not the name of a Debian package"),
-            "{error}"
-        );
+        let error = apt.resolve(None, &names).await.expect_err(wrong).to_string();
+        assert!(error.contains("not the name of a Debian package"), "{error}");
     }
     let good = ["libstdc++6", "libfoo2.0-dev", "0ad", "?essential"];
     assert!(good.into_iter().all(is_package_name));

@@ -25,9 +25,7 @@ fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
     fn matches(pattern: &[u8], path: &[u8]) -> bool {
         match (pattern.first(), path.first()) {
             (None, None) => true,
-            (Some(b'*'), _) => {
-                matches(&pattern[1..], path) || (!path.is_empty() && matches(pattern, &path[1..]))
-            }
+            (Some(b'*'), _) => matches(&pattern[1..], path) || (!path.is_empty() && matches(pattern, &path[1..])),
             (Some(a), Some(b)) if a == b => matches(&pattern[1..], &path[1..]),
             _ => false,
         }
@@ -46,15 +44,9 @@ fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
 #[test]
 fn what_packages_of_strangers_asked_for_is_known() {
     let base = load(&repository_bases(), "bookworm-ros1").expect("valid");
-    for key in [
-        "bfl",
-        "liborocos-bfl-dev",
-        "libgsl",
-        "libcairo2-dev",
-        "python3-cairosvg",
-        "python3-joblib",
-        "lm-sensors",
-    ] {
+    for key in
+        ["bfl", "liborocos-bfl-dev", "libgsl", "libcairo2-dev", "python3-cairosvg", "python3-joblib", "lm-sensors"]
+    {
         assert!(base.keys.contains_key(key), "{key}");
     }
 }
@@ -72,9 +64,7 @@ fn tools_that_only_check_have_a_stand_in_and_are_not_missed() {
 #[test]
 fn an_unknown_base_is_answered_with_those_known() {
     for name in ["nonesuch", "../images/bookworm-ros1", ""] {
-        let error = load(&repository_bases(), name)
-            .expect_err("not there")
-            .to_string();
+        let error = load(&repository_bases(), name).expect_err("not there").to_string();
         assert!(error.contains("bookworm-ros1"), "{error}");
     }
 }
@@ -88,14 +78,8 @@ fn mistakes_are_named_with_their_line() {
         (SMALLEST.replace("/opt/x", "/opt/../x"), "line 10"),
         (SMALLEST.replace("[\"libroscpp4d\"]", "[]"), "line 6"),
         (SMALLEST.replace("ros1", "ros7"), "line 4"),
-        (
-            format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"),
-            "line 12",
-        ),
-        (
-            format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"),
-            "line 12",
-        ),
+        (format!("{SMALLEST}[strip]\nunpacked = [\"rm -rf\"]\n"), "line 12"),
+        (format!("{SMALLEST}[keys]\neigen = [\"LIBEIGEN\"]\n"), "line 12"),
     ];
     for (text, line) in cases {
         let problem = parse(&text).expect_err("a mistake").to_string();
@@ -148,20 +132,13 @@ fn wheels_are_those_of_the_lists_beside_a_definition() {
     let a = ("a.requirements.txt", &*pinned);
     let lab = |b: (&str, &str)| write_definitions(&[("x.toml", &text), a, b]);
     let base = load(lab(("b.requirements.txt", "")).path(), "x").expect("valid");
-    assert_eq!(
-        (base.required.runtime.len(), base.required.build.len()),
-        (1, 0)
-    );
-    for (name, text, words) in [
-        ("other.txt", "", "b.requirements.txt"),
-        ("b.requirements.txt", "\nros-x\n", "line 2: "),
-    ] {
+    assert_eq!((base.required.runtime.len(), base.required.build.len()), (1, 0));
+    for (name, text, words) in
+        [("other.txt", "", "b.requirements.txt"), ("b.requirements.txt", "\nros-x\n", "line 2: ")]
+    {
         let error = load(lab((name, text)).path(), "x").expect_err(words);
         let error = error.to_string();
-        assert!(
-            error.contains(words) && error.contains("b.requirements.txt"),
-            "{error}"
-        );
+        assert!(error.contains(words) && error.contains("b.requirements.txt"), "{error}");
     }
     let elsewhere = text.replace("/opt/ros/jazzy", "opt/../x");
     let problem = parse(&elsewhere).expect_err("no absolute path").to_string();

@@ -44,22 +44,17 @@ impl Wheels {
     pub(crate) fn platforms(&self, machine: &str) -> impl Iterator<Item = String> {
         let minor = self.glibc.rsplit('.').next().unwrap_or_default();
         let newest: u32 = minor.parse().unwrap_or_default();
-        let numbered = (5..=newest)
-            .rev()
-            .map(|minor| format!("manylinux_2_{minor}"));
+        let numbered = (5..=newest).rev().map(|minor| format!("manylinux_2_{minor}"));
         // Legacy names of 2.17, 2.12 and 2.5.
         let named = ["manylinux2014", "manylinux2010", "manylinux1"];
-        let all: Vec<String> = numbered
-            .chain(named.map(str::to_owned))
-            .map(|kind| format!("{kind}_{machine}"))
-            .collect();
+        let all: Vec<String> =
+            numbered.chain(named.map(str::to_owned)).map(|kind| format!("{kind}_{machine}")).collect();
         all.into_iter()
     }
 
     pub(super) fn check(&self) -> Result<(), WheelsError> {
         let numbers = |text: &str, first: &str| {
-            text.strip_prefix(first)
-                .is_some_and(|rest| !rest.is_empty() && rest.bytes().all(|b| b.is_ascii_digit()))
+            text.strip_prefix(first).is_some_and(|rest| !rest.is_empty() && rest.bytes().all(|b| b.is_ascii_digit()))
         };
         if !numbers(&self.python, "3.") {
             return Err(WheelsError::Python(self.python.clone()));
@@ -97,10 +92,7 @@ impl RequiredWheels {
             let text = std::fs::read_to_string(&path).io_context("reading", &path)?;
             Requirements::parse(&text).map_err(|problem| Error::BadRequirements { path, problem })
         };
-        Ok(Self {
-            runtime: read(&wheels.runtime)?,
-            build: read(&wheels.build)?,
-        })
+        Ok(Self { runtime: read(&wheels.runtime)?, build: read(&wheels.build)? })
     }
 }
 
@@ -123,14 +115,8 @@ mod tests {
     #[test]
     fn wheels_of_older_systems_are_good_and_those_of_newer_ones_are_not() {
         let platforms: Vec<String> = wheels().platforms("x86_64").collect();
-        assert_eq!(
-            platforms.first().map(String::as_str),
-            Some("manylinux_2_17_x86_64")
-        );
-        assert_eq!(
-            platforms.last().map(String::as_str),
-            Some("manylinux1_x86_64")
-        );
+        assert_eq!(platforms.first().map(String::as_str), Some("manylinux_2_17_x86_64"));
+        assert_eq!(platforms.last().map(String::as_str), Some("manylinux1_x86_64"));
         assert!(platforms.contains(&"manylinux2014_x86_64".to_owned()));
         let abis: Vec<String> = wheels().abis().collect();
         assert_eq!(abis, ["cp311", "abi3", "none"]);
@@ -140,41 +126,11 @@ mod tests {
     fn versions_and_files_are_checked() {
         wheels().check().expect("valid");
         for (bad, words) in [
-            (
-                Wheels {
-                    python: "2.7".to_owned(),
-                    ..wheels()
-                },
-                "Python 3",
-            ),
-            (
-                Wheels {
-                    glibc: "12".to_owned(),
-                    ..wheels()
-                },
-                "glibc",
-            ),
-            (
-                Wheels {
-                    runtime: "../x".to_owned(),
-                    ..wheels()
-                },
-                "beside",
-            ),
-            (
-                Wheels {
-                    build: String::new(),
-                    ..wheels()
-                },
-                "beside",
-            ),
-            (
-                Wheels {
-                    files: [("../setup.sh".into(), String::new())].into(),
-                    ..wheels()
-                },
-                "below the prefix",
-            ),
+            (Wheels { python: "2.7".to_owned(), ..wheels() }, "Python 3"),
+            (Wheels { glibc: "12".to_owned(), ..wheels() }, "glibc"),
+            (Wheels { runtime: "../x".to_owned(), ..wheels() }, "beside"),
+            (Wheels { build: String::new(), ..wheels() }, "beside"),
+            (Wheels { files: [("../setup.sh".into(), String::new())].into(), ..wheels() }, "below the prefix"),
         ] {
             let problem = bad.check().expect_err(words).to_string();
             assert!(problem.contains(words), "{problem}");

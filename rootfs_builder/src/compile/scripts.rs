@@ -93,22 +93,13 @@ impl ScriptFixture {
         let prefix = self.path("prefix");
         let job = Job {
             check: task == Task::Check,
-            packages: units
-                .iter()
-                .map(|unit| JobPackage {
-                    unit,
-                    needs: Vec::new(),
-                })
-                .collect(),
+            packages: units.iter().map(|unit| JobPackage { unit, needs: Vec::new() }).collect(),
             workspace: units.iter().map(|unit| unit.name.as_str()).collect(),
             prefix: &prefix,
             cmake: &[],
             jobs: 2,
         };
-        self.write(
-            "cloudroid/job.json",
-            &serde_json::to_string(&job).expect("JSON"),
-        );
+        self.write("cloudroid/job.json", &serde_json::to_string(&job).expect("JSON"));
         let path = format!("{}:/usr/bin:/bin", self.path("bin").display());
         Command::new("/usr/bin/python3")
             .arg(self.path("cloudroid/compile.py"))
@@ -153,26 +144,17 @@ fn a_module_that_another_package_may_bring_is_not_missed() {
     let output = alone.run(Task::Check, &PACKAGES[1..]);
     let text = stdout_text(&output);
     assert!(!output.status.success());
-    assert!(
-        text.contains("::failed matcher") && text.contains("\nNo package 'csm' found"),
-        "{text}"
-    );
+    assert!(text.contains("::failed matcher") && text.contains("\nNo package 'csm' found"), "{text}");
 }
 
 #[test]
 fn all_that_is_missing_is_named_in_one_round() {
-    let files = [
-        ("loam/packages", "cv_bridge PCL Ceres\n"),
-        ("loam/modules", "csm\n"),
-        ("loam/optional", "frob\n"),
-    ];
+    let files = [("loam/packages", "cv_bridge PCL Ceres\n"), ("loam/modules", "csm\n"), ("loam/optional", "frob\n")];
     for task in [Task::Check, Task::Compile] {
         let output = ScriptFixture::new(&files).run(task, &[("loam", "catkin")]);
         let text = stdout_text(&output);
         assert_eq!(output.status.code(), Some(1), "{text}");
-        let (_, told) = text
-            .split_once("Missing requirements:\n")
-            .expect("a summary");
+        let (_, told) = text.split_once("Missing requirements:\n").expect("a summary");
         for words in ["\"cv_bridge\"", "\"PCL\"", "\"Ceres\"", "'csm'"] {
             assert!(told.contains(words), "{text}");
         }
@@ -184,14 +166,8 @@ fn all_that_is_missing_is_named_in_one_round() {
 fn what_is_wrong_otherwise_is_not_looked_at_again() {
     let files = [("loam/optional", "frob\n"), ("loam/modules", "")];
     let lab = ScriptFixture::new(&files);
-    lab.write(
-        "bin/cmake",
-        "#!/bin/sh\necho 'CMake Error: syntax'\nexit 1\n",
-    );
+    lab.write("bin/cmake", "#!/bin/sh\necho 'CMake Error: syntax'\nexit 1\n");
     let output = lab.run(Task::Compile, &[("loam", "catkin")]);
     let text = stdout_text(&output);
-    assert!(
-        !text.contains("not there") && !lab.path("build/build/loam-again").exists(),
-        "{text}"
-    );
+    assert!(!text.contains("not there") && !lab.path("build/build/loam-again").exists(), "{text}");
 }

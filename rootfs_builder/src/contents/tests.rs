@@ -26,14 +26,7 @@ fn example(directory: &Path) -> Contents {
     );
     let all = "usr/lib/python3/dist-packages/nodelet/__init__.py python/python3-nodelet\n\
                usr/share/doc/with space/x doc/y\n";
-    Contents::open(
-        directory,
-        &[
-            list(directory, "a.gz", &native),
-            list(directory, "b.gz", all),
-        ],
-    )
-    .expect("read")
+    Contents::open(directory, &[list(directory, "a.gz", &native), list(directory, "b.gz", all)]).expect("read")
 }
 
 #[test]
@@ -45,14 +38,8 @@ fn libraries_and_ros_packages_are_found() {
     assert_eq!(contents.library("libc.so.6"), Some("libc6"));
     assert_eq!(contents.library("libdeep.so.3"), None);
     let nodelet = contents.ros_package("nodelet");
-    assert_eq!(
-        nodelet["nodelet-tools"],
-        [RosPackagePart::Manifest, RosPackagePart::Programs].into()
-    );
-    assert_eq!(
-        nodelet["ros-nodelet-srvs"],
-        [RosPackagePart::Definitions].into()
-    );
+    assert_eq!(nodelet["nodelet-tools"], [RosPackagePart::Manifest, RosPackagePart::Programs].into());
+    assert_eq!(nodelet["ros-nodelet-srvs"], [RosPackagePart::Definitions].into());
     assert_eq!(nodelet["python3-nodelet"], [RosPackagePart::Python].into());
     assert_eq!(nodelet["libnodelet-dev"], [RosPackagePart::CMake].into());
     assert!(contents.ros_package("nodele").is_empty());
@@ -64,22 +51,13 @@ fn it_is_made_once() {
     let directory = tempfile::tempdir().expect("a directory");
     example(directory.path());
     let made = || {
-        let names = fs::read_dir(directory.path())
-            .expect("listed")
-            .flatten()
-            .map(|entry| entry.file_name());
-        names
-            .filter(|name| name.to_string_lossy().starts_with("contents-"))
-            .collect::<Vec<_>>()
+        let names = fs::read_dir(directory.path()).expect("listed").flatten().map(|entry| entry.file_name());
+        names.filter(|name| name.to_string_lossy().starts_with("contents-")).collect::<Vec<_>>()
     };
     let first = made();
     assert_eq!(first.len(), 1);
     let lists = [directory.path().join("a.gz"), directory.path().join("b.gz")];
     fs::write(directory.path().join(&first[0]), "lx.so\tmarked").expect("written");
     let again = Contents::open(directory.path(), &lists).expect("read");
-    assert_eq!(
-        again.library("x.so"),
-        Some("marked"),
-        "read, not made again"
-    );
+    assert_eq!(again.library("x.so"), Some("marked"), "read, not made again");
 }

@@ -27,35 +27,22 @@ fn a_plan_says_what_is_loaded_into_which_container() {
     let answer = parse_plan(RECORDED);
     let nodes: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(nodes, ["/box", "/deep/two"]);
-    let [listener, talker] = &answer.components["/box"][..] else {
-        panic!("two nodes: {:?}", answer.components)
-    };
-    assert_eq!(
-        (&*listener.plugin, listener.full_name()),
-        ("composition::Listener", None),
-        "it names itself"
-    );
+    let [listener, talker] = &answer.components["/box"][..] else { panic!("two nodes: {:?}", answer.components) };
+    assert_eq!((&*listener.plugin, listener.full_name()), ("composition::Listener", None), "it names itself");
     assert_eq!(talker.package, "composition");
     assert_eq!(talker.full_name().as_deref(), Some("/inner/talker"));
     assert_eq!(talker.remap_rules, ["chatter:=/said"]);
     for (name, expected) in [
         ("rate", json!({"type": 3, "double_value": 2.0})),
         ("gains.p", json!({"type": 2, "integer_value": 3})),
-        (
-            "everybody",
-            json!({"type": 7, "integer_array_value": [1, 2]}),
-        ),
-        (
-            "blob",
-            json!({"type": 8, "double_array_value": [0.5, "Infinity"]}),
-        ),
+        ("everybody", json!({"type": 7, "integer_array_value": [1, 2]})),
+        ("blob", json!({"type": 8, "double_array_value": [0.5, "Infinity"]})),
         ("own", json!({"type": 4, "string_value": "text"})),
         ("other", Value::Null),
     ] {
         assert_eq!(value(talker, name), expected, "{name}");
     }
-    let expected =
-        json!({"name": "use_intra_process_comms", "value": {"type": 1, "bool_value": true}});
+    let expected = json!({"name": "use_intra_process_comms", "value": {"type": 1, "bool_value": true}});
     assert_eq!(talker.extra_arguments, [expected]);
     let server = &answer.components["/deep/two"][0];
     assert_eq!(server.full_name().as_deref(), Some("/deep/server"));
@@ -82,9 +69,7 @@ fn what_is_loaded_must_be_defined_in_the_image() {
 
 /// Creates a package that has registered these classes.
 fn register_classes(lab: &Ros2Fixture, classes: &[&str]) {
-    let lines = classes
-        .iter()
-        .map(|class| format!("{class};lib/libtalk.so\n"));
+    let lines = classes.iter().map(|class| format!("{class};lib/libtalk.so\n"));
     let index = "space/share/ament_index/resource_index/rclcpp_components/talk";
     lab.write(index, &lines.collect::<String>(), 0o644);
 }
@@ -113,39 +98,21 @@ fn a_class_that_is_named_gets_a_container_of_its_own() {
     .into();
     let answer = lab.ask(&ask).expect("a plan");
     let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
-    assert_eq!(
-        names,
-        [
-            "/Talker_container",
-            "/Listener_container",
-            "/Talker_container_2"
-        ]
-    );
+    assert_eq!(names, ["/Talker_container", "/Listener_container", "/Talker_container_2"]);
     assert!(answer.nodes.iter().all(|node| node.named));
     assert_eq!(
         answer.nodes[0].argv[0],
-        lab.path("base/lib/rclcpp_components/component_container")
-            .display()
-            .to_string()
+        lab.path("base/lib/rclcpp_components/component_container").display().to_string()
     );
-    assert_eq!(
-        argv(&answer, 0)[..3],
-        ["--ros-args", "-r", "__node:=Talker_container"]
-    );
+    assert_eq!(argv(&answer, 0)[..3], ["--ros-args", "-r", "__node:=Talker_container"]);
     let of = |container: &str| &answer.components[container][0];
     let one = of("/Talker_container");
-    assert_eq!(
-        (&*one.package, &*one.plugin, one.full_name().as_deref()),
-        ("talk", "talk::Talker", Some("/below/one"))
-    );
+    assert_eq!((&*one.package, &*one.plugin, one.full_name().as_deref()), ("talk", "talk::Talker", Some("/below/one")));
     assert_eq!(one.remap_rules, ["chatter:=said", "in:=out"]);
     let integer = |value: i64| json!({"type": 2, "integer_value": value});
     // Settings of the push for all nodes take precedence over those after the class.
     assert_eq!(value(one, "rate"), integer(7));
-    assert_eq!(
-        value(one, "names"),
-        json!({"type": 9, "string_array_value": ["a", "b"]})
-    );
+    assert_eq!(value(one, "names"), json!({"type": 9, "string_array_value": ["a", "b"]}));
     assert_eq!(value(one, "loud"), json!({"type": 1, "bool_value": true}));
     assert_eq!(value(one, "gains.p"), integer(1));
     assert_eq!(value(of("/Talker_container_2"), "gains.p"), integer(2));
@@ -156,10 +123,7 @@ fn a_class_that_is_named_gets_a_container_of_its_own() {
     // The only class is used if there is no executable.
     register_classes(&lab, &["talk::Talker"]);
     let answer = lab.ask(&lab.query("space", &[])).expect("a plan");
-    assert_eq!(
-        answer.components["/Talker_container"][0].plugin,
-        "talk::Talker"
-    );
+    assert_eq!(answer.components["/Talker_container"][0].plugin, "talk::Talker");
 }
 
 #[test]
@@ -172,15 +136,11 @@ fn a_class_that_cannot_be_loaded_is_refused_with_what_can() {
         error.to_string()
     };
     let text = refused("talk::Talker");
-    assert!(
-        text.contains("talk::Talker is loaded into") && text.contains("--with rclcpp_components"),
-        "{text}"
-    );
+    assert!(text.contains("talk::Talker is loaded into") && text.contains("--with rclcpp_components"), "{text}");
     lab.package("base", "rclcpp_components", &["component_container"]);
     let text = refused("talk::Walker");
     assert!(
-        text.contains("no executable \"talk::Walker\"")
-            && text.contains("talker, talk::Talker, talk::Listener"),
+        text.contains("no executable \"talk::Walker\"") && text.contains("talker, talk::Talker, talk::Listener"),
         "{text}"
     );
     let text = refused("talk::Talker --loud");
@@ -198,10 +158,7 @@ fn values_of_requests_become_json() {
         ("[b'\\x01', b'\\xff']", "[1, 255]"),
         ("True", "True"),
     ] {
-        assert_eq!(
-            evaluate(&lab, &format!("components.plain({value})")),
-            expected
-        );
+        assert_eq!(evaluate(&lab, &format!("components.plain({value})")), expected);
     }
     for (value, expected) in [
         ("True", "1"),
@@ -213,10 +170,6 @@ fn values_of_requests_become_json() {
         ("[]", "None"),
         ("{}", "None"),
     ] {
-        assert_eq!(
-            evaluate(&lab, &format!("components.kind_of({value})")),
-            expected,
-            "{value}"
-        );
+        assert_eq!(evaluate(&lab, &format!("components.kind_of({value})")), expected, "{value}");
     }
 }

@@ -42,11 +42,7 @@ impl Ros1Fixture {
         let inside = format!("{}/cloudroid/", lab.0.path().display());
         for (path, text, mode) in [
             ("cloudroid/out/.keep", "", 0o644),
-            (
-                "cloudroid/launch_plan.py",
-                &*script.replace("/cloudroid/", &inside),
-                0o644,
-            ),
+            ("cloudroid/launch_plan.py", &*script.replace("/cloudroid/", &inside), 0o644),
             ("modules/rospkg/__init__.py", ROSPKG, 0o644),
             ("modules/roslib/__init__.py", "", 0o644),
             ("modules/roslib/packages.py", ROSLIB, 0o644),
@@ -108,24 +104,16 @@ fn what_builds_read_is_no_executable() {
         ("share/p/setup.py", SCRIPT, 0o755),
     ]);
     let text = lab.ask().expect_err("two").to_string();
-    assert!(
-        text.contains("executables: one, two; launch files: none"),
-        "{text}"
-    );
+    assert!(text.contains("executables: one, two; launch files: none"), "{text}");
 }
 
 #[test]
 fn of_an_executable_and_launch_files_it_is_told_which_is_taken() {
-    let lab = Ros1Fixture::new(&[
-        ("lib/p/node", SCRIPT, 0o755),
-        ("share/p/launch/demo.launch", "", 0o644),
-    ]);
+    let lab = Ros1Fixture::new(&[("lib/p/node", SCRIPT, 0o755), ("share/p/launch/demo.launch", "", 0o644)]);
     let answer = lab.ask().expect("a plan");
     assert_eq!(
         answer.warnings,
-        [
-            "node is run directly, as the only executable; for remappings and parameters of a launch file push with \
-          --launch: launch/demo.launch"
-        ]
+        ["node is run directly, as the only executable; for remappings and parameters of a launch file push with \
+          --launch: launch/demo.launch"]
     );
 }

@@ -13,9 +13,7 @@ pub(super) struct Ros2Fixture {
 
 impl Ros2Fixture {
     pub(super) fn new() -> Self {
-        let lab = Self {
-            root: tempfile::tempdir().expect("a directory"),
-        };
+        let lab = Self { root: tempfile::tempdir().expect("a directory") };
         lab.write("cloudroid/out/.keep", "", 0o644);
         for (name, text) in plan_scripts(Version::Ros2) {
             let inside = format!("{}/cloudroid/", lab.root.path().display());
@@ -44,11 +42,7 @@ impl Ros2Fixture {
         self.write(&index, "", 0o644);
         self.write(&format!("{prefix}/share/{name}/package.xml"), "", 0o644);
         for program in programs {
-            self.write(
-                &format!("{prefix}/lib/{name}/{program}"),
-                "#!/bin/sh\n",
-                0o755,
-            );
+            self.write(&format!("{prefix}/lib/{name}/{program}"), "#!/bin/sh\n", 0o755);
         }
     }
 
@@ -97,20 +91,13 @@ fn programs_of_an_installed_package_are_nodes() {
         0o644,
     );
     let mut ask = lab.query("space", &["talker --loud", "talker", "turtle/swim"]);
-    ask.params = [
-        ("rate".to_owned(), serde_json::json!(2)),
-        ("/all".to_owned(), serde_json::json!("x")),
-    ]
-    .into();
+    ask.params = [("rate".to_owned(), serde_json::json!(2)), ("/all".to_owned(), serde_json::json!("x"))].into();
     ask.remaps = [("in".to_owned(), "out".to_owned())].into();
     let answer = lab.ask(&ask).expect("a plan");
     let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(names, ["/talker", "/talker_2", "/swim"]);
     let talker = &answer.nodes[0];
-    assert_eq!(
-        talker.argv[0],
-        lab.path("space/lib/talk/talker").display().to_string()
-    );
+    assert_eq!(talker.argv[0], lab.path("space/lib/talk/talker").display().to_string());
     // The programs name their nodes themselves.
     assert!(answer.nodes.iter().all(|node| !node.named));
     let remapped = ["--ros-args", "-r", "in:=out", "--"];
@@ -118,20 +105,12 @@ fn programs_of_an_installed_package_are_nodes() {
     assert_eq!(argv(&answer, 1), remapped);
     assert_eq!(answer.nodes[2].package, "turtle");
     let keys: Vec<&str> = answer.parameters.keys().map(String::as_str).collect();
-    assert_eq!(
-        keys,
-        ["/all", "/swim/rate", "/talker/rate", "/talker_2/rate"]
-    );
+    assert_eq!(keys, ["/all", "/swim/rate", "/talker/rate", "/talker_2/rate"]);
     let (space, base) = (lab.path("space"), lab.path("base"));
     let both = format!("{}:{}", space.display(), base.display());
     assert_eq!(answer.environment["AMENT_PREFIX_PATH"], both);
     assert_eq!(answer.environment["HOOKED"], "1");
-    for name in [
-        "COLCON_CURRENT_PREFIX",
-        "AMENT_CURRENT_PREFIX",
-        "PWD",
-        "HOME",
-    ] {
+    for name in ["COLCON_CURRENT_PREFIX", "AMENT_CURRENT_PREFIX", "PWD", "HOME"] {
         assert!(!answer.environment.contains_key(name), "{name}");
     }
 }
@@ -139,16 +118,9 @@ fn programs_of_an_installed_package_are_nodes() {
 #[test]
 fn a_space_without_scripts_gets_what_it_needs() {
     let lab = Ros2Fixture::new();
-    for (prefix, name, programs) in [
-        ("space/talk", "talk", &["talker"][..]),
-        ("space/msgs", "msgs", &[]),
-    ] {
+    for (prefix, name, programs) in [("space/talk", "talk", &["talker"][..]), ("space/msgs", "msgs", &[])] {
         lab.package(prefix, name, programs);
-        lab.write(
-            &format!("{prefix}/lib/python3/dist-packages/{name}/__init__.py"),
-            "",
-            0o644,
-        );
+        lab.write(&format!("{prefix}/lib/python3/dist-packages/{name}/__init__.py"), "", 0o644);
     }
     // A single program is the default.
     let answer = lab.ask(&lab.query("space", &[])).expect("a plan");
@@ -162,10 +134,7 @@ fn a_space_without_scripts_gets_what_it_needs() {
         for name in ["talk", "msgs"] {
             let path = format!("{}{below}", lab.path("space").join(name).display());
             let value = &answer.environment[variable];
-            assert!(
-                value.split(':').any(|part| part == path),
-                "{variable}={value}"
-            );
+            assert!(value.split(':').any(|part| part == path), "{variable}={value}");
         }
     }
 }
@@ -184,36 +153,17 @@ fn nodes_are_named_as_on_either_command_line() {
     assert_eq!(names, ["/one", "/below/two", "/three"]);
     assert!(answer.nodes.iter().all(|node| node.named));
     assert_eq!(argv(&answer, 0), ["--ros-args", "-r", "__name:=one"]);
-    let words = [
-        "--loud",
-        "--ros-args",
-        "-r",
-        "__node:=two",
-        "-r",
-        "__ns:=/below",
-    ];
+    let words = ["--loud", "--ros-args", "-r", "__node:=two", "-r", "__ns:=/below"];
     assert_eq!(argv(&answer, 1), words);
     let words = ["--ros-args", "-r", "__node:=three", "-p", "rate:=1"];
     assert_eq!(argv(&answer, 2), words);
     // A name that is taken gets a number, in a rule before the one that requests it; in another namespace it is not
     // taken.
-    let asked = [
-        "talker __node:=one",
-        "talker __node:=one",
-        "talker __node:=one __ns:=/below",
-    ];
+    let asked = ["talker __node:=one", "talker __node:=one", "talker __node:=one __ns:=/below"];
     let answer = lab.ask(&lab.query("space", &asked)).expect("a plan");
     let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(names, ["/one", "/one_2", "/below/one"]);
-    let rules = [
-        "--ros-args",
-        "-r",
-        "__node:=one_2",
-        "--",
-        "--ros-args",
-        "-r",
-        "__node:=one",
-    ];
+    let rules = ["--ros-args", "-r", "__node:=one_2", "--", "--ros-args", "-r", "__node:=one"];
     assert_eq!(argv(&answer, 1), rules);
 }
 
@@ -225,67 +175,37 @@ fn what_cannot_be_run_is_told_with_what_there_is() {
     lab.write("space/share/talk/config/all.yaml", "", 0o644);
     let refused = |ask: &LaunchQuery| lab.ask(ask).expect_err("refused").to_string();
     let text = refused(&lab.query("space", &[]));
-    assert!(
-        text.contains("executables: listener, talker; launch files: launch/both.launch.py"),
-        "{text}"
-    );
+    assert!(text.contains("executables: listener, talker; launch files: launch/both.launch.py"), "{text}");
     let text = refused(&lab.query("space", &["walker"]));
-    assert!(
-        text.contains("no executable \"walker\"") && text.contains("listener, talker"),
-        "{text}"
-    );
+    assert!(text.contains("no executable \"walker\"") && text.contains("listener, talker"), "{text}");
     let mut ask = lab.query("space", &[]);
     ask.launch = "none.launch.py".to_owned();
     let text = refused(&ask);
-    assert!(
-        text.contains("no launch file \"none.launch.py\"") && text.contains("both.launch.py"),
-        "{text}"
-    );
+    assert!(text.contains("no launch file \"none.launch.py\"") && text.contains("both.launch.py"), "{text}");
     // This Python has no launch, like the base with wheels.
     ask.launch = "both.launch.py".to_owned();
     let text = refused(&ask);
-    assert!(
-        text.contains("no Python package launch") && text.contains("--node"),
-        "{text}"
-    );
+    assert!(text.contains("no Python package launch") && text.contains("--node"), "{text}");
 }
 
 #[test]
 fn a_space_for_another_python_is_refused() {
     let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker"]);
-    lab.write(
-        "space/lib/python3.2/site-packages/talk/__init__.py",
-        "",
-        0o644,
-    );
-    let text = lab
-        .ask(&lab.query("space", &["talker"]))
-        .expect_err("another")
-        .to_string();
-    assert!(
-        text.contains("built for python3.2, but the base has python3."),
-        "{text}"
-    );
+    lab.write("space/lib/python3.2/site-packages/talk/__init__.py", "", 0o644);
+    let text = lab.ask(&lab.query("space", &["talker"])).expect_err("another").to_string();
+    assert!(text.contains("built for python3.2, but the base has python3."), "{text}");
     lab.write("space/local_setup.sh", "return 3\n", 0o644);
     fs::remove_dir_all(lab.path("space/lib/python3.2")).expect("removed");
-    let text = lab
-        .ask(&lab.query("space", &["talker"]))
-        .expect_err("it fails")
-        .to_string();
+    let text = lab.ask(&lab.query("space", &["talker"])).expect_err("it fails").to_string();
     assert!(text.contains("ended with status 3"), "{text}");
 }
 
 /// Evaluates a Python expression in the second script's module.
 pub(super) fn evaluate(lab: &Ros2Fixture, expression: &str) -> String {
-    let code = format!(
-        "from ros2_launch_plan import *; import ros2_components as components; print({expression})"
-    );
-    let said = Command::new("/usr/bin/python3")
-        .args(["-c", &code])
-        .current_dir(lab.path("cloudroid"))
-        .output()
-        .expect("run");
+    let code = format!("from ros2_launch_plan import *; import ros2_components as components; print({expression})");
+    let said =
+        Command::new("/usr/bin/python3").args(["-c", &code]).current_dir(lab.path("cloudroid")).output().expect("run");
     assert!(said.status.success(), "{said:?}");
     String::from_utf8_lossy(&said.stdout).trim().to_owned()
 }
@@ -305,17 +225,10 @@ fn parameters_of_launch_files_keep_their_types() {
         ("['a', 'b']", "[\"a\", \"b\"]"),
         ("[]", "[]"),
     ] {
-        assert_eq!(
-            evaluate(&lab, &format!("written({value})")),
-            expected,
-            "{value}"
-        );
+        assert_eq!(evaluate(&lab, &format!("written({value})")), expected, "{value}");
     }
     let nested = "sorted(flattened({'a': {'b': 1, 'c': {'d': 2}}, 'e': 3}, '').items())";
-    assert_eq!(
-        evaluate(&lab, nested),
-        "[('a.b', 1), ('a.c.d', 2), ('e', 3)]"
-    );
+    assert_eq!(evaluate(&lab, nested), "[('a.b', 1), ('a.c.d', 2), ('e', 3)]");
 }
 
 #[test]
@@ -336,10 +249,7 @@ fn sections_of_parameter_files_apply_by_name() {
         assert_eq!(evaluate(&lab, &expression), expected, "{pattern} {node}");
     }
     let tree = "{'/ns': {'n': {'ros__parameters': {'k': 1}}}, '/**': {'ros__parameters': None}}";
-    assert_eq!(
-        evaluate(&lab, &format!("list(sections({tree}, ''))")),
-        "[('/ns/n', {'k': 1}), ('/**', {})]"
-    );
+    assert_eq!(evaluate(&lab, &format!("list(sections({tree}, ''))")), "[('/ns/n', {'k': 1}), ('/**', {})]");
 }
 
 /// Returns the arguments that result from a parameters file followed by a launch file's own parameters, for a node
@@ -364,10 +274,7 @@ fn arguments_behind(file: &str, own: &str, given: &[&str]) -> String {
     assert!(said.status.success(), "{said:?}");
     let words = String::from_utf8(said.stdout).expect("UTF-8");
     let words = words.trim().replace(&*file.to_string_lossy(), "FILE");
-    words
-        .strip_prefix("/x --ros-args ")
-        .expect("the same")
-        .to_owned()
+    words.strip_prefix("/x --ros-args ").expect("the same").to_owned()
 }
 
 #[test]
@@ -388,11 +295,7 @@ fn what_a_launch_file_changes_of_a_parameters_file_counts() {
         assert_eq!(changed, format!("{all} -p g:=1.0 -r a:=b"), "{given}");
     }
     // A file for other nodes, and an invalid one.
-    let others = arguments_behind(
-        "/back/board:\n  ros__parameters: {f: 2.0}\n",
-        &own("f: 1.0"),
-        &[],
-    );
+    let others = arguments_behind("/back/board:\n  ros__parameters: {f: 2.0}\n", &own("f: 1.0"), &[]);
     assert_eq!(others, "--params-file FILE -p f:=1.0 -r a:=b");
     let none = arguments_behind(": [", &own("f: 1.0"), &[]);
     assert_eq!(none, "--params-file FILE -p f:=1.0 -r a:=b");

@@ -7,10 +7,7 @@ use std::time::Duration;
 use package::interface::qos::{from_bus, to_bus};
 use package::interface::{Action, Direction, Interface, Need, Parameter, Qos, Service, Topic};
 use package::names;
-use ros::bus::{
-    Bus, BusError, Digest, Graph, NodeEntities, ParamValue, RosVersion, ServiceType, WireFormat,
-    WireType,
-};
+use ros::bus::{Bus, BusError, Digest, Graph, NodeEntities, ParamValue, RosVersion, ServiceType, WireFormat, WireType};
 use ros::plumbing;
 use ros::ros2::lifecycle::LifecycleNode;
 use ros::schema::{Base, MessageType, Registry};
@@ -44,10 +41,7 @@ pub(super) async fn describe(
     seen: &ObservedPackage<'_>,
 ) -> Result<ProbeResult, ProbeError> {
     let mut found = ProbeResult::default();
-    let mut texts = DefinitionTexts {
-        definitions,
-        used: BTreeMap::new(),
-    };
+    let mut texts = DefinitionTexts { definitions, used: BTreeMap::new() };
     let graph = &*seen.graph;
     let mut topics = Vec::new();
     for (direction, names) in [
@@ -57,51 +51,30 @@ pub(super) async fn describe(
         for name in names {
             match ask_type(&name, seen, bus.topic_type(&name)).await {
                 Ok(wire) => {
-                    let wire = if follows_any(seen, &name, direction, &wire) {
-                        WireType::any()
-                    } else {
-                        wire
-                    };
-                    topics.push(describe_topic(
-                        registry, seen, name, direction, wire, &mut texts,
-                    )?);
+                    let wire = if follows_any(seen, &name, direction, &wire) { WireType::any() } else { wire };
+                    topics.push(describe_topic(registry, seen, name, direction, wire, &mut texts)?);
                 }
                 Err(problem) => found.warnings.push(problem),
             }
         }
     }
     let actions = extract_actions(&mut topics, seen, registry, &mut texts)?;
-    topics.sort_by(|a, b| {
-        (&a.name, a.direction == Direction::Output)
-            .cmp(&(&b.name, b.direction == Direction::Output))
-    });
+    topics
+        .sort_by(|a, b| (&a.name, a.direction == Direction::Output).cmp(&(&b.name, b.direction == Direction::Output)));
     let mut services = Vec::new();
-    for (name, node) in graph
-        .services
-        .iter()
-        .filter(|(_, node)| **node != seen.options.own_name)
-    {
+    for (name, node) in graph.services.iter().filter(|(_, node)| **node != seen.options.own_name) {
         if plumbing::is_builtin_service(seen.options.ros, graph, name) {
             continue;
         }
         match ask_type(name, seen, bus.service_type(name)).await {
             Ok(wire) => {
-                let service =
-                    registry
-                        .service(&wire.name)
-                        .map_err(|problem| ProbeError::NoDefinition {
-                            what: format!("service {name}"),
-                            problem,
-                        })?;
+                let service = registry
+                    .service(&wire.name)
+                    .map_err(|problem| ProbeError::NoDefinition { what: format!("service {name}"), problem })?;
                 let defined = ServiceType::from_service(&service);
                 if !wire.is_compatible_with(&defined) {
                     let (announced, defined) = differing_digests(&wire, &defined);
-                    return Err(mismatch(
-                        &format!("service {name}"),
-                        &wire.name,
-                        &announced,
-                        &defined,
-                    ));
+                    return Err(mismatch(&format!("service {name}"), &wire.name, &announced, &defined));
                 }
                 texts.service(&wire.name, [&service.request, &service.response]);
                 services.push(Service {
@@ -124,18 +97,14 @@ pub(super) async fn describe(
         actions,
         parameters,
         needs: all_needs(seen),
-        lifecycle: lifecycle
-            .filter(|node| *node != seen.options.own_name)
-            .collect(),
+        lifecycle: lifecycle.filter(|node| *node != seen.options.own_name).collect(),
         late: Vec::new(),
         requests: None,
         definitions: texts.used,
     };
     for need in &found.interface.needs {
         let (name, nodes) = (&need.name, need.nodes.join(", "));
-        found.warnings.push(format!(
-            "{nodes} needs {name}, which no node serves here: it must be served on the robot"
-        ));
+        found.warnings.push(format!("{nodes} needs {name}, which no node serves here: it must be served on the robot"));
     }
     Ok(found)
 }
@@ -146,11 +115,7 @@ pub(super) fn missing_needs(graph: &Graph, own_name: &str) -> Vec<Need> {
     let missing = sought.filter(|(name, _)| !graph.services.contains_key(*name));
     let needs = missing.map(|(name, nodes)| Need {
         name: name.clone(),
-        nodes: nodes
-            .iter()
-            .filter(|node| *node != own_name)
-            .cloned()
-            .collect(),
+        nodes: nodes.iter().filter(|node| *node != own_name).cloned().collect(),
     });
     needs.filter(|need| !need.nodes.is_empty()).collect()
 }
@@ -165,12 +130,8 @@ fn all_needs(seen: &ObservedPackage<'_>) -> Vec<Need> {
         let nodes = nodes.iter().filter(|node| *node != own_name);
         nodes.cloned().collect()
     };
-    let sought =
-        actions.filter(|(_, ends)| ends.topics.is_empty() && others(&ends.servers).is_empty());
-    let sought = sought.map(|(name, ends)| Need {
-        name: name.clone(),
-        nodes: others(&ends.clients),
-    });
+    let sought = actions.filter(|(_, ends)| ends.topics.is_empty() && others(&ends.servers).is_empty());
+    let sought = sought.map(|(name, ends)| Need { name: name.clone(), nodes: others(&ends.clients) });
     needs.extend(sought.filter(|need| !need.nodes.is_empty()));
     for (name, nodes) in &seen.asked {
         let server = seen.graph.services.get(name);
@@ -183,10 +144,7 @@ fn all_needs(seen: &ObservedPackage<'_>) -> Vec<Need> {
                 let new: Vec<String> = new.cloned().collect();
                 need.nodes.extend(new);
             }
-            None => needs.push(Need {
-                name: name.clone(),
-                nodes: nodes.iter().cloned().collect(),
-            }),
+            None => needs.push(Need { name: name.clone(), nodes: nodes.iter().cloned().collect() }),
         }
     }
     needs.sort_by(|a, b| a.name.cmp(&b.name));
@@ -194,21 +152,13 @@ fn all_needs(seen: &ObservedPackage<'_>) -> Vec<Need> {
 }
 
 /// Returns whether an output has its type only because an input of any type was given a message of that type.
-fn follows_any(
-    seen: &ObservedPackage<'_>,
-    name: &str,
-    direction: Direction,
-    wire: &WireType,
-) -> bool {
+fn follows_any(seen: &ObservedPackage<'_>, name: &str, direction: Direction, wire: &WireType) -> bool {
     let fed = |topic: &String| {
         let ends = (seen.graph.topics.get(topic), seen.graph.topics.get(name));
         let (Some(input), Some(output)) = ends else {
             return false;
         };
-        output
-            .publishers
-            .iter()
-            .any(|node| *node != seen.options.own_name && input.subscribers.contains(node))
+        output.publishers.iter().any(|node| *node != seen.options.own_name && input.subscribers.contains(node))
     };
     match direction {
         Direction::Input => seen.any.contains(name),
@@ -224,9 +174,7 @@ async fn ask_type<T>(
     match settle::await_answer(ANSWER, seen.options, answer).await {
         Some(Ok(value)) => Ok(value),
         Some(Err(error)) => Err(format!("cannot get the type of {name}: {error}")),
-        None => Err(format!(
-            "no response about the type of {name} within {ANSWER:?}"
-        )),
+        None => Err(format!("no response about the type of {name} within {ANSWER:?}")),
     }
 }
 
@@ -249,24 +197,13 @@ fn describe_topic(
                 let added = registry.insert_full_text(&wire.name, &wire.definition);
                 added
                     .and_then(|()| registry.message(&wire.name))
-                    .map_err(|problem| ProbeError::NoDefinition {
-                        what: format!("topic {name}"),
-                        problem,
-                    })?
+                    .map_err(|problem| ProbeError::NoDefinition { what: format!("topic {name}"), problem })?
             }
             Err(problem) => {
-                return Err(ProbeError::NoDefinition {
-                    what: format!("topic {name}"),
-                    problem,
-                });
+                return Err(ProbeError::NoDefinition { what: format!("topic {name}"), problem });
             }
         };
-        compare_digests(
-            &format!("topic {name}"),
-            &wire.name,
-            wire.digest.as_str(),
-            message.md5(),
-        )?;
+        compare_digests(&format!("topic {name}"), &wire.name, wire.digest.as_str(), message.md5())?;
         texts.message(&message);
         // ROS 2 nodes before Iron report no digests.
         md5 = message.digest().to_owned();
@@ -276,12 +213,8 @@ fn describe_topic(
         Direction::Input => ends.map(|topic| &topic.subscribers),
         Direction::Output => ends.map(|topic| &topic.publishers),
     };
-    let nodes: Vec<String> = nodes
-        .into_iter()
-        .flatten()
-        .filter(|node| **node != seen.options.own_name)
-        .cloned()
-        .collect();
+    let nodes: Vec<String> =
+        nodes.into_iter().flatten().filter(|node| **node != seen.options.own_name).cloned().collect();
     let qos = combined_qos(&seen.graph, &name, direction, &nodes);
     let keeps = qos.is_some_and(|qos| to_bus(&qos, 1).is_latching());
     Ok(Topic {
@@ -299,11 +232,7 @@ fn describe_topic(
 /// Returns the QoS that is compatible with all of these nodes, if known.
 fn combined_qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[String]) -> Option<Qos> {
     let ends = nodes.iter().filter_map(|node| {
-        let NodeEntities {
-            publishers,
-            subscribers,
-            ..
-        } = graph.ends.get(node)?;
+        let NodeEntities { publishers, subscribers, .. } = graph.ends.get(node)?;
         let ends = match direction {
             Direction::Output => publishers,
             Direction::Input => subscribers,
@@ -323,19 +252,12 @@ fn differing_digests(announced: &ServiceType, defined: &ServiceType) -> (String,
         (&announced.request, &defined.request),
         (&announced.response, &defined.response),
     ];
-    let pair = parts
-        .into_iter()
-        .find(|(one, other)| !one.is_compatible_with(other));
+    let pair = parts.into_iter().find(|(one, other)| !one.is_compatible_with(other));
     let (one, other) = pair.unwrap_or(parts[0]);
     (Digest::to_string(one), Digest::to_string(other))
 }
 
-fn compare_digests(
-    what: &str,
-    type_name: &str,
-    announced: &str,
-    defined: &str,
-) -> Result<(), ProbeError> {
+fn compare_digests(what: &str, type_name: &str, announced: &str, defined: &str) -> Result<(), ProbeError> {
     if announced == "*" || announced == defined {
         return Ok(());
     }
@@ -360,38 +282,22 @@ fn extract_actions(
 ) -> Result<Vec<Action>, ProbeError> {
     let mut actions = Vec::new();
     for (name, ends) in &seen.graph.actions {
-        let mut servers = ends
-            .servers
-            .iter()
-            .filter(|node| **node != seen.options.own_name);
+        let mut servers = ends.servers.iter().filter(|node| **node != seen.options.own_name);
         let Some(node) = servers.next().filter(|_| ends.type_name != "*") else {
             continue;
         };
         if let Ok(action) = registry.action(&ends.type_name) {
             let goal = &action.action_goal;
-            let of_goals = topics.iter().filter(|topic| {
-                ends.topics.contains(&topic.name) && topic.type_name == goal.name()
-            });
+            let of_goals =
+                topics.iter().filter(|topic| ends.topics.contains(&topic.name) && topic.type_name == goal.name());
             for topic in of_goals {
-                compare_digests(
-                    &format!("action {name}"),
-                    &topic.type_name,
-                    &topic.md5,
-                    goal.md5(),
-                )?;
+                compare_digests(&format!("action {name}"), &topic.type_name, &topic.md5, goal.md5())?;
             }
-            texts.action(
-                &ends.type_name,
-                [&action.goal, &action.result, &action.feedback],
-            );
+            texts.action(&ends.type_name, [&action.goal, &action.result, &action.feedback]);
         }
         // In both directions: a server may also be its own client (move_base is).
         topics.retain(|topic| !ends.topics.contains(&topic.name));
-        actions.push(Action {
-            name: name.clone(),
-            type_name: ends.type_name.clone(),
-            node: node.clone(),
-        });
+        actions.push(Action { name: name.clone(), type_name: ends.type_name.clone(), node: node.clone() });
     }
     Ok(actions)
 }
@@ -399,21 +305,13 @@ fn extract_actions(
 async fn shared_parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
     let mut parameters = Vec::new();
     for (name, uses) in &graph.parameters {
-        let others = |nodes: &[String]| -> Vec<String> {
-            nodes.iter().filter(|node| *node != own).cloned().collect()
-        };
+        let others = |nodes: &[String]| -> Vec<String> { nodes.iter().filter(|node| *node != own).cloned().collect() };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
         if plumbing::is_builtin_parameter(name) || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
         let value = bus.parameter(name).await.ok().map(|value| to_json(&value));
-        parameters.push(Parameter {
-            name: name.clone(),
-            value,
-            read_by,
-            written_by,
-            ..Parameter::default()
-        });
+        parameters.push(Parameter { name: name.clone(), value, read_by, written_by, ..Parameter::default() });
     }
     parameters
 }
@@ -439,9 +337,7 @@ async fn own_parameters(
             Some(Err(error)) => {
                 warnings.push(format!("cannot get the parameters of {node}: {error}"));
             }
-            None => warnings.push(format!(
-                "no response about the parameters of {node} within {ANSWER:?}"
-            )),
+            None => warnings.push(format!("no response about the parameters of {node} within {ANSWER:?}")),
         }
     }
 }
@@ -482,11 +378,7 @@ impl DefinitionTexts<'_> {
     fn message(&mut self, message: &Arc<MessageType>) {
         let key = names::definition_key(message.name(), "msg");
         // Requests, goals and the like have no text of their own; it is part of the service or action.
-        let text = self
-            .definitions
-            .get(&key)
-            .cloned()
-            .unwrap_or_else(|| message.text().to_owned());
+        let text = self.definitions.get(&key).cloned().unwrap_or_else(|| message.text().to_owned());
         if self.used.insert(key, text).is_none() {
             self.fields(message);
         }

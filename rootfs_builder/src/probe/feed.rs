@@ -16,8 +16,7 @@ use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, BusError, Graph, ParamValue, Publisher, QosProfile, RosVersion, Subscription, WireType,
-    wait_for_connected,
+    Bus, BusError, Graph, ParamValue, Publisher, QosProfile, RosVersion, Subscription, WireType, wait_for_connected,
 };
 use ros::codec::{self, FillOptions, JsonOptions, Time};
 use ros::plumbing;
@@ -97,21 +96,14 @@ impl Drop for InputFeed<'_> {
 
 impl<'a> InputFeed<'a> {
     /// Starts to listen to the log of the nodes.
-    pub(super) async fn start(
-        bus: &'a dyn Bus,
-        registry: &'a Registry,
-        options: &'a ProbeOptions,
-    ) -> Self {
+    pub(super) async fn start(bus: &'a dyn Bus, registry: &'a Registry, options: &'a ProbeOptions) -> Self {
         Self {
             bus,
             registry,
             options,
             frames: Arc::default(),
             parameters: BTreeSet::new(),
-            log: bus
-                .subscribe(LOG, WireType::any(), QosProfile::keep_last(200))
-                .await
-                .ok(),
+            log: bus.subscribe(LOG, WireType::any(), QosProfile::keep_last(200)).await.ok(),
             said: BTreeMap::new(),
             lender: None,
             served: BTreeMap::new(),
@@ -132,10 +124,7 @@ impl<'a> InputFeed<'a> {
             // Nodes that wait for these retry from time to time.
             (self.options.settle * 3, began.elapsed())
         } else {
-            (
-                self.options.settle * 2,
-                self.give_default_messages(graph).await?,
-            )
+            (self.options.settle * 2, self.give_default_messages(graph).await?)
         };
         // On a busy machine everything takes longer. The duration for one of them measures that; the total only depends
         // on their number.
@@ -144,10 +133,7 @@ impl<'a> InputFeed<'a> {
 
     /// Returns the services looked up so far, with the nodes that did.
     pub(super) fn requested_services(&self) -> BTreeMap<String, BTreeSet<String>> {
-        self.lender
-            .as_ref()
-            .map(|lender| lender.requested_services())
-            .unwrap_or_default()
+        self.lender.as_ref().map(|lender| lender.requested_services()).unwrap_or_default()
     }
 
     /// Returns the inputs of any type without a stated type.
@@ -172,27 +158,20 @@ impl<'a> InputFeed<'a> {
     }
 
     async fn give_surroundings(&mut self, graph: &Graph) -> bool {
-        let told =
-            self.collect_parameter_frames(graph).await | self.collect_node_frames(graph).await;
+        let told = self.collect_parameter_frames(graph).await | self.collect_node_frames(graph).await;
         let heard = self.read_log_messages() | told;
         let (clock, timed) = has_other_ends(graph, CLOCK, &self.options.own_name);
         let listens = |topic: &&str| has_other_ends(graph, topic, &self.options.own_name).0;
         let mut new = false;
         if clock && !timed {
-            new |= self
-                .publish_periodically(CLOCK, "rosgraph_msgs/Clock")
-                .await;
+            new |= self.publish_periodically(CLOCK, "rosgraph_msgs/Clock").await;
         }
         if TRANSFORMS.iter().any(listens) {
             // Moving transforms, since a node may check their age.
-            new |= heard
-                | self
-                    .publish_periodically(TRANSFORMS[0], "tf2_msgs/TFMessage")
-                    .await;
+            new |= heard | self.publish_periodically(TRANSFORMS[0], "tf2_msgs/TFMessage").await;
         }
         let looked_for = graph.sought.iter().any(|(name, nodes)| {
-            !graph.services.contains_key(name)
-                && nodes.iter().any(|node| *node != self.options.own_name)
+            !graph.services.contains_key(name) && nodes.iter().any(|node| *node != self.options.own_name)
         });
         if !looked_for {
             return new;
@@ -230,8 +209,7 @@ impl<'a> InputFeed<'a> {
             let Some((of, false)) = of.map(|of| (of, known)) else {
                 continue;
             };
-            let Some((of, handler)) = lender.handler_for(self.registry, name, &of.name, nodes)
-            else {
+            let Some((of, handler)) = lender.handler_for(self.registry, name, &of.name, nodes) else {
                 continue;
             };
             match self.bus.serve(name, of, handler).await {
@@ -252,9 +230,7 @@ impl<'a> InputFeed<'a> {
         };
         let mut new = false;
         while let Some(message) = log.messages.try_recv() {
-            let Some((level, node, text)) =
-                read_log(self.registry, self.options.ros, &message.bytes)
-            else {
+            let Some((level, node, text)) = read_log(self.registry, self.options.ros, &message.bytes) else {
                 continue;
             };
             if node == self.options.own_name {
@@ -270,11 +246,7 @@ impl<'a> InputFeed<'a> {
 
     async fn collect_parameter_frames(&mut self, graph: &Graph) -> bool {
         let mut new = false;
-        for key in graph
-            .parameters
-            .keys()
-            .filter(|key| frames::is_parameter(key))
-        {
+        for key in graph.parameters.keys().filter(|key| frames::is_parameter(key)) {
             if !self.parameters.insert(key.clone()) {
                 continue;
             }
@@ -300,11 +272,7 @@ impl<'a> InputFeed<'a> {
             let asked = async {
                 let mut names = parameters.list(node, &[], 0).await?.names;
                 names.retain(|name| frames::is_parameter(&name.replace('.', "/")));
-                if names.is_empty() {
-                    Ok(Vec::new())
-                } else {
-                    parameters.get(node, &names).await
-                }
+                if names.is_empty() { Ok(Vec::new()) } else { parameters.get(node, &names).await }
             };
             let values = self.await_answer(asked).await;
             for value in values.and_then(Result::ok).into_iter().flatten() {
@@ -330,9 +298,7 @@ impl<'a> InputFeed<'a> {
             }
         };
         // The duration of this on a busy machine shows how long the nodes will take.
-        let _ = self
-            .await_answer(wait_for_connected(publisher.matched_subscribers(), 1))
-            .await;
+        let _ = self.await_answer(wait_for_connected(publisher.matched_subscribers(), 1)).await;
         let frames = self.frames.clone();
         let beating = tokio::spawn(async move {
             let mut beats = tokio::time::interval(BEAT);
@@ -345,12 +311,8 @@ impl<'a> InputFeed<'a> {
                     frames.lock().tree(Time::from(SystemTime::now() + AHEAD))
                 };
                 let mut bytes = Vec::new();
-                let written = codec::from_json(
-                    &message,
-                    json.to_string().as_bytes(),
-                    &mut bytes,
-                    &FillOptions::default(),
-                );
+                let written =
+                    codec::from_json(&message, json.to_string().as_bytes(), &mut bytes, &FillOptions::default());
                 if written.is_ok() {
                     publisher.publish(bytes.into());
                 }
@@ -366,12 +328,8 @@ impl<'a> InputFeed<'a> {
         let mut longest = None;
         for name in graph.topics.keys() {
             let (subscribed, published) = has_other_ends(graph, name, &self.options.own_name);
-            let apart = name == CLOCK
-                || TRANSFORMS.contains(&name.as_str())
-                || plumbing::is_builtin_topic(graph, name);
-            let known = self.given.contains_key(name)
-                || self.refused.contains_key(name)
-                || self.goals.contains(name);
+            let apart = name == CLOCK || TRANSFORMS.contains(&name.as_str()) || plumbing::is_builtin_topic(graph, name);
+            let known = self.given.contains_key(name) || self.refused.contains_key(name) || self.goals.contains(name);
             if !subscribed || published || apart || known || self.given.len() >= MOST_INPUTS {
                 continue;
             }
@@ -383,14 +341,8 @@ impl<'a> InputFeed<'a> {
                         Ok(bytes) => {
                             // Not latched unless required, which would also reach later subscribers: relays latch
                             // what was latched.
-                            let _ = self
-                                .await_answer(wait_for_connected(
-                                    publisher.matched_subscribers(),
-                                    1,
-                                ))
-                                .await;
-                            if let Some(stamp) = read_stamp(&bytes).filter(|_| message.has_header())
-                            {
+                            let _ = self.await_answer(wait_for_connected(publisher.matched_subscribers(), 1)).await;
+                            if let Some(stamp) = read_stamp(&bytes).filter(|_| message.has_header()) {
                                 self.stamps.insert(stamp, name.clone());
                             }
                             publisher.publish(bytes);
@@ -441,11 +393,7 @@ impl<'a> InputFeed<'a> {
         let message = self.registry.message(name)?;
         let publisher = self
             .bus
-            .advertise(
-                topic,
-                WireType::from_message(&message),
-                QosProfile::keep_last(10).latching(latching),
-            )
+            .advertise(topic, WireType::from_message(&message), QosProfile::keep_last(10).latching(latching))
             .await?;
         Ok(Some((message, publisher)))
     }
@@ -454,9 +402,7 @@ impl<'a> InputFeed<'a> {
 /// Returns whether anybody but the observing node subscribes to a topic, and publishes on it.
 fn has_other_ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
     let others = |nodes: &[String]| nodes.iter().any(|node| node != own);
-    graph.topics.get(topic).map_or((false, false), |topic| {
-        (others(&topic.subscribers), others(&topic.publishers))
-    })
+    graph.topics.get(topic).map_or((false, false), |topic| (others(&topic.subscribers), others(&topic.publishers)))
 }
 
 /// Returns whether a subscriber requires publishers that keep their last message for it.

@@ -50,9 +50,7 @@ impl FrameSet {
     /// Adds the frames named in a log line; returns whether any is new.
     pub(super) fn add_from_log(&mut self, line: &str) -> bool {
         let named = parse_frame_names(line);
-        named
-            .into_iter()
-            .fold(false, |new, name| self.add(&name) | new)
+        named.into_iter().fold(false, |new, name| self.add(&name) | new)
     }
 
     /// Returns a `tf2_msgs/TFMessage` as JSON with an identity transform for every frame.
@@ -64,12 +62,7 @@ impl FrameSet {
                 "transform": {"rotation": {"w": 1}},
             })
         };
-        let leaves: Vec<Value> = self
-            .0
-            .iter()
-            .filter(|name| *name != ROOT)
-            .map(leaf)
-            .collect();
+        let leaves: Vec<Value> = self.0.iter().filter(|name| *name != ROOT).map(leaf).collect();
         json!({ "transforms": leaves })
     }
 }
@@ -77,36 +70,22 @@ impl FrameSet {
 /// Returns whether a parameter is likely to contain the name of a frame, judging by its key.
 pub(super) fn is_parameter(key: &str) -> bool {
     let last = key.rsplit('/').next().unwrap_or_default();
-    ["frame", "frame_id", "frame_name"].iter().any(|end| {
-        last == *end
-            || last
-                .strip_suffix(end)
-                .is_some_and(|rest| rest.ends_with('_'))
-    })
+    ["frame", "frame_id", "frame_name"]
+        .iter()
+        .any(|end| last == *end || last.strip_suffix(end).is_some_and(|rest| rest.ends_with('_')))
 }
 
 fn is_name(text: &str) -> bool {
     text.len() <= 128
         && text.starts_with(|first: char| first.is_ascii_alphabetic())
-        && text
-            .chars()
-            .all(|char| char.is_ascii_alphanumeric() || "_/.-".contains(char))
+        && text.chars().all(|char| char.is_ascii_alphanumeric() || "_/.-".contains(char))
 }
 
 /// Returns the likely frame names in a line about transforms: words in quotes, words with an underscore, and words
 /// after `from`, `to`, `frame` and the like.
 fn parse_frame_names(line: &str) -> BTreeSet<String> {
-    const BEFORE: [&str; 9] = [
-        "from",
-        "to",
-        "frame",
-        "frames",
-        "frame_id",
-        "id",
-        "target_frame",
-        "source_frame",
-        "and",
-    ];
+    const BEFORE: [&str; 9] =
+        ["from", "to", "frame", "frames", "frame_id", "id", "target_frame", "source_frame", "and"];
     const NEVER: [&str; 14] = [
         "to",
         "from",
@@ -154,10 +133,7 @@ mod tests {
                  does not exist.",
                 &["chassis", "hall"][..],
             ),
-            (
-                "\"left_gripper\" passed to lookupTransform argument target_frame does not exist.",
-                &["left_gripper"],
-            ),
+            ("\"left_gripper\" passed to lookupTransform argument target_frame does not exist.", &["left_gripper"]),
             ("Frame id /spine does not exist! Frames (1):", &["spine"]),
             ("Could not transform from 'a/b' to [c]", &["a/b", "c"]),
             ("waiting for the map from nowhere", &[]),
@@ -168,10 +144,7 @@ mod tests {
                 assert!(known.0.contains(*frame), "{frame} in {line:?}: {known:?}");
             }
             assert!(known.0.len() - USUAL.len() >= frames.len(), "{known:?}");
-            assert!(
-                !known.0.contains("the") && !known.0.contains("become"),
-                "{known:?}"
-            );
+            assert!(!known.0.contains("the") && !known.0.contains("become"), "{known:?}");
         }
     }
 
@@ -183,31 +156,17 @@ mod tests {
         let tree = frames.tree(Time { secs: 1, nsecs: 2 });
         let leaves = tree["transforms"].as_array().expect("a list");
         assert_eq!(leaves.len(), USUAL.len());
-        let chassis = leaves
-            .iter()
-            .find(|leaf| leaf["child_frame_id"] == "chassis")
-            .expect("added");
+        let chassis = leaves.iter().find(|leaf| leaf["child_frame_id"] == "chassis").expect("added");
         assert_eq!(chassis["header"]["frame_id"], "map");
         assert!(leaves.iter().all(|leaf| leaf["child_frame_id"] != "map"));
     }
 
     #[test]
     fn parameters_that_hold_frames_are_known_by_their_names() {
-        for key in [
-            "/a/frame_id",
-            "/a/base_frame",
-            "/frame",
-            "/x/costmap/global_frame",
-            "/a/odom_frame_id",
-        ] {
+        for key in ["/a/frame_id", "/a/base_frame", "/frame", "/x/costmap/global_frame", "/a/odom_frame_id"] {
             assert!(is_parameter(key), "{key}");
         }
-        for key in [
-            "/a/frames_per_second",
-            "/a/framework",
-            "/a/subframe",
-            "/frame/rate",
-        ] {
+        for key in ["/a/frames_per_second", "/a/framework", "/a/subframe", "/frame/rate"] {
             assert!(!is_parameter(key), "{key}");
         }
     }

@@ -54,10 +54,7 @@ impl OutputRecord {
                 stamps
                     .iter()
                     .filter_map(&given)
-                    .map(|input| ObservedAnswer {
-                        input: input.clone(),
-                        output: output.clone(),
-                    }),
+                    .map(|input| ObservedAnswer { input: input.clone(), output: output.clone() }),
             );
         }
         answers

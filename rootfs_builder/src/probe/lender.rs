@@ -29,9 +29,7 @@ impl AnyServiceLender {
             if let Some((package, name)) = key.split_once("/srv/")
                 && let Ok(service) = registry.service(&format!("{package}/{name}"))
             {
-                by_digest
-                    .entry(Digest::from(&service.md5))
-                    .or_insert(service);
+                by_digest.entry(Digest::from(&service.md5)).or_insert(service);
             }
         }
         Arc::new(Self {
@@ -54,15 +52,9 @@ impl AnyServiceLender {
         let found = registry.service(type_name).ok()?;
         let nodes = nodes.iter().filter(|node| **node != self.own_name);
         let mut asked = self.asked.lock();
-        asked
-            .entry(service.to_owned())
-            .or_default()
-            .extend(nodes.cloned());
+        asked.entry(service.to_owned()).or_default().extend(nodes.cloned());
         let of = ServiceType::from_service(&found);
-        let answers = DefaultAnswers {
-            by_digest: self.by_digest.clone(),
-            service: Some(found),
-        };
+        let answers = DefaultAnswers { by_digest: self.by_digest.clone(), service: Some(found) };
         Some((of, Arc::new(answers)))
     }
 
@@ -84,16 +76,10 @@ impl Lender for AnyServiceLender {
             return None;
         }
         let mut asked = self.asked.lock();
-        asked
-            .entry(service.to_owned())
-            .or_default()
-            .insert(node.to_owned());
+        asked.entry(service.to_owned()).or_default().insert(node.to_owned());
         Some(LentService {
             service_type: ServiceType::new("*", "*"),
-            handler: Arc::new(DefaultAnswers {
-                by_digest: self.by_digest.clone(),
-                service: None,
-            }),
+            handler: Arc::new(DefaultAnswers { by_digest: self.by_digest.clone(), service: None }),
             gone: self.ending.subscribe(),
         })
     }
@@ -116,10 +102,7 @@ impl ServiceHandler for DefaultAnswers {
 
     fn for_type(&self, digest: &Digest) -> Option<Arc<dyn ServiceHandler>> {
         let service = Some(self.by_digest.get(digest)?.clone());
-        Some(Arc::new(DefaultAnswers {
-            by_digest: self.by_digest.clone(),
-            service,
-        }))
+        Some(Arc::new(DefaultAnswers { by_digest: self.by_digest.clone(), service }))
     }
 }
 
@@ -143,10 +126,7 @@ mod tests {
         // CDR header, false, and an empty string with its length.
         assert_eq!(answer[..], [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0]);
         assert_eq!(any.requested_services()["/do"], ["/node".to_owned()].into());
-        assert!(
-            any.handler_for(&registry, "/x", "lab/srv/None", &nodes)
-                .is_none()
-        );
+        assert!(any.handler_for(&registry, "/x", "lab/srv/None", &nodes).is_none());
     }
 
     #[tokio::test]
@@ -156,21 +136,12 @@ mod tests {
         let registry = Registry::from_definitions(&definitions).expect("valid");
         let add = registry.service("lab/Add").expect("defined");
         let any = AnyServiceLender::new(&registry, "/looker");
-        assert!(
-            any.find_service("/add", "/looker").await.is_none(),
-            "its own questions"
-        );
+        assert!(any.find_service("/add", "/looker").await.is_none(), "its own questions");
         let lent = any.find_service("/add", "/node").await.expect("lent");
-        let handler = lent
-            .handler
-            .for_type(&Digest::from(&add.md5))
-            .expect("the type is known");
+        let handler = lent.handler.for_type(&Digest::from(&add.md5)).expect("the type is known");
         let answer = handler.call(Bytes::new(), "/node").await.expect("answered");
         assert_eq!(answer.len(), 12);
-        assert!(
-            lent.handler.call(Bytes::new(), "/node").await.is_err(),
-            "of no type"
-        );
+        assert!(lent.handler.call(Bytes::new(), "/node").await.is_err(), "of no type");
         assert!(any.requested_services()["/add"].contains("/node"));
         any.revoke();
         assert!(any.find_service("/add", "/node").await.is_none());

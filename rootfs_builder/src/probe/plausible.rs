@@ -16,10 +16,7 @@ static VALUES: LazyLock<Map<String, Value>> =
 pub(super) fn default_message(message: &MessageType, now: Time) -> Result<Bytes, CodecError> {
     let json = Value::Object(nonzero_fields(message)).to_string();
     let mut bytes = Vec::new();
-    let options = FillOptions {
-        now: Some(now),
-        ..FillOptions::default()
-    };
+    let options = FillOptions { now: Some(now), ..FillOptions::default() };
     codec::from_json(message, json.as_bytes(), &mut bytes, &options)?;
     Ok(bytes.into())
 }
@@ -60,13 +57,8 @@ fn merge_values(into: &mut Map<String, Value>, values: &Map<String, Value>) {
 }
 
 fn expand_repeats(value: &Value) -> Value {
-    match (
-        value.get("repeat"),
-        value.get("times").and_then(Value::as_u64),
-    ) {
-        (Some(repeated), Some(times)) => {
-            Value::Array(vec![repeated.clone(); usize::try_from(times).unwrap_or(0)])
-        }
+    match (value.get("repeat"), value.get("times").and_then(Value::as_u64)) {
+        (Some(repeated), Some(times)) => Value::Array(vec![repeated.clone(); usize::try_from(times).unwrap_or(0)]),
         _ => value.clone(),
     }
 }
@@ -81,10 +73,7 @@ mod tests {
         let registry = Registry::from_definitions(
             &[
                 ("geometry_msgs/msg/Quaternion", "float64 x\nfloat64 w\n"),
-                (
-                    "lab/msg/Turned",
-                    "int8 times\ngeometry_msgs/Quaternion by\n",
-                ),
+                ("lab/msg/Turned", "int8 times\ngeometry_msgs/Quaternion by\n"),
                 ("lab/msg/Log", "Header header\nTurned[] all\nTurned last\n"),
             ]
             .map(|(key, text)| (key.to_owned(), text.to_owned()))
@@ -106,15 +95,10 @@ mod tests {
 
     #[test]
     fn types_of_ros_2_have_the_same_values() {
-        let definitions = [(
-            "sensor_msgs/msg/CameraInfo".to_owned(),
-            "uint32 height\nfloat64[] d\nfloat64[9] k\n".to_owned(),
-        )];
-        let registry = Registry::with_definitions(ros::bus::RosVersion::Two, &definitions.into())
-            .expect("valid");
-        let info = registry
-            .message("sensor_msgs/msg/CameraInfo")
-            .expect("defined");
+        let definitions =
+            [("sensor_msgs/msg/CameraInfo".to_owned(), "uint32 height\nfloat64[] d\nfloat64[9] k\n".to_owned())];
+        let registry = Registry::with_definitions(ros::bus::RosVersion::Two, &definitions.into()).expect("valid");
+        let info = registry.message("sensor_msgs/msg/CameraInfo").expect("defined");
         let bytes = default_message(&info, Time::default()).expect("a message");
         let mut json = Vec::new();
         codec::to_json(&info, &bytes, &mut json, &codec::JsonOptions::default()).expect("valid");

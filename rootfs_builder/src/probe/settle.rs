@@ -80,10 +80,7 @@ const LEAST: u32 = 20;
 
 impl NodeClock {
     async fn start(options: &ProbeOptions) -> Self {
-        Self {
-            at: Instant::now(),
-            worked: options.cpu_time().await,
-        }
+        Self { at: Instant::now(), worked: options.cpu_time().await }
     }
 
     async fn read(&mut self, options: &ProbeOptions) -> ClockReading {
@@ -200,10 +197,7 @@ fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
     });
     let services = graph.services.iter().any(|(name, server)| {
         !own(server)
-            && name
-                .rsplit('/')
-                .next()
-                .is_some_and(|last| !NODELETS.contains(&last))
+            && name.rsplit('/').next().is_some_and(|last| !NODELETS.contains(&last))
             && !plumbing::is_builtin_service(options.ros, graph, name)
     });
     let actions = graph.actions.values();
@@ -241,9 +235,7 @@ mod tests {
     async fn a_node_that_its_program_puts_elsewhere_is_known_by_its_mark() {
         let nodes = |names: &[&str]| {
             let names = names.iter();
-            names
-                .map(|&name| (name.to_owned(), String::new()))
-                .collect()
+            names.map(|&name| (name.to_owned(), String::new())).collect()
         };
         let beside = ["/hear", "/other/see", "/rear/hear"];
         let graph = Graph {
@@ -257,9 +249,7 @@ mod tests {
             marks: [("/see".to_owned(), "/mark".to_owned())].into(),
             ..ProbeOptions::new(vec!["/see".to_owned(), "/hear".to_owned()], "/probe")
         };
-        let error = wait_until_registered(&mut watch, &options)
-            .await
-            .expect_err("no /see");
+        let error = wait_until_registered(&mut watch, &options).await.expect_err("no /see");
         assert!(error.to_string().starts_with("/see did not"), "{error}");
         let of_mark = ["/camera/help".to_owned(), "/camera/see".to_owned()];
         sender.send_replace(Arc::new(Graph {
@@ -267,9 +257,7 @@ mod tests {
             enclaves: [("/mark".to_owned(), of_mark.into())].into(),
             ..graph
         }));
-        let moved = wait_until_registered(&mut watch, &options)
-            .await
-            .expect("both");
+        let moved = wait_until_registered(&mut watch, &options).await.expect("both");
         let expected = ("/see".to_owned(), "/camera/see".to_owned());
         assert_eq!(moved, [expected].into());
     }

@@ -63,10 +63,7 @@ impl Sandbox for FakeSandbox {
             grants: Default::default(),
             resident: spec.resident,
         };
-        Ok(SandboxContainer {
-            servant: self.engine.start(spec).await?,
-            uid_offset: 700_000,
-        })
+        Ok(SandboxContainer { servant: self.engine.start(spec).await?, uid_offset: 700_000 })
     }
 }
 
@@ -112,22 +109,13 @@ async fn a_build_as_deep_as_can_be_is_removed() {
 #[tokio::test]
 async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
     let root = tempfile::tempdir().expect("a directory");
-    let engine = Arc::new(FakeSandbox {
-        code: Some(3),
-        ..FakeSandbox::default()
-    });
+    let engine = Arc::new(FakeSandbox { code: Some(3), ..FakeSandbox::default() });
     let removals = PendingRemovals::default();
     let site = site(root.path(), "b1", &engine, &removals);
     let mut heard = Vec::new();
-    let finished = site
-        .run(run(), |line| heard.push(line.to_owned()))
-        .await
-        .expect("it ran");
+    let finished = site.run(run(), |line| heard.push(line.to_owned())).await.expect("it ran");
     assert_eq!(heard, ["hello"]);
-    assert_eq!(
-        (finished.success(), finished.exit.code, finished.uid_offset),
-        (false, Some(3), 700_000)
-    );
+    assert_eq!((finished.success(), finished.exit.code, finished.uid_offset), (false, Some(3), 700_000));
     assert!(engine.stopped.load(Ordering::SeqCst));
     drop(site);
     removals.wait("b1").await;
@@ -153,13 +141,5 @@ async fn a_dropped_build_ends_its_container_before_its_directory_goes() {
     removals.wait("b2").await;
     assert!(engine.stopped.load(Ordering::SeqCst));
     assert!(!directory.exists(), "the directory is removed");
-    assert_eq!(
-        engine
-            .saw
-            .lock()
-            .expect("not poisoned")
-            .as_ref()
-            .map(|(_, there)| *there),
-        Some(true)
-    );
+    assert_eq!(engine.saw.lock().expect("not poisoned").as_ref().map(|(_, there)| *there), Some(true));
 }

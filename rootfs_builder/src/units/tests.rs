@@ -11,10 +11,8 @@ struct UnitsFixture {
 impl UnitsFixture {
     /// Creates packages with additional elements in their package.xml.
     fn new(packages: &[(&str, &str)]) -> Self {
-        let lab = Self {
-            root: tempfile::tempdir().expect("a directory"),
-            place: tempfile::tempdir().expect("a directory"),
-        };
+        let lab =
+            Self { root: tempfile::tempdir().expect("a directory"), place: tempfile::tempdir().expect("a directory") };
         for (name, rest) in packages {
             let text = format!(
                 "<package format=\"2\"><name>{name}</name><version>1.2.3</version><description>d</description>\
@@ -36,14 +34,11 @@ impl UnitsFixture {
     }
 
     fn read_on(&self, below: &[Digest], build_key: &str) -> WorkspaceUnits {
-        let pushed = inspect(self.root.path(), &Variables::for_distribution(1, "noetic"))
-            .expect("a workspace");
+        let pushed = inspect(self.root.path(), &Variables::for_distribution(1, "noetic")).expect("a workspace");
         let PushedDirectory::Source(workspace) = pushed else {
             panic!("sources");
         };
-        let place = tempfile::tempdir_in(self.place.path())
-            .expect("a directory")
-            .keep();
+        let place = tempfile::tempdir_in(self.place.path()).expect("a directory").keep();
         WorkspaceUnits::read(&workspace, build_key.into(), below, &place).expect("read")
     }
 
@@ -65,12 +60,7 @@ fn keys(units: &WorkspaceUnits) -> Vec<(String, String)> {
 /// Returns the names of packages whose keys differ.
 fn changed_packages(before: &[(String, String)], after: &[(String, String)]) -> Vec<String> {
     let differ = |(one, other): &(&(String, String), &(String, String))| one != other;
-    before
-        .iter()
-        .zip(after)
-        .filter(differ)
-        .map(|(one, _)| one.0.clone())
-        .collect()
+    before.iter().zip(after).filter(differ).map(|(one, _)| one.0.clone()).collect()
 }
 
 const CHAIN: [(&str, &str); 4] = [
@@ -100,14 +90,8 @@ fn what_all_packages_see_changes_all() {
     let all = ["a_msgs", "b_lib", "c_app", "d_other"];
     assert_eq!(changed_packages(&before, &lab.keys()), all);
     let now = lab.keys();
-    for (below, build_key) in [
-        (Digest::compute("another base"), "build"),
-        (Digest::compute("base"), "another build"),
-    ] {
-        assert_eq!(
-            changed_packages(&now, &keys(&lab.read_on(&[below], build_key))),
-            all
-        );
+    for (below, build_key) in [(Digest::compute("another base"), "build"), (Digest::compute("base"), "another build")] {
+        assert_eq!(changed_packages(&now, &keys(&lab.read_on(&[below], build_key))), all);
     }
 }
 
@@ -132,18 +116,14 @@ fn a_view_shows_a_package_and_what_is_nobodys() {
     let lab = UnitsFixture::new(&CHAIN);
     lab.write("src/common/flags.cmake", "set(X 1)");
     lab.write("src/b_lib/src/b.cpp", "int b();");
-    std::os::unix::fs::symlink("../d_other", lab.root.path().join("src/b_lib/link"))
-        .expect("linked");
+    std::os::unix::fs::symlink("../d_other", lab.root.path().join("src/b_lib/link")).expect("linked");
     let units = lab.read();
     let view = units.make_view(1, lab.place.path()).expect("made");
     let text = |path: &str| std::fs::read_to_string(view.join(path)).ok();
     assert_eq!(text("src/b_lib/src/b.cpp").as_deref(), Some("int b();"));
     assert_eq!(text("src/common/flags.cmake").as_deref(), Some("set(X 1)"));
     assert!(!view.join("src/a_msgs").exists() && !view.join("src/d_other").exists());
-    assert!(
-        view.join("src/b_lib/link").symlink_metadata().is_ok(),
-        "links stay links"
-    );
+    assert!(view.join("src/b_lib/link").symlink_metadata().is_ok(), "links stay links");
     assert_eq!(units.needs, [vec![], vec![0], vec![0, 1], vec![]]);
 }
 
@@ -173,12 +153,6 @@ fn only_what_may_be_for_want_of_sight_is_tried_again() {
     }
     assert!(!units.misses_something(3, "x.cpp:1:1: error: 'y' was not declared in this scope"));
     // c_app sees all packages compiled before it, but no other package's sources.
-    assert!(!units.misses_something(
-        2,
-        "x.cpp:1:10: fatal error: foo.h: No such file or directory"
-    ));
-    assert!(units.misses_something(
-        2,
-        "CMake Error: /build/src/src/b_lib/cmake/x.cmake does not exist"
-    ));
+    assert!(!units.misses_something(2, "x.cpp:1:10: fatal error: foo.h: No such file or directory"));
+    assert!(units.misses_something(2, "CMake Error: /build/src/src/b_lib/cmake/x.cmake does not exist"));
 }

@@ -14,10 +14,7 @@ async fn only_what_is_whole_is_taken_from_the_cache() {
     assert_eq!(missing.expect("looked"), None);
     let file = cache.path().join("ros_x-1.0-py3-none-any.whl");
     fs::write(&file, "damaged").expect("written");
-    assert_eq!(
-        cached_wheels(cache.path(), &wanted).await.expect("looked"),
-        None
-    );
+    assert_eq!(cached_wheels(cache.path(), &wanted).await.expect("looked"), None);
     fs::write(&file, "good").expect("written");
     let found = cached_wheels(cache.path(), &wanted).await.expect("looked");
     assert_eq!(found, Some(vec![file]));
@@ -25,8 +22,7 @@ async fn only_what_is_whole_is_taken_from_the_cache() {
 
 #[test]
 fn pips_errors_are_told_without_its_chatter() {
-    let lines =
-        "Looking in indexes: x\nCollecting a\nERROR: No matching distribution found for a==9\n";
+    let lines = "Looking in indexes: x\nCollecting a\nERROR: No matching distribution found for a==9\n";
     assert_eq!(pip_errors(lines), "No matching distribution found for a==9");
     assert_eq!(pip_errors("boom"), "boom");
 }
@@ -73,10 +69,7 @@ impl WheelFixture {
     }
 
     fn install(&self) -> std::process::Output {
-        let (script, job) = (
-            self.place.path().join("wheels.py"),
-            self.place.path().join("job.json"),
-        );
+        let (script, job) = (self.place.path().join("wheels.py"), self.place.path().join("job.json"));
         let about = serde_json::json!({
             "prefix": self.prefix(),
             "rewrite": { "/builder/python": "/usr" },
@@ -85,12 +78,7 @@ impl WheelFixture {
         });
         fs::write(&script, INSTALL).expect("written");
         fs::write(&job, about.to_string()).expect("written");
-        python(&[
-            "-I".as_ref(),
-            script.as_ref(),
-            job.as_ref(),
-            self.place.path().as_ref(),
-        ])
+        python(&["-I".as_ref(), script.as_ref(), job.as_ref(), self.place.path().as_ref()])
     }
 
     fn read(&self, path: &str) -> String {
@@ -110,64 +98,36 @@ fn the_files_of_wheels_go_where_ros_looks_for_them() {
                 ("a/template.py", "not @Python@\n", false),
                 ("a/__pycache__/__init__.cpython-311.pyc", "old", false),
                 ("ros_a.libs/libz-0a.so", "machine code", true),
-                (
-                    "ros_a-1.0.data/data/share/a/a.cmake",
-                    "at /builder/python/x",
-                    false,
-                ),
+                ("ros_a-1.0.data/data/share/a/a.cmake", "at /builder/python/x", false),
                 ("ros_a-1.0.data/data/lib/a/run", "machine code", true),
                 ("ros_a-1.0.data/scripts/tool", "#!python\nprint(1)\n", false),
-                (
-                    "ros_a-1.0.dist-info/entry_points.txt",
-                    "[console_scripts]\nask = a.b:c.d\n",
-                    false,
-                ),
+                ("ros_a-1.0.dist-info/entry_points.txt", "[console_scripts]\nask = a.b:c.d\n", false),
             ],
         ),
-        (
-            "ros_b-1.0-py3-none-any.whl",
-            &[("ros_b.libs/libz-0a.so", "machine code", true)],
-        ),
+        ("ros_b-1.0-py3-none-any.whl", &[("ros_b.libs/libz-0a.so", "machine code", true)]),
     ]);
     let said = lab.install();
     assert!(said.status.success(), "{said:?}");
-    let version = python(&[
-        "-c".as_ref(),
-        "import sys; print('python%d.%d' % sys.version_info[:2])".as_ref(),
-    ]);
+    let version = python(&["-c".as_ref(), "import sys; print('python%d.%d' % sys.version_info[:2])".as_ref()]);
     let version = String::from_utf8(version.stdout).expect("text");
     let site = format!("lib/{}/site-packages", version.trim());
     assert_eq!(lab.read("share/a/a.cmake"), "at /usr/x");
     assert_eq!(lab.read("setup.sh"), "# nothing");
     assert_eq!(lab.read("bin/tool"), "#!/usr/bin/python3\nprint(1)\n");
     let ask = lab.read("bin/ask");
-    assert!(
-        ask.contains("from a.b import c\n") && ask.contains("c.d()"),
-        "{ask}"
-    );
-    for (path, runs) in [
-        ("lib/a/run", true),
-        ("bin/ask", true),
-        ("share/a/a.cmake", false),
-    ] {
+    assert!(ask.contains("from a.b import c\n") && ask.contains("c.d()"), "{ask}");
+    for (path, runs) in [("lib/a/run", true), ("bin/ask", true), ("share/a/a.cmake", false)] {
         let about = lab.prefix().join(path).metadata().expect(path);
         assert_eq!(about.permissions().mode() & 0o111 != 0, runs, "{path}");
     }
     // One library with three names.
     let inode = |path: &str| lab.prefix().join(path).metadata().expect("there").ino();
-    let (first, second) = (
-        format!("{site}/ros_a.libs/libz-0a.so"),
-        format!("{site}/ros_b.libs/libz-0a.so"),
-    );
+    let (first, second) = (format!("{site}/ros_a.libs/libz-0a.so"), format!("{site}/ros_b.libs/libz-0a.so"));
     assert_eq!(inode("lib/libz-0a.so"), inode(&first));
     assert_eq!(inode("lib/libz-0a.so"), inode(&second));
     // Compiled here, with the source's hash (PEP 552: flags 3).
     let cache = lab.prefix().join(&site).join("a/__pycache__");
-    let compiled = fs::read_dir(&cache)
-        .expect("there")
-        .flatten()
-        .next()
-        .expect("one");
+    let compiled = fs::read_dir(&cache).expect("there").flatten().next().expect("one");
     let bytes = fs::read(compiled.path()).expect("read");
     assert_eq!(bytes[4..8], [3, 0, 0, 0]);
     assert_eq!(fs::read_dir(&cache).expect("there").count(), 1);
@@ -177,21 +137,9 @@ fn the_files_of_wheels_go_where_ros_looks_for_them() {
 fn wheels_that_contradict_each_other_or_leave_the_prefix_are_refused() {
     let (one, two) = ("ros_a-1.0-py3-none-any.whl", "ros_b-1.0-py3-none-any.whl");
     for (first, second, words) in [
-        (
-            ("x/y.py", "1", false),
-            ("x/y.py", "2", false),
-            "different versions of",
-        ),
-        (
-            ("x/y.py", "1", false),
-            ("../../../../../x", "2", false),
-            "outside of the prefix",
-        ),
-        (
-            ("x/y.py", "1", false),
-            ("ros_b-1.0.data/data/../x", "2", false),
-            "outside of the prefix",
-        ),
+        (("x/y.py", "1", false), ("x/y.py", "2", false), "different versions of"),
+        (("x/y.py", "1", false), ("../../../../../x", "2", false), "outside of the prefix"),
+        (("x/y.py", "1", false), ("ros_b-1.0.data/data/../x", "2", false), "outside of the prefix"),
     ] {
         let said = WheelFixture::new(&[(one, &[first]), (two, &[second])]).install();
         let error = String::from_utf8_lossy(&said.stderr).into_owned();

@@ -92,21 +92,11 @@ pub struct AccessObject<'a> {
 
 impl<'a> AccessObject<'a> {
     /// The machine, or all services.
-    pub const MACHINE: AccessObject<'static> = AccessObject {
-        service: None,
-        exists: true,
-        owner: None,
-        robot: None,
-    };
+    pub const MACHINE: AccessObject<'static> = AccessObject { service: None, exists: true, owner: None, robot: None };
 
     /// Creates the object for a published service.
     pub fn service(name: &'a str, owner: Option<&'a str>) -> AccessObject<'a> {
-        AccessObject {
-            service: Some(name),
-            exists: true,
-            owner,
-            robot: None,
-        }
+        AccessObject { service: Some(name), exists: true, owner, robot: None }
     }
 }
 
@@ -124,34 +114,15 @@ pub struct AccessDenied {
 
 impl AccessDenied {
     /// Creates the refusal of an action to a principal.
-    pub fn new(
-        principal: &Principal,
-        action: AccessAction,
-        object: impl fmt::Display,
-    ) -> AccessDenied {
-        AccessDenied {
-            who: principal.to_string(),
-            action,
-            object: object.to_string(),
-        }
+    pub fn new(principal: &Principal, action: AccessAction, object: impl fmt::Display) -> AccessDenied {
+        AccessDenied { who: principal.to_string(), action, object: object.to_string() }
     }
 }
 
 /// Checks whether `principal` may perform `action` on `object`.
-pub fn decide(
-    principal: &Principal,
-    action: AccessAction,
-    object: &AccessObject<'_>,
-) -> Result<(), AccessDenied> {
-    let allowed = principal
-        .roles
-        .iter()
-        .any(|role| role_allows(*role, principal, action, object));
-    if allowed {
-        Ok(())
-    } else {
-        Err(AccessDenied::new(principal, action, describe(object)))
-    }
+pub fn decide(principal: &Principal, action: AccessAction, object: &AccessObject<'_>) -> Result<(), AccessDenied> {
+    let allowed = principal.roles.iter().any(|role| role_allows(*role, principal, action, object));
+    if allowed { Ok(()) } else { Err(AccessDenied::new(principal, action, describe(object))) }
 }
 
 fn describe(object: &AccessObject<'_>) -> String {
@@ -165,16 +136,9 @@ fn describe(object: &AccessObject<'_>) -> String {
 }
 
 /// One row of the table above.
-fn role_allows(
-    role: Role,
-    principal: &Principal,
-    action: AccessAction,
-    object: &AccessObject<'_>,
-) -> bool {
+fn role_allows(role: Role, principal: &Principal, action: AccessAction, object: &AccessObject<'_>) -> bool {
     let owned = object.owner == Some(principal.name.as_str());
-    let scoped = object
-        .service
-        .is_some_and(|service| principal.scope.includes(service));
+    let scoped = object.service.is_some_and(|service| principal.scope.includes(service));
     match (role, action) {
         (Role::Admin, _) => true,
         (Role::Operator, action) => action != AccessAction::Administer,
@@ -184,31 +148,22 @@ fn role_allows(
         (_, AccessAction::Look) => false,
         (Role::Deployer, AccessAction::See) => owned || scoped,
         (Role::Deployer, AccessAction::Deploy) => owned || (!object.exists && scoped),
-        (
-            Role::Deployer,
-            AccessAction::Try | AccessAction::Logs | AccessAction::Operate | AccessAction::Connect,
-        ) => owned,
+        (Role::Deployer, AccessAction::Try | AccessAction::Logs | AccessAction::Operate | AccessAction::Connect) => {
+            owned
+        }
         (Role::Robot | Role::Viewer, AccessAction::See) => scoped,
         (Role::Robot, AccessAction::Connect) => {
             let own = principal.scope.robot.as_deref();
             scoped && own.is_none_or(|own| object.robot == Some(own))
         }
-        (
-            Role::Robot,
-            AccessAction::Try | AccessAction::Logs | AccessAction::Deploy | AccessAction::Operate,
-        ) => false,
+        (Role::Robot, AccessAction::Try | AccessAction::Logs | AccessAction::Deploy | AccessAction::Operate) => false,
         (Role::Viewer, _) => false,
     }
 }
 
 /// Returns true if the principal may use a class of the configuration.
 pub fn can_use_class(principal: &Principal, class: &str) -> bool {
-    principal.is_unscoped()
-        || principal
-            .scope
-            .classes
-            .iter()
-            .any(|pattern| pattern.matches(class))
+    principal.is_unscoped() || principal.scope.classes.iter().any(|pattern| pattern.matches(class))
 }
 
 #[cfg(test)]
@@ -239,20 +194,8 @@ mod tests {
             ("scope", service("in_a", Some("other"))),
             ("other", service("out_a", Some("other"))),
             ("nobody's", service("out_a", None)),
-            (
-                "new in scope",
-                AccessObject {
-                    exists: false,
-                    ..service("in_new", None)
-                },
-            ),
-            (
-                "new elsewhere",
-                AccessObject {
-                    exists: false,
-                    ..service("out_new", None)
-                },
-            ),
+            ("new in scope", AccessObject { exists: false, ..service("in_new", None) }),
+            ("new elsewhere", AccessObject { exists: false, ..service("out_new", None) }),
         ]
     }
 
@@ -294,10 +237,7 @@ mod tests {
         let mut lines = String::new();
         for action in AccessAction::ALL {
             let cells = Role::ALL.map(|role| {
-                let at = |object| AccessObject {
-                    robot: Some("r1"),
-                    ..object
-                };
+                let at = |object| AccessObject { robot: Some("r1"), ..object };
                 let allowed: Vec<&str> = objects()
                     .into_iter()
                     .filter(|(_, object)| decide(&principal(role), action, &at(*object)).is_ok())
@@ -318,20 +258,13 @@ mod tests {
     fn the_documents_say_what_is_decided() {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/access.md");
         let document = std::fs::read_to_string(path).expect("docs/access.md");
-        assert!(
-            document.contains(&table()),
-            "docs/access.md lacks:\n{}",
-            table()
-        );
+        assert!(document.contains(&table()), "docs/access.md lacks:\n{}", table());
     }
 
     #[test]
     fn a_robot_is_itself_alone() {
         let robot = principal(Role::Robot);
-        let at = |service, robot| AccessObject {
-            robot,
-            ..AccessObject::service(service, None)
-        };
+        let at = |service, robot| AccessObject { robot, ..AccessObject::service(service, None) };
         decide(&robot, AccessAction::Connect, &at("in_a", Some("r1"))).expect("its own");
         for (service, name) in [("in_a", Some("r2")), ("in_a", None), ("out_a", Some("r1"))] {
             decide(&robot, AccessAction::Connect, &at(service, name)).expect_err(service);
@@ -369,31 +302,14 @@ mod tests {
 
     #[test]
     fn a_refusal_says_who_what_and_to_what() {
-        let refused = decide(
-            &principal(Role::Viewer),
-            AccessAction::Deploy,
-            &objects()[2].1,
-        );
-        assert_eq!(
-            refused.expect_err("read only").to_string(),
-            "me (viewer) may not deploy service in_a"
-        );
+        let refused = decide(&principal(Role::Viewer), AccessAction::Deploy, &objects()[2].1);
+        assert_eq!(refused.expect_err("read only").to_string(), "me (viewer) may not deploy service in_a");
         let any = AccessObject::service("", Some("me"));
         let refused = decide(&principal(Role::Viewer), AccessAction::Operate, &any);
-        assert_eq!(
-            refused.expect_err("read only").to_string(),
-            "me (viewer) may not operate any service"
-        );
-        let refused = decide(
-            &Principal::nobody(),
-            AccessAction::Enter,
-            &AccessObject::MACHINE,
-        );
+        assert_eq!(refused.expect_err("read only").to_string(), "me (viewer) may not operate any service");
+        let refused = decide(&Principal::nobody(), AccessAction::Enter, &AccessObject::MACHINE);
         let refused = refused.expect_err("nobody").to_string();
-        assert_eq!(
-            refused,
-            "a client without a token may not ask this server as a whole"
-        );
+        assert_eq!(refused, "a client without a token may not ask this server as a whole");
     }
 
     fn some_principal() -> impl Strategy<Value = Principal> {
@@ -401,19 +317,14 @@ mod tests {
         let pattern = prop::sample::select(vec!["*", "a*", "ab", "**", "b"]);
         let patterns = prop::collection::vec(pattern, 0..3);
         let robot = prop::option::of(prop::sample::select(vec!["r1", "r2"]));
-        (prop::collection::vec(role, 0..3), patterns, robot).prop_map(|(roles, patterns, robot)| {
-            Principal {
-                name: "me".into(),
-                roles,
-                scope: Scope {
-                    services: patterns
-                        .iter()
-                        .filter_map(|text| text.parse().ok())
-                        .collect(),
-                    robot: robot.map(str::to_owned),
-                    classes: Vec::new(),
-                },
-            }
+        (prop::collection::vec(role, 0..3), patterns, robot).prop_map(|(roles, patterns, robot)| Principal {
+            name: "me".into(),
+            roles,
+            scope: Scope {
+                services: patterns.iter().filter_map(|text| text.parse().ok()).collect(),
+                robot: robot.map(str::to_owned),
+                classes: Vec::new(),
+            },
         })
     }
 

@@ -129,9 +129,7 @@ mod tests {
     fn reference(pattern: &[u8], name: &[u8]) -> bool {
         match pattern {
             [] => name.is_empty(),
-            [b'*', b'*', rest @ ..] => {
-                (0..=name.len()).any(|taken| reference(rest, &name[taken..]))
-            }
+            [b'*', b'*', rest @ ..] => (0..=name.len()).any(|taken| reference(rest, &name[taken..])),
             [b'*', rest @ ..] => (0..=name.len())
                 .take_while(|taken| !name[..*taken].contains(&b'/'))
                 .any(|taken| reference(rest, &name[taken..])),

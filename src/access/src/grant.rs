@@ -20,12 +20,7 @@ pub enum Operation {
 
 impl Operation {
     /// All operations.
-    pub const ALL: [Operation; 4] = [
-        Operation::Publish,
-        Operation::Subscribe,
-        Operation::Call,
-        Operation::Advertise,
-    ];
+    pub const ALL: [Operation; 4] = [Operation::Publish, Operation::Subscribe, Operation::Call, Operation::Advertise];
 
     /// Returns the name used in grants.
     pub fn name(self) -> &'static str {
@@ -56,19 +51,13 @@ impl Grant {
 
     /// Creates a grant of one operation on all names.
     pub(crate) fn all(operation: Operation) -> Grant {
-        Grant {
-            operation: Some(operation),
-            names: Glob::everything(),
-        }
+        Grant { operation: Some(operation), names: Glob::everything() }
     }
 
     /// Returns the part of the grant that covers `operation`, if any.
     pub(crate) fn restrict_to(&self, operation: Operation) -> Option<Grant> {
         let has = self.operation.is_none_or(|granted| granted == operation);
-        has.then(|| Grant {
-            operation: Some(operation),
-            names: self.names.clone(),
-        })
+        has.then(|| Grant { operation: Some(operation), names: self.names.clone() })
     }
 
     /// Returns true if the grant covers all operations on all names.
@@ -87,9 +76,7 @@ impl FromStr for Grant {
         let operation = match operation {
             "*" => None,
             name => {
-                let known = Operation::ALL
-                    .into_iter()
-                    .find(|known| known.name() == name);
+                let known = Operation::ALL.into_iter().find(|known| known.name() == name);
                 Some(known.ok_or_else(bad)?)
             }
         };
@@ -97,10 +84,7 @@ impl FromStr for Grant {
         if !names.starts_with('/') && !names.starts_with("**") {
             return Err(bad());
         }
-        Ok(Grant {
-            operation,
-            names: names.parse().map_err(|_| bad())?,
-        })
+        Ok(Grant { operation, names: names.parse().map_err(|_| bad())? })
     }
 }
 
@@ -117,14 +101,7 @@ mod tests {
 
     #[test]
     fn grants_are_read_as_they_are_written() {
-        for text in [
-            "subscribe:/camera/**",
-            "call:/detect",
-            "publish:/cmd_vel",
-            "advertise:/robot/*",
-            "*:**",
-            "*:/a",
-        ] {
+        for text in ["subscribe:/camera/**", "call:/detect", "publish:/cmd_vel", "advertise:/robot/*", "*:**", "*:/a"] {
             let grant: Grant = text.parse().expect(text);
             assert_eq!(grant.to_string(), text);
         }
@@ -149,19 +126,11 @@ mod tests {
         let grant: Grant = "subscribe:/camera/**".parse().expect("a grant");
         for operation in Operation::ALL {
             let expected = operation == Operation::Subscribe;
-            assert_eq!(
-                grant.permits(operation, "/camera/x"),
-                expected,
-                "{operation:?}"
-            );
+            assert_eq!(grant.permits(operation, "/camera/x"), expected, "{operation:?}");
         }
         assert!(!grant.permits(Operation::Subscribe, "/cmd_vel"));
         let all: Grant = "*:/camera/**".parse().expect("a grant");
-        assert!(
-            Operation::ALL
-                .iter()
-                .all(|operation| all.permits(*operation, "/camera/x"))
-        );
+        assert!(Operation::ALL.iter().all(|operation| all.permits(*operation, "/camera/x")));
         assert!(!all.is_everything());
         for text in ["*:**", "*:/**"] {
             assert!(text.parse::<Grant>().expect(text).is_everything());

@@ -45,12 +45,8 @@ impl FailureRecord {
     /// Returns the remaining wait, given that `free` failures are allowed.
     fn remaining_wait(&self, free: u32, now: Millis) -> Option<Millis> {
         let beyond = self.times.checked_sub(free)?;
-        let whole = SHORTEST
-            .checked_shl(beyond.min(32))
-            .map_or(LONGEST, |pause| pause.min(LONGEST));
-        (self.last + whole)
-            .checked_sub(now)
-            .filter(|left| *left > 0)
+        let whole = SHORTEST.checked_shl(beyond.min(32)).map_or(LONGEST, |pause| pause.min(LONGEST));
+        (self.last + whole).checked_sub(now).filter(|left| *left > 0)
     }
 
     fn add(&mut self, now: Millis) {
@@ -96,11 +92,7 @@ pub struct GuessLimiter<S: GuessSource = Host> {
 
 impl<S: GuessSource> Default for GuessLimiter<S> {
     fn default() -> Self {
-        GuessLimiter {
-            remembered: HashMap::new(),
-            unknown: 0,
-            slowed: 0,
-        }
+        GuessLimiter { remembered: HashMap::new(), unknown: 0, slowed: 0 }
     }
 }
 
@@ -140,10 +132,7 @@ impl<S: GuessSource> GuessLimiter<S> {
         if self.remembered.len() < REMEMBERED || self.remembered.contains_key(newcomer) {
             return;
         }
-        let oldest = self
-            .remembered
-            .iter()
-            .min_by_key(|(_, guessed)| guessed.last);
+        let oldest = self.remembered.iter().min_by_key(|(_, guessed)| guessed.last);
         if let Some(oldest) = oldest.map(|(of, _)| of.clone()) {
             self.remembered.remove(&oldest);
         }
@@ -180,9 +169,7 @@ mod tests {
         let from = address("10.0.0.7");
         guess_freely(&mut guesses, "10.0.0.7", 0);
         let mut now = 0;
-        for wait in [
-            1_000, 2_000, 4_000, 8_000, 16_000, 32_000, 60_000, 60_000, 60_000,
-        ] {
+        for wait in [1_000, 2_000, 4_000, 8_000, 16_000, 32_000, 60_000, 60_000, 60_000] {
             assert_eq!(guesses.check(from, now), Ok(()), "{now}");
             assert_eq!(guesses.record_failure(from, now), Some(wait));
             assert_eq!(guesses.check(from, now + wait - 1), Err(1));
@@ -224,11 +211,7 @@ mod tests {
                     guesses.record_failure(from, 1);
                 }
             }
-            let most = if bits == 12 {
-                FREE * WIDER
-            } else {
-                FREE * WIDER * WIDER
-            };
+            let most = if bits == 12 { FREE * WIDER } else { FREE * WIDER * WIDER };
             assert_eq!(looked_at, most, "{bits}");
             assert!(guesses.remembered.len() < REMEMBERED);
             for other in ["2001:db9::1", "192.0.2.1"] {
@@ -251,10 +234,7 @@ mod tests {
             guesses.record_failure(many(1 << 20 | number), 3);
         }
         assert_eq!(guesses.remembered.len(), REMEMBERED);
-        assert!(
-            guesses.check(address("10.0.0.7"), 3).is_err(),
-            "it has a place"
-        );
+        assert!(guesses.check(address("10.0.0.7"), 3).is_err(), "it has a place");
         // A new address is looked at immediately and slowed as soon as any other.
         assert_eq!(guesses.check(address("192.0.2.1"), 3), Ok(()));
         guess_freely(&mut guesses, "192.0.2.1", 3);

@@ -19,10 +19,7 @@ pub(crate) const OF_PROVIDER: u32 = 32;
 
 impl From<IpAddr> for Host {
     fn from(address: IpAddr) -> Host {
-        let host = Host {
-            address: address.to_canonical(),
-            prefix: 0,
-        };
+        let host = Host { address: address.to_canonical(), prefix: 0 };
         host.network_with_prefix(OF_HOST)
     }
 }
@@ -34,10 +31,7 @@ impl Host {
             IpAddr::V4(_) => Host { prefix: 32, ..self },
             IpAddr::V6(address) => {
                 let network = u128::from(address) & (u128::MAX << (128 - prefix));
-                Host {
-                    address: IpAddr::V6(Ipv6Addr::from(network)),
-                    prefix,
-                }
+                Host { address: IpAddr::V6(Ipv6Addr::from(network)), prefix }
             }
         }
     }
@@ -82,12 +76,7 @@ mod tests {
             Some(Host::from(address).network())
         };
         assert_eq!(largest(&[]), None);
-        let of_site = [
-            "192.0.2.1",
-            "2001:db8:0:1::1",
-            "2001:db8:0:2::1",
-            "192.0.2.2",
-        ];
+        let of_site = ["192.0.2.1", "2001:db8:0:1::1", "2001:db8:0:2::1", "192.0.2.2"];
         assert_eq!(largest(&of_site), network("2001:db8::9"));
         let alike = ["192.0.2.7", "192.0.2.1", "2001:db8::1", "192.0.2.9"];
         assert_eq!(largest(&alike), network("192.0.2.7"));

@@ -66,40 +66,23 @@ impl AccessPolicy {
             return Grants::everything();
         }
         let rules = self.rules_for(principal, service);
-        Grants::new(
-            rules
-                .into_iter()
-                .flat_map(|rule| rule.allow.iter().cloned()),
-        )
+        Grants::new(rules.into_iter().flat_map(|rule| rule.allow.iter().cloned()))
     }
 
     /// Returns what a principal may subscribe to inside a service's servants that it may view but not connect to: the
     /// subscriptions among its grants. A viewer without any rule may subscribe to everything.
     pub fn observer_grants(&self, principal: &Principal, service: &str) -> Grants {
-        let unruled =
-            principal.has_role(Role::Viewer) && self.rules_for(principal, service).is_empty();
-        let grants = if unruled {
-            Grants::everything()
-        } else {
-            self.grants(principal, service)
-        };
+        let unruled = principal.has_role(Role::Viewer) && self.rules_for(principal, service).is_empty();
+        let grants = if unruled { Grants::everything() } else { self.grants(principal, service) };
         grants.restrict_to(Operation::Subscribe)
     }
 
     /// Returns the rules that apply to a principal at a service.
     fn rules_for(&self, principal: &Principal, service: &str) -> Vec<&AccessRule> {
-        let here = || {
-            self.rules
-                .iter()
-                .filter(|rule| rule.services.matches(service))
-        };
+        let here = || self.rules.iter().filter(|rule| rule.services.matches(service));
         let named = |rule: &&AccessRule| matches!(&rule.who, RuleSubject::Principal(name) if *name == principal.name);
         let of_role = |rule: &&AccessRule| matches!(rule.who, RuleSubject::Role(role) if principal.has_role(role));
-        if here().any(|rule| named(&rule)) {
-            here().filter(named).collect()
-        } else {
-            here().filter(of_role).collect()
-        }
+        if here().any(|rule| named(&rule)) { here().filter(named).collect() } else { here().filter(of_role).collect() }
     }
 }
 
@@ -114,18 +97,12 @@ impl Grants {
     /// Creates a set of these grants.
     pub fn new(grants: impl IntoIterator<Item = Grant>) -> Grants {
         let list: Vec<Grant> = grants.into_iter().collect();
-        Grants {
-            everything: list.iter().any(Grant::is_everything),
-            list,
-        }
+        Grants { everything: list.iter().any(Grant::is_everything), list }
     }
 
     /// Creates the grant of all operations on all names.
     pub fn everything() -> Grants {
-        Grants {
-            everything: true,
-            list: Vec::new(),
-        }
+        Grants { everything: true, list: Vec::new() }
     }
 
     /// Returns true if everything is granted.
@@ -138,11 +115,7 @@ impl Grants {
         if self.everything {
             Grants::new([Grant::all(operation)])
         } else {
-            Grants::new(
-                self.list
-                    .iter()
-                    .filter_map(|grant| grant.restrict_to(operation)),
-            )
+            Grants::new(self.list.iter().filter_map(|grant| grant.restrict_to(operation)))
         }
     }
 
@@ -153,9 +126,7 @@ impl Grants {
 
     /// Returns true if any operation on the name is granted, so that its existence may be revealed.
     pub fn permits_any(&self, name: &str) -> bool {
-        Operation::ALL
-            .into_iter()
-            .any(|operation| self.permits(operation, name))
+        Operation::ALL.into_iter().any(|operation| self.permits(operation, name))
     }
 }
 
@@ -192,19 +163,12 @@ mod tests {
         AccessRule {
             who: who.parse().expect("a principal or a role"),
             services: services.parse().expect("a pattern"),
-            allow: allow
-                .iter()
-                .map(|text| text.parse().expect("a grant"))
-                .collect(),
+            allow: allow.iter().map(|text| text.parse().expect("a grant")).collect(),
         }
     }
 
     fn robot(name: &str) -> Principal {
-        Principal {
-            name: name.into(),
-            roles: vec![Role::Robot],
-            scope: Scope::everything(),
-        }
+        Principal { name: name.into(), roles: vec![Role::Robot], scope: Scope::everything() }
     }
 
     #[test]
@@ -219,20 +183,13 @@ mod tests {
 
     #[test]
     fn a_viewer_subscribes_and_does_nothing_else() {
-        let viewer = Principal {
-            roles: vec![Role::Viewer],
-            ..robot("eve")
-        };
+        let viewer = Principal { roles: vec![Role::Viewer], ..robot("eve") };
         let is = |policy: &AccessPolicy, principal: &Principal, said: &str| {
             let grants = policy.observer_grants(principal, "detector");
             assert_eq!(grants.to_string(), said);
             for operation in Operation::ALL {
                 let heard = operation == Operation::Subscribe && said != "nothing";
-                assert_eq!(
-                    grants.permits(operation, "/camera/x"),
-                    heard,
-                    "{operation:?}"
-                );
+                assert_eq!(grants.permits(operation, "/camera/x"), heard, "{operation:?}");
             }
         };
         let none = AccessPolicy::default();
@@ -249,10 +206,7 @@ mod tests {
         };
         is(&ruled, &robot("r1"), "subscribe:/**");
         is(&ruled, &viewer, "subscribe:/camera/**");
-        let named = Principal {
-            name: "mallory".into(),
-            ..viewer
-        };
+        let named = Principal { name: "mallory".into(), ..viewer };
         is(&ruled, &named, "nothing");
     }
 
@@ -267,19 +221,12 @@ mod tests {
             ],
         };
         let narrow = policy.grants(&robot("r1"), "detector");
-        assert!(
-            narrow.permits(Operation::Subscribe, "/camera/x")
-                && narrow.permits(Operation::Call, "/detect")
-        );
+        assert!(narrow.permits(Operation::Subscribe, "/camera/x") && narrow.permits(Operation::Call, "/detect"));
         assert!(!narrow.permits(Operation::Publish, "/cmd_vel") && !narrow.is_everything());
         assert!(narrow.permits_any("/detect") && !narrow.permits_any("/cmd_vel"));
         assert!(policy.grants(&robot("r1"), "mapper").is_everything());
         assert!(policy.grants(&robot("r2"), "detector").is_everything());
-        assert!(
-            AccessPolicy::default()
-                .grants(&Principal::admin("root"), "detector")
-                .is_everything()
-        );
+        assert!(AccessPolicy::default().grants(&Principal::admin("root"), "detector").is_everything());
     }
 
     #[test]
@@ -292,22 +239,13 @@ mod tests {
         }
         let json = serde_json::to_string(&RuleSubject::Role(Role::Robot)).expect("JSON");
         assert_eq!(json, "\"role:robot\"");
-        assert_eq!(
-            serde_json::from_str::<RuleSubject>(&json).expect("read back"),
-            RuleSubject::Role(Role::Robot)
-        );
+        assert_eq!(serde_json::from_str::<RuleSubject>(&json).expect("read back"), RuleSubject::Role(Role::Robot));
     }
 
     fn some_rule() -> impl Strategy<Value = AccessRule> {
         let who = prop::sample::select(vec!["r1", "r2", "role:robot", "role:viewer"]);
         let services = prop::sample::select(vec!["*", "a", "b"]);
-        let grant = prop::sample::select(vec![
-            "*:**",
-            "call:/x",
-            "*:/x",
-            "subscribe:/**",
-            "publish:/y",
-        ]);
+        let grant = prop::sample::select(vec!["*:**", "call:/x", "*:/x", "subscribe:/**", "publish:/y"]);
         (who, services, prop::collection::vec(grant, 0..3))
             .prop_map(|(who, services, allow)| rule(who, services, &allow))
     }

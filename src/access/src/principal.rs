@@ -24,13 +24,7 @@ as_text!(Role);
 
 impl Role {
     /// All roles.
-    pub const ALL: [Role; 5] = [
-        Role::Admin,
-        Role::Operator,
-        Role::Deployer,
-        Role::Robot,
-        Role::Viewer,
-    ];
+    pub const ALL: [Role; 5] = [Role::Admin, Role::Operator, Role::Deployer, Role::Robot, Role::Viewer];
 
     /// Returns the name of the role.
     pub fn name(self) -> &'static str {
@@ -79,11 +73,7 @@ impl Scope {
     /// Creates the scope of all services, any robot and every class.
     pub fn everything() -> Scope {
         let all = || "*".parse().into_iter().collect();
-        Scope {
-            services: all(),
-            robot: None,
-            classes: all(),
-        }
+        Scope { services: all(), robot: None, classes: all() }
     }
 
     /// Returns true if the scope includes the service.
@@ -111,30 +101,18 @@ pub struct Principal {
 impl Principal {
     /// Creates a principal with all permissions.
     pub fn admin(name: &str) -> Principal {
-        Principal {
-            name: name.to_owned(),
-            roles: vec![Role::Admin],
-            scope: Scope::everything(),
-        }
+        Principal { name: name.to_owned(), roles: vec![Role::Admin], scope: Scope::everything() }
     }
 
     /// Creates the unauthenticated principal, which has no permissions.
     pub fn nobody() -> Principal {
-        Principal {
-            name: String::new(),
-            roles: Vec::new(),
-            scope: Scope::default(),
-        }
+        Principal { name: String::new(), roles: Vec::new(), scope: Scope::default() }
     }
 
     /// Creates the principal of loopback callers on a machine where no credentials exist: it views everything and may
     /// act as any robot.
     pub fn local() -> Principal {
-        Principal {
-            name: "local".to_owned(),
-            roles: vec![Role::Viewer, Role::Robot],
-            scope: Scope::everything(),
-        }
+        Principal { name: "local".to_owned(), roles: vec![Role::Viewer, Role::Robot], scope: Scope::everything() }
     }
 
     /// Returns the role of a token or a person, which have one; that of a viewer without any.
@@ -180,11 +158,7 @@ pub fn oidc_principal_name(called: &str) -> String {
     let kept = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-' | '@' | '+');
     let plain = called.chars().map(|c| if kept(c) { c } else { '-' });
     let name: String = plain.take(LONGEST_PROVIDED).collect();
-    if name.is_empty() {
-        format!("{PROVIDED}-")
-    } else {
-        format!("{PROVIDED}{name}")
-    }
+    if name.is_empty() { format!("{PROVIDED}-") } else { format!("{PROVIDED}{name}") }
 }
 
 /// Checks that a name can belong to an account, a token or a person of the identity provider.
@@ -195,10 +169,7 @@ pub(crate) fn check_any_name(name: &str) -> Result<(), Error> {
     // Of people with the same name, all but the first have a number.
     let (called, number) = called.split_once('~').unwrap_or((called, "2"));
     let numbered = number.bytes().all(|byte| byte.is_ascii_digit()) && !number.is_empty();
-    if numbered
-        && !called.is_empty()
-        && oidc_principal_name(called) == format!("{PROVIDED}{called}")
-    {
+    if numbered && !called.is_empty() && oidc_principal_name(called) == format!("{PROVIDED}{called}") {
         Ok(())
     } else {
         Err(Error::Name(name.to_owned()))
@@ -211,11 +182,7 @@ pub fn check_name(name: &str) -> Result<(), Error> {
     let well_formed = (1..=64).contains(&name.len())
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
         && name.chars().all(inner);
-    if well_formed {
-        Ok(())
-    } else {
-        Err(Error::Name(name.to_owned()))
-    }
+    if well_formed { Ok(()) } else { Err(Error::Name(name.to_owned())) }
 }
 
 #[cfg(test)]
@@ -247,14 +214,7 @@ mod tests {
         }
         assert_eq!(oidc_principal_name(&"x".repeat(99)).len(), 53);
         check_any_name("oidc:alice~2").expect("the second");
-        for name in [
-            "oidc:",
-            "oidc:a b",
-            "oidc:a~",
-            "oidc:a~2~3",
-            "oidc:a~b",
-            "other:a",
-        ] {
+        for name in ["oidc:", "oidc:a b", "oidc:a~", "oidc:a~2~3", "oidc:a~b", "other:a"] {
             check_any_name(name).expect_err(name);
         }
     }
@@ -273,10 +233,7 @@ mod tests {
     fn a_scope_of_all_services_is_told_from_one_that_names_them() {
         assert!(Scope::everything().includes_all());
         assert!(!Scope::default().includes_all());
-        let some = Scope {
-            services: vec!["det*".parse().expect("a pattern")],
-            ..Scope::default()
-        };
+        let some = Scope { services: vec!["det*".parse().expect("a pattern")], ..Scope::default() };
         assert!(some.includes("detector") && !some.includes("mapper") && !some.includes_all());
     }
 }

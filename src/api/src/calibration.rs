@@ -195,11 +195,7 @@ impl TimeSpread {
     pub fn from_samples(mut times: Vec<f64>) -> Option<TimeSpread> {
         times.sort_by(f64::total_cmp);
         let rank = |percent| qos::nearest_rank(&times, percent);
-        Some(TimeSpread {
-            p50: rank(50)?,
-            p95: rank(95)?,
-            max: rank(100)?,
-        })
+        Some(TimeSpread { p50: rank(50)?, p95: rank(95)?, max: rank(100)? })
     }
 }
 
@@ -222,20 +218,14 @@ mod tests {
         let times = (1..=40).rev().map(f64::from).collect();
         let spread = TimeSpread::from_samples(times).expect("times");
         assert_eq!((spread.p50, spread.p95, spread.max), (20.0, 38.0, 40.0));
-        assert_eq!(
-            TimeSpread::from_samples(vec![7.0]).map(|one| one.p95),
-            Some(7.0)
-        );
+        assert_eq!(TimeSpread::from_samples(vec![7.0]).map(|one| one.p95), Some(7.0));
         assert_eq!(TimeSpread::from_samples(Vec::new()), None);
     }
 
     #[test]
     fn options_say_only_what_was_asked_for_and_name_what_is_unknown() {
-        let options = CalibrationOptions {
-            source: Source::Live,
-            robot: Some("r1".into()),
-            ..CalibrationOptions::default()
-        };
+        let options =
+            CalibrationOptions { source: Source::Live, robot: Some("r1".into()), ..CalibrationOptions::default() };
         let text = serde_json::to_string(&options).expect("plain data");
         assert_eq!(text, r#"{"source":"live","robot":"r1"}"#);
         let refused = serde_json::from_str::<CalibrationOptions>(r#"{"limits":[1]}"#);

@@ -77,9 +77,7 @@ impl Serialize for CpuSet {
 
 impl<'de> Deserialize<'de> for CpuSet {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        String::deserialize(from)?
-            .parse()
-            .map_err(serde::de::Error::custom)
+        String::deserialize(from)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -89,12 +87,7 @@ mod tests {
 
     #[test]
     fn sets_are_read_and_written() {
-        for (written, read) in [
-            ("0-3,6", "0-3,6"),
-            ("1,0,2", "0-2"),
-            ("255", "255"),
-            ("63-64", "63-64"),
-        ] {
+        for (written, read) in [("0-3,6", "0-3,6"), ("1,0,2", "0-2"), ("255", "255"), ("63-64", "63-64")] {
             let set: CpuSet = written.parse().expect("a set");
             assert_eq!(set.to_string(), read);
         }

@@ -123,12 +123,7 @@ pub struct Considered {
 /// Writes the row's subject, such as `rrt 100ms with aux.width=640`.
 impl fmt::Display for Row {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "{} {}",
-            self.measure.name(),
-            self.measure.format_value(self.value)
-        )?;
+        write!(out, "{} {}", self.measure.name(), self.measure.format_value(self.value))?;
         for (index, (key, value)) in self.aux.iter().enumerate() {
             let before = if index == 0 { " with" } else { "" };
             write!(out, "{before} {AUX}{key}={value}")?;

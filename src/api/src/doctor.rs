@@ -13,9 +13,7 @@ pub struct Doctor {
 impl Doctor {
     /// Returns whether no required prerequisite is missing.
     pub fn is_healthy(&self) -> bool {
-        self.checks
-            .iter()
-            .all(|check| check.status != CheckStatus::Missing)
+        self.checks.iter().all(|check| check.status != CheckStatus::Missing)
     }
 }
 

@@ -169,12 +169,7 @@ impl Part {
         times.retain(|time| time.is_finite());
         times.sort_by(f64::total_cmp);
         let rank = |percent| qos::nearest_rank(&times, percent);
-        Some(Part {
-            name: name.to_owned(),
-            p50: rank(50)?,
-            p90: rank(90)?,
-            max: rank(100)?,
-        })
+        Some(Part { name: name.to_owned(), p50: rank(50)?, p90: rank(90)?, max: rank(100)? })
     }
 }
 
@@ -192,10 +187,7 @@ impl Link {
 
 /// Returns the phase with the largest median, not counting `total`.
 pub fn dominant(parts: &[Part]) -> Option<&Part> {
-    parts
-        .iter()
-        .filter(|part| part.name != "total" && part.p50 > 0.0)
-        .max_by(|a, b| a.p50.total_cmp(&b.p50))
+    parts.iter().filter(|part| part.name != "total" && part.p50 > 0.0).max_by(|a, b| a.p50.total_cmp(&b.p50))
 }
 
 #[cfg(test)]

@@ -21,13 +21,7 @@ pub struct Shared {
 
 impl Default for Shared {
     fn default() -> Shared {
-        Shared {
-            min: 1,
-            max: 4,
-            idempotent: false,
-            replicas: 1,
-            calls: 8,
-        }
+        Shared { min: 1, max: 4, idempotent: false, replicas: 1, calls: 8 }
     }
 }
 

@@ -210,11 +210,7 @@ impl fmt::Display for Qos {
         if self.liveliness == Liveliness::ManualByTopic {
             f.write_str(", liveliness manual_by_topic")?;
         }
-        let times = [
-            ("deadline", self.deadline),
-            ("lifespan", self.lifespan),
-            ("liveliness lease", self.lease),
-        ];
+        let times = [("deadline", self.deadline), ("lifespan", self.lifespan), ("liveliness lease", self.lease)];
         for (what, seconds) in times {
             if let Some(seconds) = seconds {
                 write!(f, ", {what} {seconds} s")?;
@@ -344,11 +340,7 @@ mod tests {
 
     #[test]
     fn what_ros_2_tells_is_put_into_words() {
-        let range = Range {
-            from: Some(0.0),
-            to: Some(2.5),
-            step: Some(0.5),
-        };
+        let range = Range { from: Some(0.0), to: Some(2.5), step: Some(0.5) };
         let descriptor = Descriptor {
             kind: "double".into(),
             description: "m/s".into(),
@@ -356,16 +348,9 @@ mod tests {
             range: Some(range),
             ..Descriptor::default()
         };
-        assert_eq!(
-            descriptor.to_string(),
-            "double, 0 to 2.5 in steps of 0.5, read only: m/s"
-        );
+        assert_eq!(descriptor.to_string(), "double, 0 to 2.5 in steps of 0.5, read only: m/s");
         assert_eq!(Descriptor::default().to_string(), "");
-        let qos = Qos {
-            durability: Durability::TransientLocal,
-            deadline: Some(0.1),
-            ..Qos::default()
-        };
+        let qos = Qos { durability: Durability::TransientLocal, deadline: Some(0.1), ..Qos::default() };
         assert_eq!(qos.to_string(), "reliable, transient_local, deadline 0.1 s");
         let json = serde_json::to_string(&qos).expect("JSON");
         assert_eq!(serde_json::from_str::<Qos>(&json).expect("the same"), qos);
@@ -384,29 +369,9 @@ mod tests {
 
     #[test]
     fn ends_of_one_topic_have_in_common_what_suits_all_of_them() {
-        let strict = Qos {
-            durability: Durability::TransientLocal,
-            deadline: Some(0.1),
-            ..Qos::default()
-        };
-        let loose = Qos {
-            reliability: Reliability::BestEffort,
-            lease: Some(2.0),
-            ..Qos::default()
-        };
-        assert_eq!(
-            strict.common_offer(loose),
-            Qos {
-                reliability: Reliability::BestEffort,
-                ..Qos::default()
-            }
-        );
-        assert_eq!(
-            strict.common_request(loose),
-            Qos {
-                lease: Some(2.0),
-                ..strict
-            }
-        );
+        let strict = Qos { durability: Durability::TransientLocal, deadline: Some(0.1), ..Qos::default() };
+        let loose = Qos { reliability: Reliability::BestEffort, lease: Some(2.0), ..Qos::default() };
+        assert_eq!(strict.common_offer(loose), Qos { reliability: Reliability::BestEffort, ..Qos::default() });
+        assert_eq!(strict.common_request(loose), Qos { lease: Some(2.0), ..strict });
     }
 }

@@ -49,8 +49,7 @@ pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
 pub use rollout::Rollout;
 pub use servant::{
-    BackOff, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms,
-    TopicDrops,
+    BackOff, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms, TopicDrops,
 };
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use shadow::{Shadow, ShadowEvent, ShadowOptions};

@@ -101,9 +101,7 @@ impl Limits {
     /// since some, such as a cpuset on cgroup v1, cannot be set again. Limits that `after` omits are lifted, to all of
     /// the machine's `cores`; a cpuset stays.
     pub fn changes_to(self, after: Limits, cores: f64) -> Limits {
-        after
-            .or(self.and(Limits::unlimited(cores)))
-            .without_equal(self)
+        after.or(self.and(Limits::unlimited(cores))).without_equal(self)
     }
 
     /// Returns the limits that lift all others of a running servant, except its cpuset.
@@ -141,9 +139,7 @@ impl Limits {
         if let Some(cpus) = self.cpus
             && !(LEAST_CPUS..=MOST_CPUS).contains(&cpus)
         {
-            return refused(format!(
-                "cpus = {cpus} is not between {LEAST_CPUS} and {MOST_CPUS}"
-            ));
+            return refused(format!("cpus = {cpus} is not between {LEAST_CPUS} and {MOST_CPUS}"));
         }
         if let Some(weight) = self.cpu_weight
             && !(1..=10_000).contains(&weight)
@@ -153,16 +149,12 @@ impl Limits {
         if let Some(memory) = self.memory
             && memory < LEAST_MEMORY
         {
-            return refused(format!(
-                "memory = {memory} is too little for any node; write at least {LEAST_MEMORY}"
-            ));
+            return refused(format!("memory = {memory} is too little for any node; write at least {LEAST_MEMORY}"));
         }
         if let Some(pids) = self.pids
             && pids < LEAST_PIDS
         {
-            return refused(format!(
-                "pids = {pids} is too few for any node; write at least {LEAST_PIDS}"
-            ));
+            return refused(format!("pids = {pids} is too few for any node; write at least {LEAST_PIDS}"));
         }
         if self.cpuset == Some(CpuSet([0; 4])) {
             return refused("cpuset has no core; omit it for all".to_owned());
@@ -170,9 +162,7 @@ impl Limits {
         // The others have no least amount.
         let zero = self.amounts().into_iter().find(|(_, it)| *it == Some(0.0));
         match zero {
-            Some((name, _)) => refused(format!(
-                "{name} = 0 would stop the servant; omit it for no limit"
-            )),
+            Some((name, _)) => refused(format!("{name} = 0 would stop the servant; omit it for no limit")),
             None => Ok(()),
         }
     }
@@ -192,8 +182,7 @@ impl Limits {
             ("io-read", text(self.io_read)),
             ("io-write", text(self.io_write)),
         ];
-        all.into_iter()
-            .filter_map(|(name, value)| Some((name, value?)))
+        all.into_iter().filter_map(|(name, value)| Some((name, value?)))
     }
 }
 
@@ -268,28 +257,15 @@ mod tests {
 
     #[test]
     fn limits_are_merged_field_by_field() {
-        let few = Limits {
-            cpus: Some(1.0),
-            pids: Some(9),
-            cpuset: "0".parse().ok(),
-            ..Limits::default()
-        };
-        let more = Limits {
-            cpus: Some(2.0),
-            memory: Some(Size(64)),
-            cpuset: "1".parse().ok(),
-            ..Limits::default()
-        };
+        let few = Limits { cpus: Some(1.0), pids: Some(9), cpuset: "0".parse().ok(), ..Limits::default() };
+        let more = Limits { cpus: Some(2.0), memory: Some(Size(64)), cpuset: "1".parse().ok(), ..Limits::default() };
         let (one, nine, first) = (Some(1.0), Some(9), few.cpuset);
         let merged = |of: Limits| (of.cpus, of.memory, of.pids, of.cpuset);
         let memory = more.memory;
         assert_eq!(merged(few.or(more)), (one, memory, nine, first));
         let shared = (more.cpus, None, None, more.cpuset);
         assert_eq!(merged(few.and(more)), shared);
-        assert_eq!(
-            merged(few.combine_max(more)),
-            (more.cpus, memory, nine, first)
-        );
+        assert_eq!(merged(few.combine_max(more)), (more.cpus, memory, nine, first));
         assert_eq!(merged(few.without_equal(few)), (None, None, None, None));
         let named: Vec<_> = few.or(more).flag_values().map(|(name, _)| name).collect();
         assert_eq!(named, ["cpus", "cpuset", "memory", "pids"]);
@@ -308,16 +284,8 @@ mod tests {
             io_write: size(9),
             cpuset: "0-1".parse().ok(),
         };
-        let after = Limits {
-            memory: size(64),
-            io_write: size(7),
-            ..Limits::default()
-        };
-        let change = Limits {
-            memory: None,
-            io_write: size(7),
-            ..Limits::unlimited(4.0)
-        };
+        let after = Limits { memory: size(64), io_write: size(7), ..Limits::default() };
+        let change = Limits { memory: None, io_write: size(7), ..Limits::unlimited(4.0) };
         assert_eq!(before.changes_to(after, 4.0), change);
         let nothing = Limits::default();
         assert_eq!(before.changes_to(before, 4.0), nothing);
@@ -330,23 +298,11 @@ mod tests {
         type Change = fn(&mut Limits);
         let wrong: [(Change, &str); 6] = [
             (|limits| limits.cpus = Some(f64::NAN), "cpus = NaN is not"),
-            (
-                |limits| limits.cpu_weight = Some(0),
-                "cpu_weight = 0 is not",
-            ),
-            (
-                |limits| limits.memory = Some(Size(1)),
-                "memory = 1 is too little for any node; write at least 4M",
-            ),
+            (|limits| limits.cpu_weight = Some(0), "cpu_weight = 0 is not"),
+            (|limits| limits.memory = Some(Size(1)), "memory = 1 is too little for any node; write at least 4M"),
             (|limits| limits.pids = Some(3), "pids = 3 is too few"),
-            (
-                |limits| limits.io_read = Some(Size(0)),
-                "io_read = 0 would stop",
-            ),
-            (
-                |limits| limits.cpuset = Some(CpuSet([0; 4])),
-                "cpuset has no core",
-            ),
+            (|limits| limits.io_read = Some(Size(0)), "io_read = 0 would stop"),
+            (|limits| limits.cpuset = Some(CpuSet([0; 4])), "cpuset has no core"),
         ];
         for (change, words) in wrong {
             let mut limits = Limits::default();

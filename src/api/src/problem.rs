@@ -36,11 +36,7 @@ pub struct Problem {
 
 impl fmt::Display for Problem {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(if self.detail.is_empty() {
-            &self.title
-        } else {
-            &self.detail
-        })
+        out.write_str(if self.detail.is_empty() { &self.title } else { &self.detail })
     }
 }
 

@@ -89,10 +89,7 @@ impl PushOptions {
     /// # Errors
     /// Returns the error of the first malformed request pair, with the expected format.
     pub fn parse_requests(&self) -> Result<Vec<qos::TopicPair>, ParsePairError> {
-        self.requests
-            .iter()
-            .map(|text| parse_request(text))
-            .collect()
+        self.requests.iter().map(|text| parse_request(text)).collect()
     }
 }
 
@@ -182,40 +179,22 @@ mod tests {
             ..PushOptions::default()
         };
         let text = serde_json::to_string(&options).expect("plain data");
-        assert_eq!(
-            text,
-            r#"{"apt":"opencv_apps","nodes":["people_detect"],"limits":{}}"#
-        );
-        assert_eq!(
-            serde_json::from_str::<PushOptions>(&text).expect("its own output"),
-            options
-        );
+        assert_eq!(text, r#"{"apt":"opencv_apps","nodes":["people_detect"],"limits":{}}"#);
+        assert_eq!(serde_json::from_str::<PushOptions>(&text).expect("its own output"), options);
     }
 
     #[test]
     fn requests_are_written_as_on_robots_or_shorter() {
         for (text, expected) in [
             ("/image=/boxes", "/image -> /boxes"),
-            (
-                "/image=/boxes,/view by arrival",
-                "/image -> /boxes, /view by arrival",
-            ),
+            ("/image=/boxes,/view by arrival", "/image -> /boxes, /view by arrival"),
             ("/image -> /boxes by stamp", "/image -> /boxes by stamp"),
         ] {
             let pair = parse_request(text).expect(text);
             assert_eq!(pair.to_string(), expected);
         }
-        for text in [
-            "/image",
-            "image=/boxes",
-            "/image=",
-            "",
-            "/image=/boxes by luck",
-        ] {
-            let options = PushOptions {
-                requests: vec![text.to_owned()],
-                ..PushOptions::default()
-            };
+        for text in ["/image", "image=/boxes", "/image=", "", "/image=/boxes by luck"] {
+            let options = PushOptions { requests: vec![text.to_owned()], ..PushOptions::default() };
             let refused = options.parse_requests().expect_err(text);
             assert!(refused.to_string().contains("write it as"), "{refused}");
         }
@@ -229,15 +208,8 @@ mod tests {
 
     #[test]
     fn events_carry_their_type() {
-        let text = serde_json::to_string(&PushEvent::Progress {
-            unit: "packages".into(),
-            done: 3,
-            total: Some(60),
-        })
-        .expect("plain data");
-        assert_eq!(
-            text,
-            r#"{"type":"progress","unit":"packages","done":3,"total":60}"#
-        );
+        let text = serde_json::to_string(&PushEvent::Progress { unit: "packages".into(), done: 3, total: Some(60) })
+            .expect("plain data");
+        assert_eq!(text, r#"{"type":"progress","unit":"packages","done":3,"total":60}"#);
     }
 }

@@ -29,9 +29,7 @@ impl utoipa::ToSchema for Share {}
 
 /// Error of parsing a [`Share`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{0:?} is not a share of robots; write a number of robots, such as 3, or a percentage, such as 10%"
-)]
+#[error("{0:?} is not a share of robots; write a number of robots, such as 3, or a percentage, such as 10%")]
 pub struct ParseShareError(String);
 
 impl FromStr for Share {
@@ -99,13 +97,7 @@ pub struct RolloutTerms {
 
 impl Default for RolloutTerms {
     fn default() -> RolloutTerms {
-        RolloutTerms {
-            canary: None,
-            bound: 0.1,
-            samples: 20,
-            deadline: None,
-            promote_after: None,
-        }
+        RolloutTerms { canary: None, bound: 0.1, samples: 20, deadline: None, promote_after: None }
     }
 }
 
@@ -232,9 +224,7 @@ mod tests {
             assert_eq!(share.to_string(), text);
         }
         assert_eq!(" 10 % ".parse(), Ok(Share::Percent(10.0)));
-        for text in [
-            "0", "0%", "101%", "-1", "-1%", "1.5", "NaN%", "%", "", "ten",
-        ] {
+        for text in ["0", "0%", "101%", "-1", "-1%", "1.5", "NaN%", "%", "", "ten"] {
             let refused = text.parse::<Share>().expect_err(text);
             assert!(refused.to_string().contains("10%"), "{refused}");
         }
@@ -243,10 +233,7 @@ mod tests {
     #[test]
     fn what_is_not_said_of_terms_is_as_by_default() {
         let terms: RolloutTerms = serde_json::from_str(r#"{"canary": "10%"}"#).expect("terms");
-        let expected = RolloutTerms {
-            canary: Some(Share::Percent(10.0)),
-            ..RolloutTerms::default()
-        };
+        let expected = RolloutTerms { canary: Some(Share::Percent(10.0)), ..RolloutTerms::default() };
         assert_eq!(terms, expected);
     }
 }

@@ -228,10 +228,7 @@ mod tests {
     fn options_have_defaults_and_name_what_is_unknown() {
         let read = |text: &str| serde_json::from_str::<ShadowOptions>(text);
         let options = read(r#"{"revision":3}"#).expect("valid");
-        let expected = ShadowOptions {
-            revision: 3,
-            ..ShadowOptions::default()
-        };
+        let expected = ShadowOptions { revision: 3, ..ShadowOptions::default() };
         assert_eq!(options, expected);
         let refused = read(r#"{"revision":3,"time":4}"#).expect_err("unknown");
         assert!(refused.to_string().contains("`time`"), "{refused}");

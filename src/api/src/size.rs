@@ -17,22 +17,13 @@ pub struct NotASize(String);
 
 impl fmt::Display for NotASize {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "{:?} is not a size; write bytes or a number with K, M, G or T, such as 512M",
-            self.0
-        )
+        write!(out, "{:?} is not a size; write bytes or a number with K, M, G or T, such as 512M", self.0)
     }
 }
 
 impl std::error::Error for NotASize {}
 
-const UNITS: [(char, u64); 4] = [
-    ('T', 1 << 40),
-    ('G', 1 << 30),
-    ('M', 1 << 20),
-    ('K', 1 << 10),
-];
+const UNITS: [(char, u64); 4] = [('T', 1 << 40), ('G', 1 << 30), ('M', 1 << 20), ('K', 1 << 10)];
 
 impl FromStr for Size {
     type Err = NotASize;
@@ -107,18 +98,14 @@ mod tests {
     fn what_is_no_size_is_named() {
         for text in ["", "M", "-1", "many", "1e400G", "99999999999T", "nan"] {
             let refused = text.parse::<Size>().expect_err(text);
-            assert!(
-                refused.to_string().contains(&format!("{text:?}")),
-                "{refused}"
-            );
+            assert!(refused.to_string().contains(&format!("{text:?}")), "{refused}");
         }
     }
 
     #[test]
     fn sizes_are_printed_shortly() {
-        let printed: Vec<String> = [0, 1023, 1024, 1536, 512 << 20, 3 << 29]
-            .map(|bytes| Size(bytes).to_string())
-            .to_vec();
+        let printed: Vec<String> =
+            [0, 1023, 1024, 1536, 512 << 20, 3 << 29].map(|bytes| Size(bytes).to_string()).to_vec();
         assert_eq!(printed, ["0", "1023", "1K", "1.5K", "512M", "1.5G"]);
     }
 }

@@ -51,44 +51,20 @@ pub struct StatedKey {
 }
 
 const fn key(name: &'static str, description: &'static str, is_number: bool) -> StatedKey {
-    StatedKey {
-        name,
-        description,
-        is_number,
-    }
+    StatedKey { name, description, is_number }
 }
 
 /// All keys except those of auxiliary parameters, in the order in which they are written.
 pub static KEYS: [StatedKey; 9] = [
-    key(
-        "rrt",
-        "Desired response time (T_desire), such as `100ms`.",
-        false,
-    ),
-    key(
-        "max_rrt",
-        "Maximum acceptable response time (T_max), such as `300ms`.",
-        false,
-    ),
+    key("rrt", "Desired response time (T_desire), such as `100ms`.", false),
+    key("max_rrt", "Maximum acceptable response time (T_max), such as `300ms`.", false),
     key("fps", "Desired frames per second of an output.", true),
-    key(
-        "min_fps",
-        "Minimum acceptable frames per second of an output.",
-        true,
-    ),
+    key("min_fps", "Minimum acceptable frames per second of an output.", true),
     key("age", "Desired age of an output, such as `100ms`.", false),
-    key(
-        "max_age",
-        "Maximum acceptable age of an output, such as `300ms`.",
-        false,
-    ),
+    key("max_age", "Maximum acceptable age of an output, such as `300ms`.", false),
     key("class", "Class of the configuration.", false),
     key("cpus", "CPU limit in cores, stated directly.", true),
-    key(
-        "memory",
-        "Memory limit, such as `512M`, stated directly.",
-        false,
-    ),
+    key("memory", "Memory limit, such as `512M`, stated directly.", false),
 ];
 
 /// Statement of a robot.
@@ -127,10 +103,7 @@ pub struct Unstatable {
 
 impl Unstatable {
     fn new(key: &str, reason: impl Into<UnstatableReason>) -> Unstatable {
-        Unstatable {
-            key: key.to_owned(),
-            reason: reason.into(),
-        }
+        Unstatable { key: key.to_owned(), reason: reason.into() }
     }
 }
 
@@ -159,9 +132,7 @@ pub enum UnstatableReason {
     #[error(transparent)]
     Aux(#[from] AuxError),
     /// The value is not a number of cores in the allowed range.
-    #[error(
-        "= {0:?} is not a number of cores between {LEAST_CPUS} and {MOST_CPUS}; write one such as 1.5"
-    )]
+    #[error("= {0:?} is not a number of cores between {LEAST_CPUS} and {MOST_CPUS}; write one such as 1.5")]
     Cores(String),
     /// The value is no size.
     #[error("= {0}")]
@@ -195,9 +166,7 @@ pub enum AuxError {
     )]
     Key,
     /// Missing or invalid value of this key.
-    #[error(
-        "has no value, or one of more than {LONGEST} bytes; write {AUX}{0}=VALUE, such as {AUX}width=640"
-    )]
+    #[error("has no value, or one of more than {LONGEST} bytes; write {AUX}{0}=VALUE, such as {AUX}width=640")]
     Value(String),
 }
 
@@ -211,9 +180,7 @@ impl Stated {
     ///
     /// # Errors
     /// Returns the first invalid key, with the reason and what to write instead.
-    pub fn read<K: AsRef<str>, V: AsRef<str>>(
-        pairs: impl IntoIterator<Item = (K, V)>,
-    ) -> Result<Stated, Unstatable> {
+    pub fn read<K: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (K, V)>) -> Result<Stated, Unstatable> {
         let mut stated = Stated::default();
         let mut seen = Vec::new();
         for (key, text) in pairs {
@@ -260,10 +227,7 @@ impl Stated {
                 self.class = Some(text.to_owned());
             }
             "cpus" => {
-                let cpus = text
-                    .parse()
-                    .ok()
-                    .filter(|cpus| (LEAST_CPUS..=MOST_CPUS).contains(cpus));
+                let cpus = text.parse().ok().filter(|cpus| (LEAST_CPUS..=MOST_CPUS).contains(cpus));
                 let refused = || Unstatable::new(key, UnstatableReason::Cores(text.to_owned()));
                 self.cpus = Some(cpus.ok_or_else(refused)?);
             }
@@ -301,13 +265,9 @@ impl Stated {
             number(self.cpus),
             self.memory.map(format_exact),
         ];
-        let own = KEYS
-            .iter()
-            .zip(own)
-            .filter_map(|(key, value)| Some((key.name.to_owned(), value?)));
+        let own = KEYS.iter().zip(own).filter_map(|(key, value)| Some((key.name.to_owned(), value?)));
         let aux = self.aux.iter();
-        own.chain(aux.map(|(key, value)| (format!("{AUX}{key}"), value.clone())))
-            .collect()
+        own.chain(aux.map(|(key, value)| (format!("{AUX}{key}"), value.clone()))).collect()
     }
 
     /// Merges two statements of one robot for the same servant: the stricter SLA and the larger resources; of two
@@ -326,9 +286,10 @@ impl Stated {
         self.memory = self.memory.max(other.memory);
         for (key, value) in other.aux {
             let number = |text: &str| text.parse::<f64>().ok();
-            let stays = self.aux.get(&key).is_some_and(|has| {
-                !matches!((number(has), number(&value)), (Some(has), Some(value)) if value > has)
-            });
+            let stays = self
+                .aux
+                .get(&key)
+                .is_some_and(|has| !matches!((number(has), number(&value)), (Some(has), Some(value)) if value > has));
             if !stays {
                 self.aux.insert(key, value);
             }
@@ -355,39 +316,26 @@ impl fmt::Display for Stated {
 /// Formats a size exactly, since its display form may be rounded.
 fn format_exact(size: Size) -> String {
     let short = size.to_string();
-    if short.parse() == Ok(size) {
-        short
-    } else {
-        size.0.to_string()
-    }
+    if short.parse() == Ok(size) { short } else { size.0.to_string() }
 }
 
 /// Validates the name of a class.
 pub fn check_name(text: &str) -> Result<(), ClassNameError> {
     let fits = !text.is_empty()
         && text.len() <= LONGEST
-        && text
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || b"-_".contains(&byte));
-    if fits {
-        Ok(())
-    } else {
-        Err(ClassNameError(text.to_owned()))
-    }
+        && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-_".contains(&byte));
+    if fits { Ok(()) } else { Err(ClassNameError(text.to_owned())) }
 }
 
 /// Validates the key and value of an auxiliary parameter.
 pub fn check_aux(key: &str, value: &str) -> Result<(), AuxError> {
     let key_fits = !key.is_empty()
         && key.len() <= LONGEST
-        && key
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte));
+        && key.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte));
     if !key_fits {
         return Err(AuxError::Key);
     }
-    let value_fits =
-        !value.is_empty() && value.len() <= LONGEST && !value.chars().any(char::is_control);
+    let value_fits = !value.is_empty() && value.len() <= LONGEST && !value.chars().any(char::is_control);
     if !value_fits {
         return Err(AuxError::Value(key.to_owned()));
     }

@@ -8,15 +8,13 @@ use std::path::Path;
 use std::time::Duration;
 
 use rcgen::{
-    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
-    KeyUsagePurpose, SanType, date_time_ymd,
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose,
+    SanType, date_time_ymd,
 };
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
 
-use crate::{
-    CertificateRequest, Error, Millis, SCHEME, UnreadableCertificate, VerifiedCertificate, shown,
-};
+use crate::{CertificateRequest, Error, Millis, SCHEME, UnreadableCertificate, VerifiedCertificate, shown};
 
 /// Time by which a certificate's validity starts earlier, because clocks of other machines may be behind.
 const BEFORE: Duration = Duration::from_secs(300);
@@ -68,28 +66,18 @@ impl Authority {
     pub fn load_or_create(path: &Path) -> Result<Authority, Error> {
         let io = |action| {
             let path = path.to_owned();
-            move |source| Error::Io {
-                action,
-                path,
-                source,
-            }
+            move |source| Error::Io { action, path, source }
         };
         let text = match std::fs::read_to_string(path) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => {
-                let text = generate().map_err(|source| Error::Unmade {
-                    what: "robots' authority".to_owned(),
-                    source,
-                })?;
+                let text =
+                    generate().map_err(|source| Error::Unmade { what: "robots' authority".to_owned(), source })?;
                 // The file is written atomically.
                 let half = path.with_extension("half");
                 let _ = std::fs::remove_file(&half);
-                let mut file = OpenOptions::new()
-                    .write(true)
-                    .create_new(true)
-                    .mode(0o600)
-                    .open(&half)
-                    .map_err(io("make"))?;
+                let mut file =
+                    OpenOptions::new().write(true).create_new(true).mode(0o600).open(&half).map_err(io("make"))?;
                 file.write_all(text.as_bytes())
                     .and_then(|()| file.sync_all())
                     .and_then(|()| std::fs::rename(&half, path))
@@ -98,24 +86,16 @@ impl Authority {
             }
             Err(error) => return Err(io("read")(error)),
         };
-        Self::from_pem(&text).map_err(|reason| Error::NoAuthority {
-            path: path.to_owned(),
-            reason,
-        })
+        Self::from_pem(&text).map_err(|reason| Error::NoAuthority { path: path.to_owned(), reason })
     }
 
     /// Parses a certificate and its key.
     fn from_pem(text: &str) -> Result<Authority, AuthorityPemError> {
-        let certificate = CertificateDer::from_pem_slice(text.as_bytes())
-            .map_err(AuthorityPemError::Certificate)?;
+        let certificate = CertificateDer::from_pem_slice(text.as_bytes()).map_err(AuthorityPemError::Certificate)?;
         let key = KeyPair::from_pem(find_private_key(text)?)?;
         let name = shown::subject_der(&certificate)?;
         let issuer = Issuer::from_ca_cert_der(&certificate, key)?;
-        Ok(Authority {
-            certificate,
-            issuer,
-            name,
-        })
+        Ok(Authority { certificate, issuer, name })
     }
 
     /// Returns the authority's own certificate, the trust anchor for those it issues.
@@ -136,10 +116,7 @@ impl Authority {
         now: Millis,
         lifetime: Duration,
     ) -> Result<IssuedRobotCertificate, Error> {
-        let unmade = |source| Error::Unmade {
-            what: format!("{SCHEME}{robot}"),
-            source,
-        };
+        let unmade = |source| Error::Unmade { what: format!("{SCHEME}{robot}"), source };
         // Certificates count in whole seconds (RFC 5280, section 4.1.2.5).
         let now_seconds = now / 1000;
         let end_seconds = now_seconds.saturating_add(lifetime.as_secs().max(1));
@@ -147,9 +124,7 @@ impl Authority {
         let mut params = CertificateParams::default();
         let name = format!("{SCHEME}{robot}");
         params.distinguished_name = rcgen::DistinguishedName::new();
-        params
-            .distinguished_name
-            .push(DnType::CommonName, name.as_str());
+        params.distinguished_name.push(DnType::CommonName, name.as_str());
         params.subject_alt_names = vec![SanType::URI(name.try_into().map_err(unmade)?)];
         params.not_before = at(now_seconds.saturating_sub(BEFORE.as_secs()));
         // notAfter is inclusive.
@@ -157,9 +132,7 @@ impl Authority {
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         params.use_authority_key_identifier_extension = true;
-        let certificate = params
-            .signed_by(request.public_key(), &self.issuer)
-            .map_err(unmade)?;
+        let certificate = params.signed_by(request.public_key(), &self.issuer).map_err(unmade)?;
         Ok(IssuedRobotCertificate {
             certificate: certificate.pem(),
             issued: now_seconds * 1000,
@@ -183,9 +156,7 @@ fn generate() -> Result<String, rcgen::Error> {
     // A unique name, so that certificates of another daemon are recognised before their signature is verified.
     let id = hex::encode(&crate::shown::hash_key(rcgen::PublicKeyData::der_bytes(&key))[..8]);
     params.distinguished_name = rcgen::DistinguishedName::new();
-    params
-        .distinguished_name
-        .push(DnType::CommonName, format!("cloudroid robots {id}"));
+    params.distinguished_name.push(DnType::CommonName, format!("cloudroid robots {id}"));
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
     params.not_before = date_time_ymd(2000, 1, 1);
@@ -204,14 +175,8 @@ mod tests {
         let key = KeyPair::generate().expect("a key");
         let mut params = CertificateParams::default();
         params.distinguished_name = rcgen::DistinguishedName::new();
-        params
-            .distinguished_name
-            .push(DnType::CommonName, format!("{SCHEME}{robot}"));
-        let text = params
-            .serialize_request(&key)
-            .expect("made")
-            .pem()
-            .expect("PEM");
+        params.distinguished_name.push(DnType::CommonName, format!("{SCHEME}{robot}"));
+        let text = params.serialize_request(&key).expect("made").pem().expect("PEM");
         let request = CertificateRequest::parse(&text, robot).expect("good");
         (key, request)
     }
@@ -221,10 +186,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("authority.pem");
         let made = Authority::load_or_create(&path).expect("made").certificate;
-        assert_eq!(
-            Authority::load_or_create(&path).expect("read").certificate,
-            made
-        );
+        assert_eq!(Authority::load_or_create(&path).expect("read").certificate, made);
         let mode = path.metadata().expect("there").permissions().mode() & 0o7777;
         assert_eq!(mode, 0o600);
         assert_eq!(std::fs::read_dir(place.path()).expect("there").count(), 1);
@@ -232,9 +194,7 @@ mod tests {
         let (certificate, _) = text.split_at(text.find("-----BEGIN PRIVATE").expect("a key"));
         for damaged in ["rubbish", certificate, &text[certificate.len()..]] {
             std::fs::write(&path, damaged).expect("written");
-            let refused = Authority::load_or_create(&path)
-                .expect_err("none")
-                .to_string();
+            let refused = Authority::load_or_create(&path).expect_err("none").to_string();
             assert!(
                 refused.contains("authority.pem holds no certificate with its key")
                     && refused.contains("pair all robots again"),
@@ -251,23 +211,14 @@ mod tests {
         let (_, request) = request("rover1");
         let week = Duration::from_secs(7 * 86_400);
         let now = 1_800_000_000_123;
-        let issued = authority
-            .issue(&request, "rover1", now, week)
-            .expect("made");
-        assert_eq!(
-            (issued.issued, issued.expires),
-            (1_800_000_000_000, 1_800_604_800_000)
-        );
+        let issued = authority.issue(&request, "rover1", now, week).expect("made");
+        assert_eq!((issued.issued, issued.expires), (1_800_000_000_000, 1_800_604_800_000));
         let der = CertificateDer::from_pem_slice(issued.certificate.as_bytes()).expect("PEM");
         let shown = shown::read_robot_certificate(&der).expect("readable");
-        assert_eq!(
-            (&*shown.robot, &*shown.key, shown.until),
-            ("rover1", request.key_hash(), issued.expires)
-        );
+        assert_eq!((&*shown.robot, &*shown.key, shown.until), ("rover1", request.key_hash(), issued.expires));
         assert!(authority.has_issued(&shown) && !other.has_issued(&shown));
         // The authority's own certificate names no robot.
-        let refused =
-            shown::read_robot_certificate(authority.certificate()).expect_err("an authority");
+        let refused = shown::read_robot_certificate(authority.certificate()).expect_err("an authority");
         assert!(refused.to_string().contains("robot:NAME"), "{refused}");
     }
 }

@@ -18,10 +18,7 @@ use std::path::PathBuf;
 
 pub use issue::{Authority, AuthorityPemError, IssuedRobotCertificate};
 pub use request::{CertificateRequest, LONGEST};
-pub use shown::{
-    UnreadableCertificate, ValidityPeriod, VerifiedCertificate, read_robot_certificate,
-    read_validity,
-};
+pub use shown::{UnreadableCertificate, ValidityPeriod, VerifiedCertificate, read_robot_certificate, read_validity};
 
 /// Milliseconds since 1970.
 pub type Millis = u64;
@@ -69,9 +66,7 @@ pub enum Error {
     #[error("a certificate request has at most {LONGEST} bytes, but this one has {0}")]
     TooLong(usize),
     /// The request is for another name.
-    #[error(
-        "the request asks for a certificate of {found}, but the pairing is for {SCHEME}{robot}"
-    )]
+    #[error("the request asks for a certificate of {found}, but the pairing is for {SCHEME}{robot}")]
     OtherName {
         /// Name in the request.
         found: String,
@@ -79,9 +74,7 @@ pub enum Error {
         robot: String,
     },
     /// The key type is not supported.
-    #[error(
-        "the key type of the request is not supported; use P-256 or Ed25519 (cloudroid-stub pair creates one)"
-    )]
+    #[error("the key type of the request is not supported; use P-256 or Ed25519 (cloudroid-stub pair creates one)")]
     Kind,
     /// The certificate names no robot, or several.
     #[error(

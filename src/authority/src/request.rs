@@ -2,8 +2,8 @@
 //! certificate.
 
 use rcgen::{
-    CertificateSigningRequestParams, DnType, DnValue, PKCS_ECDSA_P256_SHA256, PKCS_ED25519,
-    PublicKey, PublicKeyData, SanType,
+    CertificateSigningRequestParams, DnType, DnValue, PKCS_ECDSA_P256_SHA256, PKCS_ED25519, PublicKey, PublicKeyData,
+    SanType,
 };
 use tokio_rustls::rustls::pki_types::CertificateSigningRequestDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
@@ -35,16 +35,12 @@ impl CertificateRequest {
         if !has_supported_key(&der)? {
             return Err(Error::Kind);
         }
-        let read =
-            CertificateSigningRequestParams::from_der(&der).map_err(|error| match error {
-                rcgen::Error::UnsupportedSignatureAlgorithm => Error::Kind,
-                error => Error::NoRequest(error.to_string()),
-            })?;
+        let read = CertificateSigningRequestParams::from_der(&der).map_err(|error| match error {
+            rcgen::Error::UnsupportedSignatureAlgorithm => Error::Kind,
+            error => Error::NoRequest(error.to_string()),
+        })?;
         let wanted = format!("{SCHEME}{robot}");
-        let other = |found: String| Error::OtherName {
-            found,
-            robot: robot.to_owned(),
-        };
+        let other = |found: String| Error::OtherName { found, robot: robot.to_owned() };
         for (kind, value) in read.params.distinguished_name.iter() {
             let text = name_text(value);
             if *kind != DnType::CommonName || text != wanted {
@@ -70,10 +66,7 @@ impl CertificateRequest {
         if !known {
             return Err(Error::Kind);
         }
-        Ok(CertificateRequest {
-            hash: hex::encode(shown::hash_key(bytes)),
-            key,
-        })
+        Ok(CertificateRequest { hash: hex::encode(shown::hash_key(bytes)), key })
     }
 
     /// Returns the SHA-256 hash of the key in hexadecimal.
@@ -88,8 +81,7 @@ impl CertificateRequest {
 
 /// Returns true if the key is P-256 (RFC 5480, section 2.1.1) or Ed25519 (RFC 8410, section 3).
 fn has_supported_key(der: &CertificateSigningRequestDer<'_>) -> Result<bool, Error> {
-    let (_, read) = X509CertificationRequest::from_der(der)
-        .map_err(|error| Error::NoRequest(error.to_string()))?;
+    let (_, read) = X509CertificationRequest::from_der(der).map_err(|error| Error::NoRequest(error.to_string()))?;
     let kind = &read.certification_request_info.subject_pki.algorithm;
     let curve = kind.parameters.as_ref();
     let curve = curve.and_then(|parameters| parameters.as_oid().ok());
@@ -122,11 +114,7 @@ mod tests {
             params.distinguished_name.push(kind.clone(), *name);
         }
         params.subject_alt_names = alternative;
-        params
-            .serialize_request(key)
-            .expect("made")
-            .pem()
-            .expect("PEM")
+        params.serialize_request(key).expect("made").pem().expect("PEM")
     }
 
     fn uri(text: &str) -> SanType {
@@ -138,21 +126,13 @@ mod tests {
         let key = KeyPair::generate().expect("a key");
         let ed25519 = KeyPair::generate_for(&PKCS_ED25519).expect("a key");
         let own = (DnType::CommonName, "robot:r1");
-        let first =
-            CertificateRequest::parse(&request_pem(&key, &[], Vec::new()), "r1").expect("nameless");
-        for text in [
-            request_pem(&key, std::slice::from_ref(&own), Vec::new()),
-            request_pem(&key, &[], vec![uri("robot:r1")]),
-        ] {
-            assert_eq!(
-                CertificateRequest::parse(&text, "r1")
-                    .expect("its own")
-                    .hash,
-                first.hash
-            );
+        let first = CertificateRequest::parse(&request_pem(&key, &[], Vec::new()), "r1").expect("nameless");
+        for text in
+            [request_pem(&key, std::slice::from_ref(&own), Vec::new()), request_pem(&key, &[], vec![uri("robot:r1")])]
+        {
+            assert_eq!(CertificateRequest::parse(&text, "r1").expect("its own").hash, first.hash);
         }
-        CertificateRequest::parse(&request_pem(&ed25519, &[own], Vec::new()), "r1")
-            .expect("Ed25519");
+        CertificateRequest::parse(&request_pem(&ed25519, &[own], Vec::new()), "r1").expect("Ed25519");
     }
 
     #[test]
@@ -163,16 +143,10 @@ mod tests {
             request_pem(&key, &[(DnType::CommonName, "r1")], Vec::new()),
             request_pem(&key, &[(DnType::OrganizationName, "robot:r1")], Vec::new()),
             request_pem(&key, &[], vec![uri("robot:r1"), uri("robot:r2")]),
-            request_pem(
-                &key,
-                &[],
-                vec![SanType::DnsName("server".try_into().expect("a name"))],
-            ),
+            request_pem(&key, &[], vec![SanType::DnsName("server".try_into().expect("a name"))]),
             request_pem(&key, &[], vec![SanType::IpAddress([10, 0, 0, 1].into())]),
         ] {
-            let refused = CertificateRequest::parse(&text, "r1")
-                .expect_err(&text)
-                .to_string();
+            let refused = CertificateRequest::parse(&text, "r1").expect_err(&text).to_string();
             assert!(refused.contains("is for robot:r1"), "{refused}");
         }
     }
@@ -183,9 +157,7 @@ mod tests {
         // Made by openssl: req -new -newkey rsa:1024 -nodes -subj /CN=robot:r1
         let weak = include_str!("../tests/rsa1024.csr");
         for text in [&*request_pem(&key, &[], Vec::new()), weak] {
-            let refused = CertificateRequest::parse(text, "r1")
-                .expect_err(text)
-                .to_string();
+            let refused = CertificateRequest::parse(text, "r1").expect_err(text).to_string();
             assert!(refused.contains("P-256 or Ed25519"), "{refused}");
         }
     }
@@ -194,38 +166,21 @@ mod tests {
     fn what_is_no_request_is_refused() {
         let key = KeyPair::generate().expect("a key");
         let good = request_pem(&key, &[], Vec::new());
-        let certificate = CertificateParams::default()
-            .self_signed(&key)
-            .expect("made")
-            .pem();
+        let certificate = CertificateParams::default().self_signed(&key).expect("made").pem();
         // Flips a bit of the key or of the signature.
         let turned = |at: usize| {
-            let mut der = CertificateSigningRequestDer::from_pem_slice(good.as_bytes())
-                .expect("PEM")
-                .to_vec();
+            let mut der = CertificateSigningRequestDer::from_pem_slice(good.as_bytes()).expect("PEM").to_vec();
             let at = if at == 0 { der.len() - 1 } else { at };
             der[at] ^= 1;
             let encoded = encode_base64(&der);
-            format!(
-                "-----BEGIN CERTIFICATE REQUEST-----\n{encoded}\n-----END CERTIFICATE REQUEST-----\n"
-            )
+            format!("-----BEGIN CERTIFICATE REQUEST-----\n{encoded}\n-----END CERTIFICATE REQUEST-----\n")
         };
-        for text in [
-            "",
-            "rubbish",
-            &certificate,
-            &good[..good.len() / 2],
-            &turned(0),
-        ] {
-            let refused = CertificateRequest::parse(text, "r1")
-                .expect_err(text)
-                .to_string();
+        for text in ["", "rubbish", &certificate, &good[..good.len() / 2], &turned(0)] {
+            let refused = CertificateRequest::parse(text, "r1").expect_err(text).to_string();
             assert!(refused.contains("not a certificate request"), "{refused}");
         }
         let long = good + &" ".repeat(LONGEST);
-        let refused = CertificateRequest::parse(&long, "r1")
-            .expect_err("long")
-            .to_string();
+        let refused = CertificateRequest::parse(&long, "r1").expect_err("long").to_string();
         assert!(refused.contains("at most 4096 bytes"), "{refused}");
     }
 
@@ -233,9 +188,7 @@ mod tests {
         const ALPHABET: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
         let mut text = String::new();
         for three in der.chunks(3) {
-            let bits = (0..3).fold(0u32, |bits, at| {
-                bits << 8 | u32::from(*three.get(at).unwrap_or(&0))
-            });
+            let bits = (0..3).fold(0u32, |bits, at| bits << 8 | u32::from(*three.get(at).unwrap_or(&0)));
             for at in 0..4 {
                 if at <= three.len() {
                     text.push(char::from(ALPHABET[(bits >> (18 - 6 * at) & 63) as usize]))

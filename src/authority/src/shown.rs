@@ -32,17 +32,13 @@ pub(crate) fn hash_key(key: &[u8]) -> [u8; 32] {
 #[error("{0}")]
 pub struct UnreadableCertificate(nom::Err<X509Error>);
 
-fn parse_certificate<'a>(
-    certificate: &'a CertificateDer<'_>,
-) -> Result<X509Certificate<'a>, UnreadableCertificate> {
+fn parse_certificate<'a>(certificate: &'a CertificateDer<'_>) -> Result<X509Certificate<'a>, UnreadableCertificate> {
     let (_, parsed) = X509Certificate::from_der(certificate).map_err(UnreadableCertificate)?;
     Ok(parsed)
 }
 
 /// Returns the subject of a certificate (DER).
-pub(crate) fn subject_der(
-    certificate: &CertificateDer<'_>,
-) -> Result<Vec<u8>, UnreadableCertificate> {
+pub(crate) fn subject_der(certificate: &CertificateDer<'_>) -> Result<Vec<u8>, UnreadableCertificate> {
     Ok(parse_certificate(certificate)?.subject().as_raw().to_vec())
 }
 
@@ -57,9 +53,7 @@ pub struct ValidityPeriod {
 }
 
 /// Reads the validity period of any certificate. Times before 1970 count as 1970.
-pub fn read_validity(
-    certificate: &CertificateDer<'_>,
-) -> Result<ValidityPeriod, UnreadableCertificate> {
+pub fn read_validity(certificate: &CertificateDer<'_>) -> Result<ValidityPeriod, UnreadableCertificate> {
     Ok(validity_period(&parse_certificate(certificate)?))
 }
 
@@ -74,15 +68,10 @@ fn validity_period(parsed: &X509Certificate<'_>) -> ValidityPeriod {
 
 /// Reads a robot's certificate. Its name is `robot:NAME`, as a URI among the subject alternative names or, if there
 /// is none, as the subject's common name.
-pub fn read_robot_certificate(
-    certificate: &CertificateDer<'_>,
-) -> Result<VerifiedCertificate, Error> {
-    let parsed =
-        parse_certificate(certificate).map_err(|error| Error::Nameless(error.to_string()))?;
+pub fn read_robot_certificate(certificate: &CertificateDer<'_>) -> Result<VerifiedCertificate, Error> {
+    let parsed = parse_certificate(certificate).map_err(|error| Error::Nameless(error.to_string()))?;
     let mut names: Vec<&str> = Vec::new();
-    let alternative = parsed
-        .subject_alternative_name()
-        .map_err(|error| Error::Nameless(error.to_string()))?;
+    let alternative = parsed.subject_alternative_name().map_err(|error| Error::Nameless(error.to_string()))?;
     for name in alternative.iter().flat_map(|all| &all.value.general_names) {
         if let GeneralName::URI(uri) = name {
             names.extend(uri.strip_prefix(SCHEME));
@@ -126,8 +115,7 @@ mod tests {
         params.subject_alt_names = uris.iter().map(uri).collect();
         let made = params.self_signed(&key).expect("made");
         let read = read_robot_certificate(made.der());
-        read.map(|shown| shown.robot)
-            .map_err(|error| error.to_string())
+        read.map(|shown| shown.robot).map_err(|error| error.to_string())
     }
 
     /// A third-party authority puts the name where its tools do.
@@ -135,10 +123,7 @@ mod tests {
     fn the_name_stands_among_the_alternative_ones_or_in_the_subject() {
         assert_eq!(read_name(None, &["robot:r1"]), Ok("r1".into()));
         assert_eq!(read_name(Some("robot:r1"), &[]), Ok("r1".into()));
-        assert_eq!(
-            read_name(Some("robot:r2"), &["https://x", "robot:r1"]),
-            Ok("r1".into())
-        );
+        assert_eq!(read_name(Some("robot:r2"), &["https://x", "robot:r1"]), Ok("r1".into()));
         for (common, uris) in [
             (None, &[][..]),
             (Some("r1"), &[]),

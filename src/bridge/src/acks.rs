@@ -41,14 +41,7 @@ struct UnackedAnswer {
 impl Acks {
     /// Creates an empty queue for a client with this budget.
     pub(crate) fn new(budget: &Budget) -> Self {
-        Self {
-            kept: VecDeque::new(),
-            bytes: 0,
-            small: 0,
-            permit: budget.permit(),
-            unasked: 0,
-            pings: 0,
-        }
+        Self { kept: VecDeque::new(), bytes: 0, small: 0, permit: budget.permit(), unasked: 0, pings: 0 }
     }
 
     /// Records an answer that is being sent.
@@ -57,31 +50,20 @@ impl Acks {
         self.bytes += size;
         self.small += control.small_bytes();
         self.unasked += size;
-        while self.kept.len() >= MAX_KEPT
-            || self.bytes > MAX_KEPT_BYTES
-            || self.permit.count(self.small).is_err()
-        {
+        while self.kept.len() >= MAX_KEPT || self.bytes > MAX_KEPT_BYTES || self.permit.count(self.small).is_err() {
             let Some(oldest) = self.kept.pop_front() else {
                 break;
             };
             self.bytes -= oldest.control.frame.bytes.len();
             self.small -= oldest.control.small_bytes();
         }
-        self.kept.push_back(UnackedAnswer {
-            control,
-            at,
-            ping: self.pings + 1,
-        });
+        self.kept.push_back(UnackedAnswer { control, at, ping: self.pings + 1 });
     }
 
     /// Returns when a ping should follow the answers sent.
     pub(crate) fn ping_due(&self) -> Option<Instant> {
         let unpinged = self.kept.partition_point(|sent| sent.ping <= self.pings);
-        let patience = if self.unasked > ASKED_ABOUT {
-            Duration::ZERO
-        } else {
-            PATIENCE
-        };
+        let patience = if self.unasked > ASKED_ABOUT { Duration::ZERO } else { PATIENCE };
         self.kept.get(unpinged).map(|sent| sent.at + patience)
     }
 
@@ -106,16 +88,12 @@ impl Acks {
     }
 
     /// Takes all answers that were not acknowledged.
-    pub(crate) fn take_unacked(
-        &mut self,
-    ) -> impl DoubleEndedIterator<Item = ControlMessage> + use<> {
+    pub(crate) fn take_unacked(&mut self) -> impl DoubleEndedIterator<Item = ControlMessage> + use<> {
         self.bytes = 0;
         self.small = 0;
         self.unasked = 0;
         let _ = self.permit.count(0);
-        std::mem::take(&mut self.kept)
-            .into_iter()
-            .map(|sent| sent.control)
+        std::mem::take(&mut self.kept).into_iter().map(|sent| sent.control)
     }
 }
 
@@ -127,25 +105,15 @@ mod tests {
     use crate::sample::EncodedFrame;
 
     fn answer(name: &'static str) -> ControlMessage {
-        let frame = EncodedFrame {
-            format: Format::Json,
-            bytes: name.into(),
-        };
-        ControlMessage {
-            frame,
-            fragment_size: None,
-            answer: true,
-        }
+        let frame = EncodedFrame { format: Format::Json, bytes: name.into() };
+        ControlMessage { frame, fragment_size: None, answer: true }
     }
 
     #[test]
     fn what_is_kept_is_bounded_and_big_answers_are_asked_about_at_once() {
         let now = Instant::now();
         let big = |size| ControlMessage {
-            frame: EncodedFrame {
-                format: Format::Json,
-                bytes: vec![0; size].into(),
-            },
+            frame: EncodedFrame { format: Format::Json, bytes: vec![0; size].into() },
             ..answer("")
         };
         let mut acks = Acks::new(&Budget::without_limit());
@@ -177,10 +145,7 @@ mod tests {
         acks.on_pong(b"other");
         acks.on_pong(&first);
         assert_eq!(acks.ping_due(), Some(now + PATIENCE));
-        let left: Vec<_> = acks
-            .take_unacked()
-            .map(|control| control.frame.bytes)
-            .collect();
+        let left: Vec<_> = acks.take_unacked().map(|control| control.frame.bytes).collect();
         assert_eq!(left, ["b"]);
         assert_eq!(acks.take_unacked().count(), 0);
     }

@@ -26,9 +26,7 @@ impl Bridge {
     /// Creates a bridge between `bus` and the sockets passed to [`serve`](Self::serve). `registry` contains the
     /// definitions of the servant's types; types announced by publishers are added.
     pub fn new(bus: Arc<dyn Bus>, registry: Arc<Registry>, options: BridgeOptions) -> Arc<Self> {
-        Arc::new(Self {
-            shared: BridgeShared::new(bus, registry, options),
-        })
+        Arc::new(Self { shared: BridgeShared::new(bus, registry, options) })
     }
 
     /// Serves rosbridge on `io`, a connection after its WebSocket upgrade, until it ends.
@@ -36,8 +34,8 @@ impl Bridge {
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
-        let waiting = WaitingConnection::new(io, &options.read_ahead, &self.shared.options)
-            .with_budget(&options.budget);
+        let waiting =
+            WaitingConnection::new(io, &options.read_ahead, &self.shared.options).with_budget(&options.budget);
         self.serve_waiting(waiting, options).await
     }
 
@@ -62,10 +60,7 @@ impl Bridge {
         let lease = Lease::take(shared.clone(), client.clone(), options.resume);
         tracing::debug!(client = %client.name, "session begins");
         let (socket, kept) = waiting.into_parts();
-        let end =
-            BridgeConnection::new(socket, kept, client.clone(), lease.socket, &options.budget)
-                .run()
-                .await;
+        let end = BridgeConnection::new(socket, kept, client.clone(), lease.socket, &options.budget).run().await;
         tracing::debug!(client = %client.name, ?end, "session ends");
         lease.leave(&end);
         end
@@ -74,10 +69,7 @@ impl Bridge {
     /// Closes every session, connected or not, with this reason (a status message and a close frame with code 1012);
     /// later connections are refused the same way. Used when the servant ends or is replaced.
     pub fn close(&self, reason: &str) {
-        let goodbye = CloseReason {
-            code: 1012,
-            reason: reason.to_owned(),
-        };
+        let goodbye = CloseReason { code: 1012, reason: reason.to_owned() };
         for client in self.shared.close(&goodbye) {
             client.send_status(StatusLevel::Error, None, Format::Json, reason);
             client.outbox.request_close(goodbye.clone());
@@ -114,7 +106,5 @@ pub async fn refuse<S>(io: S, code: u16, reason: &str)
 where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
-    WaitingConnection::new(io, b"", &BridgeOptions::default())
-        .refuse(code, reason)
-        .await;
+    WaitingConnection::new(io, b"", &BridgeOptions::default()).refuse(code, reason).await;
 }

@@ -20,8 +20,8 @@ use parking_lot::Mutex;
 use ros::bus::RosVersion;
 use ros::schema::MessageType;
 use rosbridge::{
-    Compression, Error, Format, GoalStatus, Id, Op, Payload, ProtocolFrame as Incoming, QosRequest,
-    Status, StatusLevel, Writer,
+    Compression, Error, Format, GoalStatus, Id, Op, Payload, ProtocolFrame as Incoming, QosRequest, Status,
+    StatusLevel, Writer,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -41,10 +41,7 @@ use subscribing::SubscribeError;
 use under_way::InFlightGuard;
 
 /// Removes the entries whose names match.
-fn remove_matching<T>(
-    from: &mut HashMap<String, T>,
-    chosen: impl Fn(&str) -> bool,
-) -> Vec<(String, T)> {
+fn remove_matching<T>(from: &mut HashMap<String, T>, chosen: impl Fn(&str) -> bool) -> Vec<(String, T)> {
     let names: Vec<String> = from.keys().filter(|name| chosen(name)).cloned().collect();
     let taken = names.iter().filter_map(|name| from.remove_entry(name));
     taken.collect()
@@ -147,13 +144,7 @@ impl BridgeClient {
         self.handle_frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
     }
 
-    fn handle_frame(
-        self: &Arc<Self>,
-        inbox: &mut Inbox,
-        frame: Incoming<'_>,
-        source: Option<&Bytes>,
-        wrapping: usize,
-    ) {
+    fn handle_frame(self: &Arc<Self>, inbox: &mut Inbox, frame: Incoming<'_>, source: Option<&Bytes>, wrapping: usize) {
         let format = frame.format();
         let op = match Op::parse(frame) {
             Ok(op) => op,
@@ -162,23 +153,12 @@ impl BridgeClient {
         if self.wants_level(StatusLevel::Warning) {
             for field in rosbridge::unknown_fields(frame) {
                 let field: String = field.chars().take(SHOWN).collect();
-                let text = format!(
-                    "{}: field {field:?} is not known and was ignored",
-                    op.name()
-                );
-                self.send_status(
-                    StatusLevel::Warning,
-                    op.id().cloned().map(Id::into_owned),
-                    format,
-                    &text,
-                );
+                let text = format!("{}: field {field:?} is not known and was ignored", op.name());
+                self.send_status(StatusLevel::Warning, op.id().cloned().map(Id::into_owned), format, &text);
             }
         }
         let name = op.name();
-        let reply = ReplyTarget {
-            id: op.id().cloned().map(Id::into_owned),
-            format,
-        };
+        let reply = ReplyTarget { id: op.id().cloned().map(Id::into_owned), format };
         if let Err(reason) = self.execute(inbox, op, &reply, source, wrapping) {
             let text = format!("{name}: {reason}");
             self.send_status(StatusLevel::Error, reply.id.clone(), format, &text);
@@ -216,10 +196,9 @@ impl BridgeClient {
             Op::Status(op) => {
                 tracing::debug!(client = %self.name, level = op.level.name(), "{}", op.msg);
             }
-            Op::Auth(_) => self.info(
-                reply,
-                "auth: ignored, this server knows its clients by the token of their connection",
-            ),
+            Op::Auth(_) => {
+                self.info(reply, "auth: ignored, this server knows its clients by the token of their connection")
+            }
         }
         Ok(())
     }
@@ -236,17 +215,11 @@ impl BridgeClient {
             "send_action_goal" => "action_result",
             _ => return,
         };
-        let field = if op == "call_service" {
-            "service"
-        } else {
-            "action"
-        };
+        let field = if op == "call_service" { "service" } else { "action" };
         let name = rosbridge::text_field(frame, field);
         // Old clients wrote the id as a suffix.
         let suffix = name.as_deref().and_then(|name| name.split_once('#'));
-        let id = error
-            .id
-            .or_else(|| suffix.map(|(_, id)| Id::from(id.to_owned())));
+        let id = error.id.or_else(|| suffix.map(|(_, id)| Id::from(id.to_owned())));
         let mut out = Vec::with_capacity(256);
         let mut writer = Writer::op(&mut out, format, answer, id.as_ref());
         if let Some(name) = &name {
@@ -278,27 +251,13 @@ impl BridgeClient {
     }
 
     /// Sends a status message, if the client wants that level.
-    pub(crate) fn send_status(
-        &self,
-        level: StatusLevel,
-        id: Option<Id<'static>>,
-        format: Format,
-        text: &str,
-    ) {
+    pub(crate) fn send_status(&self, level: StatusLevel, id: Option<Id<'static>>, format: Format, text: &str) {
         if level == StatusLevel::Error {
             self.shared.metrics.errors.add(1);
             tracing::debug!(client = %self.name, "{text}");
         }
         if self.wants_level(level) {
-            self.send(
-                Status {
-                    id,
-                    level,
-                    msg: text.into(),
-                }
-                .into(),
-                format,
-            );
+            self.send(Status { id, level, msg: text.into() }.into(), format);
         }
     }
 
@@ -323,12 +282,7 @@ impl BridgeClient {
 
     /// Sends a frame made for this client alone. It counts in the client's budget until it is written; if it does not
     /// fit, the connection is closed, since an answer must not be dropped.
-    pub(crate) fn send_frame(
-        &self,
-        frame: EncodedFrame,
-        fragment_size: Option<usize>,
-        answer: bool,
-    ) {
+    pub(crate) fn send_frame(&self, frame: EncodedFrame, fragment_size: Option<usize>, answer: bool) {
         let permit = if frame.is_big() {
             match self.budget.take(frame.bytes.len()) {
                 Ok(permit) => Some(permit),
@@ -343,23 +297,14 @@ impl BridgeClient {
             None
         };
         let frame = frame.with_permit(permit);
-        self.outbox.push_control(ControlMessage {
-            frame,
-            fragment_size,
-            answer,
-        });
+        self.outbox.push_control(ControlMessage { frame, fragment_size, answer });
         if answer {
             self.shared.metrics.answers.add(1);
         }
     }
 
     /// Sends a frame, printed in JSON or CBOR, in the client's encoding.
-    pub(crate) fn send_as(
-        &self,
-        frame: EncodedFrame,
-        compression: Compression,
-        fragment_size: Option<usize>,
-    ) {
+    pub(crate) fn send_as(&self, frame: EncodedFrame, compression: Compression, fragment_size: Option<usize>) {
         let wrapped = match compression {
             Compression::Png if frame.format == Format::Json => frame.clone().into_png(),
             _ => Ok(frame),
@@ -373,13 +318,7 @@ impl BridgeClient {
     }
 
     /// Warns about policies in `qos` that have no effect here.
-    fn warn_ignored_qos(
-        &self,
-        op: &str,
-        qos: Option<QosRequest>,
-        subscribes: bool,
-        reply: &ReplyTarget,
-    ) {
+    fn warn_ignored_qos(&self, op: &str, qos: Option<QosRequest>, subscribes: bool, reply: &ReplyTarget) {
         let unheard = qos.and_then(|qos| ignored_policies(self.version(), &qos, subscribes));
         if let Some(unheard) = unheard {
             self.warn(reply, &format!("{op}: {unheard}"));
@@ -387,23 +326,15 @@ impl BridgeClient {
     }
 
     /// Warns about more arguments than the type has fields.
-    fn warn_surplus_args(
-        &self,
-        reply: &ReplyTarget,
-        op: &str,
-        message_type: &MessageType,
-        args: Option<Payload<'_>>,
-    ) {
+    fn warn_surplus_args(&self, reply: &ReplyTarget, op: &str, message_type: &MessageType, args: Option<Payload<'_>>) {
         let fields = message_type.fields().len();
         if self.wants_level(StatusLevel::Warning)
             && let Some(found) = args.and_then(|args| args.list_len())
             && found > fields
         {
             let name = message_type.name();
-            let text = format!(
-                "{op}: {name} has {fields} fields, the last {} of \"args\" were ignored",
-                found - fields
-            );
+            let text =
+                format!("{op}: {name} has {fields} fields, the last {} of \"args\" were ignored", found - fields);
             self.warn(reply, &text);
         }
     }

@@ -50,9 +50,7 @@ async fn is_simulated(shared: &BridgeShared) -> bool {
 pub(crate) async fn now(shared: &Arc<BridgeShared>) -> Time {
     if is_simulated(shared).await {
         let (ticks, mut heard) = mpsc::unbounded_channel();
-        let listening = shared
-            .fanout(CLOCK, None)
-            .listen(Arc::new(ClockListener(ticks)));
+        let listening = shared.fanout(CLOCK, None).listen(Arc::new(ClockListener(ticks)));
         let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;
         drop(listening);
         if let Ok(Some(time)) = tick {

@@ -63,11 +63,7 @@ enum StopReason {
     /// The client sent a close frame.
     Client { code: u16, reason: String },
     /// It is to be closed; `readable` unless the client's byte stream can no longer be parsed.
-    Close {
-        code: u16,
-        reason: String,
-        readable: bool,
-    },
+    Close { code: u16, reason: String, readable: bool },
     /// The socket is unusable. `heard_all`: the client ended it cleanly, having read everything that was sent.
     Lost { reason: String, heard_all: bool },
 }
@@ -110,8 +106,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
 
     fn ping(&mut self) {
         let payload = self.acks.next_ping();
-        self.socket
-            .queue(frame::PING, Bytes::copy_from_slice(&payload));
+        self.socket.queue(frame::PING, Bytes::copy_from_slice(&payload));
     }
 
     /// Reads frames from the client. Ready when a batch was handled, pending when none is available.
@@ -137,18 +132,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
             let message = match ready!(next) {
                 Ok(message) => message,
                 Err(WsError::Refused { code, reason }) => {
-                    return Poll::Ready(Err(StopReason::Close {
-                        code,
-                        reason,
-                        readable: false,
-                    }));
+                    return Poll::Ready(Err(StopReason::Close { code, reason, readable: false }));
                 }
                 Err(error) => {
                     let heard_all = matches!(error, WsError::Eof);
-                    return Poll::Ready(Err(StopReason::Lost {
-                        reason: error.to_string(),
-                        heard_all,
-                    }));
+                    return Poll::Ready(Err(StopReason::Lost { reason: error.to_string(), heard_all }));
                 }
             };
             self.handle_message(message)?;
@@ -167,11 +155,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
                     Ok(text) => self.client.on_text(&mut self.inbox, text),
                     Err(_) => {
                         let reason = "a text frame is not UTF-8".to_owned();
-                        return Err(StopReason::Close {
-                            code: 1007,
-                            reason,
-                            readable: true,
-                        });
+                        return Err(StopReason::Close { code: 1007, reason, readable: true });
                     }
                 }
             }
@@ -202,21 +186,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
         let (idle, interval) = (options.idle_timeout, options.ping_interval);
         let silent = now.saturating_duration_since(self.heard);
         if !idle.is_zero() && silent >= idle {
-            let reason = format!(
-                "nothing was received for {} s, not even a pong",
-                silent.as_secs()
-            );
-            return Err(StopReason::Close {
-                code: 1001,
-                reason,
-                readable: true,
-            });
+            let reason = format!("nothing was received for {} s, not even a pong", silent.as_secs());
+            return Err(StopReason::Close { code: 1001, reason, readable: true });
         }
         let regular = self.ping_at.is_some_and(|at| at <= now);
         // Behind a blocked message pings would only pile up.
-        if self.socket.bytes_queued() < SOCKET_FULL
-            && (regular || self.acks.ping_due().is_some_and(|at| at <= now))
-        {
+        if self.socket.bytes_queued() < SOCKET_FULL && (regular || self.acks.ping_due().is_some_and(|at| at <= now)) {
             self.ping();
         }
         if regular {
@@ -234,10 +209,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
         let blocked = self.socket.bytes_queued() >= SOCKET_FULL;
         let ack_at = self.acks.ping_due().filter(|_| !blocked);
         let sample_at = self.client.outbox.next_due().filter(|_| !blocked);
-        [self.ping_at, idle_at, ack_at, sample_at]
-            .into_iter()
-            .flatten()
-            .min()
+        [self.ping_at, idle_at, ack_at, sample_at].into_iter().flatten().min()
     }
 
     /// Ready when the time has come.
@@ -256,20 +228,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     fn step(&mut self, cx: &mut Context<'_>) -> Poll<StopReason> {
         if !self.client.outbox.register(self.number, cx.waker()) {
             let reason = "a newer connection has taken this session over".to_owned();
-            return Poll::Ready(StopReason::Close {
-                code: 4001,
-                reason,
-                readable: true,
-            });
+            return Poll::Ready(StopReason::Close { code: 4001, reason, readable: true });
         }
         self.moved = 0;
         for _ in 0..ROUNDS {
             if let Some(CloseReason { code, reason }) = self.client.outbox.close_reason() {
-                return Poll::Ready(StopReason::Close {
-                    code,
-                    reason,
-                    readable: true,
-                });
+                return Poll::Ready(StopReason::Close { code, reason, readable: true });
             }
             let now = Instant::now();
             let read = match self.read(cx, now) {
@@ -283,8 +247,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
                 Poll::Ready(Err(stop)) => return Poll::Ready(stop),
                 written => written,
             };
-            let more =
-                read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
+            let more = read.is_ready() || (std::mem::take(&mut self.held_back) && written.is_ready());
             if self.moved >= MOVED {
                 break;
             }
@@ -301,11 +264,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
         let mut granted = self.client.client_grants();
         loop {
             if let Some(reason) = granted.end_reason() {
-                return StopReason::Close {
-                    code: 1008,
-                    reason,
-                    readable: true,
-                };
+                return StopReason::Close { code: 1008, reason, readable: true };
             }
             self.client.revoke_ungranted();
             tokio::select! {
@@ -323,9 +282,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
         // Data still in our own buffer has certainly not arrived.
         let arrived = self.socket.bytes_queued() == 0;
         let (end, heard_all) = match stop {
-            StopReason::Lost { reason, heard_all } => {
-                (SessionEnd::Lost(reason), heard_all && arrived)
-            }
+            StopReason::Lost { reason, heard_all } => (SessionEnd::Lost(reason), heard_all && arrived),
             StopReason::Client { code, reason } => {
                 self.socket.queue_close(code, "");
                 let answered = poll_fn(|cx| self.socket.poll_flush(cx));
@@ -333,18 +290,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
                 let _ = timeout(patience, answered).await;
                 (SessionEnd::Client { code, reason }, arrived)
             }
-            StopReason::Close {
-                code,
-                reason,
-                readable,
-            } => {
+            StopReason::Close { code, reason, readable } => {
                 self.queue_remaining_control(code, &reason);
                 // A client that does not complete the close handshake in time is dropped.
                 let left = timeout(patience, self.socket.shutdown(readable)).await;
-                (
-                    SessionEnd::Closed { code, reason },
-                    matches!(left, Ok(Ok(()))),
-                )
+                (SessionEnd::Closed { code, reason }, matches!(left, Ok(Ok(()))))
             }
         };
         if !heard_all {
@@ -356,15 +306,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     /// Queues the rest of the control queue, and a close frame.
     fn queue_remaining_control(&mut self, code: u16, reason: &str) {
         if matches!(code, 1002 | 1007 | 1009 | 1013) {
-            self.client
-                .send_status(StatusLevel::Error, None, Format::Json, reason);
+            self.client.send_status(StatusLevel::Error, None, Format::Json, reason);
         }
         // A client that reads nothing need not be told more; one that has another socket is told there.
         if code != 1008 && code != 4001 {
             while let Some(control) = self.client.outbox.next_control() {
                 self.retain_answer(&control, Instant::now());
-                self.socket
-                    .queue(control.frame.opcode(), control.frame.bytes);
+                self.socket.queue(control.frame.opcode(), control.frame.bytes);
             }
         }
         self.socket.queue_close(code, reason);

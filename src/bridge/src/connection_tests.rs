@@ -21,19 +21,11 @@ use crate::{BridgeOptions, SessionOptions};
 async fn connection(options: SessionOptions) -> (BridgeConnection<DuplexStream>, DuplexStream) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let master = Master::new(MasterOptions {
-        uri: format!("http://{address}/"),
-        ..MasterOptions::default()
-    });
+    let master = Master::new(MasterOptions { uri: format!("http://{address}/"), ..MasterOptions::default() });
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
-    let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/bridge")
-        .await
-        .unwrap();
-    let quiet = BridgeOptions {
-        ping_interval: Duration::ZERO,
-        idle_timeout: Duration::ZERO,
-        ..BridgeOptions::default()
-    };
+    let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/bridge").await.unwrap();
+    let quiet =
+        BridgeOptions { ping_interval: Duration::ZERO, idle_timeout: Duration::ZERO, ..BridgeOptions::default() };
     let shared = BridgeShared::new(bus, Arc::new(Registry::new()), quiet);
     let client = shared.client_for(&options).unwrap();
     let (ours, theirs) = tokio::io::duplex(1 << 20);
@@ -90,15 +82,9 @@ async fn what_a_throttle_rate_holds_back_wakes_the_connection_when_it_is_due() {
 
 #[tokio::test]
 async fn an_answer_is_asked_about_when_its_patience_is_over() {
-    let options = SessionOptions {
-        resume: Some("secret".to_owned()),
-        ..SessionOptions::default()
-    };
+    let options = SessionOptions { resume: Some("secret".to_owned()), ..SessionOptions::default() };
     let (mut connection, _client) = connection(options).await;
-    let answer = |size: usize| EncodedFrame {
-        format: Format::Cbor,
-        bytes: vec![0; size].into(),
-    };
+    let answer = |size: usize| EncodedFrame { format: Format::Cbor, bytes: vec![0; size].into() };
     connection.client.send_frame(answer(10), None, true);
     step(&mut connection);
     let due = connection.acks.ping_due();

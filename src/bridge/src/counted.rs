@@ -17,11 +17,7 @@ pub(crate) struct CountingPublisher {
 
 impl CountingPublisher {
     pub(crate) fn new(publisher: Box<dyn Publisher>, topic: &str, metrics: Arc<Metrics>) -> Self {
-        Self {
-            publisher,
-            topic: topic.to_owned(),
-            metrics,
-        }
+        Self { publisher, topic: topic.to_owned(), metrics }
     }
 
     pub(crate) fn publish(&self, bytes: Bytes) {

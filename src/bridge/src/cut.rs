@@ -38,12 +38,7 @@ impl Fragmenter {
     }
 
     /// Adds a frame if it is a text longer than `size`; returns whether it was added.
-    pub(crate) fn add_if_long(
-        &mut self,
-        frame: &EncodedFrame,
-        size: Option<usize>,
-        key: Option<TopicKey>,
-    ) -> bool {
+    pub(crate) fn add_if_long(&mut self, frame: &EncodedFrame, size: Option<usize>, key: Option<TopicKey>) -> bool {
         let Some(size) = size.filter(|_| Self::is_long(frame, size)) else {
             return false;
         };
@@ -84,12 +79,7 @@ impl Fragmenter {
         let mut cut = self.cuts.pop_front()?;
         let piece = split_text(utf8_prefix(&cut.text[cut.at..], cut.size), cut.size).next()?;
         let mut out = Vec::with_capacity(piece.len() + piece.len() / 8 + 64);
-        let fragment = Fragment {
-            id: Id::Integer(cut.id),
-            data: piece.into(),
-            num: cut.num,
-            total: cut.total,
-        };
+        let fragment = Fragment { id: Id::Integer(cut.id), data: piece.into(), num: cut.num, total: cut.total };
         cut.at += piece.len();
         cut.num += 1;
         Op::from(fragment).print(&mut out, Format::Json);
@@ -124,26 +114,18 @@ mod tests {
         let texts = ["grüße ".repeat(100), "kurz ".repeat(50)];
         let mut cuts = Fragmenter::default();
         for (key, text) in texts.iter().enumerate() {
-            let frame = EncodedFrame {
-                format: Format::Json,
-                bytes: text.clone().into(),
-            };
+            let frame = EncodedFrame { format: Format::Json, bytes: text.clone().into() };
             assert!(cuts.add_if_long(&frame, Some(99), Some(key as u64)));
             assert!(!cuts.add_if_long(&frame, Some(10_000), None));
         }
-        let limits = FragmentLimits {
-            age: Duration::from_secs(1),
-            ..FragmentLimits::default()
-        };
+        let limits = FragmentLimits { age: Duration::from_secs(1), ..FragmentLimits::default() };
         let mut fragments = Fragments::new(limits);
         let mut whole = Vec::new();
         let mut ends = Vec::new();
         let mut ids = Vec::new();
         while let Some((bytes, end)) = cuts.next() {
             ends.extend(end);
-            let Ok(Op::Fragment(fragment)) =
-                Op::parse(Incoming::Text(std::str::from_utf8(&bytes).unwrap()))
-            else {
+            let Ok(Op::Fragment(fragment)) = Op::parse(Incoming::Text(std::str::from_utf8(&bytes).unwrap())) else {
                 panic!("not a fragment")
             };
             ids.push(fragment.id.to_string());

@@ -72,10 +72,7 @@ impl Drop for ListenerGuard {
     fn drop(&mut self) {
         let mut state = self.fanout.state.lock();
         let earlier = state.listeners.clone();
-        let kept = earlier
-            .iter()
-            .filter(|(number, _)| *number != self.number)
-            .cloned();
+        let kept = earlier.iter().filter(|(number, _)| *number != self.number).cloned();
         state.listeners = Arc::new(kept.collect());
         drop(state);
         // Only now may the listener itself be dropped.
@@ -166,10 +163,7 @@ impl Fanout {
         let mut listeners = Listeners::clone(&state.listeners);
         listeners.push((number, listener));
         state.listeners = Arc::new(listeners);
-        ListenerGuard {
-            fanout: self.clone(),
-            number,
-        }
+        ListenerGuard { fanout: self.clone(), number }
     }
 
     /// Delivers the last messages of latching publishers to a listener again.
@@ -184,9 +178,7 @@ impl Fanout {
         // Messages of publishers that are gone are removed.
         if let Some(shared) = self.shared.upgrade() {
             let graph = shared.bus.graph().borrow().clone();
-            state.latched.retain(|sample| {
-                sample.local || graph.publishes(sample.publisher.node(), &self.topic)
-            });
+            state.latched.retain(|sample| sample.local || graph.publishes(sample.publisher.node(), &self.topic));
         }
         for sample in &state.latched {
             listener.on_sample(sample, true);
@@ -209,9 +201,7 @@ impl Fanout {
         let listeners = {
             let mut state = self.state.lock();
             if sample.latching && self.keeps_latched() {
-                state
-                    .latched
-                    .retain(|other| other.publisher != sample.publisher);
+                state.latched.retain(|other| other.publisher != sample.publisher);
                 state.latched.push(sample.clone());
             }
             state.listeners.clone()
@@ -223,10 +213,7 @@ impl Fanout {
 
     /// Removes the message latched by a client that no longer publishes.
     pub(crate) fn forget_publisher(&self, publisher: &PeerId) {
-        self.state
-            .lock()
-            .latched
-            .retain(|sample| sample.publisher != *publisher);
+        self.state.lock().latched.retain(|sample| sample.publisher != *publisher);
     }
 
     /// Records the duration of the request that this message answers. A latched message is a state, and answers

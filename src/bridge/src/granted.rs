@@ -47,30 +47,17 @@ impl Default for ClientGrants {
 impl ClientGrants {
     /// Follows `standing` as it changes.
     pub fn from_standing(standing: watch::Receiver<ConnectionAccess>) -> ClientGrants {
-        ClientGrants {
-            standing,
-            refused: None,
-            used: None,
-        }
+        ClientGrants { standing, refused: None, used: None }
     }
 
     /// Sets a callback for each permitted operation, except subscriptions.
     pub fn with_use_observer(self, hears: impl Fn(&str) + Send + Sync + 'static) -> ClientGrants {
-        ClientGrants {
-            used: Some(Arc::new(hears)),
-            ..self
-        }
+        ClientGrants { used: Some(Arc::new(hears)), ..self }
     }
 
     /// Sets a callback for each refused operation.
-    pub fn with_refusal_observer(
-        self,
-        hears: impl Fn(&str) + Send + Sync + 'static,
-    ) -> ClientGrants {
-        ClientGrants {
-            refused: Some(Arc::new(hears)),
-            ..self
-        }
+    pub fn with_refusal_observer(self, hears: impl Fn(&str) + Send + Sync + 'static) -> ClientGrants {
+        ClientGrants { refused: Some(Arc::new(hears)), ..self }
     }
 
     /// Grants `grants` permanently.
@@ -106,10 +93,7 @@ impl ClientGrants {
         if let Some(hears) = &self.refused {
             hears(&asked);
         }
-        Err(NotGrantedError {
-            asked,
-            granted: grants,
-        })
+        Err(NotGrantedError { asked, granted: grants })
     }
 
     /// Returns the reason why the connection must end, if it must.

@@ -33,12 +33,7 @@ pub(crate) enum EarlyMessageOutcome {
 impl EarlyMessages {
     /// Creates an empty queue; messages count in `budget`.
     pub(crate) fn with_budget(budget: &Budget) -> Self {
-        Self {
-            messages: VecDeque::new(),
-            bytes: 0,
-            permit: budget.permit(),
-            left_out: 0,
-        }
+        Self { messages: VecDeque::new(), bytes: 0, permit: budget.permit(), left_out: 0 }
     }
 
     /// Adds a message. Beyond the limits publications are dropped, as a full queue drops them later; without other
@@ -66,9 +61,7 @@ impl EarlyMessages {
         };
         if is_publication(&message) {
             self.left_out += 1;
-            return EarlyMessageOutcome::LeftOut {
-                first: self.left_out == 1,
-            };
+            return EarlyMessageOutcome::LeftOut { first: self.left_out == 1 };
         }
         EarlyMessageOutcome::Refused(full)
     }

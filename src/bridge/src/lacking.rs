@@ -37,20 +37,16 @@ pub(crate) struct DefinitionError {
 
 impl DefinitionError {
     pub(crate) fn new(version: RosVersion, error: SchemaError) -> Self {
-        Self {
-            version,
-            source: Box::new(error),
-        }
+        Self { version, source: Box::new(error) }
     }
 }
 
 fn explain_schema_error(version: &RosVersion, error: &SchemaError) -> String {
     let (what, name) = match error {
         SchemaError::Unknown(name) => (format!("no definition of {name} is known here"), name),
-        SchemaError::Missing { name, needed_by } => (
-            format!("{needed_by} needs {name}, of which no definition is known here"),
-            name,
-        ),
+        SchemaError::Missing { name, needed_by } => {
+            (format!("{needed_by} needs {name}, of which no definition is known here"), name)
+        }
         _ => return error.to_string(),
     };
     let package = name.split('/').next().unwrap_or_default();
@@ -64,9 +60,7 @@ fn explain_schema_error(version: &RosVersion, error: &SchemaError) -> String {
     }
     if *version == RosVersion::One && OF_DEBIAN.contains(&package) {
         let debian = package.replace('_', "-");
-        return format!(
-            "{what}; the deployer of this service can add it: cloudroidctl push … --with ros-{debian}"
-        );
+        return format!("{what}; the deployer of this service can add it: cloudroidctl push … --with ros-{debian}");
     }
     format!(
         "{what}; the deployer of this service can add it: cloudroidctl push … of a workspace that also has {package}"
@@ -79,9 +73,7 @@ mod tests {
 
     #[test]
     fn who_deploys_is_told_what_to_add() {
-        let of = |version, name: &str| {
-            DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string()
-        };
+        let of = |version, name: &str| DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string();
         assert_eq!(
             of(RosVersion::One, "nav_msgs/Path"),
             "no definition of nav_msgs/Path is known here; the deployer of this service can add it: cloudroidctl push \
@@ -93,27 +85,19 @@ mod tests {
             "no definition of nav_msgs/msg/Path is known here; the deployer of this service can add it: cloudroidctl \
                 push … of a workspace that also has nav_msgs"
         );
-        let missing = SchemaError::Missing {
-            name: "arm_msgs/Joint".to_owned(),
-            needed_by: "arm_msgs/Arm".to_owned(),
-        };
+        let missing = SchemaError::Missing { name: "arm_msgs/Joint".to_owned(), needed_by: "arm_msgs/Arm".to_owned() };
         assert_eq!(
             DefinitionError::new(RosVersion::One, missing).to_string(),
             "arm_msgs/Arm needs arm_msgs/Joint, of which no definition is known here; the deployer of this service can \
                 add it: cloudroidctl push … of a workspace that also has arm_msgs"
         );
         let other = SchemaError::BadName("x".to_owned());
-        assert_eq!(
-            DefinitionError::new(RosVersion::One, other.clone()).to_string(),
-            other.to_string()
-        );
+        assert_eq!(DefinitionError::new(RosVersion::One, other.clone()).to_string(), other.to_string());
     }
 
     #[test]
     fn who_uses_actions_by_topics_is_told_how_ros_2_has_them() {
-        let of = |version, name: &str| {
-            DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string()
-        };
+        let of = |version, name: &str| DefinitionError::new(version, SchemaError::Unknown(name.to_owned())).to_string();
         for name in ["x_msgs/msg/CountActionGoal", "actionlib_msgs/msg/GoalID"] {
             let two = of(RosVersion::Two, name);
             assert_eq!(

@@ -20,25 +20,14 @@ pub(crate) struct Lease {
 }
 
 impl Lease {
-    pub(crate) fn take(
-        shared: Arc<BridgeShared>,
-        client: Arc<BridgeClient>,
-        token: Option<String>,
-    ) -> Self {
+    pub(crate) fn take(shared: Arc<BridgeShared>, client: Arc<BridgeClient>, token: Option<String>) -> Self {
         shared.metrics.sessions.add(1);
         shared.sessions.send_modify(|count| count.connected += 1);
         let present = shared.next_number();
         shared.presence.enter(present, &client.name);
         shared.report_presence();
         let socket = client.outbox.attach();
-        Self {
-            shared,
-            client,
-            token,
-            socket,
-            present,
-            over: false,
-        }
+        Self { shared, client, token, socket, present, over: false }
     }
 
     pub(crate) fn leave(mut self, end: &SessionEnd) {
@@ -63,12 +52,7 @@ impl Drop for Lease {
         match runtime {
             Ok(runtime) if !self.over && !shared.options.resume_grace.is_zero() => {
                 shared.sessions.send_modify(|count| count.away += 1);
-                runtime.spawn(wait_for_return(
-                    shared.clone(),
-                    self.client.clone(),
-                    self.socket,
-                    token,
-                ));
+                runtime.spawn(wait_for_return(shared.clone(), self.client.clone(), self.socket, token));
             }
             _ => shared.forget_client(&self.client, &token),
         }
@@ -76,12 +60,7 @@ impl Drop for Lease {
 }
 
 /// Keeps a disconnected client until it comes back or its grace period is over.
-async fn wait_for_return(
-    shared: Arc<BridgeShared>,
-    client: Arc<BridgeClient>,
-    socket: u64,
-    token: String,
-) {
+async fn wait_for_return(shared: Arc<BridgeShared>, client: Arc<BridgeClient>, socket: u64, token: String) {
     tokio::select! {
         () = tokio::time::sleep(shared.options.resume_grace) => {}
         () = client.outbox.wait_for_takeover(socket) => {}

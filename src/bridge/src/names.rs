@@ -30,11 +30,7 @@ pub(crate) struct DeclaredTypeError {
 impl DeclaredTypeError {
     /// Creates the error of `what`, such as `topic /text`, whose type is `theirs` instead of `said`.
     pub(crate) fn new(what: String, theirs: &str, said: &str) -> Self {
-        Self {
-            what,
-            theirs: theirs.to_owned(),
-            said: said.to_owned(),
-        }
+        Self { what, theirs: theirs.to_owned(), said: said.to_owned() }
     }
 }
 
@@ -42,32 +38,18 @@ impl DeclaredTypeError {
 pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, ResolveNameError> {
     let well_formed = |part: &str| {
         let mut characters = part.chars();
-        characters
-            .next()
-            .is_some_and(|first| first.is_ascii_alphabetic())
+        characters.next().is_some_and(|first| first.is_ascii_alphabetic())
             && characters.all(|other| other.is_ascii_alphanumeric() || other == '_')
     };
     if name.starts_with('~') {
         return Err(ResolveNameError::Private(name.to_owned()));
     }
-    if name
-        .strip_prefix('/')
-        .unwrap_or(name)
-        .split('/')
-        .all(well_formed)
-    {
-        return Ok(if name.starts_with('/') {
-            Cow::Borrowed(name)
-        } else {
-            Cow::Owned(format!("/{name}"))
-        });
+    if name.strip_prefix('/').unwrap_or(name).split('/').all(well_formed) {
+        return Ok(if name.starts_with('/') { Cow::Borrowed(name) } else { Cow::Owned(format!("/{name}")) });
     }
     // Duplicate and trailing slashes are tolerated.
     let parts: Vec<&str> = name.split('/').filter(|part| !part.is_empty()).collect();
-    let characters = |part: &&str| {
-        part.chars()
-            .all(|other| other.is_ascii_alphanumeric() || other == '_')
-    };
+    let characters = |part: &&str| part.chars().all(|other| other.is_ascii_alphanumeric() || other == '_');
     let starts = match version {
         // Components may start with a digit or an underscore, except for the first.
         RosVersion::One => parts.first().is_some_and(|first| well_formed(first)),
@@ -78,9 +60,7 @@ pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, R
         }
     };
     if starts && parts.iter().all(characters) {
-        return Ok(Cow::Owned(
-            parts.iter().flat_map(|part| ["/", part]).collect(),
-        ));
+        return Ok(Cow::Owned(parts.iter().flat_map(|part| ["/", part]).collect()));
     }
     let shown = name.chars().take(64).collect();
     let rule = match version {
@@ -112,9 +92,7 @@ pub(crate) fn ros_type_name<'a>(version: RosVersion, name: &'a str, kind: &str) 
     match version {
         RosVersion::One => short_type_name(name),
         RosVersion::Two => match name.split_once('/') {
-            Some((package, rest)) if !rest.contains('/') => {
-                Cow::Owned(format!("{package}/{kind}/{rest}"))
-            }
+            Some((package, rest)) if !rest.contains('/') => Cow::Owned(format!("{package}/{kind}/{rest}")),
             _ => Cow::Borrowed(name),
         },
     }
@@ -131,10 +109,7 @@ pub(crate) fn lookup_name(version: RosVersion, name: &str) -> Cow<'_, str> {
 
 /// Returns the type of this name (any at all for `*`), with any definition.
 pub(crate) fn wildcard_type(version: RosVersion, name: &str) -> WireType {
-    WireType {
-        format: WireFormat::for_version(version),
-        ..WireType::with_name(name)
-    }
+    WireType { format: WireFormat::for_version(version), ..WireType::with_name(name) }
 }
 
 /// Returns the term of each ROS for what identifies a definition.
@@ -154,10 +129,7 @@ mod tests {
     #[test]
     fn names_become_absolute() {
         for version in BOTH {
-            assert!(matches!(
-                resolve(version, "/camera/image_raw"),
-                Ok(Cow::Borrowed("/camera/image_raw"))
-            ));
+            assert!(matches!(resolve(version, "/camera/image_raw"), Ok(Cow::Borrowed("/camera/image_raw"))));
             assert_eq!(resolve(version, "chatter").unwrap(), "/chatter");
             assert_eq!(resolve(version, "//a///b/").unwrap(), "/a/b");
             assert_eq!(resolve(version, "/a/_b").unwrap(), "/a/_b");
@@ -188,10 +160,7 @@ mod tests {
             assert!(is_same_type(name, "std_msgs/String"));
             assert!(!is_same_type(name, "std_msgs/Int32"));
         }
-        assert_eq!(
-            message(RosVersion::Two, "a/action/B_Goal"),
-            "a/action/B_Goal"
-        );
+        assert_eq!(message(RosVersion::Two, "a/action/B_Goal"), "a/action/B_Goal");
         assert_eq!(ros_type_name(RosVersion::Two, "a/B", "srv"), "a/srv/B");
         assert_eq!(message(RosVersion::Two, "*"), "*");
         assert_eq!(message(RosVersion::Two, ""), "");
@@ -201,16 +170,10 @@ mod tests {
     fn whoever_takes_any_definition_takes_those_of_its_ros() {
         for version in BOTH {
             let any = wildcard_type(version, "*");
-            let own = WireType {
-                format: WireFormat::for_version(version),
-                ..WireType::new("a/B", "1234", "")
-            };
+            let own = WireType { format: WireFormat::for_version(version), ..WireType::new("a/B", "1234", "") };
             assert!(any.is_compatible_with(&own));
             for other in BOTH {
-                assert_eq!(
-                    wildcard_type(other, "a/B").is_compatible_with(&own),
-                    other == version
-                );
+                assert_eq!(wildcard_type(other, "a/B").is_compatible_with(&own), other == version);
             }
         }
     }

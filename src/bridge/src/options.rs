@@ -124,10 +124,7 @@ impl Default for BridgeOptions {
             action_timeout: Duration::from_secs(10),
             warm_up: Duration::from_secs(1),
             resume_grace: Duration::from_secs(30),
-            fragments: FragmentLimits {
-                bytes: 32 << 20,
-                ..FragmentLimits::default()
-            },
+            fragments: FragmentLimits { bytes: 32 << 20, ..FragmentLimits::default() },
             max_png: 32 << 20,
             non_finite: NonFinite::Null,
             max_encoded: 64 << 20,

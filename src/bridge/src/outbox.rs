@@ -80,22 +80,11 @@ impl Outbox {
     /// Creates the outbox of a client with this budget.
     pub(crate) fn new(options: &BridgeOptions, metrics: Arc<Metrics>, budget: &Budget) -> Self {
         let limits = OutboxLimits {
-            control: RingBounds {
-                messages: options.control_messages,
-                bytes: options.control_bytes,
-            },
+            control: RingBounds { messages: options.control_messages, bytes: options.control_bytes },
             session_bytes: options.session_bytes,
-            topic: RingBounds {
-                messages: options.topic_messages.max(1),
-                bytes: options.topic_bytes,
-            },
+            topic: RingBounds { messages: options.topic_messages.max(1), bytes: options.topic_bytes },
         };
-        Self {
-            queues: Mutex::new(OutboxQueues::new(budget)),
-            limits,
-            metrics,
-            attached: watch::Sender::default(),
-        }
+        Self { queues: Mutex::new(OutboxQueues::new(budget)), limits, metrics, attached: watch::Sender::default() }
     }
 
     /// Makes the caller's socket the one that sends, and wakes the previous one, which notices. Returns the caller's
@@ -128,11 +117,7 @@ impl Outbox {
         if queues.socket != socket {
             return false;
         }
-        if !queues
-            .waker
-            .as_ref()
-            .is_some_and(|known| known.will_wake(waker))
-        {
+        if !queues.waker.as_ref().is_some_and(|known| known.will_wake(waker)) {
             queues.waker = Some(waker.clone());
         }
         true
@@ -255,21 +240,11 @@ impl Outbox {
             return Some(Outgoing::Control(control));
         }
         let (key, sample, queue) = queues.topics.next(now)?;
-        let SubscriptionOptions {
-            compression,
-            fragment_size,
-            ..
-        } = queue.wishes;
+        let SubscriptionOptions { compression, fragment_size, .. } = queue.wishes;
         let topic = queue.topic.clone();
         // Shrinking always succeeds.
         let _ = queues.count_bytes();
-        Some(Outgoing::Sample {
-            key,
-            sample,
-            topic,
-            compression,
-            fragment_size,
-        })
+        Some(Outgoing::Sample { key, sample, topic, compression, fragment_size })
     }
 
     /// Takes the next control message only, before the connection is closed.
@@ -278,10 +253,7 @@ impl Outbox {
     }
 
     /// Takes the next control message, if `fits` accepts it.
-    pub(crate) fn next_control_if(
-        &self,
-        fits: impl Fn(&ControlMessage) -> bool,
-    ) -> Option<ControlMessage> {
+    pub(crate) fn next_control_if(&self, fits: impl Fn(&ControlMessage) -> bool) -> Option<ControlMessage> {
         let mut queues = self.queues.lock();
         if !fits(queues.control.front()?) {
             return None;
@@ -298,11 +270,7 @@ impl Outbox {
 impl ControlMessage {
     /// Returns its bytes, unless they have a permit of their own.
     pub(crate) fn small_bytes(&self) -> usize {
-        if self.frame.is_big() {
-            0
-        } else {
-            self.frame.bytes.len()
-        }
+        if self.frame.is_big() { 0 } else { self.frame.bytes.len() }
     }
 }
 

@@ -9,35 +9,20 @@ use crate::sample::TopicTypes;
 
 fn outbox(options: BridgeOptions) -> (Outbox, Arc<Metrics>) {
     let metrics = Arc::new(Metrics::default());
-    (
-        Outbox::new(&options, metrics.clone(), &Budget::without_limit()),
-        metrics,
-    )
+    (Outbox::new(&options, metrics.clone(), &Budget::without_limit()), metrics)
 }
 
 fn sample(size: usize) -> Arc<TopicSample> {
     let wire_type = Arc::new(WireType::with_name("a/B"));
-    let message = SerializedMessage {
-        bytes: vec![0; size].into(),
-        wire_type,
-        publisher: "/p".into(),
-        latching: false,
-    };
+    let message = SerializedMessage { bytes: vec![0; size].into(), wire_type, publisher: "/p".into(), latching: false };
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
     let options = BridgeOptions::default();
     Arc::new(TopicSample::new(message, false, types, &options).unwrap())
 }
 
 fn control(size: usize) -> ControlMessage {
-    let frame = EncodedFrame {
-        format: Format::Json,
-        bytes: vec![b'x'; size].into(),
-    };
-    ControlMessage {
-        frame,
-        fragment_size: None,
-        answer: false,
-    }
+    let frame = EncodedFrame { format: Format::Json, bytes: vec![b'x'; size].into() };
+    ControlMessage { frame, fragment_size: None, answer: false }
 }
 
 fn wishes() -> SubscriptionOptions {
@@ -64,19 +49,13 @@ fn drain(outbox: &Outbox, now: Instant) -> Vec<String> {
 #[test]
 fn control_goes_first_and_topics_take_turns() {
     let (outbox, _) = outbox(BridgeOptions::default());
-    let (a, b) = (
-        outbox.add_topic("/a".into(), wishes()),
-        outbox.add_topic("/b".into(), wishes()),
-    );
+    let (a, b) = (outbox.add_topic("/a".into(), wishes()), outbox.add_topic("/b".into(), wishes()));
     for size in 1..=3 {
         outbox.push_sample(a, sample(size), false);
     }
     outbox.push_sample(b, sample(9), false);
     outbox.push_control(control(1));
-    assert_eq!(
-        drain(&outbox, Instant::now()),
-        ["c", "/a1", "/b9", "/a2", "/a3"]
-    );
+    assert_eq!(drain(&outbox, Instant::now()), ["c", "/a1", "/b9", "/a2", "/a3"]);
     outbox.push_sample(a, sample(1), false);
     outbox.remove_topic(a);
     outbox.push_sample(a, sample(1), false);
@@ -86,10 +65,7 @@ fn control_goes_first_and_topics_take_turns() {
 #[test]
 fn a_topic_in_fragments_waits_and_others_do_not() {
     let (outbox, _) = outbox(BridgeOptions::default());
-    let (a, b) = (
-        outbox.add_topic("/a".into(), wishes()),
-        outbox.add_topic("/b".into(), wishes()),
-    );
+    let (a, b) = (outbox.add_topic("/a".into(), wishes()), outbox.add_topic("/b".into(), wishes()));
     outbox.push_sample(a, sample(1), false);
     outbox.push_sample(a, sample(2), false);
     let now = Instant::now();
@@ -114,9 +90,7 @@ fn a_topic_whose_fragments_went_down_with_a_socket_goes_on_over_the_next() {
     assert!(outbox.next(now).is_some());
     outbox.hold_topic(old, key);
     let new = outbox.attach();
-    assert!(
-        matches!(outbox.next(now), Some(Outgoing::Sample { sample, .. }) if sample.bytes.len() == 2)
-    );
+    assert!(matches!(outbox.next(now), Some(Outgoing::Sample { sample, .. }) if sample.bytes.len() == 2));
     // The old socket, which has not noticed yet, changes nothing.
     outbox.hold_topic(old, key);
     outbox.hold_topic(new, key);
@@ -128,13 +102,8 @@ fn a_topic_whose_fragments_went_down_with_a_socket_goes_on_over_the_next() {
 
 #[test]
 fn one_client_holds_bounded_memory_whatever_it_subscribes_to() {
-    let (outbox, metrics) = outbox(BridgeOptions {
-        session_bytes: 1000,
-        ..BridgeOptions::default()
-    });
-    let topics: Vec<_> = (0..10)
-        .map(|number| outbox.add_topic(format!("/{number}").into(), wishes()))
-        .collect();
+    let (outbox, metrics) = outbox(BridgeOptions { session_bytes: 1000, ..BridgeOptions::default() });
+    let topics: Vec<_> = (0..10).map(|number| outbox.add_topic(format!("/{number}").into(), wishes())).collect();
     for _ in 0..100 {
         for key in &topics {
             outbox.push_sample(*key, sample(90), false);
@@ -156,10 +125,7 @@ fn one_client_holds_bounded_memory_whatever_it_subscribes_to() {
 #[test]
 fn ten_large_pictures_fit_into_one_clients_memory() {
     let (outbox, metrics) = outbox(BridgeOptions::default());
-    let wishes = SubscriptionOptions {
-        queue_length: 10,
-        ..wishes()
-    };
+    let wishes = SubscriptionOptions { queue_length: 10, ..wishes() };
     let key = outbox.add_topic("/pictures".into(), wishes);
     for number in 0..10 {
         outbox.push_sample(key, sample(1920 * 1080 * 3 + number), false);
@@ -170,20 +136,14 @@ fn ten_large_pictures_fit_into_one_clients_memory() {
 
 #[test]
 fn who_reads_no_answers_is_told_goodbye() {
-    let (outbox, _) = outbox(BridgeOptions {
-        control_messages: 2,
-        ..BridgeOptions::default()
-    });
+    let (outbox, _) = outbox(BridgeOptions { control_messages: 2, ..BridgeOptions::default() });
     outbox.push_control(control(1));
     outbox.push_control(control(1));
     assert_eq!(outbox.close_reason(), None);
     outbox.push_control(control(1));
     assert_eq!(
         outbox.close_reason(),
-        Some(CloseReason {
-            code: 1008,
-            reason: "2 answers wait and none is read".to_owned()
-        })
+        Some(CloseReason { code: 1008, reason: "2 answers wait and none is read".to_owned() })
     );
 }
 
@@ -191,14 +151,7 @@ fn who_reads_no_answers_is_told_goodbye() {
 fn throttled_topics_come_when_they_are_due() {
     let (outbox, metrics) = outbox(BridgeOptions::default());
     let rate = Duration::from_secs(60);
-    let key = outbox.add_topic(
-        "/a".into(),
-        SubscriptionOptions {
-            throttle_rate: rate,
-            queue_length: 5,
-            ..wishes()
-        },
-    );
+    let key = outbox.add_topic("/a".into(), SubscriptionOptions { throttle_rate: rate, queue_length: 5, ..wishes() });
     outbox.push_sample(key, sample(1), false);
     outbox.push_sample(key, sample(2), false);
     let now = Instant::now();

@@ -24,10 +24,7 @@ fn definitions(version: RosVersion) -> [(&'static str, &'static str); 3] {
     [
         ("std_msgs/msg/Int32", "int32 data\n"),
         ("rosbridge_msgs/msg/ConnectedClient", client),
-        (
-            "rosbridge_msgs/msg/ConnectedClients",
-            "ConnectedClient[] clients\n",
-        ),
+        ("rosbridge_msgs/msg/ConnectedClients", "ConnectedClient[] clients\n"),
     ]
 }
 
@@ -67,25 +64,15 @@ pub(crate) fn define_types(version: RosVersion, registry: &Registry) {
 
 impl Presence {
     pub(crate) fn enter(&self, number: u64, name: &str) {
-        self.present.lock().push(ConnectedClient {
-            number,
-            name: name.to_owned(),
-            since: Time::now(),
-        });
+        self.present.lock().push(ConnectedClient { number, name: name.to_owned(), since: Time::now() });
     }
 
     pub(crate) fn leave(&self, number: u64) {
-        self.present
-            .lock()
-            .retain(|present| present.number != number);
+        self.present.lock().retain(|present| present.number != number);
     }
 
     /// Builds the current message of the topic, if its type has the expected fields.
-    pub(crate) fn build_message(
-        &self,
-        topic: &str,
-        message_type: &MessageType,
-    ) -> Option<SerializedMessage> {
+    pub(crate) fn build_message(&self, topic: &str, message_type: &MessageType) -> Option<SerializedMessage> {
         let said = {
             let present = self.present.lock();
             let client = |ConnectedClient { name, since, .. }: &ConnectedClient| {
@@ -99,13 +86,7 @@ impl Presence {
         };
         let mut bytes = Vec::new();
         let options = FillOptions::default();
-        codec::from_json(
-            message_type,
-            said.to_string().as_bytes(),
-            &mut bytes,
-            &options,
-        )
-        .ok()?;
+        codec::from_json(message_type, said.to_string().as_bytes(), &mut bytes, &options).ok()?;
         Some(SerializedMessage {
             bytes: bytes.into(),
             wire_type: Arc::new(WireType::from_message(message_type)),

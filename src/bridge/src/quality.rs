@@ -60,11 +60,7 @@ pub(crate) fn merge_qos<'q>(all: impl Iterator<Item = &'q QosProfile>) -> Option
 
 /// Describes the policies of a client that have no effect: for ROS 1, or for a subscription, which requests nothing
 /// about the timing of publishers.
-pub(crate) fn ignored_policies(
-    version: RosVersion,
-    qos: &rosbridge::QosRequest,
-    subscribes: bool,
-) -> Option<String> {
+pub(crate) fn ignored_policies(version: RosVersion, qos: &rosbridge::QosRequest, subscribes: bool) -> Option<String> {
     if version == RosVersion::Two && !subscribes {
         return None;
     }
@@ -72,10 +68,7 @@ pub(crate) fn ignored_policies(
         ("qos.deadline", qos.deadline.is_some()),
         ("qos.lifespan", qos.lifespan.is_some()),
         ("qos.liveliness", qos.liveliness.is_some()),
-        (
-            "qos.liveliness_lease_duration",
-            qos.liveliness_lease_duration.is_some(),
-        ),
+        ("qos.liveliness_lease_duration", qos.liveliness_lease_duration.is_some()),
     ];
     let names = said.iter().filter(|(_, is_said)| *is_said);
     let names: Vec<String> = names.map(|(name, _)| format!("{name:?}")).collect();
@@ -127,9 +120,7 @@ pub(crate) fn publication_offer(
         (_, Some(depth)) => depth,
         // This many are sent to new subscribers: of latched messages the last one.
         (_, None) if latch && version == RosVersion::Two => 1,
-        (_, None) => said.map_or(DEFAULT_QUEUE, |size| {
-            usize::try_from(size).unwrap_or(usize::MAX)
-        }),
+        (_, None) => said.map_or(DEFAULT_QUEUE, |size| usize::try_from(size).unwrap_or(usize::MAX)),
     };
     let reliability = match qos.reliability {
         Some(rosbridge::ReliabilityPolicy::BestEffort) => QosReliability::BestEffort,
@@ -139,10 +130,7 @@ pub(crate) fn publication_offer(
         Some(rosbridge::LivelinessPolicy::ManualByTopic) => QosLiveliness::ManualByTopic,
         _ => QosLiveliness::Automatic,
     };
-    let basic = QosProfile {
-        reliability,
-        ..QosProfile::keep_last(depth.min(MOST_QUEUED)).latching(latch)
-    };
+    let basic = QosProfile { reliability, ..QosProfile::keep_last(depth.min(MOST_QUEUED)).latching(latch) };
     let qos = match version {
         RosVersion::One => basic,
         RosVersion::Two => QosProfile {
@@ -173,21 +161,14 @@ mod tests {
         let all = default_subscription_qos(256);
         assert!(all.is_latching());
         assert_eq!(subscription_qos(None, 256), all);
-        assert_eq!(
-            subscription_qos(some_qos(rosbridge::QosRequest::default()), 256),
-            all
-        );
+        assert_eq!(subscription_qos(some_qos(rosbridge::QosRequest::default()), 256), all);
         let deep = rosbridge::QosRequest {
             depth: Some(5),
             reliability: Some(rosbridge::ReliabilityPolicy::BestAvailable),
             durability: Some(rosbridge::DurabilityPolicy::TransientLocal),
             ..rosbridge::QosRequest::default()
         };
-        assert_eq!(
-            subscription_qos(some_qos(deep), 256),
-            all,
-            "its depth is its own queue's"
-        );
+        assert_eq!(subscription_qos(some_qos(deep), 256), all, "its depth is its own queue's");
         let least = rosbridge::QosRequest {
             reliability: Some(rosbridge::ReliabilityPolicy::BestEffort),
             durability: Some(rosbridge::DurabilityPolicy::Volatile),
@@ -211,14 +192,8 @@ mod tests {
             compression: Compression::None,
             qos,
         };
-        let depth = |depth| rosbridge::QosRequest {
-            depth: Some(depth),
-            ..rosbridge::QosRequest::default()
-        };
-        let all = rosbridge::QosRequest {
-            history: Some(HistoryPolicy::KeepAll),
-            ..depth(5)
-        };
+        let depth = |depth| rosbridge::QosRequest { depth: Some(depth), ..rosbridge::QosRequest::default() };
+        let all = rosbridge::QosRequest { history: Some(HistoryPolicy::KeepAll), ..depth(5) };
         for (length, qos, expected) in [
             (0, None, 0),
             (3, None, 3),
@@ -234,8 +209,7 @@ mod tests {
     #[test]
     fn latch_and_queue_size_are_other_words_for_it() {
         let of = |qos, latch, size| {
-            let PublisherOffer { qos, latch } =
-                publication_offer(RosVersion::One, qos, latch, size);
+            let PublisherOffer { qos, latch } = publication_offer(RosVersion::One, qos, latch, size);
             (qos.durability, qos.depth, latch)
         };
         let (old, new) = (QosDurability::TransientLocal, QosDurability::Volatile);
@@ -254,21 +228,11 @@ mod tests {
             durability: Some(rosbridge::DurabilityPolicy::Volatile),
             ..kept
         };
-        assert_eq!(
-            of(some_qos(fleeting), true, None),
-            (new, MOST_QUEUED, false)
-        );
-        let best = rosbridge::QosRequest {
-            durability: Some(rosbridge::DurabilityPolicy::BestAvailable),
-            ..kept
-        };
+        assert_eq!(of(some_qos(fleeting), true, None), (new, MOST_QUEUED, false));
+        let best = rosbridge::QosRequest { durability: Some(rosbridge::DurabilityPolicy::BestAvailable), ..kept };
         assert_eq!(of(some_qos(best), true, None), (old, 1, true));
         // In ROS 2 new subscribers receive as many messages as are kept.
-        let two = |latch, size| {
-            publication_offer(RosVersion::Two, None, latch, size)
-                .qos
-                .depth
-        };
+        let two = |latch, size| publication_offer(RosVersion::Two, None, latch, size).qos.depth;
         assert_eq!((two(true, Some(7)), two(false, Some(7))), (1, 7));
     }
 
@@ -296,9 +260,6 @@ mod tests {
         assert!(told.ends_with("subscriptions here accept whatever publishers offer there"));
         let silent = rosbridge::QosRequest::default();
         assert_eq!(ignored_policies(RosVersion::One, &silent, true), None);
-        assert_eq!(
-            subscription_qos(some_qos(timed), 256),
-            default_subscription_qos(256)
-        );
+        assert_eq!(subscription_qos(some_qos(timed), 256), default_subscription_qos(256));
     }
 }

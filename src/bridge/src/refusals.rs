@@ -18,18 +18,14 @@ impl Refusals {
     /// come back.
     pub(crate) fn update(&mut self, matched: &MatchedPeers) -> Vec<String> {
         let refused = &matched.refused;
-        self.known
-            .retain(|(peer, _)| refused.iter().any(|refusal| refusal.peer == *peer));
+        self.known.retain(|(peer, _)| refused.iter().any(|refusal| refusal.peer == *peer));
         let mut new = Vec::new();
         for refusal in refused {
             let is_known = self.known.iter().any(|(peer, _)| *peer == refusal.peer);
             if is_known || self.known.len() >= MOST {
                 continue;
             }
-            let told = format!(
-                "no messages pass between {} and this client: {}",
-                refusal.peer, refusal.why
-            );
+            let told = format!("no messages pass between {} and this client: {}", refusal.peer, refusal.why);
             self.known.push((refusal.peer.clone(), told.clone()));
             new.push(told);
         }
@@ -51,13 +47,9 @@ mod tests {
     fn refused_by(peers: &[(&str, u128)]) -> MatchedPeers {
         let refused = peers.iter().map(|(node, number)| IncompatiblePeer {
             peer: PeerId::new(*node, *number),
-            why: "reliability: the publisher offers best_effort, the subscriber asks for reliable"
-                .to_owned(),
+            why: "reliability: the publisher offers best_effort, the subscriber asks for reliable".to_owned(),
         });
-        MatchedPeers {
-            refused: refused.collect(),
-            ..MatchedPeers::default()
-        }
+        MatchedPeers { refused: refused.collect(), ..MatchedPeers::default() }
     }
 
     #[test]
@@ -65,18 +57,11 @@ mod tests {
         let mut refusals = Refusals::default();
         assert_eq!(
             refusals.update(&refused_by(&[("/camera", 1)])),
-            [
-                "no messages pass between /camera and this client: reliability: the publisher offers best_effort, the \
-                    subscriber asks for reliable"
-            ]
+            ["no messages pass between /camera and this client: reliability: the publisher offers best_effort, the \
+                    subscriber asks for reliable"]
         );
         assert_eq!(refusals.update(&refused_by(&[("/camera", 1)])).len(), 0);
-        assert_eq!(
-            refusals
-                .update(&refused_by(&[("/camera", 1), ("/camera", 2)]))
-                .len(),
-            1
-        );
+        assert_eq!(refusals.update(&refused_by(&[("/camera", 1), ("/camera", 2)])).len(), 1);
         assert_eq!(refusals.reasons().count(), 2);
         assert_eq!(refusals.update(&MatchedPeers::default()).len(), 0);
         assert_eq!(refusals.reasons().count(), 0);

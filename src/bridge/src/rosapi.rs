@@ -56,17 +56,12 @@ impl RosapiService {
     /// Finds the service with this absolute name.
     pub(crate) fn find(name: &str) -> Option<RosapiService> {
         let name = name.strip_prefix("/rosapi/")?;
-        definitions::SERVICES
-            .iter()
-            .find(|(known, _)| *known == name)
-            .map(|(name, srv)| RosapiService { name, srv })
+        definitions::SERVICES.iter().find(|(known, _)| *known == name).map(|(name, srv)| RosapiService { name, srv })
     }
 
     /// Iterates over all services of rosapi.
     pub(crate) fn all() -> impl Iterator<Item = RosapiService> {
-        definitions::SERVICES
-            .iter()
-            .map(|(name, srv)| RosapiService { name, srv })
+        definitions::SERVICES.iter().map(|(name, srv)| RosapiService { name, srv })
     }
 
     /// Returns the absolute name, `/rosapi/…`.
@@ -88,10 +83,7 @@ impl RosapiService {
         let (version, grants) = (shared.bus.version(), caller.grants);
         let now = graph::with_own_topics(version, &shared.bus.graph().borrow());
         let now = graph::filter_by_grants(now, grants);
-        let definitions = Definitions {
-            version,
-            registry: &shared.registry,
-        };
+        let definitions = Definitions { version, registry: &shared.registry };
         Ok(match self.name {
             "topics" => graph::topics(&now),
             "topics_for_type" => graph::topics_for_type(&now, &args.type_name),
@@ -115,9 +107,7 @@ impl RosapiService {
             "service_response_details" => definitions.response(&args.type_name)?,
             "action_goal_details" => definitions.action_part(&args.type_name, |of| &of.goal)?,
             "action_result_details" => definitions.action_part(&args.type_name, |of| &of.result)?,
-            "action_feedback_details" => {
-                definitions.action_part(&args.type_name, |of| &of.feedback)?
-            }
+            "action_feedback_details" => definitions.action_part(&args.type_name, |of| &of.feedback)?,
             name if name.contains("param") => match version {
                 RosVersion::One => self.shared_param(shared, args, caller.budget).await?,
                 RosVersion::Two => self.node_param(shared, args, caller.budget).await?,

@@ -59,10 +59,7 @@ pub(crate) enum SampleError {
     #[error(transparent)]
     Type(#[from] Arc<TopicTypeError>),
     #[error("{error} (from {publisher})")]
-    Codec {
-        error: Box<CodecError>,
-        publisher: PeerId,
-    },
+    Codec { error: Box<CodecError>, publisher: PeerId },
     #[error(transparent)]
     Pack(#[from] PackError),
     /// The encoding does not fit into the servant's budget.
@@ -88,10 +85,7 @@ impl EncodedFrame {
         if printed.capacity() > UNCOUNTED {
             printed.shrink_to_fit();
         }
-        Self {
-            format,
-            bytes: printed.into(),
-        }
+        Self { format, bytes: printed.into() }
     }
 
     /// Returns whether it counts by itself.
@@ -102,10 +96,7 @@ impl EncodedFrame {
     /// Attaches `permit` to the bytes.
     pub(crate) fn with_permit(self, permit: Option<Permit>) -> Self {
         match permit {
-            Some(permit) => Self {
-                bytes: permit.wrap_bytes(self.bytes),
-                ..self
-            },
+            Some(permit) => Self { bytes: permit.wrap_bytes(self.bytes), ..self },
             None => self,
         }
     }
@@ -125,12 +116,7 @@ impl EncodedFrame {
         let data = rosbridge::encode_png(ascii.as_bytes());
         let data = data.map_err(|error| PackError(error.into()))?;
         let mut out = Vec::with_capacity(data.len() + 64);
-        rosbridge::Op::from(rosbridge::Png {
-            id: None,
-            data: data.into(),
-            part: None,
-        })
-        .print(&mut out, Format::Json);
+        rosbridge::Op::from(rosbridge::Png { id: None, data: data.into(), part: None }).print(&mut out, Format::Json);
         Ok(EncodedFrame::new(Format::Json, out))
     }
 }
@@ -159,12 +145,7 @@ type SharedFrame = Result<EncodedFrame, Arc<SampleError>>;
 
 impl TopicTypes {
     pub(crate) fn new(registry: Arc<Registry>) -> Self {
-        Self {
-            registry,
-            found: Mutex::default(),
-            sizes: Default::default(),
-            warm: Mutex::default(),
-        }
+        Self { registry, found: Mutex::default(), sizes: Default::default(), warm: Mutex::default() }
     }
 
     /// Keeps an encoding of `bytes` bytes of this message, and drops older ones.
@@ -225,9 +206,7 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, T
         });
     }
     let theirs = if ours.is_err() {
-        registry
-            .insert_full_text(&wire.name, &wire.definition)
-            .and_then(|()| registry.message(&wire.name))
+        registry.insert_full_text(&wire.name, &wire.definition).and_then(|()| registry.message(&wire.name))
     } else {
         wire.schema()
     };
@@ -282,11 +261,7 @@ impl TopicSample {
         options: &BridgeOptions,
     ) -> Result<Self, Exceeded> {
         let length = message.bytes.len();
-        let permit = if length > UNCOUNTED {
-            options.budget.take(length)?.split().1
-        } else {
-            None
-        };
+        let permit = if length > UNCOUNTED { options.budget.take(length)?.split().1 } else { None };
         Ok(Self {
             bytes: message.bytes,
             wire_type: message.wire_type,
@@ -323,8 +298,7 @@ impl TopicSample {
     ) -> SharedFrame {
         // Held while encoding, so that a second subscriber waits for the first one's result instead of encoding again.
         let mut encoded = self.encoded.lock();
-        let same =
-            |other: &&CachedEncoding| other.compression == compression && other.topic == *topic;
+        let same = |other: &&CachedEncoding| other.compression == compression && other.topic == *topic;
         if let Encodings::Warm(known) = &*encoded
             && let Some(known) = known.iter().find(same)
         {
@@ -334,22 +308,11 @@ impl TopicSample {
         let mut permit = options.budget.permit();
         let made = self.encode(compression, topic, options, &mut permit);
         let (own, above) = permit.split();
-        let frame = made.map_err(Arc::new).map(|frame| {
-            if frame.is_big() {
-                frame.with_permit(above)
-            } else {
-                frame
-            }
-        });
+        let frame = made.map_err(Arc::new).map(|frame| if frame.is_big() { frame.with_permit(above) } else { frame });
         let Encodings::Warm(known) = &mut *encoded else {
             return frame;
         };
-        known.push(CachedEncoding {
-            compression,
-            topic: topic.clone(),
-            frame: frame.clone(),
-            _permit: own,
-        });
+        known.push(CachedEncoding { compression, topic: topic.clone(), frame: frame.clone(), _permit: own });
         drop(encoded);
         let bytes = frame.as_ref().map_or(0, |frame| frame.bytes.len());
         self.types.cache(self, bytes);
@@ -372,10 +335,7 @@ impl TopicSample {
         let last = self.types.sizes[slot].load(Ordering::Relaxed);
         // The last one may have had a very different size.
         let hint = last.min(LONGEST * length + SHORT).max(length) + 128;
-        let full = |full: Exceeded| SampleError::NoRoom {
-            publisher: self.publisher.clone(),
-            full,
-        };
+        let full = |full: Exceeded| SampleError::NoRoom { publisher: self.publisher.clone(), full };
         if hint > UNCOUNTED {
             permit.resize(hint).map_err(full)?;
         }
@@ -383,47 +343,27 @@ impl TopicSample {
         let left = permit.bytes().saturating_add(options.budget.available());
         let max_bytes = max_bytes.min(left.max(UNCOUNTED));
         let mut out = Vec::with_capacity(hint);
-        let failed = |error: CodecError| SampleError::Codec {
-            error: Box::new(error),
-            publisher: self.publisher.clone(),
-        };
+        let failed =
+            |error: CodecError| SampleError::Codec { error: Box::new(error), publisher: self.publisher.clone() };
         match compression {
             Compression::CborRaw => {
-                Publish::print_raw(
-                    &mut out,
-                    topic,
-                    (self.received.secs, self.received.nsecs),
-                    &self.bytes,
-                );
+                Publish::print_raw(&mut out, topic, (self.received.secs, self.received.nsecs), &self.bytes);
             }
             Compression::Cbor => {
                 let message_type = self.types.find(&self.wire_type)?;
-                let options = CborOptions {
-                    max_bytes,
-                    ..CborOptions::default()
-                };
-                let write =
-                    |out: &mut Vec<u8>| codec::to_cbor(&message_type, &self.bytes, out, &options);
+                let options = CborOptions { max_bytes, ..CborOptions::default() };
+                let write = |out: &mut Vec<u8>| codec::to_cbor(&message_type, &self.bytes, out, &options);
                 Publish::print_with(&mut out, Format::Cbor, topic, write).map_err(failed)?;
             }
             Compression::None | Compression::Png => {
                 let message_type = self.types.find(&self.wire_type)?;
-                let options = JsonOptions {
-                    non_finite: options.non_finite,
-                    max_bytes,
-                    ..JsonOptions::default()
-                };
-                let write =
-                    |out: &mut Vec<u8>| codec::to_json(&message_type, &self.bytes, out, &options);
+                let options = JsonOptions { non_finite: options.non_finite, max_bytes, ..JsonOptions::default() };
+                let write = |out: &mut Vec<u8>| codec::to_json(&message_type, &self.bytes, out, &options);
                 Publish::print_with(&mut out, Format::Json, topic, write).map_err(failed)?;
             }
         }
         self.types.sizes[slot].store(out.len(), Ordering::Relaxed);
-        let format = if slot == 0 {
-            Format::Json
-        } else {
-            Format::Cbor
-        };
+        let format = if slot == 0 { Format::Json } else { Format::Cbor };
         let mut frame = EncodedFrame::new(format, out);
         if compression == Compression::Png {
             frame = frame.into_png()?;

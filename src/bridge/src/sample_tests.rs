@@ -6,19 +6,12 @@ use super::*;
 #[test]
 fn a_topic_keeps_the_encodings_of_its_latest_messages_only() {
     let daemon = Budget::new("the daemon", 1 << 30);
-    let options = BridgeOptions {
-        budget: daemon.child("servant x", 64 << 20),
-        ..BridgeOptions::default()
-    };
+    let options = BridgeOptions { budget: daemon.child("servant x", 64 << 20), ..BridgeOptions::default() };
     let metrics = Metrics::default();
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
     let wire_type = Arc::new(WireType::with_name("a/B"));
     let topic: Arc<str> = "/t".into();
-    let frame = |sample: &Arc<TopicSample>| {
-        sample
-            .frame(Compression::CborRaw, &topic, &options, &metrics)
-            .unwrap()
-    };
+    let frame = |sample: &Arc<TopicSample>| sample.frame(Compression::CborRaw, &topic, &options, &metrics).unwrap();
     // As in the queue of a client that reads slowly.
     let waiting: Vec<_> = (0..40)
         .map(|_| {
@@ -43,11 +36,7 @@ fn a_topic_keeps_the_encodings_of_its_latest_messages_only() {
     assert_eq!(metrics.encoded.get(), 41);
     drop(waiting);
     assert_eq!(options.budget.used_bytes(), 0);
-    assert_eq!(
-        daemon.used_bytes(),
-        late.bytes.len(),
-        "a client is being sent it"
-    );
+    assert_eq!(daemon.used_bytes(), late.bytes.len(), "a client is being sent it");
     drop(late);
     assert_eq!(daemon.used_bytes(), 0);
 }

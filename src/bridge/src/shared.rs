@@ -61,8 +61,7 @@ struct KnownFanout {
 impl KnownFanout {
     fn serves(&self, qos: QosProfile, type_name: Option<&str>) -> bool {
         let hears = |(own, asked): (&str, &str)| own == asked;
-        self.qos.is_none_or(|own| own == qos)
-            && self.type_name.as_deref().zip(type_name).is_none_or(hears)
+        self.qos.is_none_or(|own| own == qos) && self.type_name.as_deref().zip(type_name).is_none_or(hears)
     }
 }
 
@@ -84,11 +83,7 @@ struct ClientRegistry {
 }
 
 impl BridgeShared {
-    pub(crate) fn new(
-        bus: Arc<dyn Bus>,
-        registry: Arc<Registry>,
-        options: BridgeOptions,
-    ) -> Arc<Self> {
+    pub(crate) fn new(bus: Arc<dyn Bus>, registry: Arc<Registry>, options: BridgeOptions) -> Arc<Self> {
         presence::define_types(bus.version(), &registry);
         tf::define_types(bus.version(), &registry);
         let requests = options.pair.as_ref().map(TopicRequests::for_pair);
@@ -117,11 +112,7 @@ impl BridgeShared {
         let mut clients = self.clients.lock();
         clients.closed.get_or_insert_with(|| reason.clone());
         clients.resumable.clear();
-        clients
-            .all
-            .drain(..)
-            .filter_map(|client| client.upgrade())
-            .collect()
+        clients.all.drain(..).filter_map(|client| client.upgrade()).collect()
     }
 
     pub(crate) fn clients(&self) -> Vec<Arc<BridgeClient>> {
@@ -131,10 +122,7 @@ impl BridgeShared {
 
     /// Returns the client of a connection: a resumed one, or a new one. Fails after [`close`](Self::close), with the
     /// reason for closing the connection.
-    pub(crate) fn client_for(
-        self: &Arc<Self>,
-        options: &SessionOptions,
-    ) -> Result<Arc<BridgeClient>, CloseReason> {
+    pub(crate) fn client_for(self: &Arc<Self>, options: &SessionOptions) -> Result<Arc<BridgeClient>, CloseReason> {
         let mut clients = self.clients.lock();
         if let Some(reason) = &clients.closed {
             return Err(reason.clone());
@@ -157,11 +145,7 @@ impl BridgeShared {
 
     pub(crate) fn forget_client(&self, client: &Arc<BridgeClient>, token: &str) {
         let mut clients = self.clients.lock();
-        if clients
-            .resumable
-            .get(token)
-            .is_some_and(|known| Arc::ptr_eq(known, client))
-        {
+        if clients.resumable.get(token).is_some_and(|known| Arc::ptr_eq(known, client)) {
             clients.resumable.remove(token);
         }
         drop(clients);
@@ -169,16 +153,8 @@ impl BridgeShared {
     }
 
     /// Returns the topic's fanout with the default quality of service; starts it if necessary.
-    pub(crate) fn fanout(
-        self: &Arc<Self>,
-        topic: &str,
-        message_type: Option<&MessageType>,
-    ) -> Arc<Fanout> {
-        self.fanout_with_qos(
-            topic,
-            message_type,
-            default_subscription_qos(self.options.bus_queue),
-        )
+    pub(crate) fn fanout(self: &Arc<Self>, topic: &str, message_type: Option<&MessageType>) -> Arc<Fanout> {
+        self.fanout_with_qos(topic, message_type, default_subscription_qos(self.options.bus_queue))
     }
 
     /// Returns the topic's fanout with this quality of service; starts it if necessary.
@@ -208,9 +184,7 @@ impl BridgeShared {
             None => (Fanout::start(self, topic, message_type, qos), Some(qos)),
         };
         let topic_publishers = self.publishers_of(topic);
-        let latched = topic_publishers
-            .iter()
-            .filter_map(|topic_publisher| topic_publisher.latched_message());
+        let latched = topic_publishers.iter().filter_map(|topic_publisher| topic_publisher.latched_message());
         for message in latched.filter(|_| fanout.keeps_latched()) {
             fanout.deliver(message, true);
         }
@@ -266,20 +240,12 @@ impl BridgeShared {
     }
 
     fn publishers_of(&self, topic: &str) -> Vec<Arc<TopicPublisher>> {
-        self.topic_publishers
-            .lock()
-            .get(topic)
-            .into_iter()
-            .flatten()
-            .filter_map(Weak::upgrade)
-            .collect()
+        self.topic_publishers.lock().get(topic).into_iter().flatten().filter_map(Weak::upgrade).collect()
     }
 
     /// Returns whether the client's publisher with this id still exists.
     pub(crate) fn has_publisher(&self, topic: &str, id: &PeerId) -> bool {
-        self.publishers_of(topic)
-            .iter()
-            .any(|topic_publisher| topic_publisher.id == *id)
+        self.publishers_of(topic).iter().any(|topic_publisher| topic_publisher.id == *id)
     }
 
     pub(crate) fn add_publisher(&self, topic_publisher: &Arc<TopicPublisher>) {
@@ -311,9 +277,7 @@ impl BridgeShared {
     /// it.
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
         let topic_publishers = self.publishers_of(topic);
-        let known = topic_publishers
-            .first()
-            .map(|topic_publisher| topic_publisher.message_type.name());
+        let known = topic_publishers.first().map(|topic_publisher| topic_publisher.message_type.name());
         let version = self.bus.version();
         known
             .or(presence::type_name(version, topic))
@@ -326,9 +290,7 @@ impl BridgeShared {
         let fanouts = self.fanouts.lock();
         let of_topic = fanouts.get(topic).into_iter().flatten();
         // None is dropped here: dropping the last reference would take the lock.
-        of_topic
-            .filter_map(|known| known.fanout.upgrade())
-            .collect()
+        of_topic.filter_map(|known| known.fanout.upgrade()).collect()
     }
 
     /// Delivers a message of the bridge itself, or of one of its clients, to all listeners; returns false if there are

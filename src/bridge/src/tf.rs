@@ -26,22 +26,10 @@ pub(crate) use transform::Transform;
 
 /// Definitions of transforms, which mean the same in both versions of ROS.
 const DEFINITIONS: &[(&str, &str)] = &[
-    (
-        "geometry_msgs/msg/Vector3",
-        "float64 x\nfloat64 y\nfloat64 z\n",
-    ),
-    (
-        "geometry_msgs/msg/Quaternion",
-        "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    ),
-    (
-        "geometry_msgs/msg/Transform",
-        "Vector3 translation\nQuaternion rotation\n",
-    ),
-    (
-        "geometry_msgs/msg/TransformStamped",
-        "std_msgs/Header header\nstring child_frame_id\nTransform transform\n",
-    ),
+    ("geometry_msgs/msg/Vector3", "float64 x\nfloat64 y\nfloat64 z\n"),
+    ("geometry_msgs/msg/Quaternion", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"),
+    ("geometry_msgs/msg/Transform", "Vector3 translation\nQuaternion rotation\n"),
+    ("geometry_msgs/msg/TransformStamped", "std_msgs/Header header\nstring child_frame_id\nTransform transform\n"),
 ];
 
 /// Fields of requests by callers and goals.
@@ -82,14 +70,8 @@ fn own_definitions(version: RosVersion) -> [(String, String); 3] {
     };
     [
         (format!("{package}/msg/TFArray"), TRANSFORMS.to_owned()),
-        (
-            format!("{package}/srv/RepublishTFs"),
-            format!("{WANTED}{duration} timeout\n---\nstring topic_name\n"),
-        ),
-        (
-            format!("{package}/action/TFSubscription"),
-            format!("{WANTED}---\n---\n{TRANSFORMS}"),
-        ),
+        (format!("{package}/srv/RepublishTFs"), format!("{WANTED}{duration} timeout\n---\nstring topic_name\n")),
+        (format!("{package}/action/TFSubscription"), format!("{WANTED}---\n---\n{TRANSFORMS}")),
     ]
 }
 

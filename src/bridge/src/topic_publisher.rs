@@ -21,10 +21,7 @@ use crate::shared::BridgeShared;
 use crate::topic_requests::TopicRequests;
 
 /// Limits of messages kept while the topic is being advertised.
-const WARM: RingBounds = RingBounds {
-    messages: 256,
-    bytes: 16 << 20,
-};
+const WARM: RingBounds = RingBounds { messages: 256, bytes: 16 << 20 };
 
 /// Factor of the waiting time for a registered node while nobody else is connected: on a busy machine rospy takes
 /// seconds.
@@ -86,10 +83,7 @@ enum State {
 
 impl State {
     fn warming(publisher: Option<CountingPublisher>) -> State {
-        State::Warming {
-            waiting: Ring::new(WARM),
-            publisher,
-        }
+        State::Warming { waiting: Ring::new(WARM), publisher }
     }
 }
 
@@ -139,27 +133,19 @@ impl TopicPublisher {
             && self.is_incomplete(publisher, settled)
         {
             let subscribers = publisher.match_events();
-            if let State::Live { publisher, .. } =
-                std::mem::replace(&mut *state, State::warming(None))
-            {
+            if let State::Live { publisher, .. } = std::mem::replace(&mut *state, State::warming(None)) {
                 *state = State::warming(Some(publisher));
             }
-            tokio::spawn(wait_for_subscribers(
-                self.clone(),
-                subscribers,
-                self.wait_deadlines(),
-            ));
+            tokio::spawn(wait_for_subscribers(self.clone(), subscribers, self.wait_deadlines()));
         }
         match &mut *state {
             State::Live { publisher, .. } => {
                 // Not for messages that wait for connections: that time is not the servant's.
                 if let Some(requests) = &self.requests {
                     let shared = &self.shared;
-                    let heard =
-                        requests.has_listener(|topic| !shared.live_fanouts(topic).is_empty());
+                    let heard = requests.has_listener(|topic| !shared.live_fanouts(topic).is_empty());
                     let now = Instant::now();
-                    let unanswered =
-                        requests.record_request(&self.message_type, &bytes, now, heard);
+                    let unanswered = requests.record_request(&self.message_type, &bytes, now, heard);
                     (0..unanswered).for_each(|_| shared.options.called.record(None));
                 }
                 publisher.publish(bytes);
@@ -209,10 +195,7 @@ impl TopicPublisher {
     /// Returns the deadlines of waiting for subscribers, from now on.
     fn wait_deadlines(&self) -> WaitDeadlines {
         let (warm_up, now) = (self.shared.options.warm_up, Instant::now());
-        WaitDeadlines {
-            some: now + warm_up,
-            none: now + warm_up * ALONE,
-        }
+        WaitDeadlines { some: now + warm_up, none: now + warm_up * ALONE }
     }
 
     /// Returns the nodes registered as subscribers that are not connected. The bridge itself may be registered, but
@@ -238,20 +221,14 @@ impl TopicPublisher {
     /// Returns whether all subscribers that should be connected are, and at least one is. An observing node does not
     /// count.
     fn is_complete(&self, matched: &MatchedPeers) -> bool {
-        matched.connected_count_except(INSIDE) > 0
-            && self
-                .missing_subscribers(matched)
-                .is_subset(&self.given_up.lock())
+        matched.connected_count_except(INSIDE) > 0 && self.missing_subscribers(matched).is_subset(&self.given_up.lock())
     }
 
     /// Sends the queued messages, in order, and from now on all at once.
     fn go_live(&self) {
         let settled = self.shared.bus.graph().borrow().generation;
         let mut state = self.state.lock();
-        let State::Warming {
-            waiting, publisher, ..
-        } = &mut *state
-        else {
+        let State::Warming { waiting, publisher, .. } = &mut *state else {
             return;
         };
         let Some(publisher) = publisher.take() else {
@@ -276,11 +253,7 @@ fn is_refused(matched: &MatchedPeers, node: &str) -> bool {
     refused.any(|refusal| refusal.peer.node() == node)
 }
 
-async fn warm_up(
-    topic_publisher: Arc<TopicPublisher>,
-    of: WireType,
-    notified: Arc<dyn PublisherEvents>,
-) {
+async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: Arc<dyn PublisherEvents>) {
     let shared = topic_publisher.shared.clone();
     let patience = topic_publisher.wait_deadlines();
     let (topic, qos) = (&topic_publisher.topic, topic_publisher.offer.qos);
@@ -293,20 +266,14 @@ async fn warm_up(
     };
     let subscribers = publisher.match_events();
     tokio::spawn(report_refusals(subscribers.clone(), notified));
-    if let State::Warming {
-        publisher: held, ..
-    } = &mut *topic_publisher.state.lock()
-    {
+    if let State::Warming { publisher: held, .. } = &mut *topic_publisher.state.lock() {
         *held = Some(publisher);
     }
     wait_for_subscribers(topic_publisher, subscribers, patience).await;
 }
 
 /// Reports incompatible subscribers for as long as the topic is advertised.
-async fn report_refusals(
-    mut subscribers: watch::Receiver<MatchedPeers>,
-    notified: Arc<dyn PublisherEvents>,
-) {
+async fn report_refusals(mut subscribers: watch::Receiver<MatchedPeers>, notified: Arc<dyn PublisherEvents>) {
     let mut refusals = Refusals::default();
     loop {
         let new = refusals.update(&subscribers.borrow_and_update());
@@ -330,16 +297,14 @@ async fn wait_for_subscribers(
     let mut in_time = wait_connected(&topic_publisher, &mut subscribers, patience.some).await;
     let is_slow = {
         let matched = subscribers.borrow();
-        matched.connected_count_except(INSIDE) == 0
-            && !topic_publisher.missing_subscribers(&matched).is_empty()
+        matched.connected_count_except(INSIDE) == 0 && !topic_publisher.missing_subscribers(&matched).is_empty()
     };
     if !in_time && is_slow {
         in_time = wait_connected(&topic_publisher, &mut subscribers, patience.none).await;
     }
     if !in_time {
         // They are not waited for again while they do not change.
-        *topic_publisher.given_up.lock() =
-            topic_publisher.missing_subscribers(&subscribers.borrow());
+        *topic_publisher.given_up.lock() = topic_publisher.missing_subscribers(&subscribers.borrow());
     }
     topic_publisher.go_live();
 }

@@ -32,9 +32,7 @@ pub(crate) struct SubscriptionOptions {
 impl SubscriptionOptions {
     /// Returns the options that satisfy all of a client's subscriptions to a topic: the lowest throttle rate and
     /// fragment size, the longest queue, the most compact encoding.
-    pub(crate) fn merge<'w>(
-        all: impl Iterator<Item = &'w SubscriptionOptions>,
-    ) -> Option<SubscriptionOptions> {
+    pub(crate) fn merge<'w>(all: impl Iterator<Item = &'w SubscriptionOptions>) -> Option<SubscriptionOptions> {
         all.copied().reduce(|one, other| SubscriptionOptions {
             throttle_rate: one.throttle_rate.min(other.throttle_rate),
             queue_length: one.queue_length.max(other.queue_length),
@@ -98,12 +96,7 @@ pub(crate) struct TopicQueue {
 }
 
 impl TopicQueue {
-    pub(crate) fn new(
-        topic: Arc<str>,
-        wishes: SubscriptionOptions,
-        limits: RingBounds,
-        drops: Arc<Drops>,
-    ) -> Self {
+    pub(crate) fn new(topic: Arc<str>, wishes: SubscriptionOptions, limits: RingBounds, drops: Arc<Drops>) -> Self {
         Self {
             topic,
             drops,
@@ -122,20 +115,12 @@ impl TopicQueue {
     }
 
     pub(crate) fn load(&self) -> QueuedBytes {
-        QueuedBytes {
-            bytes: self.samples.bytes(),
-            big: self.big,
-        }
+        QueuedBytes { bytes: self.samples.bytes(), big: self.big }
     }
 
     /// Queues a sample, for which others may be dropped; returns `None` if it is dropped because of the throttle rate.
     /// `replay`: it is an old one for a new subscriber.
-    pub(crate) fn push(
-        &mut self,
-        sample: Arc<TopicSample>,
-        replay: bool,
-        now: Instant,
-    ) -> Option<DropTally> {
+    pub(crate) fn push(&mut self, sample: Arc<TopicSample>, replay: bool, now: Instant) -> Option<DropTally> {
         let first = self.is_first(&sample, replay);
         let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
         if throttles && !first {
@@ -145,11 +130,7 @@ impl TopicQueue {
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
         self.big += sample.counted_bytes();
-        let at = if first {
-            self.first_count()
-        } else {
-            self.samples.len()
-        };
+        let at = if first { self.first_count() } else { self.samples.len() };
         self.samples.insert(at, QueuedSample { sample, first });
         let mut lost = DropTally::default();
         while self.exceeds_limits() {
@@ -216,13 +197,8 @@ impl TopicQueue {
     /// Returns when the next sample may be sent; `None` while there is none.
     pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
         let next = self.samples.front()?;
-        let held_back =
-            !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
-        Some(
-            self.next_at
-                .filter(|at| held_back && *at > now)
-                .unwrap_or(now),
-        )
+        let held_back = !next.first && self.wishes.queue_length > 0 && !self.wishes.throttle_rate.is_zero();
+        Some(self.next_at.filter(|at| held_back && *at > now).unwrap_or(now))
     }
 
     /// Takes the next sample to send.

@@ -7,12 +7,7 @@ use crate::sample::TopicTypes;
 
 fn sample(publisher: &str, latching: bool, size: usize) -> Arc<TopicSample> {
     let wire_type = Arc::new(WireType::with_name("a/B"));
-    let message = SerializedMessage {
-        bytes: vec![0; size].into(),
-        wire_type,
-        publisher: publisher.into(),
-        latching,
-    };
+    let message = SerializedMessage { bytes: vec![0; size].into(), wire_type, publisher: publisher.into(), latching };
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
     let options = BridgeOptions::default();
     Arc::new(TopicSample::new(message, false, types, &options).unwrap())
@@ -28,23 +23,11 @@ fn wishes(throttle: u64, length: usize) -> SubscriptionOptions {
 }
 
 fn queue(throttle: u64, length: usize) -> TopicQueue {
-    TopicQueue::new(
-        "/x".into(),
-        wishes(throttle, length),
-        RingBounds {
-            messages: 5,
-            bytes: 1000,
-        },
-        Arc::default(),
-    )
+    TopicQueue::new("/x".into(), wishes(throttle, length), RingBounds { messages: 5, bytes: 1000 }, Arc::default())
 }
 
 fn sizes(queue: &TopicQueue) -> Vec<usize> {
-    queue
-        .samples
-        .iter()
-        .map(|waiting| waiting.sample.bytes.len())
-        .collect()
+    queue.samples.iter().map(|waiting| waiting.sample.bytes.len()).collect()
 }
 
 #[test]
@@ -62,10 +45,7 @@ fn the_newest_win_within_messages_and_bytes() {
         let _ = bytes.push(sample("/p", false, size), false, now);
     }
     let lost = bytes.push(sample("/p", false, 402), false, now).unwrap();
-    assert_eq!(
-        (lost.messages, lost.bytes, sizes(&bytes)),
-        (1, 400, vec![401, 402])
-    );
+    assert_eq!((lost.messages, lost.bytes, sizes(&bytes)), (1, 400, vec![401, 402]));
     let mut asked = queue(0, 2);
     for size in 1..=4 {
         let _ = asked.push(sample("/p", false, size), false, now);
@@ -78,15 +58,8 @@ fn the_newest_win_within_messages_and_bytes() {
 fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
     let now = Instant::now();
     let kept = |asked| {
-        let mut queue = TopicQueue::new(
-            "/x".into(),
-            wishes(0, asked),
-            RingBounds {
-                messages: 1000,
-                bytes: 1000,
-            },
-            Arc::default(),
-        );
+        let mut queue =
+            TopicQueue::new("/x".into(), wishes(0, asked), RingBounds { messages: 1000, bytes: 1000 }, Arc::default());
         for size in 6001..=6020 {
             let _ = queue.push(sample("/p", false, size), false, now);
         }
@@ -104,8 +77,7 @@ fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
 fn without_a_queue_a_throttle_leaves_messages_out() {
     let (now, ms) = (Instant::now(), Duration::from_millis(1));
     let mut queue = queue(100, 0);
-    let mut is_throttled =
-        |size, replay, at| queue.push(sample("/p", false, size), replay, at).is_none();
+    let mut is_throttled = |size, replay, at| queue.push(sample("/p", false, size), replay, at).is_none();
     assert!(!is_throttled(1, false, now));
     assert!(is_throttled(2, false, now + 99 * ms));
     assert!(!is_throttled(3, true, now + 99 * ms));
@@ -141,11 +113,7 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
     }
     assert_eq!(dropped("/b", 2), Some(0));
     assert_eq!(dropped("/b", 3), Some(2));
-    assert_eq!(
-        sizes(&queue),
-        [1, 1, 3],
-        "of a publisher of whom a newer one is there the older give way"
-    );
+    assert_eq!(sizes(&queue), [1, 1, 3], "of a publisher of whom a newer one is there the older give way");
     for _ in 0..3 {
         assert_eq!(queue.due(now), Some(now));
         queue.pop(now);
@@ -156,20 +124,10 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
 
 #[test]
 fn several_subscriptions_of_a_topic_merge() {
-    let one = SubscriptionOptions {
-        fragment_size: Some(500),
-        ..wishes(100, 0)
-    };
-    let two = SubscriptionOptions {
-        compression: Compression::CborRaw,
-        ..wishes(50, 3)
-    };
+    let one = SubscriptionOptions { fragment_size: Some(500), ..wishes(100, 0) };
+    let two = SubscriptionOptions { compression: Compression::CborRaw, ..wishes(50, 3) };
     let merged = SubscriptionOptions::merge([one, two].iter()).unwrap();
-    let expected = SubscriptionOptions {
-        fragment_size: Some(500),
-        compression: Compression::CborRaw,
-        ..wishes(50, 3)
-    };
+    let expected = SubscriptionOptions { fragment_size: Some(500), compression: Compression::CborRaw, ..wishes(50, 3) };
     assert_eq!(merged, expected);
     assert_eq!(SubscriptionOptions::merge([].iter()), None);
 }

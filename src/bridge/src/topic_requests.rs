@@ -33,10 +33,7 @@ struct OpenRequest {
 
 impl TopicRequests {
     pub(crate) fn for_pair(pair: &TopicPair) -> TopicRequests {
-        TopicRequests {
-            pair: pair.clone(),
-            open: Mutex::default(),
-        }
+        TopicRequests { pair: pair.clone(), open: Mutex::default() }
     }
 
     pub(crate) fn is_input(&self, topic: &str) -> bool {
@@ -59,13 +56,7 @@ impl TopicRequests {
     /// Records a client's message on the input. Among several with the same stamp the first is the request; without
     /// stamps, messages before the answer are no requests of their own. Returns how many earlier requests are given up
     /// that the servant has not answered: those that were `heard` and after which it has answered none.
-    pub(crate) fn record_request(
-        &self,
-        of: &MessageType,
-        bytes: &[u8],
-        now: Instant,
-        heard: bool,
-    ) -> usize {
+    pub(crate) fn record_request(&self, of: &MessageType, bytes: &[u8], now: Instant, heard: bool) -> usize {
         let Some(stamp) = self.correlation_key(of, bytes) else {
             return 0;
         };
@@ -75,22 +66,14 @@ impl TopicRequests {
             let first = open.pop_front();
             unanswered += usize::from(first.is_some_and(|it| it.heard && heard && !it.left_out));
         };
-        while open
-            .front()
-            .is_some_and(|first| now.saturating_duration_since(first.since) >= FORGOTTEN)
-        {
+        while open.front().is_some_and(|first| now.saturating_duration_since(first.since) >= FORGOTTEN) {
             forget(&mut open);
         }
         if open.iter().all(|one| one.stamp != stamp) {
             if open.len() == OPEN {
                 forget(&mut open);
             }
-            open.push_back(OpenRequest {
-                stamp,
-                since: now,
-                heard,
-                left_out: false,
-            });
+            open.push_back(OpenRequest { stamp, since: now, heard, left_out: false });
         }
         unanswered
     }
@@ -102,12 +85,7 @@ impl TopicRequests {
 
     /// Records a message of the servant on one of the outputs; returns how long its request took if it answers one. The
     /// first output is the answer.
-    pub(crate) fn record_answer(
-        &self,
-        of: &MessageType,
-        bytes: &[u8],
-        now: Instant,
-    ) -> Option<Duration> {
+    pub(crate) fn record_answer(&self, of: &MessageType, bytes: &[u8], now: Instant) -> Option<Duration> {
         let stamp = self.correlation_key(of, bytes)?;
         let mut open = self.open.lock();
         let at = open.iter().position(|one| one.stamp == stamp)?;
@@ -137,9 +115,7 @@ mod tests {
 
     fn of_type(name: &str, text: &str) -> Arc<MessageType> {
         let registry = Registry::new();
-        registry
-            .insert(&format!("x/msg/{name}"), text)
-            .expect("a type");
+        registry.insert(&format!("x/msg/{name}"), text).expect("a type");
         registry.message(&format!("x/{name}")).expect("it is known")
     }
 
@@ -184,18 +160,12 @@ mod tests {
         assert_eq!(requests.record_answer(&of, b"", began), None);
         requests.record_request(&of, b"", began, true);
         requests.record_request(&of, b"", began + SECOND, true);
-        assert_eq!(
-            requests.record_answer(&of, b"", began + SECOND * 2),
-            Some(SECOND * 2)
-        );
+        assert_eq!(requests.record_answer(&of, b"", began + SECOND * 2), Some(SECOND * 2));
         assert_eq!(requests.record_answer(&of, b"", began + SECOND * 2), None);
         // A request that is never answered does not block others forever.
         requests.record_request(&of, b"", began, true);
         requests.record_request(&of, b"", began + FORGOTTEN, true);
-        assert_eq!(
-            requests.record_answer(&of, b"", began + FORGOTTEN + SECOND),
-            Some(SECOND)
-        );
+        assert_eq!(requests.record_answer(&of, b"", began + FORGOTTEN + SECOND), Some(SECOND));
     }
 
     #[test]
@@ -208,14 +178,8 @@ mod tests {
         }
         assert_eq!(requests.open.lock().len(), OPEN);
         let last = stamped_message(10 * OPEN as u32, 0);
-        assert_eq!(
-            requests.record_answer(&of, &last, began),
-            Some(Duration::ZERO)
-        );
-        assert_eq!(
-            requests.record_answer(&of, &stamped_message(1, 0), began),
-            None
-        );
+        assert_eq!(requests.record_answer(&of, &last, began), Some(Duration::ZERO));
+        assert_eq!(requests.record_answer(&of, &stamped_message(1, 0), began), None);
     }
 
     #[test]
@@ -232,11 +196,7 @@ mod tests {
         }
         assert_eq!(asked(5, 0, false), 0, "nobody would see its answer");
         // The servant takes the newest, and skips those before.
-        assert!(
-            requests
-                .record_answer(&of, &stamped_message(3, 0), began)
-                .is_some()
-        );
+        assert!(requests.record_answer(&of, &stamped_message(3, 0), began).is_some());
         assert_eq!(asked(6, 60, true), 1, "the fourth alone");
         assert_eq!(asked(7, 120, false), 0, "nobody listens any more");
         // One after the other, too fast to be answered in time.

@@ -30,11 +30,7 @@ impl TopicQueues {
     }
 
     /// Updates a topic, if it still exists.
-    pub(crate) fn update<R>(
-        &mut self,
-        key: TopicKey,
-        change: impl FnOnce(&mut TopicQueue) -> R,
-    ) -> Option<R> {
+    pub(crate) fn update<R>(&mut self, key: TopicKey, change: impl FnOnce(&mut TopicQueue) -> R) -> Option<R> {
         let queue = self.queues.get_mut(&key)?;
         let before = queue.load();
         let result = change(queue);
@@ -88,10 +84,7 @@ impl TopicQueues {
     }
 
     /// Returns the next sample of the topic whose turn it is.
-    pub(crate) fn next(
-        &mut self,
-        now: Instant,
-    ) -> Option<(TopicKey, Arc<TopicSample>, &TopicQueue)> {
+    pub(crate) fn next(&mut self, now: Instant) -> Option<(TopicKey, Arc<TopicSample>, &TopicQueue)> {
         self.turns.wake_due(now);
         loop {
             let key = self.turns.take(|_| true)?;

@@ -134,10 +134,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WaitingConnection<S> {
                 SessionEnd::Closed { code, reason }
             }
             WaitEnd::Silent(silence) => {
-                let reason = format!(
-                    "nothing was received for {} s, not even a pong",
-                    silence.as_secs()
-                );
+                let reason = format!("nothing was received for {} s, not even a pong", silence.as_secs());
                 self.close_with_reason(1001, &reason, true).await;
                 SessionEnd::Closed { code: 1001, reason }
             }
@@ -146,11 +143,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WaitingConnection<S> {
 
     fn send_status(&mut self, level: StatusLevel, text: &str) {
         let mut out = Vec::new();
-        let status = Status {
-            id: None,
-            level,
-            msg: text.into(),
-        };
+        let status = Status { id: None, level, msg: text.into() };
         Op::from(status).print(&mut out, Format::Json);
         self.socket.queue(frame::TEXT, Bytes::from(out));
     }

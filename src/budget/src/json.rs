@@ -37,10 +37,7 @@ impl JsonWeight {
 
     /// Estimates a text, valid JSON or not. Allocates nothing.
     pub fn estimate(text: &[u8]) -> Self {
-        let mut weight = Self {
-            bytes: VALUE + TEXT * text.len(),
-            depth: 0,
-        };
+        let mut weight = Self { bytes: VALUE + TEXT * text.len(), depth: 0 };
         let mut open: usize = 0;
         let mut rest = text.iter();
         while let Some(byte) = rest.next() {

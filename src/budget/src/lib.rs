@@ -55,9 +55,7 @@ pub type Observer = Box<dyn Fn(&str, &Exceeded) + Send + Sync>;
 
 /// A request for bytes that do not fit into a budget.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{asked} bytes more do not fit into the memory for {name}: {used} of {limit} bytes are in use"
-)]
+#[error("{asked} bytes more do not fit into the memory for {name}: {used} of {limit} bytes are in use")]
 pub struct Exceeded {
     /// Name of the budget that is full.
     pub name: String,
@@ -90,12 +88,7 @@ impl Budget {
         Self::new("everything", usize::MAX)
     }
 
-    fn from_parts(
-        name: String,
-        limit: usize,
-        above: Option<Budget>,
-        observer: Option<Observer>,
-    ) -> Self {
+    fn from_parts(name: String, limit: usize, above: Option<Budget>, observer: Option<Observer>) -> Self {
         Self::from(Arc::new(BudgetNode {
             name,
             limit,
@@ -111,10 +104,7 @@ impl Budget {
     /// because another permit holds them. A message shared by many clients counts once for the daemon, and once in the
     /// budget of each client.
     pub fn without_parents(&self) -> Self {
-        Self {
-            node: self.node.clone(),
-            alone: true,
-        }
+        Self { node: self.node.clone(), alone: true }
     }
 
     /// Returns the name used in error messages.
@@ -150,10 +140,7 @@ impl Budget {
 
     /// Returns an empty permit.
     pub fn permit(&self) -> Permit {
-        Permit {
-            budget: self.clone(),
-            bytes: 0,
-        }
+        Permit { budget: self.clone(), bytes: 0 }
     }
 
     /// Takes a permit for `bytes` bytes.
@@ -190,23 +177,11 @@ impl Budget {
         for (depth, budget) in self.chain().enumerate() {
             let node = &budget.node;
             let more = |used: usize| used.checked_add(bytes).filter(|sum| *sum <= node.limit);
-            let added = node
-                .used
-                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
+            let added = node.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
             if let Err(used) = added {
-                self.chain()
-                    .take(depth)
-                    .for_each(|below| below.sub_here(bytes));
-                let exceeded = Exceeded {
-                    name: node.name.clone(),
-                    asked: bytes,
-                    used,
-                    limit: node.limit,
-                };
-                return Err(FullBudget {
-                    at: node.clone(),
-                    exceeded,
-                });
+                self.chain().take(depth).for_each(|below| below.sub_here(bytes));
+                let exceeded = Exceeded { name: node.name.clone(), asked: bytes, used, limit: node.limit };
+                return Err(FullBudget { at: node.clone(), exceeded });
             }
         }
         Ok(())
@@ -274,8 +249,7 @@ impl Permit {
     /// # Errors
     /// Fails if additional bytes do not fit; the size then stays as it is. Shrinking always succeeds.
     pub fn resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
-        self.try_resize(bytes)
-            .map_err(|full| self.budget.report(full))
+        self.try_resize(bytes).map_err(|full| self.budget.report(full))
     }
 
     fn try_resize(&mut self, bytes: usize) -> Result<(), FullBudget> {
@@ -311,19 +285,13 @@ impl Permit {
     pub fn split(mut self) -> (Permit, Option<Permit>) {
         let bytes = std::mem::take(&mut self.bytes);
         let above = self.budget.parent().cloned();
-        let alone = Permit {
-            budget: self.budget.without_parents(),
-            bytes,
-        };
+        let alone = Permit { budget: self.budget.without_parents(), bytes };
         (alone, above.map(|budget| Permit { budget, bytes }))
     }
 
     /// Wraps `bytes` so that the permit is held until the last handle to any slice of them is dropped.
     pub fn wrap_bytes(self, bytes: impl AsRef<[u8]> + Send + 'static) -> Bytes {
-        Bytes::from_owner(BytesWithPermit {
-            bytes,
-            _permit: self,
-        })
+        Bytes::from_owner(BytesWithPermit { bytes, _permit: self })
     }
 
     /// Grows the permit to `bytes`, waiting up to `patience` until others have released enough.

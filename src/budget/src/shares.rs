@@ -20,12 +20,7 @@ pub struct Shares {
 impl Shares {
     /// Creates a set of budgets of `each` bytes below `whole`; their names start with `what` (such as "client").
     pub fn new(whole: &Budget, what: &'static str, each: usize) -> Self {
-        Self {
-            whole: whole.clone(),
-            what,
-            each,
-            known: Mutex::default(),
-        }
+        Self { whole: whole.clone(), what, each, known: Mutex::default() }
     }
 
     /// Returns the budget for `name`, creating it if necessary.
@@ -43,10 +38,7 @@ impl Shares {
     /// Returns the number of names that have a budget now.
     pub fn len(&self) -> usize {
         let known = self.known.lock();
-        known
-            .values()
-            .filter(|node| node.strong_count() > 0)
-            .count()
+        known.values().filter(|node| node.strong_count() > 0).count()
     }
 
     /// Returns whether no name has a budget now.

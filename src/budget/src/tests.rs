@@ -16,18 +16,12 @@ fn who_exceeds_its_own_budget_takes_nothing_from_others() {
     let (a, b) = (daemon.child("client a", 60), daemon.child("client b", 60));
     let held = a.take(50).expect("it fits");
     let refused = a.take(11).expect_err("11 more are too many");
-    assert_eq!(
-        refused.to_string(),
-        "11 bytes more do not fit into the memory for client a: 50 of 60 bytes are in use"
-    );
+    assert_eq!(refused.to_string(), "11 bytes more do not fit into the memory for client a: 50 of 60 bytes are in use");
     assert_eq!((a.refusal_count(), daemon.refusal_count()), (1, 0));
     let other = b.take(50).expect("the other has its own");
     assert_eq!(b.available(), 0, "the daemon's is used up");
     drop((held, other));
-    assert_eq!(
-        (a.used_bytes(), b.used_bytes(), daemon.used_bytes()),
-        (0, 0, 0)
-    );
+    assert_eq!((a.used_bytes(), b.used_bytes(), daemon.used_bytes()), (0, 0, 0));
 }
 
 #[test]
@@ -108,9 +102,7 @@ fn many_threads_leave_the_sums_as_they_were() {
             })
         })
         .collect();
-    threads
-        .into_iter()
-        .for_each(|thread| thread.join().expect("no panic"));
+    threads.into_iter().for_each(|thread| thread.join().expect("no panic"));
     assert_eq!(daemon.used_bytes(), 0);
 }
 
@@ -118,9 +110,7 @@ fn many_threads_leave_the_sums_as_they_were() {
 async fn whoever_looks_after_all_is_told_who_was_refused_and_once() {
     let (sender, told) = std::sync::mpsc::channel();
     let observer = move |who: &str, full: &Exceeded| {
-        sender
-            .send((who.to_owned(), full.name.clone()))
-            .expect("heard");
+        sender.send((who.to_owned(), full.name.clone())).expect("heard");
     };
     let daemon = Budget::with_observer("the daemon", 100, Box::new(observer));
     let client = daemon.child("client a", 200);
@@ -146,20 +136,11 @@ fn what_others_have_counted_counts_in_one_budget_alone() {
     let (a, b) = (daemon.child("client a", 60), daemon.child("client b", 60));
     let made = daemon.take(50).expect("it fits");
     let shared = (a.without_parents().take(50), b.without_parents().take(50));
-    assert_eq!(
-        (a.used_bytes(), b.used_bytes(), daemon.used_bytes()),
-        (50, 50, 50)
-    );
-    let refused = a
-        .without_parents()
-        .take(11)
-        .expect_err("60 are for client a");
+    assert_eq!((a.used_bytes(), b.used_bytes(), daemon.used_bytes()), (50, 50, 50));
+    let refused = a.without_parents().take(11).expect_err("60 are for client a");
     assert_eq!(refused.name, "client a");
     drop((made, shared));
-    assert_eq!(
-        (a.used_bytes(), b.used_bytes(), daemon.used_bytes()),
-        (0, 0, 0)
-    );
+    assert_eq!((a.used_bytes(), b.used_bytes(), daemon.used_bytes()), (0, 0, 0));
 }
 
 #[test]

@@ -102,10 +102,7 @@ mod tests {
             source: String::new(),
             flavour: Default::default(),
             plan: Default::default(),
-            interface: Interface {
-                topics: topics.iter().map(topic).collect(),
-                ..Interface::default()
-            },
+            interface: Interface { topics: topics.iter().map(topic).collect(), ..Interface::default() },
         }
     }
 
@@ -113,27 +110,14 @@ mod tests {
     fn a_stub_goes_on_until_something_it_relies_on_is_gone() {
         let place = tempfile::tempdir().expect("a directory");
         let state = State::open(&place.path().join("cloudroid.db")).expect("a database");
-        let all = [
-            revision(1, &["/a"]),
-            revision(2, &["/a", "/b"]),
-            revision(3, &["/b"]),
-        ];
+        let all = [revision(1, &["/a"]), revision(2, &["/a", "/b"]), revision(3, &["/b"])];
         for revision in &all {
-            state
-                .publish(revision, &Default::default())
-                .expect("published");
+            state.publish(revision, &Default::default()).expect("published");
         }
-        let fits = |now: usize, image: &str| {
-            super::check_stub_compatibility(&state, &all[now], Some(1), image)
-        };
+        let fits = |now: usize, image: &str| super::check_stub_compatibility(&state, &all[now], Some(1), image);
         fits(1, "sha256:1").expect("something is new");
-        let refused = fits(2, "sha256:1")
-            .expect_err("something is gone")
-            .to_string();
-        assert!(
-            refused.contains("output topic /a was removed") && refused.contains("/stubs/s.tar.gz"),
-            "{refused}"
-        );
+        let refused = fits(2, "sha256:1").expect_err("something is gone").to_string();
+        assert!(refused.contains("output topic /a was removed") && refused.contains("/stubs/s.tar.gz"), "{refused}");
         fits(2, "sha256:of another server").expect("nothing is known of it");
         super::check_stub_compatibility(&state, &all[2], None, "").expect("it names no revision");
     }

@@ -31,18 +31,12 @@ pub(crate) type ContentsCache = Mutex<HashMap<(String, u64), (Weak<Inventory>, W
 
 impl Catalogue {
     /// Returns the contents of a revision.
-    pub async fn revision_contents(
-        &self,
-        revision: &RevisionRecord,
-    ) -> Result<RevisionContents, Error> {
+    pub async fn revision_contents(&self, revision: &RevisionRecord) -> Result<RevisionContents, Error> {
         let key = (revision.service.clone(), revision.number);
         if let Some((inventory, registry)) = self.in_use.lock().get(&key)
             && let (Some(inventory), Some(registry)) = (inventory.upgrade(), registry.upgrade())
         {
-            return Ok(RevisionContents {
-                inventory,
-                registry,
-            });
+            return Ok(RevisionContents { inventory, registry });
         }
         let inventory = Arc::new(self.inventory(revision).await?);
         let registry = Registry::for_version(revision.flavour.ros.ros_version());
@@ -50,10 +44,7 @@ impl Catalogue {
         let texts = inventory.definitions.iter();
         for (key, text) in texts.chain(&revision.interface.definitions) {
             if let Err(error) = registry.insert(key, text) {
-                tracing::debug!(
-                    "invalid message definition {key} of {}: {error}",
-                    revision.service
-                );
+                tracing::debug!("invalid message definition {key} of {}: {error}", revision.service);
             }
         }
         let registry = Arc::new(registry);
@@ -61,10 +52,7 @@ impl Catalogue {
         in_use.retain(|_, (_, registry)| registry.strong_count() > 0);
         let weak = (Arc::downgrade(&inventory), Arc::downgrade(&registry));
         in_use.insert(key, weak);
-        Ok(RevisionContents {
-            inventory,
-            registry,
-        })
+        Ok(RevisionContents { inventory, registry })
     }
 
     /// Records the missing inventories of current revisions that were published by an earlier version of this program,
@@ -74,11 +62,7 @@ impl Catalogue {
             if let Some(revision) = self.state.revision(&line.service, line.number)?
                 && let Err(error) = self.inventory(&revision).await
             {
-                tracing::warn!(
-                    "cannot inspect the image of revision {} of {}: {error}",
-                    line.number,
-                    line.service
-                );
+                tracing::warn!("cannot inspect the image of revision {} of {}: {error}", line.number, line.service);
             }
         }
         Ok(())
@@ -90,26 +74,15 @@ impl Catalogue {
         }
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let revision = revision.clone();
-        blocking("inspecting an image", move || {
-            take_inventory(&state, &store, &revision)
-        })
-        .await
+        blocking("inspecting an image", move || take_inventory(&state, &store, &revision)).await
     }
 }
 
 /// Takes the inventory of a revision's image and records it. Blocking.
-fn take_inventory(
-    state: &State,
-    store: &Store,
-    revision: &RevisionRecord,
-) -> Result<Inventory, Error> {
+fn take_inventory(state: &State, store: &Store, revision: &RevisionRecord) -> Result<Inventory, Error> {
     let nodes = revision.plan.nodes.iter();
     let commands: Vec<&[String]> = nodes.map(|node| node.argv.as_slice()).collect();
-    let of = SearchHints {
-        package: &revision.package,
-        environment: &revision.plan.environment,
-        commands: &commands,
-    };
+    let of = SearchHints { package: &revision.package, environment: &revision.plan.environment, commands: &commands };
     let layers = layers(store, &revision.image)?;
     let taken = privilege::run_as_reader(|| Inventory::scan(&layers, of));
     let inventory = taken.map_err(Error::Inventory)?;
@@ -117,13 +90,8 @@ fn take_inventory(
     let mut flavour = Flavour::default();
     flavour.base = labels.get(BASE).cloned().unwrap_or(flavour.base);
     // A failure is not fatal: the inventory is taken again at the next request.
-    if let Err(error) =
-        state.record_inventory(&revision.service, revision.number, &flavour, &inventory)
-    {
-        tracing::warn!(
-            "cannot record the contents of the image of {}: {error}",
-            revision.service
-        );
+    if let Err(error) = state.record_inventory(&revision.service, revision.number, &flavour, &inventory) {
+        tracing::warn!("cannot record the contents of the image of {}: {error}", revision.service);
     }
     Ok(inventory)
 }
@@ -131,16 +99,11 @@ fn take_inventory(
 /// Returns the extracted layers of an image, lowest first.
 pub(crate) fn layers(store: &Store, image: &str) -> Result<Vec<PathBuf>, Error> {
     let layers = store.image(&digest(image)?)?.spec.layers;
-    Ok(layers
-        .iter()
-        .map(|layer| store.ensure_extracted(&layer.diff_id))
-        .collect::<Result<_, _>>()?)
+    Ok(layers.iter().map(|layer| store.ensure_extracted(&layer.diff_id)).collect::<Result<_, _>>()?)
 }
 
 pub(crate) fn digest(image: &str) -> Result<image::Digest, Error> {
-    image.parse().map_err(|_| Error::UnknownImage {
-        what: image.to_owned(),
-    })
+    image.parse().map_err(|_| Error::UnknownImage { what: image.to_owned() })
 }
 
 #[cfg(test)]
@@ -169,9 +132,7 @@ pub(crate) mod tests {
         write(&tree, "usr/share/p/msg/Said.msg", "string words\n", 0o644);
         write(&tree, "usr/lib/p/node", "", 0o755);
         let images = Store::open(&place.join("images"), &place.join("layers")).expect("a store");
-        let layer = images
-            .layer_from_tree(&tree, &TreeOptions::default())
-            .expect("packed");
+        let layer = images.layer_from_tree(&tree, &TreeOptions::default()).expect("packed");
         let spec = ImageSpec {
             layers: vec![layer],
             labels: BTreeMap::from([(BASE.to_owned(), "lab-ros1".to_owned())]),
@@ -218,17 +179,11 @@ pub(crate) mod tests {
         // The image has been removed.
         std::fs::remove_dir_all(place.path().join("layers")).expect("removed");
         std::fs::remove_dir_all(place.path().join("images")).expect("removed");
-        let known = catalogue
-            .revision_contents(&revision)
-            .await
-            .expect("recorded");
+        let known = catalogue.revision_contents(&revision).await.expect("recorded");
         assert_eq!(*known.inventory, recorded);
         known.registry.message("p/Other").expect("defined");
         // Servants of the same revision share its contents.
-        let again = catalogue
-            .revision_contents(&revision)
-            .await
-            .expect("recorded");
+        let again = catalogue.revision_contents(&revision).await.expect("recorded");
         assert!(Arc::ptr_eq(&known.registry, &again.registry));
     }
 
@@ -240,14 +195,9 @@ pub(crate) mod tests {
         published.expect("published");
         let database = rusqlite::Connection::open(place.path().join("cloudroid.db"));
         database
-            .and_then(|database| {
-                database.execute("UPDATE revisions SET inventory = NULL, flavour = NULL", [])
-            })
+            .and_then(|database| database.execute("UPDATE revisions SET inventory = NULL, flavour = NULL", []))
             .expect("as it was before");
-        catalogue
-            .record_missing_inventories()
-            .await
-            .expect("completed");
+        catalogue.record_missing_inventories().await.expect("completed");
         let state = &catalogue.state;
         let inventory = state.inventory("serves", 1).expect("readable");
         let inventory = inventory.expect("recorded");
@@ -256,11 +206,6 @@ pub(crate) mod tests {
         assert!(inventory.definitions.contains_key("p/msg/Said"));
         let revision = catalogue.current_revision("serves").expect("there");
         assert_eq!(revision.flavour.base, "lab-ros1");
-        assert!(
-            state
-                .revisions_without_inventory()
-                .expect("readable")
-                .is_empty()
-        );
+        assert!(state.revisions_without_inventory().expect("readable").is_empty());
     }
 }

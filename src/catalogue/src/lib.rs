@@ -40,11 +40,7 @@ pub struct Catalogue {
 impl Catalogue {
     /// Creates a catalogue on a state database and an image store.
     pub fn new(state: Arc<State>, images: Arc<image::Store>) -> Catalogue {
-        Catalogue {
-            state,
-            images,
-            in_use: ContentsCache::default(),
-        }
+        Catalogue { state, images, in_use: ContentsCache::default() }
     }
 
     /// Returns the image store.
@@ -84,11 +80,7 @@ impl Catalogue {
     }
 
     /// Writes the rows of a service's dictionary if it is empty; returns whether it was.
-    pub fn initialize_dictionary(
-        &self,
-        service: &str,
-        rows: &api::dictionary::NewRows,
-    ) -> Result<bool, Error> {
+    pub fn initialize_dictionary(&self, service: &str, rows: &api::dictionary::NewRows) -> Result<bool, Error> {
         if !self.state.dictionary(service)?.is_empty() {
             return Ok(false);
         }
@@ -110,19 +102,13 @@ impl Catalogue {
 
     /// Returns the error for a service that does not exist, naming those that do.
     pub fn unknown_service(&self, service: &str) -> Result<Error, Error> {
-        Ok(Error::UnknownService {
-            name: service.to_owned(),
-            exists: self.state.service_names()?,
-        })
+        Ok(Error::UnknownService { name: service.to_owned(), exists: self.state.service_names()? })
     }
 
     /// Returns the extracted layers of an image, lowest first.
     pub async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Error> {
         let (images, digest) = (Arc::clone(&self.images), image.to_owned());
-        blocking("extracting layers", move || {
-            inventory::layers(&images, &digest)
-        })
-        .await
+        blocking("extracting layers", move || inventory::layers(&images, &digest)).await
     }
 }
 
@@ -131,7 +117,5 @@ async fn blocking<T: Send + 'static>(
     what: &'static str,
     work: impl FnOnce() -> Result<T, Error> + Send + 'static,
 ) -> Result<T, Error> {
-    privilege::spawn_blocking(work)
-        .await
-        .map_err(|_| Error::Internal(what))?
+    privilege::spawn_blocking(work).await.map_err(|_| Error::Internal(what))?
 }

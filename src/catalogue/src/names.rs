@@ -2,9 +2,7 @@
 //! names) and of robots.
 
 /// First path segments reserved by the portal.
-pub const RESERVED: [&str; 7] = [
-    "api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove",
-];
+pub const RESERVED: [&str; 7] = ["api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove"];
 
 /// An invalid name.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
@@ -16,9 +14,7 @@ pub enum NameError {
     )]
     Service(String),
     /// Path reserved by the portal.
-    #[error(
-        "{0:?} is a reserved name: the portal serves something else at that path; choose another with --name"
-    )]
+    #[error("{0:?} is a reserved name: the portal serves something else at that path; choose another with --name")]
     Reserved(String),
     /// Malformed robot name.
     #[error(
@@ -49,20 +45,12 @@ pub fn validate_robot(name: &str) -> Result<(), NameError> {
     let well_formed = (1..=64).contains(&name.len())
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
         && name.chars().all(inner);
-    if well_formed {
-        Ok(())
-    } else {
-        Err(NameError::Robot(name.to_owned()))
-    }
+    if well_formed { Ok(()) } else { Err(NameError::Robot(name.to_owned())) }
 }
 
 /// Generates an id for a servant of `service`: the service name as a valid host name, followed by random characters.
 pub fn servant_id(service: &str) -> String {
-    let mut id: String = service
-        .chars()
-        .take(32)
-        .map(|c| if c == '_' { '-' } else { c })
-        .collect();
+    let mut id: String = service.chars().take(32).map(|c| if c == '_' { '-' } else { c }).collect();
     id.push('-');
     id.push_str(&random(8));
     id
@@ -73,9 +61,7 @@ pub fn random(length: usize) -> String {
     use rand::Rng;
     const ALPHABET: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
     let mut random = rand::rng();
-    (0..length)
-        .map(|_| char::from(ALPHABET[random.random_range(0..ALPHABET.len())]))
-        .collect()
+    (0..length).map(|_| char::from(ALPHABET[random.random_range(0..ALPHABET.len())])).collect()
 }
 
 #[cfg(test)]
@@ -92,23 +78,15 @@ mod tests {
     #[test]
     fn what_breaks_a_path_names_no_service() {
         let long = "a".repeat(64);
-        for name in [
-            "", "Image", "2d", "a/b", "..", "a b", "a_", "-a", "é", "a.b", &long,
-        ] {
-            assert_eq!(
-                validate_service(name),
-                Err(NameError::Service(name.to_owned()))
-            );
+        for name in ["", "Image", "2d", "a/b", "..", "a b", "a_", "-a", "é", "a.b", &long] {
+            assert_eq!(validate_service(name), Err(NameError::Service(name.to_owned())));
         }
     }
 
     #[test]
     fn the_portals_own_paths_are_reserved() {
         for name in RESERVED {
-            assert_eq!(
-                validate_service(name),
-                Err(NameError::Reserved(name.to_owned()))
-            );
+            assert_eq!(validate_service(name), Err(NameError::Reserved(name.to_owned())));
         }
     }
 
@@ -125,13 +103,7 @@ mod tests {
     #[test]
     fn servant_ids_are_host_names() {
         let id = servant_id(&"a_".repeat(31));
-        assert!(
-            id.len() <= 48
-                && id
-                    .chars()
-                    .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-'),
-            "{id}"
-        );
+        assert!(id.len() <= 48 && id.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-'), "{id}");
         assert_ne!(servant_id("a"), servant_id("a"));
     }
 }

@@ -67,20 +67,13 @@ mod tests {
         std::fs::create_dir_all(tree.join("opt")).expect("made");
         let own = images.layer_from_tree(&tree, &TreeOptions::default());
         let own = own.expect("packed");
-        let spec = ImageSpec {
-            layers: vec![shared, own],
-            ..ImageSpec::default()
-        };
+        let spec = ImageSpec { layers: vec![shared, own], ..ImageSpec::default() };
         let other = images.put_image(&spec).expect("written").to_string();
         let taken = async |owner: &str, image: Option<&str>| {
             let bytes = catalogue.owner_image_bytes(owner, image).await;
             bytes.expect("counted")
         };
-        for (service, owner) in [
-            ("nobodys", None),
-            ("two", Some("ben")),
-            ("one", Some("ann")),
-        ] {
+        for (service, owner) in [("nobodys", None), ("two", Some("ben")), ("one", Some("ann"))] {
             assert_eq!(taken("ann", None).await, 0, "{service} is another's");
             let mut record = revision.clone();
             record.service = service.to_owned();

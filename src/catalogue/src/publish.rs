@@ -29,20 +29,12 @@ pub struct WithdrawnService {
 
 impl Catalogue {
     /// Publishes a revision and makes it the current one, from which new servants are started. Returns its number.
-    pub async fn publish(
-        &self,
-        record: RevisionRecord,
-        inventory: Inventory,
-    ) -> Result<u64, Error> {
+    pub async fn publish(&self, record: RevisionRecord, inventory: Inventory) -> Result<u64, Error> {
         self.publish_revision(record, inventory, true).await
     }
 
     /// Publishes a revision without making it the current one. Returns its number.
-    pub async fn publish_inactive(
-        &self,
-        record: RevisionRecord,
-        inventory: Inventory,
-    ) -> Result<u64, Error> {
+    pub async fn publish_inactive(&self, record: RevisionRecord, inventory: Inventory) -> Result<u64, Error> {
         self.publish_revision(record, inventory, false).await
     }
 
@@ -75,21 +67,13 @@ impl Catalogue {
         let revisions = self.state.revisions(name)?;
         let target = match wanted {
             Some(number) => revisions.iter().find(|revision| revision.number == number),
-            None => revisions
-                .iter()
-                .find(|revision| revision.number < current.number),
+            None => revisions.iter().find(|revision| revision.number < current.number),
         };
         let Some(target) = target.cloned() else {
             return Err(Error::UnknownRevision {
                 service: name.to_owned(),
-                revision: wanted.map_or_else(
-                    || format!("before {}", current.number),
-                    |number| number.to_string(),
-                ),
-                exists: revisions
-                    .iter()
-                    .map(|revision| revision.number.to_string())
-                    .collect(),
+                revision: wanted.map_or_else(|| format!("before {}", current.number), |number| number.to_string()),
+                exists: revisions.iter().map(|revision| revision.number.to_string()).collect(),
             });
         };
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
@@ -99,10 +83,7 @@ impl Catalogue {
             tag_current(&store, &target.service, &target.image)
         })
         .await?;
-        Ok(RollbackResult {
-            from: current.number,
-            to,
-        })
+        Ok(RollbackResult { from: current.number, to })
     }
 
     /// Makes revision `to` the current one if the current one is `from` or `to`; otherwise changes nothing and returns
@@ -129,10 +110,7 @@ impl Catalogue {
     pub fn withdraw(&self, service: &str) -> Result<WithdrawnService, Error> {
         let revisions = self.state.revisions(service)?;
         self.state.remove_service(service)?;
-        Ok(WithdrawnService {
-            service: service.to_owned(),
-            revisions,
-        })
+        Ok(WithdrawnService { service: service.to_owned(), revisions })
     }
 
     /// Removes the tags of a withdrawn service whose servants have ended.
@@ -184,11 +162,7 @@ impl Catalogue {
         let store = Arc::clone(&self.images);
         match blocking("collecting garbage", move || Ok(store.gc(&keep)?)).await {
             Ok(swept) if swept.blobs + swept.trees + swept.leftovers > 0 => {
-                tracing::info!(
-                    "removed {} unused blobs and {} unused trees",
-                    swept.blobs,
-                    swept.trees
-                );
+                tracing::info!("removed {} unused blobs and {} unused trees", swept.blobs, swept.trees);
             }
             Ok(_) => {}
             Err(error) => tracing::warn!("cannot collect garbage: {error}"),

@@ -9,8 +9,7 @@ use api::stub::{ARCHITECTURES, parse_architecture};
 use flate2::{Compression, GzBuilder};
 use package::inventory::Inventory;
 use package::stub::{
-    Content, Contents, Files, MANIFEST, PROGRAM, Portal, ProgramRequest, SIGNATURE, SIGNER,
-    StubInfo, compose, manifest,
+    Content, Contents, Files, MANIFEST, PROGRAM, Portal, ProgramRequest, SIGNATURE, SIGNER, StubInfo, compose, manifest,
 };
 use ros::bus::RosVersion;
 use ros::remaps::Remaps;
@@ -40,9 +39,7 @@ pub struct StubProgram {
 impl StubPrograms {
     /// Finds the installed programs. They may be added while the daemon runs.
     pub fn find_installed() -> StubPrograms {
-        let beside = std::env::current_exe()
-            .ok()
-            .and_then(|path| Some(path.parent()?.to_owned()));
+        let beside = std::env::current_exe().ok().and_then(|path| Some(path.parent()?.to_owned()));
         let installed = ["/usr/local/lib/cloudroid", "/usr/lib/cloudroid"].map(PathBuf::from);
         let places: Vec<PathBuf> = beside.into_iter().chain(installed).collect();
         Self::find_in(&places)
@@ -54,27 +51,18 @@ impl StubPrograms {
             let path = places.iter().map(of).find(|path| path.is_file())?;
             Some(StubProgram { architecture, path })
         };
-        StubPrograms {
-            found: ARCHITECTURES.into_iter().filter_map(find).collect(),
-        }
+        StubPrograms { found: ARCHITECTURES.into_iter().filter_map(find).collect() }
     }
 
     /// Returns the architectures for which a program is installed.
     pub fn architectures(&self) -> Vec<String> {
-        self.found
-            .iter()
-            .map(|program| program.architecture.to_owned())
-            .collect()
+        self.found.iter().map(|program| program.architecture.to_owned()).collect()
     }
 
     /// Returns the supported architectures for which no program is installed.
     pub fn missing_architectures(&self) -> Vec<String> {
         let held = self.architectures();
-        ARCHITECTURES
-            .into_iter()
-            .map(str::to_owned)
-            .filter(|architecture| !held.contains(architecture))
-            .collect()
+        ARCHITECTURES.into_iter().map(str::to_owned).filter(|architecture| !held.contains(architecture)).collect()
     }
 
     /// Returns the program for an architecture; `None` means that of this machine.
@@ -85,19 +73,13 @@ impl StubPrograms {
         self.found
             .into_iter()
             .find(|program| Some(program.architecture) == wanted)
-            .ok_or_else(|| Error::UnknownArchitecture {
-                asked: asked.to_owned(),
-                exists,
-            })
+            .ok_or_else(|| Error::UnknownArchitecture { asked: asked.to_owned(), exists })
     }
 }
 
 /// Returns whether a text is `HOST` or `HOST:PORT` without characters that are special in files or scripts.
 pub fn is_authority(text: &str) -> bool {
-    !text.is_empty()
-        && text
-            .chars()
-            .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
+    !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
 /// Returns the files of a revision's stub, except the robot's program.
@@ -108,10 +90,8 @@ pub fn compose_files(
     architecture: &str,
     portal: &Portal,
 ) -> Result<Files, Error> {
-    let no_stub = |error: package::Error| Error::NoStub {
-        service: revision.service.clone(),
-        reason: error.to_string(),
-    };
+    let no_stub =
+        |error: package::Error| Error::NoStub { service: revision.service.clone(), reason: error.to_string() };
     let layers = inventory::layers(store, &revision.image)?;
     let contents = match inventory.packages.get(&revision.package) {
         Some(package) => Contents::read(&layers, package).map_err(no_stub)?,
@@ -165,18 +145,13 @@ fn request_pairs(revision: &RevisionRecord, inventory: &Inventory) -> Vec<Progra
     let ros = revision.flavour.ros.ros_version();
     let mut answered: Vec<ProgramRequest> = Vec::new();
     for request in revision.interface.decided_requests(ros) {
-        let node = revision
-            .plan
-            .nodes
-            .iter()
-            .find(|node| node.name == request.node);
+        let node = revision.plan.nodes.iter().find(|node| node.name == request.node);
         let program = node.and_then(|node| {
             let mut programs = inventory.programs.iter();
             programs.find(|(_, path)| node.argv.contains(path))
         });
-        let remaps = node
-            .map(|node| Remaps::parse(ros, node.argv.get(1..).unwrap_or_default(), &node.name))
-            .unwrap_or_default();
+        let remaps =
+            node.map(|node| Remaps::parse(ros, node.argv.get(1..).unwrap_or_default(), &node.name)).unwrap_or_default();
         let one = ProgramRequest {
             program: program.map(|(name, _)| name.clone()),
             request: request.pair.map_names(|name| remaps.undo(name).to_owned()),
@@ -219,19 +194,14 @@ pub fn build_archive(
     };
     let bytes = std::fs::read(&program.path).map_err(failed)?;
     let executable = true;
-    files.insert(
-        format!("lib/{}/{PROGRAM}", revision.package),
-        Content::File { bytes, executable },
-    );
+    files.insert(format!("lib/{}/{PROGRAM}", revision.package), Content::File { bytes, executable });
     pack(&revision.service, files, key).map_err(failed)
 }
 
 fn pack(service: &str, mut files: Files, key: &SigningKey) -> std::io::Result<Archive> {
     sign_all(&mut files, key)?;
     let file = tempfile::tempfile()?;
-    let gzip = GzBuilder::new()
-        .mtime(0)
-        .write(file, Compression::default());
+    let gzip = GzBuilder::new().mtime(0).write(file, Compression::default());
     let mut archive = tar::Builder::new(gzip);
     let top = format!("{service}-stub");
     for directory in directories(files.keys()) {
@@ -256,18 +226,12 @@ fn pack(service: &str, mut files: Files, key: &SigningKey) -> std::io::Result<Ar
     file.seek(SeekFrom::Start(0))?;
     let digest = sign::digest(&mut file)?;
     file.seek(SeekFrom::Start(0))?;
-    Ok(Archive {
-        file,
-        signature: key.sign(api::stub::ARCHIVE, &digest),
-    })
+    Ok(Archive { file, signature: key.sign(api::stub::ARCHIVE, &digest) })
 }
 
 /// Adds the public key, the list of all files, and the list's signature.
 fn sign_all(files: &mut Files, key: &SigningKey) -> std::io::Result<()> {
-    let plain = |text: String| Content::File {
-        bytes: text.into_bytes(),
-        executable: false,
-    };
+    let plain = |text: String| Content::File { bytes: text.into_bytes(), executable: false };
     let signer = format!("{}\n", key.public_key().allowed_signers_line());
     files.insert(SIGNER.to_owned(), plain(signer));
     let list = manifest(files);
@@ -314,15 +278,9 @@ mod tests {
 
     fn pack_example(key: &SigningKey) -> (Vec<u8>, String) {
         let executable = true;
-        let node = Content::File {
-            bytes: b"#!/bin/sh".to_vec(),
-            executable,
-        };
-        let files: Files = [
-            ("lib/p/node".to_owned(), node),
-            ("share/p/a/b".to_owned(), Content::Link("c".into())),
-        ]
-        .into();
+        let node = Content::File { bytes: b"#!/bin/sh".to_vec(), executable };
+        let files: Files =
+            [("lib/p/node".to_owned(), node), ("share/p/a/b".to_owned(), Content::Link("c".into()))].into();
         let mut archive = super::pack("serves", files, key).expect("packed");
         let mut bytes = Vec::new();
         archive.file.read_to_end(&mut bytes).expect("read");
@@ -357,10 +315,7 @@ mod tests {
             package: "p".into(),
             owner: None,
             source: String::new(),
-            flavour: Flavour {
-                ros: Version::Ros2,
-                ..Flavour::default()
-            },
+            flavour: Flavour { ros: Version::Ros2, ..Flavour::default() },
             plan: Plan {
                 nodes: vec![
                     put("/front", "camera", "/opt/p/lib/p/camera_node"),
@@ -381,11 +336,7 @@ mod tests {
             ..Inventory::default()
         };
         // A program that runs twice does not determine a name, unless only one of its nodes was left unnamed.
-        let expected = [
-            ("camera_node", "camera"),
-            ("duet", "alto"),
-            ("gripper", "/arm/gripper"),
-        ];
+        let expected = [("camera_node", "camera"), ("duet", "alto"), ("gripper", "/arm/gripper")];
         let expected = expected.map(|(program, node)| (program.to_owned(), node.to_owned()));
         assert_eq!(node_names(&revision, &inventory), expected.into());
         revision.flavour.ros = Version::Ros1;
@@ -418,9 +369,7 @@ mod tests {
             plan: Plan {
                 nodes: vec![NodeSpec {
                     name: "/left/finder".into(),
-                    argv: ["/opt/p/lib/p/find", "image:=/camera", "_rate:=2"]
-                        .map(str::to_owned)
-                        .into(),
+                    argv: ["/opt/p/lib/p/find", "image:=/camera", "_rate:=2"].map(str::to_owned).into(),
                     environment: BTreeMap::new(),
                     directory: String::new(),
                     respawn: false,
@@ -431,10 +380,7 @@ mod tests {
             },
             // Published by an earlier release, without request pairs.
             interface: Interface {
-                topics: vec![
-                    topic("/camera", Direction::Input),
-                    topic("/left/finder/found", Direction::Output),
-                ],
+                topics: vec![topic("/camera", Direction::Input), topic("/left/finder/found", Direction::Output)],
                 definitions: [definition].into(),
                 ..Interface::default()
             },
@@ -446,9 +392,7 @@ mod tests {
         let expected = ProgramRequest {
             node: "/left/finder".into(),
             program: Some("find".into()),
-            request: "/left/image -> /left/finder/found by arrival"
-                .parse()
-                .expect("a pair"),
+            request: "/left/image -> /left/finder/found by arrival".parse().expect("a pair"),
         };
         assert_eq!(request_pairs(&revision, &inventory), [expected]);
     }
@@ -491,8 +435,7 @@ mod tests {
         let (mut bytes, signature) = pack_example(&key);
         let verify = |bytes: &[u8]| {
             let digest = sign::digest(&mut &*bytes).expect("read");
-            key.public_key()
-                .verify(api::stub::ARCHIVE, &digest, &signature)
+            key.public_key().verify(api::stub::ARCHIVE, &digest, &signature)
         };
         verify(&bytes).expect("signed");
         bytes.pop();
@@ -508,13 +451,7 @@ mod tests {
         let look = || StubPrograms::find_in(&[place.path().to_owned()]);
         assert_eq!(look().architectures(), ["aarch64"]);
         assert_eq!(look().missing_architectures(), ["x86_64", "armv7"]);
-        assert_eq!(
-            look()
-                .for_architecture(Some("arm64"))
-                .ok()
-                .map(|program| program.architecture),
-            Some("aarch64")
-        );
+        assert_eq!(look().for_architecture(Some("arm64")).ok().map(|program| program.architecture), Some("aarch64"));
         let refused = look().for_architecture(Some("riscv64")).err();
         assert!(
             matches!(&refused, Some(Error::UnknownArchitecture { exists, .. }) if *exists == ["aarch64"]),

@@ -128,9 +128,7 @@ impl Choreographer {
             ending: AtomicBool::new(false),
             refusals: Mutex::default(),
         };
-        Choreographer {
-            inner: Arc::new(inner),
-        }
+        Choreographer { inner: Arc::new(inner) }
     }
 
     /// Returns a lease of the requested servant: the existing one, or a new one. Returns at once; the lease reports
@@ -160,8 +158,7 @@ impl Choreographer {
             // A container with promised capacity must not overtake waiting requests, nor have nodes running with more
             // memory than the robot may use.
             let bounded = request.set.memory.is_some();
-            let default_names =
-                request.stub.is_none() && !bounded && inner.admission.is_uncontended();
+            let default_names = request.stub.is_none() && !bounded && inner.admission.is_uncontended();
             let (placement, warm) = if is_place(&revision, &request.robot) {
                 // It needs no container.
                 let placement = place(has.as_ref(), None, revision.number, &revision.image);
@@ -173,10 +170,7 @@ impl Choreographer {
             let ends = match placement {
                 Placement::Keep(id) => {
                     let lease = Lease::new(Arc::clone(&servants.all[id]), request.client());
-                    return Ok(lease.with_statement(NewStatement {
-                        inner: Arc::clone(inner),
-                        stated: request.stated,
-                    }));
+                    return Ok(lease.with_statement(NewStatement { inner: Arc::clone(inner), stated: request.stated }));
                 }
                 Placement::Start { ends, .. } => ends,
             };
@@ -206,10 +200,7 @@ impl Choreographer {
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
                 request.robot,
                 request.anonymous,
-                decide::demand::LimitSources {
-                    set: request.set,
-                    ..inner.limit_sources(terms)
-                },
+                decide::demand::LimitSources { set: request.set, ..inner.limit_sources(terms) },
                 revision,
                 store::now(),
             ));
@@ -243,10 +234,7 @@ impl Choreographer {
         servants.all.get(id).cloned().ok_or_else(|| {
             let mut exists: Vec<String> = servants.all.keys().cloned().collect();
             exists.sort();
-            Error::UnknownServant {
-                id: id.to_owned(),
-                exists,
-            }
+            Error::UnknownServant { id: id.to_owned(), exists }
         })
     }
 
@@ -254,12 +242,7 @@ impl Choreographer {
     pub async fn stop(&self, reason: &str, chosen: impl Fn(&Handle) -> bool) -> Vec<String> {
         let leaving: Vec<Arc<Handle>> = {
             let servants = self.inner.servants.lock();
-            let leaving = servants
-                .all
-                .values()
-                .filter(|handle| chosen(handle))
-                .cloned()
-                .collect::<Vec<_>>();
+            let leaving = servants.all.values().filter(|handle| chosen(handle)).cloned().collect::<Vec<_>>();
             for handle in &leaving {
                 handle.end(reason);
             }
@@ -371,19 +354,16 @@ impl Choreographer {
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Error> {
         let cpus = self.inner.options.reserve_cpus;
-        let wanted = self.inner.promised_amount(&api::Limits {
-            cpus: Some(asked.cpus.map_or(cpus, |asked| asked.min(cpus))),
-            ..*asked
-        });
+        let wanted = self
+            .inner
+            .promised_amount(&api::Limits { cpus: Some(asked.cpus.map_or(cpus, |asked| asked.min(cpus))), ..*asked });
         let make_room = || {
             on_wait();
             self.inner.make_room();
         };
         let admission = &self.inner.admission;
         let stands = watch::Sender::new(None);
-        Ok(admission
-            .admit(AdmissionRequest::push(wanted), deadline, stands, make_room)
-            .await?)
+        Ok(admission.admit(AdmissionRequest::push(wanted), deadline, stands, make_room).await?)
     }
 
     /// Returns the limits of servants whose push states none.
@@ -403,11 +383,7 @@ impl Choreographer {
     }
 
     /// Tries the current revision of a service, with a servant started for the trial only.
-    pub async fn trial(
-        &self,
-        service: &str,
-        material: Material,
-    ) -> Result<api::trial::Trial, Error> {
+    pub async fn trial(&self, service: &str, material: Material) -> Result<api::trial::Trial, Error> {
         let measured = self.start_measured(service, "try", api::Limits::default())?;
         measured.lease.wait_admitted().await?;
         let reach = measured.lease.wait_ready().await?;
@@ -423,12 +399,7 @@ impl Choreographer {
 
     /// Starts a servant without a robot, to be measured; `why` becomes part of its robot's name. For a shared service
     /// it is a servant of its own, beside the group. It has the limits of `set` from the start.
-    fn start_measured(
-        &self,
-        service: &str,
-        why: &str,
-        set: api::Limits,
-    ) -> Result<MeasuredServant, Error> {
+    fn start_measured(&self, service: &str, why: &str, set: api::Limits) -> Result<MeasuredServant, Error> {
         let robot = format!("~{why}-{}", names::random(6));
         let request = ServantRequest::new(service, &robot).with_limits(set);
         let lease = self.ensure(request.anonymous())?;
@@ -436,11 +407,7 @@ impl Choreographer {
     }
 
     /// Returns what a robot with this statement would get from a service, and why.
-    pub fn explain_terms(
-        &self,
-        service: &str,
-        stated: &api::Stated,
-    ) -> Result<api::dictionary::Explained, Error> {
+    pub fn explain_terms(&self, service: &str, stated: &api::Stated) -> Result<api::dictionary::Explained, Error> {
         let inner = &self.inner;
         let revision = inner.catalogue.current_revision(service)?;
         inner.with_offer(&revision, |_| Aux::new(), |offer| explain(stated, offer))
@@ -448,22 +415,14 @@ impl Choreographer {
 
     /// Refuses limits that can never be admitted.
     pub fn check_limits(&self, limits: &api::Limits) -> Result<(), Error> {
-        Ok(self
-            .inner
-            .admission
-            .check(self.inner.promised_amount(limits))?)
+        Ok(self.inner.admission.check(self.inner.promised_amount(limits))?)
     }
 
     /// Returns the images of live servants and warm containers, which must be kept.
     pub fn images_in_use(&self) -> Vec<String> {
         let mut images = self.inner.warm_pool.images();
         let servants = self.inner.servants.lock();
-        images.extend(
-            servants
-                .all
-                .values()
-                .map(|handle| handle.revision.image.clone()),
-        );
+        images.extend(servants.all.values().map(|handle| handle.revision.image.clone()));
         images
     }
 }

@@ -22,17 +22,10 @@ mod tests {
 
     #[test]
     fn a_weight_beyond_the_promise_is_refused_with_the_way_to_more() {
-        let asking = |cpus, cpu_weight| api::Limits {
-            cpus,
-            cpu_weight: Some(cpu_weight),
-            ..api::Limits::default()
-        };
-        for (cpus, weight, is_refused) in [
-            (None, 100, false),
-            (None, 101, true),
-            (Some(2.0), 2000, false),
-            (Some(2.0), 2001, true),
-        ] {
+        let asking = |cpus, cpu_weight| api::Limits { cpus, cpu_weight: Some(cpu_weight), ..api::Limits::default() };
+        for (cpus, weight, is_refused) in
+            [(None, 100, false), (None, 101, true), (Some(2.0), 2000, false), (Some(2.0), 2001, true)]
+        {
             let outcome = check_weight(&asking(cpus, weight));
             assert_eq!(outcome.is_err(), is_refused, "{cpus:?} {weight}");
         }

@@ -109,19 +109,12 @@ impl ChoreographerInner {
         } else {
             revision.plan.limits
         };
-        self.limit_sources(api::Terms {
-            limits,
-            ..api::Terms::default()
-        })
+        self.limit_sources(api::Terms { limits, ..api::Terms::default() })
     }
 
     /// Returns the limits of a servant with these terms.
     pub(crate) fn limit_sources(&self, terms: api::Terms) -> LimitSources {
-        LimitSources {
-            set: api::Limits::default(),
-            terms,
-            default: self.options.limits,
-        }
+        LimitSources { set: api::Limits::default(), terms, default: self.options.limits }
     }
 
     /// Derives the terms of a servant of this revision from the statements of one robot's clients.
@@ -130,11 +123,7 @@ impl ChoreographerInner {
         stated: &BTreeMap<String, api::Stated>,
         revision: &RevisionRecord,
     ) -> Result<api::Terms, Error> {
-        self.with_offer(
-            revision,
-            |_| Aux::new(),
-            |offer| Ok(compute_terms(stated, offer)?),
-        )?
+        self.with_offer(revision, |_| Aux::new(), |offer| Ok(compute_terms(stated, offer)?))?
     }
 
     /// Derives the terms of a servant of the revision that a robot would be given now.
@@ -203,9 +192,8 @@ impl ChoreographerInner {
         let all = servants.all.values().map(|handle| self.facts(handle));
         let (lacking, pushes) = self.admission.shortage();
         let RoomPlan { ends, give_way } = capacity::make_room(lacking, warm.chain(all), &pushes);
-        let (warm, used): (Vec<StopOrder<'_>>, Vec<StopOrder<'_>>) = ends
-            .into_iter()
-            .partition(|end| !servants.all.contains_key(end.id));
+        let (warm, used): (Vec<StopOrder<'_>>, Vec<StopOrder<'_>>) =
+            ends.into_iter().partition(|end| !servants.all.contains_key(end.id));
         for end in warm {
             self.warm_pool.end_for_room(self, end.id);
         }
@@ -237,9 +225,7 @@ impl ChoreographerInner {
 
 /// Returns prepared containers with a promise as input for decisions; given as id, promise, and whether it is being
 /// ended.
-pub(crate) fn warm_facts(
-    warm: &[(String, Amount, bool)],
-) -> impl Iterator<Item = ServantFacts<'_>> {
+pub(crate) fn warm_facts(warm: &[(String, Amount, bool)]) -> impl Iterator<Item = ServantFacts<'_>> {
     warm.iter().map(|(id, promised, ending)| ServantFacts {
         id,
         revision: 0,
@@ -261,11 +247,7 @@ impl Servants {
 
     fn unassign(&mut self, handle: &Arc<Handle>) {
         let key = (handle.service().to_owned(), handle.robot.clone());
-        if self
-            .given
-            .get(&key)
-            .is_some_and(|given| Arc::ptr_eq(given, handle))
-        {
+        if self.given.get(&key).is_some_and(|given| Arc::ptr_eq(given, handle)) {
             self.given.remove(&key);
         }
     }

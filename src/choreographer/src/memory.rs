@@ -87,15 +87,11 @@ impl Memory {
 fn report(journal: &Journal, who: &str, full: &Exceeded) {
     let journal = journal.clone();
     let servant = who.strip_prefix("servant ").map(str::to_owned);
-    let message = format!(
-        "{who} reached its memory limit: {full}; the data was dropped (limits: [memory] of the configuration)"
-    );
+    let message =
+        format!("{who} reached its memory limit: {full}; the data was dropped (limits: [memory] of the configuration)");
     // Writing to the database may block; a request for memory must not.
     let write = move || {
-        let about = NewEvent {
-            servant: servant.as_deref(),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { servant: servant.as_deref(), ..NewEvent::default() };
         journal.warning("memory-refused", &message, &about);
     };
     match tokio::runtime::Handle::try_current() {

@@ -23,27 +23,17 @@ pub struct ServantRequest {
 impl ServantRequest {
     /// Creates a request of a rosbridge client without a statement.
     pub fn new(service: &str, robot: &str) -> ServantRequest {
-        ServantRequest {
-            service: service.to_owned(),
-            robot: robot.to_owned(),
-            ..ServantRequest::default()
-        }
+        ServantRequest { service: service.to_owned(), robot: robot.to_owned(), ..ServantRequest::default() }
     }
 
     /// Marks the robot as one without a name.
     pub fn anonymous(self) -> ServantRequest {
-        ServantRequest {
-            anonymous: true,
-            ..self
-        }
+        ServantRequest { anonymous: true, ..self }
     }
 
     /// Sets the stub's node.
     pub fn with_stub(self, node: &str) -> ServantRequest {
-        ServantRequest {
-            stub: Some(node.to_owned()),
-            ..self
-        }
+        ServantRequest { stub: Some(node.to_owned()), ..self }
     }
 
     /// Sets the statement.
@@ -63,8 +53,7 @@ impl ServantRequest {
 
     /// Returns the statement by client; empty without a statement.
     pub(crate) fn statement(&self) -> BTreeMap<String, Stated> {
-        let some =
-            (!self.stated.is_empty()).then(|| (self.client().to_owned(), self.stated.clone()));
+        let some = (!self.stated.is_empty()).then(|| (self.client().to_owned(), self.stated.clone()));
         some.into_iter().collect()
     }
 }

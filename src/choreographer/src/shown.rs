@@ -17,39 +17,24 @@ impl Choreographer {
         let reach = handle.reach();
         let running = is_running(life.phase);
         let container = handle.container().filter(|_| running);
-        let enforced = container
-            .as_ref()
-            .map(|container| container.enforced_limits());
-        let pids = container
-            .as_ref()
-            .map(|container| inner.opener.process_ids(container.id()));
+        let enforced = container.as_ref().map(|container| container.enforced_limits());
+        let pids = container.as_ref().map(|container| inner.opener.process_ids(container.id()));
         api::Servant {
             id: handle.id.clone(),
             service: handle.service().to_owned(),
             revision: handle.revision.number,
             robot: handle.robot.clone(),
             phase: life.phase,
-            reason: life.reason().or_else(|| {
-                handle
-                    .watch_standing()
-                    .borrow()
-                    .as_ref()
-                    .map(ToString::to_string)
-            }),
+            reason: life.reason().or_else(|| handle.watch_standing().borrow().as_ref().map(ToString::to_string)),
             created: handle.created,
             connections: handle.connections(),
             idle_until: handle.idle_until(),
-            terms: Some(handle.terms())
-                .filter(|terms| !terms.stated.is_empty() || terms.class.is_some()),
+            terms: Some(handle.terms()).filter(|terms| !terms.stated.is_empty() || terms.class.is_some()),
             limits: handle.limits(),
-            cgroup_version: enforced
-                .as_ref()
-                .map_or(0, |enforced| enforced.cgroup_version),
+            cgroup_version: enforced.as_ref().map_or(0, |enforced| enforced.cgroup_version),
             enforced: enforced.map(|enforced| enforced.limits),
             usage: usage(handle).await,
-            response: inner
-                .recent
-                .response_times(&handle.id, Instant::now().into_std()),
+            response: inner.recent.response_times(&handle.id, Instant::now().into_std()),
             pids: pids.unwrap_or_default(),
             dropped: reach.as_ref().map_or(0, |reach| reach.dropped_count()),
             lifecycle: reach.as_deref().map(lifecycle).unwrap_or_default(),
@@ -65,13 +50,7 @@ fn lifecycle(reach: &dyn Reach) -> Vec<api::NodeStage> {
     let stages = reach.lifecycles();
     let stages = stages.map(|stages| stages.borrow().clone());
     let stages = stages.unwrap_or_default().into_iter();
-    stages
-        .map(|(node, stage)| api::NodeStage {
-            node,
-            state: stage.state,
-            refused: stage.refused,
-        })
-        .collect()
+    stages.map(|(node, stage)| api::NodeStage { node, state: stage.state, refused: stage.refused }).collect()
 }
 
 /// Returns the topics with the most drops.
@@ -83,9 +62,7 @@ fn drops(reach: &dyn Reach) -> Vec<api::TopicDrops> {
 
 /// Returns the resource usage of a running servant.
 pub async fn usage(handle: &Handle) -> Option<api::Usage> {
-    let container = handle
-        .container()
-        .filter(|_| is_running(handle.life().phase))?;
+    let container = handle.container().filter(|_| is_running(handle.life().phase))?;
     // A servant that has ended meanwhile uses nothing.
     let usage = container.usage().await.ok()?;
     Some(api::Usage {

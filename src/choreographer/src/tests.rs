@@ -23,11 +23,7 @@ fn revision(image: &str, cpus: f64) -> RevisionRecord {
         source: "a test".into(),
         flavour: Default::default(),
         plan: Plan {
-            limits: api::Limits {
-                cpus: Some(cpus),
-                memory: Some(api::Size(0)),
-                ..api::Limits::default()
-            },
+            limits: api::Limits { cpus: Some(cpus), memory: Some(api::Size(0)), ..api::Limits::default() },
             ..Plan::default()
         },
         interface: Default::default(),
@@ -53,12 +49,7 @@ fn options() -> Options {
         hung: HungPolicy::default(),
         hung_after: 10.0,
         bridge: BridgeOptions::default(),
-        memory: MemoryOptions {
-            daemon: memory,
-            client: memory,
-            servant: memory,
-            unfinished: Duration::from_secs(300),
-        },
+        memory: MemoryOptions { daemon: memory, client: memory, servant: memory, unfinished: Duration::from_secs(300) },
     }
 }
 
@@ -67,8 +58,7 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let home = tempfile::tempdir().expect("a directory");
     let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
     let state = Arc::new(state);
-    let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
-        .expect("a store");
+    let store = image::Store::open(&home.path().join("images"), &home.path().join("layers")).expect("a store");
     let engine = Arc::new(MemoryEngine::default());
     let choreographer = Choreographer::new(
         options(),
@@ -82,19 +72,12 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
 }
 
 /// Adds a running servant with these promised cores, idle since then.
-async fn running_servant(
-    choreographer: &Choreographer,
-    id: &str,
-    cpus: f64,
-    idle_until: Option<u64>,
-) -> Arc<Handle> {
+async fn running_servant(choreographer: &Choreographer, id: &str, cpus: f64, idle_until: Option<u64>) -> Arc<Handle> {
     let inner = &choreographer.inner;
     let revision = Arc::new(revision("sha256:1", cpus));
     let asked = inner.push_limits(&revision);
     let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
-    let permit = inner
-        .admission
-        .adopt(inner.promised_amount(&handle.requested_limits()));
+    let permit = inner.admission.adopt(inner.promised_amount(&handle.requested_limits()));
     handle.set_promise(permit.promise());
     std::mem::forget(permit);
     handle.set_idle_until(idle_until);
@@ -117,27 +100,18 @@ async fn as_many_idle_servants_end_as_it_takes() {
     assert!(!ending(&oldest), "nobody waits");
     let wanted = Amount::new(1.0, 0);
     let deadline = Duration::from_secs(1);
-    let waiting = inner.admission.admit(
-        AdmissionRequest::robot(wanted, 0),
-        deadline,
-        watch::Sender::new(None),
-        || inner.make_room(),
-    );
+    let waiting = inner
+        .admission
+        .admit(AdmissionRequest::robot(wanted, 0), deadline, watch::Sender::new(None), || inner.make_room());
     let refused = waiting.await;
     assert!(refused.is_err(), "none of them ends in this test");
-    assert!(
-        ending(&oldest) && ending(&middle),
-        "one of them has not enough"
-    );
+    assert!(ending(&oldest) && ending(&middle), "one of them has not enough");
     assert!(!ending(&newest) && !ending(&busy), "more is not needed");
     // A request that waits for more than is idle takes the next servant as soon as that is idle.
     let wanted = Amount::new(2.0, 0);
-    let waiting = inner.admission.admit(
-        AdmissionRequest::robot(wanted, 0),
-        deadline,
-        watch::Sender::new(None),
-        || inner.make_room(),
-    );
+    let waiting = inner
+        .admission
+        .admit(AdmissionRequest::robot(wanted, 0), deadline, watch::Sender::new(None), || inner.make_room());
     let left = async {
         tokio::time::sleep(deadline / 2).await;
         assert!(ending(&newest) && !ending(&busy));
@@ -152,9 +126,7 @@ async fn as_many_idle_servants_end_as_it_takes() {
 async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
     let (_home, choreographer) = choreographer();
     let state = &choreographer.inner.state;
-    let first = state
-        .publish(&revision("sha256:1", 9.0), &Default::default())
-        .expect("published");
+    let first = state.publish(&revision("sha256:1", 9.0), &Default::default()).expect("published");
     // A robot asks while others are being given theirs, and meanwhile there is a new revision.
     let held = choreographer.inner.servants.lock();
     let (sender, thread) = std::sync::mpsc::channel();
@@ -174,9 +146,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
     while !state_of().expect("it runs").contains(") S ") {
         std::thread::yield_now();
     }
-    let second = state
-        .publish(&revision("sha256:2", 9.0), &Default::default())
-        .expect("published");
+    let second = state.publish(&revision("sha256:2", 9.0), &Default::default()).expect("published");
     drop(held);
     let given = asking.join().expect("no panic");
     assert_eq!((first, given), (1, second));

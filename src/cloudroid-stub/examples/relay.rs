@@ -18,8 +18,8 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, ActionServer, Bus, FailureReason, GoalEnd, GoalOutcome, ParamValue, QosProfile,
-    RosVersion, ServiceHandler, ServiceType, WireType,
+    ActionHandler, ActionServer, Bus, FailureReason, GoalEnd, GoalOutcome, ParamValue, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, WireType,
 };
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::names::{self, PeerUri};
@@ -50,10 +50,7 @@ impl ActionHandler for RelayGoals {
 }
 
 /// An action server and the goals that it receives.
-type Counting = (
-    Box<dyn ActionServer>,
-    mpsc::UnboundedReceiver<(String, Bytes)>,
-);
+type Counting = (Box<dyn ActionServer>, mpsc::UnboundedReceiver<(String, Bytes)>);
 
 fn serve_count(bus: &dyn Bus, action: &str) -> Result<Counting, Box<dyn std::error::Error>> {
     let registry = Registry::for_version(RosVersion::Two);
@@ -118,26 +115,17 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
     let given = |name: &str| {
         let prefix = format!("{name}:=");
-        arguments
-            .iter()
-            .rev()
-            .find_map(|argument| argument.strip_prefix(&prefix))
-            .map(str::to_owned)
+        arguments.iter().rev().find_map(|argument| argument.strip_prefix(&prefix)).map(str::to_owned)
     };
-    let version = if arguments.iter().any(|argument| argument == "--ros-args") {
-        RosVersion::Two
-    } else {
-        RosVersion::One
-    };
+    let version =
+        if arguments.iter().any(|argument| argument == "--ros-args") { RosVersion::Two } else { RosVersion::One };
     let namespace = std::env::var("ROS_NAMESPACE").unwrap_or_default();
     let namespace = given("__ns").unwrap_or(namespace);
     let name = given("__node").or_else(|| given("__name"));
     let name = name.unwrap_or_else(|| "relay".into());
     let node = names::canonical(&format!("{namespace}/{name}"));
     let topic = |name: &str| names::resolve(&given(name).unwrap_or_else(|| name.into()), &node);
-    let crash = arguments
-        .iter()
-        .find_map(|argument| argument.strip_prefix("crash-on="));
+    let crash = arguments.iter().find_map(|argument| argument.strip_prefix("crash-on="));
 
     let bus = join(version, &node).await?;
     let greeting = match bus.parameters() {
@@ -163,16 +151,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     };
     let echo_type = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
-    let _echo = bus
-        .serve(&format!("{node}/echo"), echo_type, Arc::new(Echo))
-        .await?;
-    let out = bus
-        .advertise(&topic("out"), wire_type.clone(), QosProfile::keep_last(8))
-        .await?;
+    let _echo = bus.serve(&format!("{node}/echo"), echo_type, Arc::new(Echo)).await?;
+    let out = bus.advertise(&topic("out"), wire_type.clone(), QosProfile::keep_last(8)).await?;
     if arguments.iter().any(|argument| argument == "patient") {
-        out.matched_subscribers()
-            .wait_for(|now| now.connected_count() > 0)
-            .await?;
+        out.matched_subscribers().wait_for(|now| now.connected_count() > 0).await?;
     }
     for (prefix, is_latched) in [("awaits=", false), ("awaits-latched=", true)] {
         let awaited = arguments.iter().find_map(|it| it.strip_prefix(prefix));

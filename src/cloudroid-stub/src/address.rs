@@ -46,23 +46,15 @@ impl Address {
 
     /// Parses an address; the error describes the mistake.
     pub fn parse(server: &str) -> Result<Self, ParseAddressError> {
-        let wrong = |fault| ParseAddressError {
-            server: server.to_owned(),
-            fault,
-        };
-        let (scheme, authority) = server
-            .split_once("://")
-            .ok_or_else(|| wrong(AddressFault::NoUrl))?;
+        let wrong = |fault| ParseAddressError { server: server.to_owned(), fault };
+        let (scheme, authority) = server.split_once("://").ok_or_else(|| wrong(AddressFault::NoUrl))?;
         let secure = match scheme {
             "ws" => false,
             "wss" => true,
             _ => return Err(wrong(AddressFault::Scheme)),
         };
         let authority = authority.trim_end_matches('/');
-        if authority.is_empty()
-            || authority.contains(['/', '?', '#', '@'])
-            || authority.contains(char::is_whitespace)
-        {
+        if authority.is_empty() || authority.contains(['/', '?', '#', '@']) || authority.contains(char::is_whitespace) {
             return Err(wrong(AddressFault::Authority));
         }
         let (host, port) = match authority.rsplit_once(':') {
@@ -72,12 +64,7 @@ impl Address {
             }
             _ => (authority, if secure { 443 } else { 80 }),
         };
-        Ok(Self {
-            secure,
-            host: host.trim_matches(['[', ']']).to_owned(),
-            port,
-            authority: authority.to_owned(),
-        })
+        Ok(Self { secure, host: host.trim_matches(['[', ']']).to_owned(), port, authority: authority.to_owned() })
     }
 }
 
@@ -91,10 +78,7 @@ mod tests {
             let address = Address::parse(server).unwrap();
             (address.secure, address.host, address.port)
         };
-        assert_eq!(
-            parts("ws://robots.local:9090/"),
-            (false, "robots.local".into(), 9090)
-        );
+        assert_eq!(parts("ws://robots.local:9090/"), (false, "robots.local".into(), 9090));
         assert_eq!(parts("ws://server"), (false, "server".into(), 80));
         assert_eq!(parts("wss://server"), (true, "server".into(), 443));
         assert_eq!(parts("ws://[::1]:81"), (false, "::1".into(), 81));
@@ -103,19 +87,9 @@ mod tests {
 
     #[test]
     fn others_are_named_with_what_is_right() {
-        for server in [
-            "cloud:9090",
-            "http://cloud",
-            "ws://",
-            "ws://a/b",
-            "ws://a:b",
-            "ws://me@a",
-        ] {
+        for server in ["cloud:9090", "http://cloud", "ws://", "ws://a/b", "ws://a:b", "ws://me@a"] {
             let words = Address::parse(server).unwrap_err().to_string();
-            assert!(
-                words.contains(server) && words.contains("ws://host:9090"),
-                "{words}"
-            );
+            assert!(words.contains(server) && words.contains("ws://host:9090"), "{words}");
         }
     }
 }

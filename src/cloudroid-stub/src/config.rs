@@ -239,26 +239,14 @@ impl Config {
         if self.has_promise() {
             return self;
         }
-        Config {
-            desire: defaults.desire,
-            max: defaults.max,
-            ..self
-        }
+        Config { desire: defaults.desire, max: defaults.max, ..self }
     }
 
     /// Returns the robot id.
     pub fn robot_id(&self) -> String {
-        let host = || {
-            nix::unistd::gethostname()
-                .ok()
-                .and_then(|name| name.into_string().ok())
-        };
+        let host = || nix::unistd::gethostname().ok().and_then(|name| name.into_string().ok());
         let paired = || pairing::paired_robot(self);
-        self.robot
-            .clone()
-            .or_else(paired)
-            .or_else(host)
-            .unwrap_or_else(|| "robot".to_owned())
+        self.robot.clone().or_else(paired).or_else(host).unwrap_or_else(|| "robot".to_owned())
     }
 
     /// Returns the parsed address of the portal.
@@ -275,10 +263,7 @@ impl Config {
         Ok(Trust {
             authorities: self.ca_file.as_deref().map(expand_home),
             fingerprint: self.fingerprint,
-            known: named
-                .or(beside)
-                .map(KnownServers::new)
-                .or_else(KnownServers::for_user),
+            known: named.or(beside).map(KnownServers::new).or_else(KnownServers::for_user),
             accept: "install.sh --fingerprint".to_owned(),
             advice: NOBODY_TRUSTED,
             identity: pairing::load_identity(self)?,
@@ -294,8 +279,8 @@ impl Config {
             return Ok(None);
         };
         let path = expand_home(path);
-        let text = std::fs::read_to_string(&path)
-            .with_context(|| format!("cannot read the token in {}", path.display()))?;
+        let text =
+            std::fs::read_to_string(&path).with_context(|| format!("cannot read the token in {}", path.display()))?;
         Ok(Some(text.trim().to_owned()))
     }
 }
@@ -376,9 +361,7 @@ impl CodecSetting {
         let lossy = self.lossy()?;
         let name = lossy.name();
         let instead = match self {
-            Self::Video => {
-                "set codec = \"jpeg\", or use a stub and a server that are built with the feature `video`"
-            }
+            Self::Video => "set codec = \"jpeg\", or use a stub and a server that are built with the feature `video`",
             _ => "update the server",
         };
         if !lossy.is_available() {

@@ -50,16 +50,11 @@ pub async fn open(
 ) -> Result<WebSocket<PortalStream>, Error> {
     let address = config.address();
     let address = address.map_err(|error| Error::Refused(error.to_string()))?;
-    let trust = config
-        .trust()
-        .map_err(|error| Error::Refused(format!("{error:#}")))?;
+    let trust = config.trust().map_err(|error| Error::Refused(format!("{error:#}")))?;
     let opening = handshake(&address, &trust, path, token);
     match timeout(patience, opening).await {
         Ok(opened) => opened,
-        Err(_) => Err(Error::Unreachable(format!(
-            "{} did not answer within {patience:?}",
-            config.server
-        ))),
+        Err(_) => Err(Error::Unreachable(format!("{} did not answer within {patience:?}", config.server))),
     }
 }
 
@@ -74,9 +69,7 @@ async fn handshake(
         Some(words) => Error::Refused(format!("{authority} refuses this robot: {words}")),
         None => Error::Unreachable(format!("{what} {authority}: {error}")),
     };
-    let ip = resolver::resolve(&address.host)
-        .await
-        .map_err(|error| unreachable("cannot find", error))?;
+    let ip = resolver::resolve(&address.host).await.map_err(|error| unreachable("cannot find", error))?;
     // TCP would retransmit a lost packet at increasing intervals.
     let stream = match timeout(TCP, TcpStream::connect((ip, address.port))).await {
         Ok(stream) => stream,
@@ -119,20 +112,14 @@ async fn handshake(
         }
         match stream.read_buf(&mut answer).await {
             Ok(0) => {
-                return Err(Error::Unreachable(format!(
-                    "{authority} closed the connection"
-                )));
+                return Err(Error::Unreachable(format!("{authority} closed the connection")));
             }
             Ok(_) => {}
             Err(error) => return Err(unreachable("cannot read from", error)),
         }
     };
     let head = String::from_utf8_lossy(&answer[..end]).into_owned();
-    let status: u16 = head
-        .split(' ')
-        .nth(1)
-        .and_then(|code| code.parse().ok())
-        .unwrap_or(0);
+    let status: u16 = head.split(' ').nth(1).and_then(|code| code.parse().ok()).unwrap_or(0);
     if status != 101 {
         let problem = problem_text(&mut stream, &head, answer.split_off(end)).await;
         let mut text = format!("{authority} answers {status}: {problem}");
@@ -147,9 +134,7 @@ async fn handshake(
     }
     let expected = STANDARD.encode_to_string(Sha1::digest(format!("{key}{GUID}")));
     if header(&head, "sec-websocket-accept") != Some(&expected) {
-        return Err(Error::Refused(format!(
-            "{authority} is not a WebSocket server"
-        )));
+        return Err(Error::Refused(format!("{authority} is not a WebSocket server")));
     }
     if header(&head, "sec-websocket-protocol") != Some(link::SUBPROTOCOL) {
         return Err(Error::Refused(format!(
@@ -158,42 +143,23 @@ async fn handshake(
             link::SUBPROTOCOL
         )));
     }
-    let socket = WebSocket::client(
-        stream,
-        &answer[end..],
-        link::MAX_FRAME,
-        link::MAX_RECORD,
-        rand::random(),
-    );
+    let socket = WebSocket::client(stream, &answer[end..], link::MAX_FRAME, link::MAX_RECORD, rand::random());
     Ok(socket.with_budget(&run::FROM_SERVER, UNFINISHED))
 }
 
 /// Returns keepalive settings: while a servant is started no data arrives, and a lost network must still be noticed.
 fn keepalive() -> socket2::TcpKeepalive {
-    socket2::TcpKeepalive::new()
-        .with_time(Duration::from_secs(5))
-        .with_interval(Duration::from_secs(2))
-        .with_retries(3)
+    socket2::TcpKeepalive::new().with_time(Duration::from_secs(5)).with_interval(Duration::from_secs(2)).with_retries(3)
 }
 
 /// Reads the details of a problem document, or the body as text.
 async fn problem_text(stream: &mut PortalStream, head: &str, mut begun: Vec<u8>) -> String {
-    let length = header(head, "content-length")
-        .and_then(|text| text.parse().ok())
-        .unwrap_or(0_usize);
-    while begun.len() < length.min(MAX_HEAD)
-        && stream.read_buf(&mut begun).await.is_ok_and(|read| read > 0)
-    {}
+    let length = header(head, "content-length").and_then(|text| text.parse().ok()).unwrap_or(0_usize);
+    while begun.len() < length.min(MAX_HEAD) && stream.read_buf(&mut begun).await.is_ok_and(|read| read > 0) {}
     let document: serde_json::Value = serde_json::from_slice(&begun).unwrap_or_default();
-    let said = ["detail", "next", "title"]
-        .iter()
-        .filter_map(|key| document[key].as_str());
+    let said = ["detail", "next", "title"].iter().filter_map(|key| document[key].as_str());
     let said: Vec<&str> = said.take(2).collect();
-    if said.is_empty() {
-        String::from_utf8_lossy(&begun).trim().to_owned()
-    } else {
-        said.join("; ")
-    }
+    if said.is_empty() { String::from_utf8_lossy(&begun).trim().to_owned() } else { said.join("; ") }
 }
 
 fn header<'a>(head: &'a str, name: &str) -> Option<&'a str> {
@@ -204,9 +170,7 @@ fn header<'a>(head: &'a str, name: &str) -> Option<&'a str> {
 }
 
 fn find_bytes(bytes: &[u8], wanted: &[u8]) -> Option<usize> {
-    bytes
-        .windows(wanted.len())
-        .position(|window| window == wanted)
+    bytes.windows(wanted.len()).position(|window| window == wanted)
 }
 
 #[cfg(test)]
@@ -216,18 +180,12 @@ mod tests {
     use super::*;
 
     /// Returns the error of connecting to a server that `serves` one connection.
-    async fn error_from<F: Future<Output = ()> + Send + 'static>(
-        serves: impl FnOnce(TcpStream) -> F,
-    ) -> Error {
+    async fn error_from<F: Future<Output = ()> + Send + 'static>(serves: impl FnOnce(TcpStream) -> F) -> Error {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let server = format!("ws://{}", listener.local_addr().unwrap());
         let settings = format!("server = {server:?}\nservice = 'any'");
         let config: Config = toml::from_str(&settings).unwrap();
-        let opened = tokio::spawn(async move {
-            open(&config, "/any", None, Duration::from_secs(20))
-                .await
-                .err()
-        });
+        let opened = tokio::spawn(async move { open(&config, "/any", None, Duration::from_secs(20)).await.err() });
         let served = tokio::spawn(serves(listener.accept().await.unwrap().0));
         let error = opened.await.unwrap().expect("no link");
         served.await.unwrap();
@@ -244,14 +202,8 @@ mod tests {
         let Error::Refused(text) = error else {
             panic!("trying again changes nothing, but: {error}");
         };
-        assert!(
-            text.contains("does not support cloudroid-link.v2"),
-            "{text}"
-        );
-        assert!(
-            text.contains("install the stub again from this server"),
-            "{text}"
-        );
+        assert!(text.contains("does not support cloudroid-link.v2"), "{text}");
+        assert!(text.contains("install the stub again from this server"), "{text}");
     }
 
     #[tokio::test]
@@ -261,10 +213,7 @@ mod tests {
             let _ = stream.write_all(&noise).await;
         })
         .await;
-        assert!(
-            error.to_string().contains("is not an HTTP server"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("is not an HTTP server"), "{error}");
         let error = error_from(|stream| async move { drop(stream) }).await;
         assert!(matches!(error, Error::Unreachable(_)), "{error}");
     }

@@ -15,9 +15,7 @@ use check::CheckVerdict;
 pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
     let stub = overlay::ExaminedStub::from_args(asked)?;
     let config = crate::config::load(&stub.share, std::env::vars())?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let mut checks = runtime.block_on(server::checks(&config, &stub));
     if asked.only != Some(DoctorPart::Server) {
         let variable = |name: &str| std::env::var(name).ok();
@@ -26,14 +24,8 @@ pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
     for check in &checks {
         println!("{}", terminal::escape(&check.render(), false));
     }
-    let bad = checks
-        .iter()
-        .any(|check| check.verdict == CheckVerdict::Bad);
-    Ok(if bad {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    })
+    let bad = checks.iter().any(|check| check.verdict == CheckVerdict::Bad);
+    Ok(if bad { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
 #[cfg(test)]
@@ -42,18 +34,11 @@ mod tests {
 
     #[test]
     fn a_check_names_the_command_that_mends_it() {
-        let check = Check::bad(
-            "token",
-            "the server wants one",
-            "sh install.sh --token TOKEN",
-        );
+        let check = Check::bad("token", "the server wants one", "sh install.sh --token TOKEN");
         assert_eq!(
             check.render(),
             "FAIL  token      the server wants one\n                 fix it:  sh install.sh --token TOKEN"
         );
-        assert_eq!(
-            Check::good("clock", "in step").render(),
-            "ok    clock      in step"
-        );
+        assert_eq!(Check::good("clock", "in step").render(), "ok    clock      in step");
     }
 }

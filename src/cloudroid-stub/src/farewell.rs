@@ -29,11 +29,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 const TOLD: Duration = Duration::from_millis(500);
 
 /// Sends this signal to the real node and returns its exit, unless the cloud stops responding or `other` ends the wait.
-pub async fn stop_node(
-    mirror: &Mirror,
-    signal: i32,
-    other: impl Future<Output = ()>,
-) -> Option<Exit> {
+pub async fn stop_node(mirror: &Mirror, signal: i32, other: impl Future<Output = ()>) -> Option<Exit> {
     if let Some(keeper) = mirror.keeper() {
         keeper.end();
     }

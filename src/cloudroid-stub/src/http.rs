@@ -49,11 +49,7 @@ pub async fn get(server: &HttpServer, path: &str, token: Option<&str>) -> io::Re
 }
 
 /// Sends `POST path` with JSON.
-pub async fn post(
-    server: &HttpServer,
-    path: &str,
-    body: &serde_json::Value,
-) -> io::Result<HttpAnswer> {
+pub async fn post(server: &HttpServer, path: &str, body: &serde_json::Value) -> io::Result<HttpAnswer> {
     exchange_in_time(server, path, None, Some(body.to_string())).await
 }
 
@@ -63,12 +59,10 @@ async fn exchange_in_time(
     token: Option<&str>,
     body: Option<String>,
 ) -> io::Result<HttpAnswer> {
-    tokio::time::timeout(PATIENCE, exchange(server, path, token, body))
-        .await
-        .unwrap_or_else(|_| {
-            let words = format!("no complete response to {path} within {PATIENCE:?}");
-            Err(io::Error::new(io::ErrorKind::TimedOut, words))
-        })
+    tokio::time::timeout(PATIENCE, exchange(server, path, token, body)).await.unwrap_or_else(|_| {
+        let words = format!("no complete response to {path} within {PATIENCE:?}");
+        Err(io::Error::new(io::ErrorKind::TimedOut, words))
+    })
 }
 
 async fn exchange(
@@ -98,9 +92,7 @@ async fn exchange(
     }
     if let Some(body) = &body {
         let length = body.len();
-        request.push_str(&format!(
-            "Content-Type: application/json\r\nContent-Length: {length}\r\n"
-        ));
+        request.push_str(&format!("Content-Type: application/json\r\nContent-Length: {length}\r\n"));
     }
     request.push_str("\r\n");
     request.push_str(body.as_deref().unwrap_or_default());
@@ -123,15 +115,9 @@ async fn exchange(
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {}
         Err(error) => return Err(error),
     }
-    let (status, body) = parse_answer(&answer)
-        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "not an HTTP response"))?;
-    Ok(HttpAnswer {
-        status,
-        body,
-        waited,
-        arrived,
-        mtu,
-    })
+    let (status, body) =
+        parse_answer(&answer).ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "not an HTTP response"))?;
+    Ok(HttpAnswer { status, body, waited, arrived, mtu })
 }
 
 impl HttpAnswer {
@@ -140,11 +126,7 @@ impl HttpAnswer {
         let document: serde_json::Value = serde_json::from_slice(&self.body).unwrap_or_default();
         let said = ["detail", "next"].iter();
         let said: Vec<&str> = said.filter_map(|key| document[key].as_str()).collect();
-        if said.is_empty() {
-            String::from_utf8_lossy(&self.body).trim().to_owned()
-        } else {
-            said.join("; ")
-        }
+        if said.is_empty() { String::from_utf8_lossy(&self.body).trim().to_owned() } else { said.join("; ") }
     }
 }
 
@@ -152,21 +134,10 @@ impl HttpAnswer {
 fn parse_answer(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
     let end = answer.windows(4).position(|four| four == b"\r\n\r\n")?;
     let head = std::str::from_utf8(&answer[..end]).ok()?;
-    let status = head
-        .strip_prefix("HTTP/1.")?
-        .split(' ')
-        .nth(1)?
-        .parse()
-        .ok()?;
+    let status = head.strip_prefix("HTTP/1.")?.split(' ').nth(1)?.parse().ok()?;
     let body = &answer[end + 4..];
-    let chunked = head
-        .to_ascii_lowercase()
-        .contains("transfer-encoding: chunked");
-    let body = if chunked {
-        decode_chunked(body)?
-    } else {
-        body.to_vec()
-    };
+    let chunked = head.to_ascii_lowercase().contains("transfer-encoding: chunked");
+    let body = if chunked { decode_chunked(body)? } else { body.to_vec() };
     Some((status, body))
 }
 
@@ -227,14 +198,11 @@ mod tests {
     fn answers_are_understood_whole_or_in_chunks() {
         let plain = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok";
         assert_eq!(parse_answer(plain), Some((200, b"ok".to_vec())));
-        let chunked =
-            b"HTTP/1.1 404 Not Found\r\nTransfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1;x\r\nc\r\n0\r\n\r\n";
+        let chunked = b"HTTP/1.1 404 Not Found\r\nTransfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1;x\r\nc\r\n0\r\n\r\n";
         assert_eq!(parse_answer(chunked), Some((404, b"abc".to_vec())));
-        for broken in [
-            &b""[..],
-            b"SSH-2.0-x\r\n\r\n",
-            b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nff\r\nshort",
-        ] {
+        for broken in
+            [&b""[..], b"SSH-2.0-x\r\n\r\n", b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nff\r\nshort"]
+        {
             assert_eq!(parse_answer(broken), None);
         }
     }

@@ -71,26 +71,11 @@ enum LinkEnd {
 pub async fn run_link(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
     let (robot, node) = (config.robot_id(), hello.node.name.clone());
     let span = tracing::error_span!("link", robot, node);
-    run_link_with(config, mirror, hello, &PAUSES)
-        .instrument(span)
-        .await
+    run_link_with(config, mirror, hello, &PAUSES).instrument(span).await
 }
 
-async fn run_link_with(
-    config: &Config,
-    mirror: &Arc<Mirror>,
-    hello: &mut Hello,
-    pauses: &RetryPauses,
-) -> String {
-    let mut link = RobotLink {
-        config,
-        mirror,
-        hello,
-        session: None,
-        since: None,
-        welcome: WELCOME,
-        unmet: None,
-    };
+async fn run_link_with(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello, pauses: &RetryPauses) -> String {
+    let mut link = RobotLink { config, mirror, hello, session: None, since: None, welcome: WELCOME, unmet: None };
     let mut pace = RetryPace::default();
     let mut told = String::new();
     let mut standby: Option<Box<WebSocket<PortalStream>>> = None;
@@ -109,10 +94,7 @@ async fn run_link_with(
                 None
             }
             Ok(LinkEnd::Replaced(socket)) => {
-                tracing::warn!(
-                    "the connection to {} is silent, a new one replaces it",
-                    config.server
-                );
+                tracing::warn!("the connection to {} is silent, a new one replaces it", config.server);
                 told.clear();
                 standby = Some(socket);
                 continue;
@@ -126,12 +108,8 @@ async fn run_link_with(
                 );
                 Some((format!("{reason}; {again}"), pauses.refused))
             }
-            Err(connect::Error::Unreachable(reason)) => {
-                Some((format!("{reason}; trying again"), pauses.away))
-            }
-            Err(connect::Error::Busy(reason)) => {
-                Some((format!("{reason}; trying again"), pauses.busy))
-            }
+            Err(connect::Error::Unreachable(reason)) => Some((format!("{reason}; trying again"), pauses.away)),
+            Err(connect::Error::Busy(reason)) => Some((format!("{reason}; trying again"), pauses.busy)),
         };
         let longest = reason.as_ref().map_or(pauses.away, |(_, longest)| *longest);
         if let Some((reason, _)) = reason {
@@ -152,10 +130,7 @@ struct RetryPace {
 
 impl Default for RetryPace {
     fn default() -> Self {
-        Self {
-            began: Instant::now(),
-            pause: PAUSE,
-        }
+        Self { began: Instant::now(), pause: PAUSE }
     }
 }
 
@@ -204,10 +179,7 @@ impl RobotLink<'_> {
     }
 
     /// Exchanges hello and welcome on a connection, and lets it carry the link until it is lost or replaced.
-    async fn carry(
-        &mut self,
-        mut socket: WebSocket<PortalStream>,
-    ) -> Result<LinkEnd, connect::Error> {
+    async fn carry(&mut self, mut socket: WebSocket<PortalStream>) -> Result<LinkEnd, connect::Error> {
         self.exchange_hello(&mut socket).await?;
         let session = self.mirror.session();
         let running = session.run(&mut socket, &**self.mirror);
@@ -219,10 +191,7 @@ impl RobotLink<'_> {
     }
 
     /// Sends hello and receives welcome; the session is resumed, or another one begins.
-    async fn exchange_hello(
-        &mut self,
-        socket: &mut WebSocket<PortalStream>,
-    ) -> Result<(), connect::Error> {
+    async fn exchange_hello(&mut self, socket: &mut WebSocket<PortalStream>) -> Result<(), connect::Error> {
         let hello = &mut *self.hello;
         if self.session.is_none() && hello.parameters.is_empty() {
             hello.parameters = self.mirror.parameters().await;
@@ -230,11 +199,7 @@ impl RobotLink<'_> {
         let (received, ahead, next) = self.mirror.session().position();
         hello.attempt += 1;
         hello.next = next;
-        hello.resume = self.session.clone().map(|session| Resume {
-            session,
-            received,
-            ahead,
-        });
+        hello.resume = self.session.clone().map(|session| Resume { session, received, ahead });
         let patience = match &self.session {
             Some(_) => self.welcome,
             None => SERVANT,
@@ -255,21 +220,9 @@ impl RobotLink<'_> {
         };
         self.welcome = WELCOME;
         match welcome {
-            Welcome::Refused {
-                reason,
-                again: true,
-            } => Err(connect::Error::Busy(reason)),
+            Welcome::Refused { reason, again: true } => Err(connect::Error::Busy(reason)),
             Welcome::Refused { reason, .. } => Err(connect::Error::Refused(reason)),
-            Welcome::Accepted {
-                session,
-                resumed,
-                received,
-                ahead,
-                next,
-                codecs,
-                limits,
-                servant,
-            } => {
+            Welcome::Accepted { session, resumed, received, ahead, next, codecs, limits, servant } => {
                 if !resumed && self.session.is_some() {
                     let fresh = run::new_session(self.config);
                     fresh.begin_at(self.hello.next);
@@ -309,11 +262,7 @@ async fn open_link(config: &Config, node: &str) -> Result<WebSocket<PortalStream
 }
 
 /// Opens a connection besides the one that carries the session, after that has been silent for a while and still is.
-async fn connect_standby(
-    config: &Config,
-    node: &str,
-    session: &RobotSession,
-) -> WebSocket<PortalStream> {
+async fn connect_standby(config: &Config, node: &str, session: &RobotSession) -> WebSocket<PortalStream> {
     let mut up = session.watch_up();
     loop {
         // The session outlives this function.

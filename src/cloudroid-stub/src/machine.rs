@@ -6,11 +6,7 @@ use ros::bus::{Bus, ParamValue};
 use sha1::{Digest, Sha1};
 
 /// Files that identify a machine. Machines cloned from one disk image share the first two; no two share a boot id.
-const IDS: [&str; 3] = [
-    "/etc/machine-id",
-    "/var/lib/dbus/machine-id",
-    "/proc/sys/kernel/random/boot_id",
-];
+const IDS: [&str; 3] = ["/etc/machine-id", "/var/lib/dbus/machine-id", "/proc/sys/kernel/random/boot_id"];
 
 /// Returns an id that distinguishes this machine, since its last boot, from others without revealing which it is.
 pub fn id() -> String {
@@ -52,11 +48,7 @@ mod tests {
     fn copies_of_one_disk_are_told_apart() {
         let ids = |machine: &str, boot: &str| [machine.into(), String::new(), boot.into()];
         assert_eq!(digest_ids(ids("a\n", "1")), digest_ids(ids("a", "1")));
-        assert_ne!(
-            digest_ids(ids("a", "1")),
-            digest_ids(ids("a", "2")),
-            "one disk, two machines"
-        );
+        assert_ne!(digest_ids(ids("a", "1")), digest_ids(ids("a", "2")), "one disk, two machines");
         assert_ne!(digest_ids(ids("a", "1")), digest_ids(ids("b", "1")));
         assert_eq!(id(), id());
     }

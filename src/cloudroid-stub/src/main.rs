@@ -49,15 +49,10 @@ use foreign::terminal;
 fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_env("CLOUDROID_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(|| &*output::STDERR)
-        .with_target(false)
-        .init();
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(|| &*output::STDERR).with_target(false).init();
     // A machine has only one clock; tests of two clocks shift it.
-    if let Some(seconds) = std::env::var("CLOUDROID_TEST_CLOCK_SHIFT")
-        .ok()
-        .and_then(|seconds| seconds.parse::<i64>().ok())
+    if let Some(seconds) =
+        std::env::var("CLOUDROID_TEST_CLOCK_SHIFT").ok().and_then(|seconds| seconds.parse::<i64>().ok())
     {
         link::clock::shift_clock(seconds.saturating_mul(1_000_000_000));
     }

@@ -53,12 +53,7 @@ const SETTLE: Duration = Duration::from_secs(3);
 impl Mirror {
     /// Starts a mirror on `bus`, labeled with `label`; its tasks end with it. `call_limit` is the time limit for calls
     /// that the node makes to the robot's services.
-    pub fn start(
-        bus: Arc<dyn Bus>,
-        label: String,
-        session: Arc<RobotSession>,
-        call_limit: Duration,
-    ) -> Arc<Self> {
+    pub fn start(bus: Arc<dyn Bus>, label: String, session: Arc<RobotSession>, call_limit: Duration) -> Arc<Self> {
         let (orders, taken) = mpsc::unbounded_channel();
         let mirror = Arc::new_cyclic(|this| Self {
             this: this.clone(),
@@ -115,10 +110,7 @@ impl Mirror {
             self.drops.add(&drop.topic, drop.cause, drop.count);
         }
         self.lent.clear();
-        self.calls.fail_all(
-            self.keeper(),
-            "this call was lost: the daemon or the servant was restarted",
-        );
+        self.calls.fail_all(self.keeper(), "this call was lost: the daemon or the servant was restarted");
         self.inputs.reset_channels();
     }
 
@@ -169,29 +161,13 @@ impl SessionHandler<FromCloud> for Mirror {
     fn on_record(&self, record: Record<FromCloud>, held: Permit, arrived: i64) {
         match record {
             Record::Data(data) => self.outputs.publish_cloud(self, data, arrived),
-            Record::Answer {
-                id,
-                taken,
-                given,
-                response,
-            } => {
+            Record::Answer { id, taken, given, response } => {
                 let way = (taken, given, arrived);
                 self.calls.on_answer(self, id, way, response);
             }
-            Record::Call {
-                id,
-                service,
-                request,
-            } => self.lent.call(
-                self,
-                ReceivedCall {
-                    id,
-                    service,
-                    request,
-                    held,
-                    taken: arrived,
-                },
-            ),
+            Record::Call { id, service, request } => {
+                self.lent.call(self, ReceivedCall { id, service, request, held, taken: arrived })
+            }
             // An untrusted server could otherwise send control sequences to the robot's terminal.
             Record::Control(FromCloud::Line { error: true, text }) => {
                 output::STDERR.print(format!("{}\n", terminal::escape(&text, true)));
@@ -244,26 +220,16 @@ async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
 }
 
 /// Processes messages from the cloud in order.
-async fn process_orders(
-    mirror: Weak<Mirror>,
-    mut orders: mpsc::UnboundedReceiver<(FromCloud, Permit)>,
-) {
+async fn process_orders(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<(FromCloud, Permit)>) {
     while let Some((order, held)) = orders.recv().await {
         let Some(mirror) = mirror.upgrade() else {
             return;
         };
         match order {
-            FromCloud::Type {
-                name,
-                md5,
-                definition,
-            } => {
+            FromCloud::Type { name, md5, definition } => {
                 let key = (name.clone(), md5.clone());
                 let wire_type = WireType::new(name, md5, definition);
-                let known = KnownType {
-                    of: wire_type.with_version(mirror.bus.version()),
-                    _held: Some(held),
-                };
+                let known = KnownType { of: wire_type.with_version(mirror.bus.version()), _held: Some(held) };
                 mirror.types.lock().insert(key, known);
             }
             FromCloud::Graph(graph) => mirror.apply_graph(graph).await,
@@ -271,10 +237,7 @@ async fn process_orders(
             FromCloud::Exited(exit) => {
                 mirror.exit.send_replace(Some(exit));
             }
-            FromCloud::Notice {
-                warning: true,
-                text,
-            } => tracing::warn!("{text}"),
+            FromCloud::Notice { warning: true, text } => tracing::warn!("{text}"),
             FromCloud::Notice { text, .. } => tracing::info!("{text}"),
             other => tracing::debug!(?other, "unexpected record from the cloud"),
         }

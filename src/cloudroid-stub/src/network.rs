@@ -40,17 +40,9 @@ pub async fn read_network(variable: Variable<'_>) -> anyhow::Result<(u16, Discov
     let given = |name: &str| variable(name).filter(|value| !value.is_empty());
     let domain = parse_domain(given(DOMAIN).as_deref())?;
     let this_machine = parse_localhost_only(given(LOCALHOST_ONLY).as_deref())?;
-    let range = if this_machine {
-        DiscoveryRange::Localhost
-    } else {
-        parse_range(given(RANGE).as_deref())?
-    };
+    let range = if this_machine { DiscoveryRange::Localhost } else { parse_range(given(RANGE).as_deref())? };
     if range == DiscoveryRange::Off {
-        let alone = DiscoveryNetwork {
-            alone: true,
-            multicast: false,
-            ..DiscoveryNetwork::default()
-        };
+        let alone = DiscoveryNetwork { alone: true, multicast: false, ..DiscoveryNetwork::default() };
         return Ok((domain, alone));
     }
     // If discovery is limited to this machine, ROS 2 does not read the peers either.
@@ -62,14 +54,9 @@ pub async fn read_network(variable: Variable<'_>) -> anyhow::Result<(u16, Discov
         peers.clear();
     }
     let mut named = servers.iter().map(|server| &server.at).chain(&peers);
-    let is_wide =
-        range == DiscoveryRange::Subnet || named.any(|address| !address.ip().is_loopback());
+    let is_wide = range == DiscoveryRange::Subnet || named.any(|address| !address.ip().is_loopback());
     let network = DiscoveryNetwork {
-        interfaces: if is_wide && !this_machine {
-            InterfaceSelection::All
-        } else {
-            InterfaceSelection::default()
-        },
+        interfaces: if is_wide && !this_machine { InterfaceSelection::All } else { InterfaceSelection::default() },
         multicast: range == DiscoveryRange::Subnet && servers.is_empty(),
         alone: false,
         peers,
@@ -110,9 +97,7 @@ fn parse_localhost_only(given: Option<&str>) -> anyhow::Result<bool> {
 }
 
 fn entries(list: &str) -> impl Iterator<Item = &str> {
-    list.split(';')
-        .map(str::trim)
-        .filter(|entry| !entry.is_empty())
+    list.split(';').map(str::trim).filter(|entry| !entry.is_empty())
 }
 
 /// Resolves the peers, each with port 0, which stands for the ports of all nodes on a host.
@@ -121,9 +106,9 @@ async fn resolve_peers(list: &str) -> Vec<SocketAddr> {
     for host in entries(list) {
         match resolve_ipv4(host).await {
             Ok(ip) => found.push(SocketAddr::new(ip, 0)),
-            Err(error) => tracing::warn!(
-                "{PEERS} has {host}, which is skipped: {error:#}; its nodes do not discover this one"
-            ),
+            Err(error) => {
+                tracing::warn!("{PEERS} has {host}, which is skipped: {error:#}; its nodes do not discover this one")
+            }
         }
     }
     found
@@ -144,9 +129,7 @@ mod tests {
     async fn parse_network(given: &[(&str, &str)]) -> anyhow::Result<(u16, DiscoveryNetwork)> {
         let variable = |name: &str| {
             let mut given = given.iter();
-            given
-                .find(|(given, _)| *given == name)
-                .map(|(_, value)| (*value).to_owned())
+            given.find(|(given, _)| *given == name).map(|(_, value)| (*value).to_owned())
         };
         read_network(&variable).await
     }
@@ -166,11 +149,8 @@ mod tests {
 
     #[tokio::test]
     async fn without_a_word_all_networks_are_used() {
-        let wide = DiscoveryNetwork {
-            interfaces: InterfaceSelection::All,
-            well_known: true,
-            ..DiscoveryNetwork::default()
-        };
+        let wide =
+            DiscoveryNetwork { interfaces: InterfaceSelection::All, well_known: true, ..DiscoveryNetwork::default() };
         assert_eq!(good(&[]).await, (0, wide.clone()));
         // A variable set to an empty string in the shell.
         let empty = [DOMAIN, RANGE, LOCALHOST_ONLY, PEERS, SERVERS].map(|name| (name, ""));
@@ -193,34 +173,16 @@ mod tests {
 
     #[tokio::test]
     async fn this_machine_alone() {
-        let narrow = DiscoveryNetwork {
-            multicast: false,
-            well_known: true,
-            ..DiscoveryNetwork::default()
-        };
+        let narrow = DiscoveryNetwork { multicast: false, well_known: true, ..DiscoveryNetwork::default() };
         assert_eq!(good(&[(RANGE, "LOCALHOST")]).await.1, narrow);
         // The older variable has precedence over both.
-        let older = [
-            (LOCALHOST_ONLY, "1"),
-            (RANGE, "SUBNET"),
-            (PEERS, "10.0.0.7"),
-        ];
+        let older = [(LOCALHOST_ONLY, "1"), (RANGE, "SUBNET"), (PEERS, "10.0.0.7")];
         assert_eq!(good(&older).await.1, narrow);
-        assert_eq!(
-            good(&[(LOCALHOST_ONLY, "0")]).await.1,
-            good(&[]).await.1,
-            "0 is as nothing"
-        );
+        assert_eq!(good(&[(LOCALHOST_ONLY, "0")]).await.1, good(&[]).await.1, "0 is as nothing");
         // Peers on other machines must be able to reach this node.
         let (_, peers) = good(&[(RANGE, "LOCALHOST"), (PEERS, "10.0.0.7")]).await;
-        assert_eq!(
-            (peers.interfaces, peers.multicast),
-            (InterfaceSelection::All, false)
-        );
-        assert_eq!(
-            bad(&[(LOCALHOST_ONLY, "yes")]).await,
-            "ROS_LOCALHOST_ONLY is \"yes\": expected 0 or 1"
-        );
+        assert_eq!((peers.interfaces, peers.multicast), (InterfaceSelection::All, false));
+        assert_eq!(bad(&[(LOCALHOST_ONLY, "yes")]).await, "ROS_LOCALHOST_ONLY is \"yes\": expected 0 or 1");
     }
 
     #[tokio::test]
@@ -255,10 +217,7 @@ mod tests {
         // interface.
         let of = |server| [(SERVERS, server), (RANGE, "LOCALHOST")];
         let interfaces = |(_, network): (u16, DiscoveryNetwork)| network.interfaces;
-        assert_eq!(
-            interfaces(good(&of("10.0.0.7")).await),
-            InterfaceSelection::All
-        );
+        assert_eq!(interfaces(good(&of("10.0.0.7")).await), InterfaceSelection::All);
         let here = interfaces(good(&of("127.0.0.1")).await);
         assert_eq!(here, InterfaceSelection::default());
         let told = bad(&[(SERVERS, "10.0.0.7;TCPv4:[10.0.0.8]:42100")]).await;

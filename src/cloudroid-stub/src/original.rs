@@ -24,12 +24,7 @@ use crate::revision::Revision;
 /// Maximum depth of executables below `share/PKG` or a source directory.
 const DEPTH: usize = 4;
 /// Variables that list workspaces.
-const SEARCHED: [&str; 4] = [
-    "CMAKE_PREFIX_PATH",
-    "ROS_PACKAGE_PATH",
-    "AMENT_PREFIX_PATH",
-    "COLCON_PREFIX_PATH",
-];
+const SEARCHED: [&str; 4] = ["CMAKE_PREFIX_PATH", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"];
 
 /// Replaces this process with the original, in the environment that it would have had.
 pub fn exec(node: &NodeArgs, argv: &[String]) -> anyhow::Result<ExitCode> {
@@ -41,29 +36,19 @@ pub fn exec(node: &NodeArgs, argv: &[String]) -> anyhow::Result<ExitCode> {
             node.node
         );
     };
-    let error = Command::new(&path)
-        .args(argv)
-        .envs(environment(&overlay))
-        .exec();
+    let error = Command::new(&path).args(argv).envs(environment(&overlay)).exec();
     bail!("cannot execute {}: {error}", path.display())
 }
 
 /// Returns the overlay that `share/PKG` belongs to.
 pub fn overlay(share: &Path) -> PathBuf {
-    share
-        .parent()
-        .and_then(Path::parent)
-        .unwrap_or(share)
-        .to_owned()
+    share.parent().and_then(Path::parent).unwrap_or(share).to_owned()
 }
 
 /// Returns the variables that list workspaces, without this stub's overlay, so that programs started by the original
 /// find originals, too.
 pub fn environment(overlay: &Path) -> Vec<(&'static str, OsString)> {
-    SEARCHED
-        .into_iter()
-        .filter_map(|name| Some((name, without_overlay(&std::env::var_os(name)?, overlay)?)))
-        .collect()
+    SEARCHED.into_iter().filter_map(|name| Some((name, without_overlay(&std::env::var_os(name)?, overlay)?))).collect()
 }
 
 /// Returns the list of directories without those in the overlay.
@@ -88,9 +73,7 @@ impl OriginalSearch<'_> {
     /// Returns the directories that a variable lists, without the stub's.
     fn entries(&self, name: &str) -> Vec<PathBuf> {
         let value = (self.variable)(name).unwrap_or_default();
-        std::env::split_paths(&value)
-            .filter(|entry| entry.is_absolute() && !is_within(entry, &self.overlay))
-            .collect()
+        std::env::split_paths(&value).filter(|entry| entry.is_absolute() && !is_within(entry, &self.overlay)).collect()
     }
 
     /// Returns the directory of the ROS distribution, which may not be installed in `/usr`.
@@ -102,11 +85,7 @@ impl OriginalSearch<'_> {
 
 /// Returns the next executable of this name after the stub, with variables from `variable`.
 pub fn find(node: &NodeArgs, variable: &dyn Fn(&str) -> Option<String>) -> Option<PathBuf> {
-    let search = OriginalSearch {
-        node,
-        overlay: overlay(&node.share),
-        variable,
-    };
+    let search = OriginalSearch { node, overlay: overlay(&node.share), variable };
     match Revision::read(&node.share).ros() {
         RosVersion::One => catkin::find(&search),
         RosVersion::Two => ament::find(&search),
@@ -122,11 +101,7 @@ fn find_below(directory: &Path, node: &str) -> Option<PathBuf> {
             return Some(here);
         }
         if depth < DEPTH {
-            open.extend(
-                children(&directory)
-                    .into_iter()
-                    .map(|child| (child, depth + 1)),
-            );
+            open.extend(children(&directory).into_iter().map(|child| (child, depth + 1)));
         }
     }
     None

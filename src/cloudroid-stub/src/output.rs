@@ -15,10 +15,7 @@ use parking_lot::{Condvar, Mutex};
 use ros::ring::{Ring, RingBounds};
 
 /// Limits for lines that wait for a slow reader.
-const WAITING: RingBounds = RingBounds {
-    messages: 4096,
-    bytes: 1 << 20,
-};
+const WAITING: RingBounds = RingBounds { messages: 4096, bytes: 1 << 20 };
 /// Time that a reader has for the last lines when the stub ends.
 const LAST: Duration = Duration::from_millis(500);
 
@@ -54,20 +51,10 @@ struct State {
 
 impl Printer {
     fn new(stream: impl Write + Send + 'static) -> Self {
-        let state = State {
-            waiting: Ring::new(WAITING),
-            left_out: 0,
-            is_writing: false,
-            is_closed: false,
-        };
-        let shared = Arc::new(PrinterShared {
-            state: Mutex::new(state),
-            changed: Condvar::new(),
-        });
+        let state = State { waiting: Ring::new(WAITING), left_out: 0, is_writing: false, is_closed: false };
+        let shared = Arc::new(PrinterShared { state: Mutex::new(state), changed: Condvar::new() });
         let printing = Arc::clone(&shared);
-        let spawned = std::thread::Builder::new()
-            .name("output".to_owned())
-            .spawn(move || printing.print(stream));
+        let spawned = std::thread::Builder::new().name("output".to_owned()).spawn(move || printing.print(stream));
         // If the thread cannot be started nothing is printed, which is better than a robot that does not start.
         shared.state.lock().is_closed = spawned.is_err();
         Self(shared)

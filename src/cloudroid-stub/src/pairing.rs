@@ -61,10 +61,7 @@ pub fn load_identity(config: &Config) -> anyhow::Result<Option<Arc<ClientIdentit
         return Ok(None);
     };
     let key = RobotKey::read(&own.key_path())?;
-    Ok(Some(Arc::new(ClientIdentity {
-        chain: certificate.chain()?,
-        key: key.private_key(),
-    })))
+    Ok(Some(Arc::new(ClientIdentity { chain: certificate.chain()?, key: key.private_key() })))
 }
 
 /// Pairs this robot.
@@ -72,9 +69,7 @@ pub fn pair(asked: &arguments::PairRobotArgs) -> anyhow::Result<ExitCode> {
     let line: PairingLine = asked.line.parse()?;
     let own = identity_directory(asked.identity.as_deref())
         .context("neither XDG_CONFIG_HOME nor HOME is set; set one of them, or name a directory with --identity")?;
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let lifetime = runtime.block_on(request_pairing(&line, &own))?;
     println!(
         "This robot is paired with {} as {}. Its key is {}; its certificate is valid for {}, and the stubs renew it.",
@@ -97,9 +92,7 @@ async fn request_pairing(line: &PairingLine, own: &IdentityDirectory) -> anyhow:
         advice: "",
         identity: None,
     };
-    let ip = resolver::resolve(&address.host)
-        .await
-        .with_context(|| format!("cannot find {}", address.host))?;
+    let ip = resolver::resolve(&address.host).await.with_context(|| format!("cannot find {}", address.host))?;
     let server = http::HttpServer {
         address,
         ip,
@@ -112,22 +105,14 @@ async fn request_pairing(line: &PairingLine, own: &IdentityDirectory) -> anyhow:
         .await
         .with_context(|| format!("cannot pair with {}", line.server))?;
     if answer.status != 200 {
-        bail!(
-            "{} answers {}: {}",
-            line.server,
-            answer.status,
-            answer.problem_text()
-        );
+        bail!("{} answers {}: {}", line.server, answer.status, answer.problem_text());
     }
     let certificate = PairedCertificate::read(&answer.body)
         .with_context(|| format!("the response of {} is not a certificate", line.server))?;
     own.store_certificate(&server.address, &certificate)?;
     own.trust_signer(&line.key)?;
     own.known_servers()
-        .remember(
-            &server.address.known_server_name(),
-            KnownIdentity::Certificate(line.fingerprint),
-        )
+        .remember(&server.address.known_server_name(), KnownIdentity::Certificate(line.fingerprint))
         .context("cannot store the server's certificate")?;
     Ok(certificate.lifetime())
 }

@@ -70,10 +70,7 @@ fn warn_once(name: &str, reason: &dyn std::fmt::Display) {
 
 /// Returns whether the Master was reached but its answer cannot be used.
 fn is_value_error(error: &BusError) -> bool {
-    matches!(
-        error,
-        BusError::Master { .. } | BusError::Protocol { .. } | BusError::NoParam(_)
-    )
+    matches!(error, BusError::Master { .. } | BusError::Protocol { .. } | BusError::NoParam(_))
 }
 
 async fn read_one_by_one(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
@@ -97,9 +94,7 @@ fn insert(tree: &mut BTreeMap<String, ParamValue>, path: &str, value: ParamValue
         tree.insert(path.to_owned(), value);
         return;
     };
-    let below = tree
-        .entry(first.to_owned())
-        .or_insert_with(|| ParamValue::Map(BTreeMap::new()));
+    let below = tree.entry(first.to_owned()).or_insert_with(|| ParamValue::Map(BTreeMap::new()));
     if let ParamValue::Map(below) = below {
         insert(below, rest, value);
     }
@@ -113,11 +108,7 @@ mod tests {
     fn what_is_no_value_is_left_out_and_the_rest_stays() {
         let map = |members: &[(&str, ParamValue)]| {
             let members = members.iter().cloned();
-            ParamValue::Map(
-                members
-                    .map(|(name, value)| (name.to_owned(), value))
-                    .collect(),
-            )
+            ParamValue::Map(members.map(|(name, value)| (name.to_owned(), value)).collect())
         };
         let list = |items: &[ParamValue]| ParamValue::List(items.to_vec());
         let (one, bytes) = (ParamValue::Int(1), ParamValue::Binary(vec![0]));
@@ -125,10 +116,7 @@ mod tests {
             ("one", one.clone()),
             ("nothing", ParamValue::Nil),
             ("holes", list(&[one.clone(), ParamValue::Nil])),
-            (
-                "below",
-                map(&[("nothing", ParamValue::Nil), ("bytes", bytes.clone())]),
-            ),
+            ("below", map(&[("nothing", ParamValue::Nil), ("bytes", bytes.clone())])),
         ]));
         assert!(make_transferable("/n", &mut value));
         let rest = map(&[("one", one), ("below", map(&[("bytes", bytes)]))]);

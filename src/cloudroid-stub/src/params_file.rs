@@ -46,10 +46,7 @@ impl Sections {
     pub fn set(&mut self, nodes: &str, name: String, value: ParamValue) {
         let at = self.0.iter().position(|section| section.nodes == nodes);
         let at = at.unwrap_or_else(|| {
-            self.0.push(Section {
-                nodes: nodes.to_owned(),
-                ..Section::default()
-            });
+            self.0.push(Section { nodes: nodes.to_owned(), ..Section::default() });
             self.0.len() - 1
         });
         self.0[at].parameters.insert(name, value);
@@ -68,10 +65,7 @@ impl Sections {
     }
 
     fn parse(&mut self, text: &str) -> Result<(), Problem> {
-        let mut file = ParametersFileReader {
-            events: YamlEvents::new(text),
-            found: self,
-        };
+        let mut file = ParametersFileReader { events: YamlEvents::new(text), found: self };
         file.read()
     }
 
@@ -85,12 +79,8 @@ impl Sections {
 }
 
 fn read_text(path: &Path) -> anyhow::Result<String> {
-    let failed = || {
-        format!(
-            "cannot read the parameters file {}; --params-file names a file of this robot",
-            path.display()
-        )
-    };
+    let failed =
+        || format!("cannot read the parameters file {}; --params-file names a file of this robot", path.display());
     let size = std::fs::metadata(path).with_context(failed)?.len();
     if size > MAX_BYTES {
         return Err(anyhow!("it has {size} bytes; the limit is {MAX_BYTES}")).with_context(failed);
@@ -105,9 +95,7 @@ fn matches_node(nodes: &str, node: &str) -> bool {
         match (pattern.split_first(), node.split_first()) {
             (None, None) => true,
             (Some((&"**", rest)), _) => (0..=node.len()).any(|taken| parts(rest, &node[taken..])),
-            (Some((&first, rest)), Some((&own, below))) => {
-                (first == "*" || first == own) && parts(rest, below)
-            }
+            (Some((&first, rest)), Some((&own, below))) => (first == "*" || first == own) && parts(rest, below),
             _ => false,
         }
     }
@@ -135,10 +123,7 @@ impl ParametersFileReader<'_, '_> {
                 Event::StreamEnd => return Ok(()),
                 Event::MappingStart(..) => self.nodes("", 0)?,
                 _ => {
-                    return Err(Problem::new(
-                        line,
-                        format!("expected a node name with {PARAMETERS} below it"),
-                    ));
+                    return Err(Problem::new(line, format!("expected a node name with {PARAMETERS} below it")));
                 }
             }
         }
@@ -163,13 +148,9 @@ impl ParametersFileReader<'_, '_> {
                 continue;
             }
             let mut parts = key.split('/').filter(|part| !part.is_empty()).peekable();
-            let named = parts.peek().is_some()
-                && parts.all(|part| is_token(part) || part == "*" || part == "**");
+            let named = parts.peek().is_some() && parts.all(|part| is_token(part) || part == "*" || part == "**");
             if !named {
-                return Err(Problem::new(
-                    line,
-                    format!("{key:?} is not a valid node name"),
-                ));
+                return Err(Problem::new(line, format!("{key:?} is not a valid node name")));
             }
             if !is_group {
                 return Err(Problem::new(
@@ -197,11 +178,7 @@ impl ParametersFileReader<'_, '_> {
             }
             let value = value::parse_event(event, at, &mut self.events).map_err(|problem| {
                 // An empty value has the position of the next token.
-                let line = if problem.reason == value::NO_VALUE {
-                    line
-                } else {
-                    problem.line
-                };
+                let line = if problem.reason == value::NO_VALUE { line } else { problem.line };
                 Problem::new(line, format!("{name}: {}", problem.reason))
             })?;
             self.found.set(nodes, name, value);
@@ -214,15 +191,9 @@ impl ParametersFileReader<'_, '_> {
         let (event, line) = self.events.next()?;
         match event {
             Event::MappingEnd => Ok(None),
-            _ if depth > MAX_DEPTH => Err(Problem::new(
-                line,
-                format!("more than {MAX_DEPTH} nested groups"),
-            )),
+            _ if depth > MAX_DEPTH => Err(Problem::new(line, format!("more than {MAX_DEPTH} nested groups"))),
             Event::Scalar(text, ..) if !text.is_empty() => Ok(Some((text.into_owned(), line))),
-            Event::Alias(_) => Err(Problem::new(
-                line,
-                "ROS 2 does not support aliases: write the name",
-            )),
+            Event::Alias(_) => Err(Problem::new(line, "ROS 2 does not support aliases: write the name")),
             _ => Err(Problem::new(line, "expected a name before each colon")),
         }
     }

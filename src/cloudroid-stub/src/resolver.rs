@@ -62,10 +62,7 @@ impl Sockets for RobotSockets {
 /// `NotFound`, with the servers that were queried, if the name does not exist; otherwise the reason why the query
 /// failed.
 pub async fn resolve(host: &str) -> io::Result<IpAddr> {
-    let bare = host
-        .strip_prefix('[')
-        .and_then(|rest| rest.strip_suffix(']'))
-        .unwrap_or(host);
+    let bare = host.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(host);
     if let Ok(literal) = bare.parse() {
         return Ok(literal);
     }
@@ -85,34 +82,23 @@ pub async fn resolve(host: &str) -> io::Result<IpAddr> {
 }
 
 fn not_found(name: &str, asked: &str) -> io::Error {
-    io::Error::new(
-        io::ErrorKind::NotFound,
-        format!("host {name} has no address: {asked}"),
-    )
+    io::Error::new(io::ErrorKind::NotFound, format!("host {name} has no address: {asked}"))
 }
 
 fn lookup_hosts_file(name: &Name) -> Option<IpAddr> {
     let hosts = Hosts::from_system().ok()?;
-    [RecordType::A, RecordType::AAAA]
-        .into_iter()
-        .find_map(|kind| {
-            let found = hosts.lookup_static_host(&Query::query(name.clone(), kind))?;
-            found
-                .iter()
-                .find_map(hickory_resolver::proto::rr::RData::ip_addr)
-        })
+    [RecordType::A, RecordType::AAAA].into_iter().find_map(|kind| {
+        let found = hosts.lookup_static_host(&Query::query(name.clone(), kind))?;
+        found.iter().find_map(hickory_resolver::proto::rr::RData::ip_addr)
+    })
 }
 
 /// Queries the hosts on all networks of this machine.
 async fn resolve_multicast(name: &str) -> io::Result<IpAddr> {
-    let failed = |error: mdns_sd::Error| {
-        io::Error::other(format!("cannot look up {name} by multicast DNS: {error}"))
-    };
+    let failed = |error: mdns_sd::Error| io::Error::other(format!("cannot look up {name} by multicast DNS: {error}"));
     let daemon = ServiceDaemon::new().map_err(failed)?;
     let patience = u64::try_from(MULTICAST.as_millis()).unwrap_or(u64::MAX);
-    let events = daemon
-        .resolve_hostname(&format!("{name}."), Some(patience))
-        .map_err(failed)?;
+    let events = daemon.resolve_hostname(&format!("{name}."), Some(patience)).map_err(failed)?;
     let mut found: Vec<IpAddr> = Vec::new();
     while let Ok(event) = events.recv_async().await {
         match event {
@@ -122,47 +108,31 @@ async fn resolve_multicast(name: &str) -> io::Result<IpAddr> {
                     break;
                 }
             }
-            HostnameResolutionEvent::SearchTimeout(_)
-            | HostnameResolutionEvent::SearchStopped(_) => break,
+            HostnameResolutionEvent::SearchTimeout(_) | HostnameResolutionEvent::SearchStopped(_) => break,
             _ => {}
         }
     }
     // Ends its thread and sockets, which is not waited for.
     let _ = daemon.shutdown();
     found.sort_by_key(|address| !address.is_ipv4());
-    found.into_iter().next().ok_or_else(|| {
-        not_found(
-            name,
-            "no host on this network has that name (multicast DNS)",
-        )
-    })
+    found.into_iter().next().ok_or_else(|| not_found(name, "no host on this network has that name (multicast DNS)"))
 }
 
 async fn resolve_dns(name: &str, parsed: Name) -> io::Result<IpAddr> {
-    let (config, mut options): (ResolverConfig, ResolverOpts) =
-        read_system_conf().map_err(|error| {
-            not_found(
-                name,
-                &format!("it is not in /etc/hosts, and /etc/resolv.conf cannot be used ({error})"),
-            )
-        })?;
+    let (config, mut options): (ResolverConfig, ResolverOpts) = read_system_conf().map_err(|error| {
+        not_found(name, &format!("it is not in /etc/hosts, and /etc/resolv.conf cannot be used ({error})"))
+    })?;
     options.ip_strategy = LookupIpStrategy::Ipv4thenIpv6;
     options.use_hosts_file = ResolveHosts::Never;
     options.timeout = options.timeout.min(ANSWER);
     options.attempts = ATTEMPTS;
-    let servers: Vec<String> = config
-        .name_servers()
-        .iter()
-        .map(|server| server.socket_addr.ip().to_string())
-        .collect();
-    let resolver = TokioResolver::builder_with_config(config, TokioConnectionProvider::default())
-        .with_options(options)
-        .build();
+    let servers: Vec<String> = config.name_servers().iter().map(|server| server.socket_addr.ip().to_string()).collect();
+    let resolver =
+        TokioResolver::builder_with_config(config, TokioConnectionProvider::default()).with_options(options).build();
     match resolver.lookup_ip(parsed).await {
-        Ok(addresses) => addresses
-            .iter()
-            .next()
-            .ok_or_else(|| not_found(name, "the DNS servers have no address for it")),
+        Ok(addresses) => {
+            addresses.iter().next().ok_or_else(|| not_found(name, "the DNS servers have no address for it"))
+        }
         Err(error) if error.is_nx_domain() || error.is_no_records_found() => {
             let mut servers = servers;
             servers.dedup();
@@ -178,10 +148,7 @@ mod tests {
 
     #[tokio::test]
     async fn names_of_this_machine_are_known_without_asking() {
-        assert_eq!(
-            resolve("[::1]").await.unwrap(),
-            IpAddr::from(std::net::Ipv6Addr::LOCALHOST)
-        );
+        assert_eq!(resolve("[::1]").await.unwrap(), IpAddr::from(std::net::Ipv6Addr::LOCALHOST));
         assert!(resolve("localhost").await.unwrap().is_loopback());
         assert!(resolve("robot.localhost.").await.unwrap().is_loopback());
     }

@@ -92,12 +92,7 @@ impl LaunchedNode {
     }
 
     /// Returns the description of the node that the cloud is to run.
-    pub fn to_cloud_node(
-        &self,
-        package: &str,
-        executable: &str,
-        share: &Path,
-    ) -> control::NodeLaunch {
+    pub fn to_cloud_node(&self, package: &str, executable: &str, share: &Path) -> control::NodeLaunch {
         let made_of = Revision::read(share);
         let share = normalize(share);
         let directory = working_directory(&share, std::env::current_dir().unwrap_or_default());
@@ -106,11 +101,7 @@ impl LaunchedNode {
             package: package.to_owned(),
             executable: executable.to_owned(),
             argv: self.argv.clone(),
-            namespace: self
-                .node
-                .rsplit_once('/')
-                .map_or("", |(parent, _)| parent)
-                .to_owned(),
+            namespace: self.node.rsplit_once('/').map_or("", |(parent, _)| parent).to_owned(),
             share: share.to_string_lossy().into_owned(),
             directory: directory.to_string_lossy().into_owned(),
             revision: made_of.revision,
@@ -139,9 +130,7 @@ fn normalize(path: &Path) -> PathBuf {
 fn working_directory(share: &Path, current: PathBuf) -> PathBuf {
     let overlay = original::overlay(share);
     let canonical = overlay.canonicalize();
-    let below = canonical
-        .ok()
-        .and_then(|overlay| Some(current.strip_prefix(overlay).ok()?.to_owned()));
+    let below = canonical.ok().and_then(|overlay| Some(current.strip_prefix(overlay).ok()?.to_owned()));
     below.map_or(current, |below| overlay.join(below))
 }
 
@@ -149,11 +138,7 @@ fn working_directory(share: &Path, current: PathBuf) -> PathBuf {
 pub fn default_node_name(executable: &str) -> String {
     let stem = executable.strip_suffix(".py").unwrap_or(executable);
     let allowed = |letter: char| {
-        if letter.is_ascii_alphanumeric() {
-            letter
-        } else {
-            '_'
-        }
+        if letter.is_ascii_alphanumeric() { letter } else { '_' }
     };
     stem.chars().map(allowed).collect()
 }
@@ -171,14 +156,8 @@ mod tests {
         std::fs::create_dir_all(real.join("lib/p")).unwrap();
         std::os::unix::fs::symlink(&real, &link).unwrap();
         let current = real.canonicalize().unwrap().join("lib/p");
-        assert_eq!(
-            working_directory(&link.join("share/p"), current),
-            link.join("lib/p")
-        );
-        assert_eq!(
-            working_directory(&link.join("share/p"), "/root".into()),
-            Path::new("/root")
-        );
+        assert_eq!(working_directory(&link.join("share/p"), current), link.join("lib/p"));
+        assert_eq!(working_directory(&link.join("share/p"), "/root".into()), Path::new("/root"));
     }
 
     #[test]

@@ -70,9 +70,7 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
         name: set.or(found).unwrap_or(&guessed),
         by_program: found.is_some() && set.is_none_or(|set| Some(set) == found),
     };
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let ros = made_of.ros();
     let variable = |name: &str| std::env::var(name).ok();
     let robot = runtime.block_on(LaunchedNode::read(&asked.argv, usual, ros, &variable))?;
@@ -96,23 +94,14 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-async fn run_stub(
-    asked: &crate::arguments::RunArgs,
-    config: Config,
-    robot: &LaunchedNode,
-) -> anyhow::Result<StubEnd> {
+async fn run_stub(asked: &crate::arguments::RunArgs, config: Config, robot: &LaunchedNode) -> anyhow::Result<StubEnd> {
     let mut stopping = stop_signals()?;
     let mut buses = Vec::new();
     let begun = tokio::select! {
         begun = start(asked, config, robot, &mut buses) => begun.map(Some),
         () = wait_for_signal(&mut stopping) => Ok(None),
     };
-    let StartedStub {
-        config,
-        mirror,
-        mut hello,
-        mut shutdown,
-    } = match begun {
+    let StartedStub { config, mirror, mut hello, mut shutdown } = match begun {
         Ok(Some(begun)) => begun,
         over => {
             farewell::close_buses(&buses).await;
@@ -182,9 +171,7 @@ async fn start(
         let diagnostics = Diagnostics::new(&watcher, &robot.node, &config.robot_id()).await?;
         let original = original_setup(asked, robot);
         let decided = RequestPattern::from_revision(&made_of.requests, &asked.node.node, robot);
-        mirror
-            .start_promise(sla, original, decided, diagnostics, &watcher)
-            .await?;
+        mirror.start_promise(sla, original, decided, diagnostics, &watcher).await?;
     }
     let mut parameters = mirror.parameters().await;
     if robot.sim_time {
@@ -209,12 +196,7 @@ async fn start(
         parameters,
         ..Hello::default()
     };
-    Ok(StartedStub {
-        config,
-        mirror,
-        hello,
-        shutdown,
-    })
+    Ok(StartedStub { config, mirror, hello, shutdown })
 }
 
 /// Returns the end of a node that has exited, or of one whose state is unknown.
@@ -239,10 +221,7 @@ async fn join(robot: &LaunchedNode, node: &str) -> anyhow::Result<Arc<dyn Bus>> 
             let options = match &robot.place {
                 RosLocation::Master { host, port, own } => {
                     let master = RobotSockets.resolve(host, *port).await?;
-                    JoinOptions {
-                        host: own.clone(),
-                        ..JoinOptions::new(master, node)
-                    }
+                    JoinOptions { host: own.clone(), ..JoinOptions::new(master, node) }
                 }
                 RosLocation::Domain { id, network } => JoinOptions {
                     network: network.clone(),
@@ -266,33 +245,23 @@ async fn join(robot: &LaunchedNode, node: &str) -> anyhow::Result<Arc<dyn Bus>> 
 
 /// Returns the configuration with the settings that parameters of the node (ROS 2) or of its namespaces (ROS 1)
 /// override.
-async fn apply_parameters(
-    config: Config,
-    bus: &dyn Bus,
-    robot: &LaunchedNode,
-) -> anyhow::Result<Config> {
+async fn apply_parameters(config: Config, bus: &dyn Bus, robot: &LaunchedNode) -> anyhow::Result<Config> {
     if robot.ros == RosVersion::Two {
         let settings = robot.settings();
-        return config.with_parameters(&[ParameterGroup {
-            name: None,
-            settings,
-        }]);
+        return config.with_parameters(&[ParameterGroup { name: None, settings }]);
     }
     let mut given = Vec::new();
     for name in config::group_names(&robot.node) {
         match bus.parameter(&name).await {
-            Ok(ParamValue::Map(settings)) => given.push(ParameterGroup {
-                name: Some(name),
-                settings,
-            }),
+            Ok(ParamValue::Map(settings)) => given.push(ParameterGroup { name: Some(name), settings }),
             Ok(_) => bail!(
                 "parameter {name} is a single value, but this node's settings are expected there; remove it with: \
                     rosparam delete {name}"
             ),
             Err(BusError::NoParam(_)) => {}
-            Err(error) => bail!(
-                "cannot read parameter {name} ({error}); correct it, or remove it with: rosparam delete {name}"
-            ),
+            Err(error) => {
+                bail!("cannot read parameter {name} ({error}); correct it, or remove it with: rosparam delete {name}")
+            }
         }
     }
     config.with_parameters(&given)
@@ -313,11 +282,7 @@ fn original_setup(asked: &crate::arguments::RunArgs, robot: &LaunchedNode) -> Or
     };
     let argv = robot.original_argv.clone();
     OriginalSetup {
-        program: path.map(|path| OriginalProgram {
-            path,
-            argv,
-            environment,
-        }),
+        program: path.map(|path| OriginalProgram { path, argv, environment }),
         node: robot.node.clone(),
         domain,
         patience: READY,
@@ -326,8 +291,7 @@ fn original_setup(asked: &crate::arguments::RunArgs, robot: &LaunchedNode) -> Or
 
 /// Memory budget for data from the server: records in progress, and those that it has sent until they are processed. No
 /// server uses more of the robot's memory.
-pub static FROM_SERVER: LazyLock<Budget> =
-    LazyLock::new(|| Budget::new("data from the server", 256 << 20));
+pub static FROM_SERVER: LazyLock<Budget> = LazyLock::new(|| Budget::new("data from the server", 256 << 20));
 
 /// Creates a session with the cloud that has no connection yet.
 pub fn new_session(config: &Config) -> Arc<RobotSession> {
@@ -336,9 +300,7 @@ pub fn new_session(config: &Config) -> Arc<RobotSession> {
 
 /// Returns the timeouts of the link.
 fn session_options(config: &Config) -> SessionOptions {
-    let max = config
-        .promise_timeout()
-        .and_then(|max| Duration::try_from_secs_f64(max).ok());
+    let max = config.promise_timeout().and_then(|max| Duration::try_from_secs_f64(max).ok());
     SessionOptions::for_silence(max.unwrap_or(SILENT), max)
 }
 
@@ -349,10 +311,7 @@ struct StopSignals {
 }
 
 fn stop_signals() -> std::io::Result<StopSignals> {
-    Ok(StopSignals {
-        interrupt: signals(SignalKind::interrupt())?,
-        terminate: signals(SignalKind::terminate())?,
-    })
+    Ok(StopSignals { interrupt: signals(SignalKind::interrupt())?, terminate: signals(SignalKind::terminate())? })
 }
 
 async fn wait_for_signal(stopping: &mut StopSignals) {
@@ -363,10 +322,7 @@ async fn wait_for_signal(stopping: &mut StopSignals) {
 }
 
 /// Waits for a signal, or for the `shutdown` call of XML-RPC, which is equivalent to SIGINT.
-async fn wait_for_stop(
-    stopping: &mut StopSignals,
-    shutdown: &mut Option<watch::Receiver<Option<String>>>,
-) -> i32 {
+async fn wait_for_stop(stopping: &mut StopSignals, shutdown: &mut Option<watch::Receiver<Option<String>>>) -> i32 {
     let asked = async {
         let is_asked = match shutdown {
             Some(asked) => asked.changed().await.is_ok(),

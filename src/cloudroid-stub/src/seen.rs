@@ -28,8 +28,7 @@ pub fn subscribes(graph: &Graph, node: &str, topic: &str) -> bool {
 pub fn serves(graph: &Graph, node: &str, service: &str) -> bool {
     let shown = graph.services.get(service);
     let ends = graph.ends.get(node);
-    shown.is_some_and(|server| server == node)
-        || ends.is_some_and(|ends| ends.services.contains_key(service))
+    shown.is_some_and(|server| server == node) || ends.is_some_and(|ends| ends.services.contains_key(service))
 }
 
 #[cfg(test)]
@@ -56,10 +55,7 @@ mod tests {
         let graph = Graph {
             topics: BTreeMap::from([(
                 "/scan".to_owned(),
-                TopicNodes {
-                    subscribers: vec!["/one".to_owned()],
-                    ..TopicNodes::default()
-                },
+                TopicNodes { subscribers: vec!["/one".to_owned()], ..TopicNodes::default() },
             )]),
             services: BTreeMap::from([("/set".to_owned(), "/one".to_owned())]),
             ends: BTreeMap::from([("/two".to_owned(), of_two)]),

@@ -27,9 +27,7 @@ impl PortalStream {
         if !address.secure {
             return Ok(Self::Plain(tcp));
         }
-        let connected = trust
-            .connect(tcp, &address.host, &address.known_server_name())
-            .await;
+        let connected = trust.connect(tcp, &address.host, &address.known_server_name()).await;
         let connected = connected.map_err(explain_error)?;
         if let (Some(first), Some(known)) = (connected.first, &trust.known) {
             tracing::warn!(
@@ -65,9 +63,7 @@ impl PortalStream {
 /// Adds advice to an error, if there is any.
 fn explain_error(error: io::Error) -> io::Error {
     use rustls::CertificateError as Certificate;
-    let inner = error
-        .get_ref()
-        .and_then(|inner| inner.downcast_ref::<rustls::Error>());
+    let inner = error.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>());
     let next = match inner {
         Some(rustls::Error::InvalidCertificate(reason)) => match reason {
             // `BadSignature` is reported for another authority of the same name.
@@ -81,17 +77,13 @@ fn explain_error(error: io::Error) -> io::Error {
             Certificate::Expired
             | Certificate::ExpiredContext { .. }
             | Certificate::NotValidYet
-            | Certificate::NotValidYetContext { .. } => {
-                "check this robot's clock (date) first, then the certificate"
-            }
+            | Certificate::NotValidYetContext { .. } => "check this robot's clock (date) first, then the certificate",
             Certificate::Other(reason) if reason.to_string().contains("CaUsedAsEndEntity") => {
                 "it is a CA certificate, which servers must not use; issue a server certificate with it"
             }
             _ => "replace it",
         },
-        Some(rustls::Error::InvalidMessage(_)) => {
-            "the server does not use TLS there; try ws:// instead of wss://"
-        }
+        Some(rustls::Error::InvalidMessage(_)) => "the server does not use TLS there; try ws:// instead of wss://",
         _ => return error,
     };
     io::Error::other(format!("{error}: {next}"))
@@ -110,10 +102,7 @@ pub fn certificate_refusal(error: &io::Error) -> Option<&'static str> {
             "its certificate has expired, because the robot or the server was off for too long; pair it again: on the \
                 server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
         ),
-        Alert::UnknownCA
-        | Alert::BadCertificate
-        | Alert::CertificateUnknown
-        | Alert::DecryptError => Some(
+        Alert::UnknownCA | Alert::BadCertificate | Alert::CertificateUnknown | Alert::DecryptError => Some(
             "its certificate is not signed by an authority that the server trusts, for example because the server was \
                 set up again; pair it again: on the server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
         ),
@@ -122,11 +111,7 @@ pub fn certificate_refusal(error: &io::Error) -> Option<&'static str> {
 }
 
 impl AsyncRead for PortalStream {
-    fn poll_read(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
+    fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         match self.get_mut() {
             Self::Plain(tcp) => Pin::new(tcp).poll_read(cx, buffer),
             Self::Tls(tls) => Pin::new(tls).poll_read(cx, buffer),
@@ -135,11 +120,7 @@ impl AsyncRead for PortalStream {
 }
 
 impl AsyncWrite for PortalStream {
-    fn poll_write(
-        self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
+    fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         match self.get_mut() {
             Self::Plain(tcp) => Pin::new(tcp).poll_write(cx, bytes),
             Self::Tls(tls) => Pin::new(tls).poll_write(cx, bytes),

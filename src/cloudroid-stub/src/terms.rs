@@ -17,28 +17,19 @@ const CPUS: std::ops::RangeInclusive<f64> = 0.01..=4096.0;
 /// Rejects settings that the server would reject. The error is the key, and the reason with the expected value.
 pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
     if let Some(cpus) = config.cpus.filter(|cpus| !CPUS.contains(cpus)) {
-        let reason = format!(
-            "is {cpus}; it should be a number of cores from {} to {}",
-            CPUS.start(),
-            CPUS.end()
-        );
+        let reason = format!("is {cpus}; it should be a number of cores from {} to {}", CPUS.start(), CPUS.end());
         return Err(("cpus", reason));
     }
     if let Some(memory) = &config.memory {
         match parse_size(memory) {
             Some(bytes) if bytes >= LEAST_MEMORY => {}
             Some(_) => {
-                return Err((
-                    "memory",
-                    format!("is {memory}, too little for any node; it should be at least 4M"),
-                ));
+                return Err(("memory", format!("is {memory}, too little for any node; it should be at least 4M")));
             }
             None => {
                 return Err((
                     "memory",
-                    format!(
-                        "is {memory}; it should be bytes, or a number with K, M, G or T, such as \"512M\""
-                    ),
+                    format!("is {memory}; it should be bytes, or a number with K, M, G or T, such as \"512M\""),
                 ));
             }
         }
@@ -46,9 +37,7 @@ pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
     if let Some(class) = &config.class {
         let fits = |byte: u8| byte.is_ascii_alphanumeric() || b"-_".contains(&byte);
         if class.is_empty() || class.len() > LONGEST || !class.bytes().all(fits) {
-            let reason = format!(
-                "is {class:?}; it should be the name of a class, of letters, digits, - and _"
-            );
+            let reason = format!("is {class:?}; it should be the name of a class, of letters, digits, - and _");
             return Err(("class", reason));
         }
     }
@@ -62,15 +51,13 @@ pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
         let fits = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
         for (key, value) in pairs {
             if key.is_empty() || key.len() > LONGEST || !key.bytes().all(fits) {
-                let reason = format!(
-                    "names {key:?}; a name should be of letters, digits, -, _ and ., at most {LONGEST}"
-                );
+                let reason =
+                    format!("names {key:?}; a name should be of letters, digits, -, _ and ., at most {LONGEST}");
                 return Err(("aux", reason));
             }
             if value.is_empty() || value.len() > LONGEST || value.chars().any(char::is_control) {
-                let reason = format!(
-                    "gives {key} the value {value:?}; it should have 1 to {LONGEST} bytes, such as 640"
-                );
+                let reason =
+                    format!("gives {key} the value {value:?}; it should have 1 to {LONGEST} bytes, such as 640");
                 return Err(("aux", reason));
             }
         }
@@ -101,9 +88,8 @@ pub fn to_query(config: &Config, node: &str) -> String {
     let number = |value: Option<f64>| value.map(|value| value.to_string());
     let mut pairs = vec![("node".to_owned(), node.to_owned())];
     let times = [("rrt", config.desire), ("max_rrt", config.max)];
-    let measured = OUTPUT_MEASURES
-        .iter()
-        .flat_map(|measure| measure.stated_keys.into_iter().zip(measure.values(config)));
+    let measured =
+        OUTPUT_MEASURES.iter().flat_map(|measure| measure.stated_keys.into_iter().zip(measure.values(config)));
     let numbers = times.into_iter().chain(measured);
     let numbers = numbers.map(|(key, value)| (key, number(value)));
     let others = [
@@ -146,10 +132,7 @@ mod tests {
     use super::*;
 
     fn config(settings: &str) -> Config {
-        toml::from_str(&format!(
-            "server = 'ws://cloud:9090'\nservice = 's'\n{settings}"
-        ))
-        .unwrap()
+        toml::from_str(&format!("server = 'ws://cloud:9090'\nservice = 's'\n{settings}")).unwrap()
     }
 
     #[test]
@@ -158,28 +141,13 @@ mod tests {
             ("", "&node=/a/b"),
             ("desire = 0.1\nmax = 0.3", "&node=/a/b&rrt=0.1&max_rrt=0.3"),
             ("frames_per_second = 5", "&node=/a/b&min_fps=5"),
-            (
-                "frames_per_second = 5\ndesired_frames_per_second = 10",
-                "&node=/a/b&fps=10&min_fps=5",
-            ),
+            ("frames_per_second = 5\ndesired_frames_per_second = 10", "&node=/a/b&fps=10&min_fps=5"),
             ("age = 0.5", "&node=/a/b&max_age=0.5"),
-            (
-                "age = 0.5\ndesired_age = 0.25",
-                "&node=/a/b&age=0.25&max_age=0.5",
-            ),
-            (
-                "class = 'urgent'\ncpus = 1.5\nmemory = '1G'",
-                "&node=/a/b&class=urgent&cpus=1.5&memory=1G",
-            ),
+            ("age = 0.5\ndesired_age = 0.25", "&node=/a/b&age=0.25&max_age=0.5"),
+            ("class = 'urgent'\ncpus = 1.5\nmemory = '1G'", "&node=/a/b&class=urgent&cpus=1.5&memory=1G"),
             ("memory = 1073741824", "&node=/a/b&memory=1073741824"),
-            (
-                "aux = { width = 640, model = 'a b&c' }",
-                "&node=/a/b&aux.model=a%20b%26c&aux.width=640",
-            ),
-            (
-                "aux = 'width=640 model=big'",
-                "&node=/a/b&aux.width=640&aux.model=big",
-            ),
+            ("aux = { width = 640, model = 'a b&c' }", "&node=/a/b&aux.model=a%20b%26c&aux.width=640"),
+            ("aux = 'width=640 model=big'", "&node=/a/b&aux.width=640&aux.model=big"),
         ] {
             let config = config(settings);
             check(&config).unwrap();
@@ -190,11 +158,7 @@ mod tests {
     #[test]
     fn what_the_server_would_refuse_is_named_with_what_to_write() {
         for (settings, key, words) in [
-            (
-                "cpus = 0",
-                "cpus",
-                "is 0; it should be a number of cores from 0.01",
-            ),
+            ("cpus = 0", "cpus", "is 0; it should be a number of cores from 0.01"),
             ("cpus = nan", "cpus", "is NaN"),
             ("memory = 'lots'", "memory", "is lots; it should be bytes"),
             ("memory = '1K'", "memory", "too little for any node"),

@@ -47,19 +47,12 @@ impl World {
                 (JoinOptions::in_domain(domain.id(), ""), Some(domain))
             }
         };
-        Self {
-            ros,
-            options,
-            domain,
-        }
+        Self { ros, options, domain }
     }
 
     /// Joins as a node of this name.
     pub async fn node(&self, name: &str) -> Arc<dyn Bus> {
-        let options = JoinOptions {
-            node: name.to_owned(),
-            ..self.options.clone()
-        };
+        let options = JoinOptions { node: name.to_owned(), ..self.options.clone() };
         let joined = ros::connect(self.ros, Arc::new(HostSockets), options);
         joined.await.unwrap()
     }
@@ -73,10 +66,7 @@ impl World {
 async fn start_master() -> SocketAddr {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let master = Master::new(MasterOptions {
-        uri: format!("http://{address}/"),
-        ..MasterOptions::default()
-    });
+    let master = Master::new(MasterOptions { uri: format!("http://{address}/"), ..MasterOptions::default() });
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     address
 }
@@ -96,9 +86,7 @@ pub fn encode_string(ros: RosVersion, text: &str) -> Bytes {
         RosVersion::Two => (&[0, 1, 0, 0], &[0]),
     };
     let length = u32::try_from(text.len() + end.len()).unwrap();
-    [header, &length.to_le_bytes(), text.as_bytes(), end]
-        .concat()
-        .into()
+    [header, &length.to_le_bytes(), text.as_bytes(), end].concat().into()
 }
 
 /// Returns a message of a node of the application.

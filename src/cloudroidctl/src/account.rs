@@ -124,10 +124,7 @@ impl AccountArgs {
                 let all = client.post("/api/v1/accounts", &new).await?;
                 print_outcome(all, format, &format!("account {} created", new.name))
             }
-            AccountCommand::List(ListAccounts) => list(
-                &client.get::<Vec<Account>>("/api/v1/accounts").await?,
-                format,
-            ),
+            AccountCommand::List(ListAccounts) => list(&client.get::<Vec<Account>>("/api/v1/accounts").await?, format),
             AccountCommand::Passwd(verb) => {
                 let change = AccountChange {
                     password: Some(password::read_password(verb.password_stdin)?),
@@ -143,11 +140,7 @@ impl AccountArgs {
                     ..AccountChange::default()
                 };
                 let all = client.patch(&account_path(&verb.name), &change).await?;
-                print_outcome(
-                    all,
-                    format,
-                    &format!("{} now has the role {}", verb.name, verb.role),
-                )
+                print_outcome(all, format, &format!("{} now has the role {}", verb.name, verb.role))
             }
             AccountCommand::Disable(DisableAccount { name }) => {
                 let all = set_disabled(client, &name, true).await?;
@@ -171,24 +164,15 @@ impl AccountArgs {
                 let all: Vec<SessionLine> = client.delete(&path).await?;
                 match format {
                     OutputFormat::Json => output::json(&all),
-                    OutputFormat::Table => {
-                        output::line(&format!("{name} is signed out everywhere"))
-                    }
+                    OutputFormat::Table => output::line(&format!("{name} is signed out everywhere")),
                 }
             }
         }
     }
 }
 
-async fn set_disabled(
-    client: &DaemonClient,
-    name: &str,
-    disabled: bool,
-) -> anyhow::Result<Vec<Account>> {
-    let change = AccountChange {
-        disabled: Some(disabled),
-        ..AccountChange::default()
-    };
+async fn set_disabled(client: &DaemonClient, name: &str, disabled: bool) -> anyhow::Result<Vec<Account>> {
+    let change = AccountChange { disabled: Some(disabled), ..AccountChange::default() };
     client.patch(&account_path(name), &change).await
 }
 
@@ -203,15 +187,7 @@ fn list(accounts: &[Account], format: OutputFormat) -> anyhow::Result<()> {
     if let OutputFormat::Json = format {
         return output::json(&accounts);
     }
-    let mut table = Table::new(&[
-        "NAME",
-        "ROLE",
-        "SERVICES",
-        "AGE",
-        "SIGNED IN",
-        "SESSIONS",
-        "STATE",
-    ]);
+    let mut table = Table::new(&["NAME", "ROLE", "SERVICES", "AGE", "SIGNED IN", "SESSIONS", "STATE"]);
     for account in accounts {
         table.row([
             account.name.clone(),
@@ -220,10 +196,7 @@ fn list(accounts: &[Account], format: OutputFormat) -> anyhow::Result<()> {
             output::age(account.created),
             output::last_use(account.last_login),
             account.sessions.to_string(),
-            account.disabled.map_or_else(
-                || "active".into(),
-                |at| format!("disabled {} ago", output::age(at)),
-            ),
+            account.disabled.map_or_else(|| "active".into(), |at| format!("disabled {} ago", output::age(at))),
         ]);
     }
     if table.is_empty() {
@@ -248,9 +221,5 @@ fn list_sessions(sessions: &[SessionLine], format: OutputFormat) -> anyhow::Resu
             format!("expires in {}", output::time_until(session.expires)),
         ]);
     }
-    if table.is_empty() {
-        output::line("nobody is signed in")
-    } else {
-        table.print()
-    }
+    if table.is_empty() { output::line("nobody is signed in") } else { table.print() }
 }

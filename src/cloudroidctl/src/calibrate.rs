@@ -77,10 +77,7 @@ impl CalibrateArgs {
     /// Measures, prints the result and writes the rows if that is confirmed.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let body = self.read_material()?;
-        let curve = self
-            .curve
-            .clone()
-            .unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
+        let curve = self.curve.clone().unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
         check_writable(&curve, "curve")?;
         let calibration = tokio::select! {
             measured = self.measure(client, format, body) => measured?,
@@ -109,16 +106,12 @@ impl CalibrateArgs {
         let rows = calibration.rows;
         let count = rows.len();
         write_rows(client, &self.service, rows).await?;
-        say(&format!(
-            "{count} entries written; see them with: cloudroidctl sla list {}",
-            self.service
-        ))
+        say(&format!("{count} entries written; see them with: cloudroidctl sla list {}", self.service))
     }
 
     /// Returns the body of the request: a recording, or the concatenated images.
     fn read_material(&self) -> anyhow::Result<Vec<u8>> {
-        let read =
-            |path: &Path| fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+        let read = |path: &Path| fs::read(path).with_context(|| format!("cannot read {}", path.display()));
         match (&self.bag, &self.frames) {
             (Some(path), _) => read(path),
             (None, Some(directory)) => {
@@ -153,26 +146,20 @@ impl CalibrateArgs {
         }
     }
 
-    async fn measure(
-        &self,
-        client: &DaemonClient,
-        format: OutputFormat,
-        body: Vec<u8>,
-    ) -> anyhow::Result<Calibration> {
+    async fn measure(&self, client: &DaemonClient, format: OutputFormat, body: Vec<u8>) -> anyhow::Result<Calibration> {
         let path = format!(
             "/api/v1/services/{}/calibration?options={}",
             percent_encode(&self.service),
             percent_encode(&serde_json::to_string(&self.options())?)
         );
-        let body = Full::new(body.into())
-            .map_err(|never| match never {})
-            .boxed_unsync();
+        let body = Full::new(body.into()).map_err(|never| match never {}).boxed_unsync();
         let answer = client.send(Method::POST, &path, body).await?;
         let mut events = client::json_lines(answer);
         while let Some(event) = events.next().await {
             match event? {
-                CalibrationEvent::Done { calibration }
-                | CalibrationEvent::Kept { calibration, .. } => return Ok(*calibration),
+                CalibrationEvent::Done { calibration } | CalibrationEvent::Kept { calibration, .. } => {
+                    return Ok(*calibration);
+                }
                 CalibrationEvent::Error { problem } => return Err(problem.into()),
                 event if format == OutputFormat::Json => output::json_line(&event)?,
                 CalibrationEvent::Step { title } => output::line(&format!("== {title}"))?,
@@ -191,18 +178,13 @@ fn find_pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(directory).with_context(reading)? {
         let path = entry.with_context(reading)?.path();
-        let is_png = path
-            .extension()
-            .is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
+        let is_png = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
         if is_png {
             found.push(path);
         }
     }
     if found.is_empty() {
-        bail!(
-            "{} holds no .png file; convert pictures to PNG, or give a recording with --bag",
-            directory.display()
-        );
+        bail!("{} holds no .png file; convert pictures to PNG, or give a recording with --bag", directory.display());
     }
     found.sort();
     Ok(found)
@@ -219,23 +201,11 @@ pub(crate) fn format_point(point: &Point) -> String {
 }
 
 fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
-    let mut table = Table::new(&[
-        "CPUS",
-        "ANSWERED",
-        "P50 MS",
-        "P95 MS",
-        "MAX MS",
-        "RUNNING",
-        "THROTTLED",
-        "PER S",
-        "MEMORY",
-    ]);
+    let mut table =
+        Table::new(&["CPUS", "ANSWERED", "P50 MS", "P95 MS", "MAX MS", "RUNNING", "THROTTLED", "PER S", "MEMORY"]);
     for point in &calibration.points {
         let time = |of: fn(&api::calibration::TimeSpread) -> f64| {
-            point
-                .compute
-                .as_ref()
-                .map_or("-".to_owned(), |compute| format!("{:.1}", of(compute)))
+            point.compute.as_ref().map_or("-".to_owned(), |compute| format!("{:.1}", of(compute)))
         };
         table.row([
             point.cpus.to_string(),
@@ -259,15 +229,10 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
         output::line(&format!("not used: {}", calibration.unused.join(", ")))?;
     }
     if let Some(pace) = calibration.pace {
-        output::line(&format!(
-            "sent {pace:.1} requests per second; limits that cannot keep up are not proposed"
-        ))?;
+        output::line(&format!("sent {pace:.1} requests per second; limits that cannot keep up are not proposed"))?;
     }
     if let Some(network) = calibration.network {
-        output::line(&format!(
-            "added for the network: p50 {:.1} ms, p95 {:.1} ms",
-            network.p50, network.p95
-        ))?;
+        output::line(&format!("added for the network: p50 {:.1} ms, p95 {:.1} ms", network.p50, network.p95))?;
     }
     output::line(&format!(
         "largest request {}; peak memory {}, proposed with a margin of {} %",
@@ -275,24 +240,15 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     ))?;
     output::line(&format!("curve: {}", curve.display()))?;
     if calibration.rows.is_empty() {
-        return output::line(
-            "no entry is proposed: no limit answered enough requests at the request rate",
-        );
+        return output::line("no entry is proposed: no limit answered enough requests at the request rate");
     }
     output::line("")?;
     print_rows(&calibration.rows)
 }
 
 /// Writes rows to the dictionary of a service and returns all its rows.
-pub(crate) async fn write_rows(
-    client: &DaemonClient,
-    service: &str,
-    rows: Vec<Row>,
-) -> anyhow::Result<Vec<Row>> {
-    let new = NewRows {
-        rows,
-        replace: false,
-    };
+pub(crate) async fn write_rows(client: &DaemonClient, service: &str, rows: Vec<Row>) -> anyhow::Result<Vec<Row>> {
+    let new = NewRows { rows, replace: false };
     let path = format!("/api/v1/services/{}/sla", percent_encode(service));
     client.put(&path, &new).await
 }
@@ -300,16 +256,9 @@ pub(crate) async fn write_rows(
 /// Checks that the output file of `option` can be written, before minutes are spent on measuring.
 pub(crate) fn check_writable(curve: &Path, option: &str) -> anyhow::Result<()> {
     let new = !curve.exists();
-    fs::OpenOptions::new()
-        .append(true)
-        .create(true)
-        .open(curve)
-        .with_context(|| {
-            format!(
-                "cannot write the {option} to {}; name another file with --{option}",
-                curve.display()
-            )
-        })?;
+    fs::OpenOptions::new().append(true).create(true).open(curve).with_context(|| {
+        format!("cannot write the {option} to {}; name another file with --{option}", curve.display())
+    })?;
     if new {
         let _ = fs::remove_file(curve);
     }
@@ -322,10 +271,7 @@ pub(crate) fn confirm(service: &str) -> anyhow::Result<bool> {
         return Ok(false);
     }
     let mut out = std::io::stderr().lock();
-    write!(
-        out,
-        "write these entries to the SLA table of {service}? [y/N] "
-    )?;
+    write!(out, "write these entries to the SLA table of {service}? [y/N] ")?;
     out.flush()?;
     let mut answer = String::new();
     std::io::stdin().lock().read_line(&mut answer)?;
@@ -361,8 +307,7 @@ mod tests {
     #[test]
     fn a_curve_that_cannot_be_written_is_told_before_measuring() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = check_writable(&place.path().join("gone/curve.svg"), "curve")
-            .expect_err("no directory");
+        let told = check_writable(&place.path().join("gone/curve.svg"), "curve").expect_err("no directory");
         assert!(format!("{told:#}").contains("--curve"), "{told:#}");
         let fine = place.path().join("curve.svg");
         check_writable(&fine, "curve").expect("it can be written");
@@ -374,13 +319,7 @@ mod tests {
 
     #[test]
     fn only_a_yes_is_a_yes() {
-        for (answer, yes) in [
-            ("y\n", true),
-            ("Yes\n", true),
-            ("\n", false),
-            ("", false),
-            ("yep", false),
-        ] {
+        for (answer, yes) in [("y\n", true), ("Yes\n", true), ("\n", false), ("", false), ("yep", false)] {
             assert_eq!(is_yes(answer), yes, "{answer:?}");
         }
     }
@@ -396,11 +335,8 @@ mod tests {
         }
         let found = find_pictures(&directory);
         fs::remove_dir_all(&directory).expect("removed");
-        let names: Vec<_> = found
-            .expect("pictures")
-            .iter()
-            .filter_map(|path| path.file_name()?.to_str().map(str::to_owned))
-            .collect();
+        let names: Vec<_> =
+            found.expect("pictures").iter().filter_map(|path| path.file_name()?.to_str().map(str::to_owned)).collect();
         assert_eq!(names, ["a.PNG", "b.png"]);
     }
 }

@@ -85,9 +85,7 @@ impl ServerAddress {
             Some(("http" | "ws", rest)) => (false, rest, 9090),
             Some(("https" | "wss", rest)) => (true, rest, 443),
             Some((scheme, _)) => {
-                bail!(
-                    "{text}: unsupported scheme {scheme}; write https://HOST:PORT, http://HOST:PORT or unix:PATH"
-                )
+                bail!("{text}: unsupported scheme {scheme}; write https://HOST:PORT, http://HOST:PORT or unix:PATH")
             }
             None => (false, text, 9090),
         };
@@ -95,35 +93,21 @@ impl ServerAddress {
         if authority.is_empty() || authority.contains(['/', '?', ' ']) {
             bail!("{text} names no server; write https://HOST:PORT, http://HOST:PORT or unix:PATH");
         }
-        let has_port = authority.rsplit_once(':').is_some_and(|(host, port)| {
-            (!host.contains(':') || host.ends_with(']')) && port.parse::<u16>().is_ok()
-        });
-        let authority = if has_port {
-            authority.to_owned()
-        } else {
-            format!("{authority}:{port}")
-        };
-        Ok(if secure {
-            ServerAddress::Tls(authority)
-        } else {
-            ServerAddress::Tcp(authority)
-        })
+        let has_port = authority
+            .rsplit_once(':')
+            .is_some_and(|(host, port)| (!host.contains(':') || host.ends_with(']')) && port.parse::<u16>().is_ok());
+        let authority = if has_port { authority.to_owned() } else { format!("{authority}:{port}") };
+        Ok(if secure { ServerAddress::Tls(authority) } else { ServerAddress::Tcp(authority) })
     }
 
     /// Returns the address of this machine's daemon.
     fn local_daemon() -> ServerAddress {
-        let variable = |name| {
-            std::env::var_os(name)
-                .filter(|value| !value.is_empty())
-                .map(PathBuf::from)
-        };
+        let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
         let home = variable("CLOUDROID_HOME")
             .or_else(|| variable("XDG_DATA_HOME").map(|data| data.join("cloudroid")))
             .or_else(|| variable("HOME").map(|user| user.join(".local/share/cloudroid")));
         let chosen = variable("CLOUDROID_HOME").is_some();
-        let candidates = home
-            .into_iter()
-            .chain([PathBuf::from("/var/lib/cloudroid")]);
+        let candidates = home.into_iter().chain([PathBuf::from("/var/lib/cloudroid")]);
         let sockets: Vec<PathBuf> = candidates
             .map(|home| home.join("run/daemon.sock"))
             // The admin socket, where members of a group are admins.
@@ -178,9 +162,7 @@ impl fmt::Display for ConnectionLost {
 
 /// Returns whether an error means that the daemon does not answer now; one that is being restarted will answer soon.
 pub fn is_unavailable(error: &anyhow::Error) -> bool {
-    error.is::<DaemonUnreachable>()
-        || error.is::<ConnectionLost>()
-        || error.is::<TruncatedResponse>()
+    error.is::<DaemonUnreachable>() || error.is::<ConnectionLost>() || error.is::<TruncatedResponse>()
 }
 
 /// The connection was lost in the middle of a streamed response.
@@ -204,10 +186,7 @@ impl DaemonClient {
             Some(text) => ServerAddress::parse(text)?,
             None => ServerAddress::local_daemon(),
         };
-        Ok(DaemonClient {
-            server,
-            token: token.filter(|token| !token.is_empty()),
-        })
+        Ok(DaemonClient { server, token: token.filter(|token| !token.is_empty()) })
     }
 
     /// Sends `GET path`.
@@ -216,11 +195,7 @@ impl DaemonClient {
     }
 
     /// Sends `PATCH path` with `body` as JSON.
-    pub async fn patch<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        body: &impl Serialize,
-    ) -> anyhow::Result<T> {
+    pub async fn patch<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> anyhow::Result<T> {
         read_json(self.send(Method::PATCH, path, json_body(body)?).await?).await
     }
 
@@ -230,20 +205,12 @@ impl DaemonClient {
     }
 
     /// Sends `PUT path` with `body` as JSON.
-    pub async fn put<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        body: &impl Serialize,
-    ) -> anyhow::Result<T> {
+    pub async fn put<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> anyhow::Result<T> {
         read_json(self.send(Method::PUT, path, json_body(body)?).await?).await
     }
 
     /// Sends `POST path` with `body` as JSON.
-    pub async fn post<T: DeserializeOwned>(
-        &self,
-        path: &str,
-        body: &impl Serialize,
-    ) -> anyhow::Result<T> {
+    pub async fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize) -> anyhow::Result<T> {
         read_json(self.send(Method::POST, path, json_body(body)?).await?).await
     }
 
@@ -252,29 +219,18 @@ impl DaemonClient {
         &self,
         path: &str,
     ) -> anyhow::Result<impl Stream<Item = anyhow::Result<T>>> {
-        Ok(json_lines(
-            self.send(Method::GET, path, empty_body()).await?,
-        ))
+        Ok(json_lines(self.send(Method::GET, path, empty_body()).await?))
     }
 
     /// Sends a request and returns the response if its status is a success; otherwise returns its [`Problem`] as the
     /// error.
-    pub async fn send(
-        &self,
-        method: Method,
-        path: &str,
-        body: RequestBody,
-    ) -> anyhow::Result<Response<Incoming>> {
+    pub async fn send(&self, method: Method, path: &str, body: RequestBody) -> anyhow::Result<Response<Incoming>> {
         let request = Request::builder().method(method).uri(path);
         self.dispatch(request.body(body)?).await
     }
 
     /// Opens a WebSocket with this subprotocol (RFC 6455, section 4.1).
-    pub async fn connect_websocket(
-        &self,
-        path: &str,
-        protocol: &str,
-    ) -> anyhow::Result<DaemonSocket> {
+    pub async fn connect_websocket(&self, path: &str, protocol: &str) -> anyhow::Result<DaemonSocket> {
         let key = generate_key();
         let request = Request::builder()
             .uri(path)
@@ -289,23 +245,15 @@ impl DaemonClient {
         if response.status() != StatusCode::SWITCHING_PROTOCOLS || !accepted {
             bail!("the server at {} does not support WebSocket", self.server);
         }
-        let upgraded = hyper::upgrade::on(response)
-            .await
-            .with_context(|| ConnectionLost {
-                server: self.server.clone(),
-            })?;
-        let config = WebSocketConfig::default()
-            .max_message_size(None)
-            .max_frame_size(None);
+        let upgraded =
+            hyper::upgrade::on(response).await.with_context(|| ConnectionLost { server: self.server.clone() })?;
+        let config = WebSocketConfig::default().max_message_size(None).max_frame_size(None);
         let io = TokioIo::new(upgraded);
         Ok(WebSocketStream::from_raw_socket(io, Role::Client, Some(config)).await)
     }
 
     async fn dispatch(&self, request: Request<RequestBody>) -> anyhow::Result<Response<Incoming>> {
-        let unreachable = |source| DaemonUnreachable {
-            server: self.server.clone(),
-            source,
-        };
+        let unreachable = |source| DaemonUnreachable { server: self.server.clone(), source };
         match &self.server {
             ServerAddress::Tcp(authority) => {
                 let stream = connect_tcp(authority).await.map_err(unreachable)?;
@@ -323,11 +271,7 @@ impl DaemonClient {
         }
     }
 
-    async fn connect_tls(
-        &self,
-        stream: TcpStream,
-        authority: &str,
-    ) -> anyhow::Result<TlsStream<TcpStream>> {
+    async fn connect_tls(&self, stream: TcpStream, authority: &str) -> anyhow::Result<TlsStream<TcpStream>> {
         let (host, _) = authority.rsplit_once(':').unwrap_or((authority, ""));
         let trust = Trust {
             authorities: None,
@@ -359,12 +303,9 @@ impl DaemonClient {
         host: &str,
         mut request: Request<RequestBody>,
     ) -> anyhow::Result<Response<Incoming>> {
-        let lost = || ConnectionLost {
-            server: self.server.clone(),
-        };
-        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
-            .await
-            .with_context(lost)?;
+        let lost = || ConnectionLost { server: self.server.clone() };
+        let (mut sender, connection) =
+            hyper::client::conn::http1::handshake(TokioIo::new(stream)).await.with_context(lost)?;
         tokio::spawn(connection.with_upgrades());
         let headers = request.headers_mut();
         headers.insert(header::HOST, HeaderValue::from_str(host)?);
@@ -412,16 +353,12 @@ async fn connect_unix(socket: &Path) -> io::Result<UnixStream> {
 
 /// Returns an empty body.
 pub fn empty_body() -> RequestBody {
-    Full::default()
-        .map_err(|never| match never {})
-        .boxed_unsync()
+    Full::default().map_err(|never| match never {}).boxed_unsync()
 }
 
 /// Returns a body of JSON.
 pub fn json_body(body: &impl Serialize) -> serde_json::Result<RequestBody> {
-    Ok(Full::new(Bytes::from(serde_json::to_vec(body)?))
-        .map_err(|never| match never {})
-        .boxed_unsync())
+    Ok(Full::new(Bytes::from(serde_json::to_vec(body)?)).map_err(|never| match never {}).boxed_unsync())
 }
 
 async fn error_from_response(response: Response<Incoming>) -> anyhow::Error {
@@ -440,29 +377,18 @@ async fn error_from_response(response: Response<Incoming>) -> anyhow::Error {
             }
             problem.into()
         }
-        Err(_) => anyhow!(
-            "the daemon answered {status}: {}",
-            String::from_utf8_lossy(&body).trim()
-        ),
+        Err(_) => anyhow!("the daemon answered {status}: {}", String::from_utf8_lossy(&body).trim()),
     }
 }
 
 /// Reads a response as JSON.
 pub async fn read_json<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
-    let body = response
-        .into_body()
-        .collect()
-        .await
-        .context("the daemon's response was cut off")?
-        .to_bytes();
-    serde_json::from_slice(&body)
-        .context("this version of cloudroidctl does not understand the daemon's response")
+    let body = response.into_body().collect().await.context("the daemon's response was cut off")?.to_bytes();
+    serde_json::from_slice(&body).context("this version of cloudroidctl does not understand the daemon's response")
 }
 
 /// Reads a response as a stream of JSON lines.
-pub fn json_lines<T: DeserializeOwned>(
-    response: Response<Incoming>,
-) -> impl Stream<Item = anyhow::Result<T>> {
+pub fn json_lines<T: DeserializeOwned>(response: Response<Incoming>) -> impl Stream<Item = anyhow::Result<T>> {
     let state = (response.into_body(), BytesMut::new());
     futures_util::stream::try_unfold(state, |(mut body, mut pending)| async move {
         loop {
@@ -471,17 +397,13 @@ pub fn json_lines<T: DeserializeOwned>(
                 if line.iter().all(u8::is_ascii_whitespace) {
                     continue;
                 }
-                let value = serde_json::from_slice(&line).context(
-                    "this version of cloudroidctl does not understand the daemon's response",
-                )?;
+                let value = serde_json::from_slice(&line)
+                    .context("this version of cloudroidctl does not understand the daemon's response")?;
                 return Ok(Some((value, (body, pending))));
             }
             match body.frame().await {
                 Some(frame) => {
-                    if let Ok(data) = frame
-                        .map_err(|source| TruncatedResponse { source })?
-                        .into_data()
-                    {
+                    if let Ok(data) = frame.map_err(|source| TruncatedResponse { source })?.into_data() {
                         pending.extend_from_slice(&data);
                     }
                 }
@@ -501,9 +423,7 @@ pub fn percent_encode(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for byte in text.bytes() {
         match byte {
-            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
-                escaped.push(char::from(byte))
-            }
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => escaped.push(char::from(byte)),
             _ => escaped.push_str(&format!("%{byte:02X}")),
         }
     }
@@ -527,14 +447,8 @@ mod tests {
             ("https://10.0.0.1:9091/", tls("10.0.0.1:9091")),
             ("wss://robot-server", tls("robot-server:443")),
             ("https://[::1]", tls("[::1]:443")),
-            (
-                "unix:/run/x.sock",
-                ServerAddress::Unix("/run/x.sock".into()),
-            ),
-            (
-                "unix:///run/x.sock",
-                ServerAddress::Unix("/run/x.sock".into()),
-            ),
+            ("unix:/run/x.sock", ServerAddress::Unix("/run/x.sock".into())),
+            ("unix:///run/x.sock", ServerAddress::Unix("/run/x.sock".into())),
         ] {
             assert_eq!(ServerAddress::parse(text).expect(text), server);
         }
@@ -545,13 +459,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_daemon_that_ends_before_it_answers_is_away() {
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0")
-            .await
-            .expect("a port");
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("its address");
         let ends = tokio::spawn(async move { drop(listener.accept().await) });
-        let client =
-            DaemonClient::new(Some(&format!("http://{address}")), None).expect("an address");
+        let client = DaemonClient::new(Some(&format!("http://{address}")), None).expect("an address");
         let asked = || client.get::<api::Clock>("/api/v1/clock");
         let lost = asked().await.expect_err("nothing answers");
         assert!(is_unavailable(&lost), "{lost:#}");

@@ -22,14 +22,8 @@ impl DiffArgs {
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let asked = [("from", self.from), ("to", self.to)];
         let asked = asked.iter();
-        let query: Vec<String> = asked
-            .filter_map(|(name, number)| Some(format!("{name}={}", (*number)?)))
-            .collect();
-        let path = format!(
-            "/api/v1/services/{}/differences?{}",
-            percent_encode(&self.service),
-            query.join("&")
-        );
+        let query: Vec<String> = asked.filter_map(|(name, number)| Some(format!("{name}={}", (*number)?))).collect();
+        let path = format!("/api/v1/services/{}/differences?{}", percent_encode(&self.service), query.join("&"));
         let found: Differences = client.get(&path).await?;
         match format {
             OutputFormat::Json => output::json(&found),
@@ -39,13 +33,9 @@ impl DiffArgs {
 }
 
 fn show(found: &Differences) -> anyhow::Result<()> {
-    let Differences {
-        service, from, to, ..
-    } = found;
+    let Differences { service, from, to, .. } = found;
     if found.differences.is_empty() {
-        return output::line(&format!(
-            "no recorded differences between revisions {from} and {to} of {service}"
-        ));
+        return output::line(&format!("no recorded differences between revisions {from} and {to} of {service}"));
     }
     let (before, after) = (format!("REVISION {from}"), format!("REVISION {to}"));
     let mut table = Table::new(&["PART", "NAME", &before, &after]);

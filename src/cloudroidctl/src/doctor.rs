@@ -38,30 +38,17 @@ impl DoctorArgs {
 }
 
 async fn check_without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doctor> {
-    let beside = std::env::current_exe()
-        .ok()
-        .and_then(|path| Some(path.parent()?.join("cloudroidd")));
-    let program = beside
-        .filter(|path| path.exists())
-        .unwrap_or_else(|| PathBuf::from("cloudroidd"));
+    let beside = std::env::current_exe().ok().and_then(|path| Some(path.parent()?.join("cloudroidd")));
+    let program = beside.filter(|path| path.exists()).unwrap_or_else(|| PathBuf::from("cloudroidd"));
     let output = tokio::process::Command::new(&program)
         .args(["doctor", "--json"])
         .stdin(Stdio::null())
         .stderr(Stdio::inherit())
         .output()
         .await
-        .with_context(|| {
-            format!(
-                "{unreachable}; cannot run {} to check without the daemon",
-                program.display()
-            )
-        })?;
-    let mut doctor: api::Doctor = serde_json::from_slice(&output.stdout).with_context(|| {
-        format!(
-            "the output of {} doctor --json is not valid",
-            program.display()
-        )
-    })?;
+        .with_context(|| format!("{unreachable}; cannot run {} to check without the daemon", program.display()))?;
+    let mut doctor: api::Doctor = serde_json::from_slice(&output.stdout)
+        .with_context(|| format!("the output of {} doctor --json is not valid", program.display()))?;
     doctor.checks.push(Check {
         name: "daemon".to_owned(),
         status: CheckStatus::Warning,
@@ -82,10 +69,7 @@ fn show(doctor: &api::Doctor) -> anyhow::Result<()> {
         table.row([mark.to_owned(), check.name.clone(), check.found.clone()]);
     }
     table.print()?;
-    let fixable = doctor
-        .checks
-        .iter()
-        .filter(|check| check.status != CheckStatus::Ok);
+    let fixable = doctor.checks.iter().filter(|check| check.status != CheckStatus::Ok);
     for check in fixable {
         if let Some(fix) = &check.fix {
             output::line(&format!("\nto fix {}:\n    {fix}", check.name))?;

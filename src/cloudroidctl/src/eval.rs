@@ -81,19 +81,14 @@ pub struct EvalArgs {
 impl EvalArgs {
     /// Measures both sides, prints the result and writes the row if that is confirmed.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let file =
-            fs::read(&self.bag).with_context(|| format!("cannot read {}", self.bag.display()))?;
+        let file = fs::read(&self.bag).with_context(|| format!("cannot read {}", self.bag.display()))?;
         let file = Bytes::from(file);
         // A recording that cannot be replayed is reported before anything is sent or started.
-        let recorded = ros::bag::read(&file, probe::RECORDED).map_err(|why| {
-            invalid_input(format!("{} cannot be replayed: {why}", self.bag.display()))
-        })?;
+        let recorded = ros::bag::read(&file, probe::RECORDED)
+            .map_err(|why| invalid_input(format!("{} cannot be replayed: {why}", self.bag.display())))?;
         let service = self.check(client).await?;
         self.check_capacity(client).await?;
-        let plot = self
-            .plot
-            .clone()
-            .unwrap_or_else(|| PathBuf::from(format!("{}-evaluation.svg", self.service)));
+        let plot = self.plot.clone().unwrap_or_else(|| PathBuf::from(format!("{}-evaluation.svg", self.service)));
         check_writable(&plot, "plot")?;
         let mut measured = tokio::select! {
             measured = self.measure(client, format, file, &recorded, &service) => measured?,
@@ -104,11 +99,7 @@ impl EvalArgs {
             .with_context(|| format!("cannot write the plot {}", plot.display()));
         // The JSON output is one value, which includes the written row.
         let is_written = self.yes && matches!(format, OutputFormat::Json);
-        let written = if is_written {
-            self.write_row(client, &mut measured).await.map(drop)
-        } else {
-            Ok(())
-        };
+        let written = if is_written { self.write_row(client, &mut measured).await.map(drop) } else { Ok(()) };
         match format {
             OutputFormat::Json => output::json(&measured)?,
             OutputFormat::Table => shown::print(&measured, &plot)?,
@@ -123,19 +114,11 @@ impl EvalArgs {
             );
         }
         written?;
-        if is_written {
-            Ok(())
-        } else {
-            self.propose(client, format, measured).await
-        }
+        if is_written { Ok(()) } else { self.propose(client, format, measured).await }
     }
 
     /// Writes the suggested row; returns the ids of other rows for the same limits.
-    async fn write_row(
-        &self,
-        client: &DaemonClient,
-        measured: &mut Evaluation,
-    ) -> anyhow::Result<Vec<i64>> {
+    async fn write_row(&self, client: &DaemonClient, measured: &mut Evaluation) -> anyhow::Result<Vec<i64>> {
         let Some(sla) = &mut measured.sla else {
             return Ok(Vec::new());
         };
@@ -167,9 +150,7 @@ impl EvalArgs {
         }
         let name = &self.service;
         let others = self.write_row(client, &mut measured).await?;
-        say(&format!(
-            "1 entry written; see it with: cloudroidctl sla list {name}"
-        ))?;
+        say(&format!("1 entry written; see it with: cloudroidctl sla list {name}"))?;
         if others.is_empty() {
             return Ok(());
         }

@@ -46,9 +46,7 @@ impl EventsArgs {
         let path = format!("/api/v1/events?{}", self.query(0, self.tail));
         let events: Vec<Event> = client.get(&path).await?;
         if let (true, Some(kind)) = (events.is_empty(), &self.kind) {
-            let all: Vec<Event> = client
-                .get(&format!("/api/v1/events?since=0&limit={ALL}"))
-                .await?;
+            let all: Vec<Event> = client.get(&format!("/api/v1/events?since=0&limit={ALL}")).await?;
             output::eprint_line(&describe_no_events(kind, &all));
         }
         match format {
@@ -113,16 +111,11 @@ impl EventsArgs {
     }
 
     fn query(&self, since: i64, limit: u32) -> String {
-        let filter = [
-            ("kind", &self.kind),
-            ("service", &self.service),
-            ("servant", &self.servant),
-            ("robot", &self.robot),
-        ];
+        let filter =
+            [("kind", &self.kind), ("service", &self.service), ("servant", &self.servant), ("robot", &self.robot)];
         let filter = filter.into_iter();
-        let filter: String = filter
-            .filter_map(|(key, value)| Some(format!("&{key}={}", percent_encode(value.as_ref()?))))
-            .collect();
+        let filter: String =
+            filter.filter_map(|(key, value)| Some(format!("&{key}={}", percent_encode(value.as_ref()?)))).collect();
         format!("since={since}&limit={limit}{filter}")
     }
 }
@@ -176,10 +169,7 @@ mod tests {
         for (line, expected) in [
             ("", "since=7&limit=50"),
             ("-n 3 -f --kind node-hung", "since=7&limit=3&kind=node-hung"),
-            (
-                "--robot r&d --service s --servant s-1",
-                "since=7&limit=50&service=s&servant=s-1&robot=r%26d",
-            ),
+            ("--robot r&d --service s --servant s-1", "since=7&limit=50&service=s&servant=s-1&robot=r%26d"),
         ] {
             assert_eq!(query(line), expected, "{line}");
         }
@@ -197,9 +187,6 @@ mod tests {
         assert!(unknown.contains("recorded kinds: node-hung;"), "{unknown}");
         let known = describe_no_events("node-hung", std::slice::from_ref(&event));
         assert!(!known.contains("recorded kinds"), "{known}");
-        assert_eq!(
-            format_event(&event),
-            "00:00:00.000 ! node-hung          it hangs"
-        );
+        assert_eq!(format_event(&event), "00:00:00.000 ! node-hung          it hangs");
     }
 }

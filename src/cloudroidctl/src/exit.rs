@@ -67,10 +67,7 @@ impl Exit {
         if error.is::<WaitTimedOut>() {
             return Exit::TimedOut;
         }
-        match error
-            .downcast_ref::<Problem>()
-            .map(|problem| problem.status)
-        {
+        match error.downcast_ref::<Problem>().map(|problem| problem.status) {
             Some(401 | 403) => Exit::Forbidden,
             Some(404 | 410) => Exit::Missing,
             Some(429 | 503 | 507) => Exit::Busy,
@@ -113,15 +110,7 @@ mod tests {
 
     #[test]
     fn every_refusal_has_its_number() {
-        let refused = |status| {
-            Exit::from_error(
-                &Problem {
-                    status,
-                    ..Problem::default()
-                }
-                .into(),
-            )
-        };
+        let refused = |status| Exit::from_error(&Problem { status, ..Problem::default() }.into());
         for (status, expected) in [
             (400, Exit::Refused),
             (401, Exit::Forbidden),
@@ -139,10 +128,7 @@ mod tests {
         }
         assert_eq!(Exit::from_error(&anyhow::anyhow!("anything")), Exit::Failed);
         let words = "late".to_owned();
-        assert_eq!(
-            Exit::from_error(&WaitTimedOut { words }.into()),
-            Exit::TimedOut
-        );
+        assert_eq!(Exit::from_error(&WaitTimedOut { words }.into()), Exit::TimedOut);
     }
 
     #[test]

@@ -43,11 +43,7 @@ fn print(explanation: &Explanation) -> anyhow::Result<()> {
         output::line("\nlately")?;
     }
     for event in &explanation.events {
-        output::line(&format!(
-            "  {}  {}",
-            output::clock(event.time),
-            event.message
-        ))?;
+        output::line(&format!("  {}  {}", output::clock(event.time), event.message))?;
     }
     Ok(())
 }
@@ -77,9 +73,7 @@ fn print_servant(served: &Served) -> anyhow::Result<()> {
 /// Returns the robot's SLA in words.
 fn promise_in_words(link: &Link) -> String {
     let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
-    let threshold = link
-        .threshold
-        .map_or_else(String::new, |threshold| format!(", Q_t {threshold:.1}"));
+    let threshold = link.threshold.map_or_else(String::new, |threshold| format!(", Q_t {threshold:.1}"));
     if let Some(after) = link.fallback_after {
         let after = after / 1000.0;
         return format!("no response time set, fallback {after:.1} s after the link is lost");
@@ -95,11 +89,7 @@ fn promise_in_words(link: &Link) -> String {
             let desired = desired.map_or_else(String::new, |age| format!(", {age} desired"));
             format!("at most {} old{desired}{threshold}", millis(link.age))
         }
-        (None, None) => format!(
-            "T_desire {}, T_max {}{threshold}",
-            millis(link.desire),
-            millis(link.max)
-        ),
+        (None, None) => format!("T_desire {}, T_max {}{threshold}", millis(link.desire), millis(link.max)),
     }
 }
 
@@ -112,8 +102,7 @@ fn print_link(link: &Link) -> anyhow::Result<()> {
         millis(link.round_trip),
         millis(link.clock),
         promise_in_words(link),
-        link.satisfaction
-            .map_or("-".to_owned(), |q| format!("{q:.1}")),
+        link.satisfaction.map_or("-".to_owned(), |q| format!("{q:.1}")),
         link.requests,
         link.late,
         link.local,

@@ -86,18 +86,11 @@ impl ExportArgs {
             }
             .into());
         };
-        let target = self
-            .output
-            .unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.service)));
+        let target = self.output.unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.service)));
         let half = AtomicFile::create_beside(&target)?;
         let record = fetch_record(client, &self.service, number).await?;
         let name = format!("{}:{number}", self.service);
-        let of = ExportedImage {
-            service: &self.service,
-            image: &revision.image,
-            name: &name,
-            record,
-        };
+        let of = ExportedImage { service: &self.service, image: &revision.image, name: &name, record };
         let mut out = LayoutWriter::new(BufWriter::new(&half.file));
         copy_image(client, of, &mut out).await?;
         let bytes = out.finish().with_context(|| half.error_context())?;
@@ -123,11 +116,7 @@ impl ExportArgs {
 }
 
 /// Downloads the record of a revision, which is not in its image; `None` if the caller may not see it.
-async fn fetch_record(
-    client: &DaemonClient,
-    service: &str,
-    number: u64,
-) -> anyhow::Result<Option<Bytes>> {
+async fn fetch_record(client: &DaemonClient, service: &str, number: u64) -> anyhow::Result<Option<Bytes>> {
     let service = percent_encode(service);
     let path = format!("/api/v1/services/{service}/record?revision={number}");
     let answer = match client.send(Method::GET, &path, empty_body()).await {
@@ -164,12 +153,7 @@ async fn copy_image(
     of: ExportedImage<'_>,
     out: &mut LayoutWriter<impl Write>,
 ) -> anyhow::Result<()> {
-    let ExportedImage {
-        image,
-        name,
-        record,
-        ..
-    } = of;
+    let ExportedImage { image, name, record, .. } = of;
     let service = percent_encode(of.service);
     let path = format!("/v2/{service}/manifests/{}", percent_encode(image));
     let answer = client.send(Method::GET, &path, empty_body()).await?;
@@ -178,14 +162,11 @@ async fn copy_image(
         Ok(collected) => collected.to_bytes(),
         Err(error) => bail!("the daemon did not send the manifest {image}: {error}"),
     };
-    let manifest: BlobManifest = serde_json::from_slice(&bytes)
-        .with_context(|| format!("the manifest {image} cannot be read"))?;
+    let manifest: BlobManifest =
+        serde_json::from_slice(&bytes).with_context(|| format!("the manifest {image} cannot be read"))?;
     let mut annotations = json!({ "org.opencontainers.image.ref.name": name });
     let record = record.map(|record| {
-        let named = BlobDescriptor {
-            digest: sha256_digest(&record),
-            size: record.len() as u64,
-        };
+        let named = BlobDescriptor { digest: sha256_digest(&record), size: record.len() as u64 };
         annotations[RECORD] = named.digest.clone().into();
         (named, record)
     });
@@ -201,15 +182,10 @@ async fn copy_image(
     });
     out.write_file("oci-layout", br#"{"imageLayoutVersion":"1.0.0"}"#)?;
     out.write_file("index.json", &serde_json::to_vec(&index)?)?;
-    let named = BlobDescriptor {
-        digest: image.to_owned(),
-        size: bytes.len() as u64,
-    };
-    out.write_blob(&named, futures_util::stream::iter([Ok(bytes)]))
-        .await?;
+    let named = BlobDescriptor { digest: image.to_owned(), size: bytes.len() as u64 };
+    out.write_blob(&named, futures_util::stream::iter([Ok(bytes)])).await?;
     if let Some((named, record)) = record {
-        out.write_blob(&named, futures_util::stream::iter([Ok(record)]))
-            .await?;
+        out.write_blob(&named, futures_util::stream::iter([Ok(record)])).await?;
     }
     let mut written = BTreeSet::new();
     for blob in std::iter::once(&manifest.config).chain(&manifest.layers) {
@@ -275,24 +251,13 @@ impl<W: Write> LayoutWriter<W> {
         while let Some(part) = parts.next().await {
             let part = part?;
             came += part.len() as u64;
-            ensure!(
-                came <= named.size,
-                "the daemon sent more than the {} bytes of {digest}",
-                named.size
-            );
+            ensure!(came <= named.size, "the daemon sent more than the {} bytes of {digest}", named.size);
             hash.update(&part);
             self.write(&part)?;
         }
-        ensure!(
-            came == named.size,
-            "the daemon sent {came} of the {} bytes of {digest}",
-            named.size
-        );
+        ensure!(came == named.size, "the daemon sent {came} of the {} bytes of {digest}", named.size);
         let found = hex_digits(&hash.finalize());
-        ensure!(
-            found == hex,
-            "the daemon's data for {digest} has the digest sha256:{found}; nothing was written"
-        );
+        ensure!(found == hex, "the daemon's data for {digest} has the digest sha256:{found}; nothing was written");
         self.pad_entry(named.size)
     }
 
@@ -320,9 +285,7 @@ impl<W: Write> LayoutWriter<W> {
     }
 
     fn write(&mut self, bytes: &[u8]) -> anyhow::Result<()> {
-        self.out
-            .write_all(bytes)
-            .context("cannot write the archive")?;
+        self.out.write_all(bytes).context("cannot write the archive")?;
         self.bytes += bytes.len() as u64;
         Ok(())
     }
@@ -344,26 +307,13 @@ mod tests {
     /// SHA-256 of `abc` (FIPS 180-2, appendix B.1).
     const ABC: &str = "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
 
-    async fn export_blob(
-        digest: &str,
-        size: u64,
-        parts: &[&'static str],
-    ) -> anyhow::Result<Vec<u8>> {
+    async fn export_blob(digest: &str, size: u64, parts: &[&'static str]) -> anyhow::Result<Vec<u8>> {
         let mut bytes = Vec::new();
         let mut out = LayoutWriter::new(&mut bytes);
         out.write_file("oci-layout", b"{}")?;
-        let parts = parts
-            .iter()
-            .map(|part| Ok(Bytes::from_static(part.as_bytes())));
-        let named = BlobDescriptor {
-            digest: digest.to_owned(),
-            size,
-        };
-        out.write_blob(
-            &named,
-            futures_util::stream::iter(parts.collect::<Vec<_>>()),
-        )
-        .await?;
+        let parts = parts.iter().map(|part| Ok(Bytes::from_static(part.as_bytes())));
+        let named = BlobDescriptor { digest: digest.to_owned(), size };
+        out.write_blob(&named, futures_util::stream::iter(parts.collect::<Vec<_>>())).await?;
         let length = out.finish()?;
         assert_eq!(length, bytes.len() as u64);
         Ok(bytes)
@@ -381,13 +331,7 @@ mod tests {
             read.push((path, content));
         }
         let blob = format!("blobs/sha256/{}", &ABC["sha256:".len()..]);
-        assert_eq!(
-            read,
-            [
-                ("oci-layout".to_owned(), "{}".to_owned()),
-                (blob, "abc".to_owned())
-            ]
-        );
+        assert_eq!(read, [("oci-layout".to_owned(), "{}".to_owned()), (blob, "abc".to_owned())]);
     }
 
     #[tokio::test]

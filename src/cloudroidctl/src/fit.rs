@@ -39,10 +39,7 @@ impl FitArgs {
 
     fn path(&self) -> anyhow::Result<String> {
         let query = to_query(&self.stated.to_stated()?);
-        Ok(format!(
-            "/api/v1/services/{}/fit{query}",
-            percent_encode(&self.service)
-        ))
+        Ok(format!("/api/v1/services/{}/fit{query}", percent_encode(&self.service)))
     }
 }
 
@@ -52,9 +49,7 @@ fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
         return Ok(());
     }
     output::line("\nif it used all of that, these servants would get less than they use now")?;
-    let mut table = Table::new(&[
-        "SERVANT", "ROBOT", "CORES", "LEFT", "RRT", "THEN", "ACCEPTS",
-    ]);
+    let mut table = Table::new(&["SERVANT", "ROBOT", "CORES", "LEFT", "RRT", "THEN", "ACCEPTS"]);
     for cost in &fit.costs {
         table.row([
             cost.servant.clone(),
@@ -71,10 +66,7 @@ fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
 
 /// Formats a time in whole milliseconds; a dash if it is unknown.
 fn time(seconds: Option<f64>) -> String {
-    seconds.map_or_else(
-        || "-".to_owned(),
-        |seconds| format!("{:.0} ms", seconds * 1000.0),
-    )
+    seconds.map_or_else(|| "-".to_owned(), |seconds| format!("{:.0} ms", seconds * 1000.0))
 }
 
 /// Formats missing resources.
@@ -89,10 +81,7 @@ fn lacking_in_words(cpus: f64, memory: Size) -> String {
 fn fit_in_words(service: &str, fit: &api::Fit) -> String {
     let expected = fit.expected.as_ref().map(|expected| {
         let rrt = time(Some(expected.rrt));
-        format!(
-            "\n95 % of its requests would take up to {rrt} ({})",
-            expected.from
-        )
+        format!("\n95 % of its requests would take up to {rrt} ({})", expected.from)
     });
     let expected = expected.unwrap_or_default();
     if let Some(servants @ 1..) = fit.shared {
@@ -100,31 +89,22 @@ fn fit_in_words(service: &str, fit: &api::Fit) -> String {
             1 => "1 servant".to_owned(),
             more => format!("{more} servants"),
         };
-        return format!(
-            "robots share {servants} of {service}; one more robot needs no more capacity{expected}"
-        );
+        return format!("robots share {servants} of {service}; one more robot needs no more capacity{expected}");
     }
-    let wanted = format!(
-        "one more servant of {service} reserves {} cores and {} of memory",
-        fit.cpus, fit.memory
-    );
+    let wanted = format!("one more servant of {service} reserves {} cores and {} of memory", fit.cpus, fit.memory);
     let lacks = fit.lacking_cpus > 0.0 || fit.lacking_memory > Size(0);
     let now = match (&fit.stalled, fit.now) {
         (Some(why), _) => format!("it would wait: {why}"),
         (None, true) => "it would start at once".to_owned(),
-        (None, false) if fit.full => format!(
-            "it would be refused: the queue is full with {} robots ([capacity] queue)",
-            fit.waiting
-        ),
+        (None, false) if fit.full => {
+            format!("it would be refused: the queue is full with {} robots ([capacity] queue)", fit.waiting)
+        }
         (None, false) if lacks => format!(
             "it would wait: {}; {} already waiting",
             lacking_in_words(fit.lacking_cpus, fit.lacking_memory),
             fit.waiting
         ),
-        (None, false) => format!(
-            "it would start once these idle servants have ended: {}",
-            fit.ends.join(", ")
-        ),
+        (None, false) => format!("it would start once these idle servants have ended: {}", fit.ends.join(", ")),
     };
     let answer = match &fit.never {
         Some(why) => format!("it would always be refused: {why}"),
@@ -139,10 +119,7 @@ fn fit_in_words(service: &str, fit: &api::Fit) -> String {
             lacking_in_words(fit.beyond_cpus, fit.beyond_memory)
         ),
     };
-    format!(
-        "{wanted}; {} cores and {} are free\n{answer}\n{more}{expected}",
-        fit.free_cpus, fit.free_memory
-    )
+    format!("{wanted}; {} cores and {} are free\n{answer}\n{more}{expected}", fit.free_cpus, fit.free_memory)
 }
 
 #[cfg(test)]
@@ -174,69 +151,24 @@ mod tests {
 
     #[test]
     fn every_answer_has_its_words() {
-        let lacking = api::Fit {
-            lacking_cpus: 0.5,
-            more: Some(0),
-            ..fit()
-        };
-        let never = api::Fit {
-            never: Some("64 cores are more than the 2 that servants may have".into()),
-            ..lacking.clone()
-        };
-        let full = api::Fit {
-            full: true,
-            ..lacking.clone()
-        };
-        let now = api::Fit {
-            now: true,
-            more: None,
-            ..fit()
-        };
-        let stalled = api::Fit {
-            stalled: Some("this machine swaps".into()),
-            ..now.clone()
-        };
-        let expected = api::Fit {
-            expected: Some(api::Expected {
-                rrt: 0.11,
-                from: "entry 3 of the SLA table".into(),
-            }),
-            ..fit()
-        };
-        let shared = api::Fit {
-            shared: Some(2),
-            ..expected.clone()
-        };
-        let none_yet = api::Fit {
-            shared: Some(0),
-            ..fit()
-        };
-        assert_eq!(
-            (time(None).as_str(), time(Some(0.0126)).as_str()),
-            ("-", "13 ms")
-        );
+        let lacking = api::Fit { lacking_cpus: 0.5, more: Some(0), ..fit() };
+        let never =
+            api::Fit { never: Some("64 cores are more than the 2 that servants may have".into()), ..lacking.clone() };
+        let full = api::Fit { full: true, ..lacking.clone() };
+        let now = api::Fit { now: true, more: None, ..fit() };
+        let stalled = api::Fit { stalled: Some("this machine swaps".into()), ..now.clone() };
+        let expected =
+            api::Fit { expected: Some(api::Expected { rrt: 0.11, from: "entry 3 of the SLA table".into() }), ..fit() };
+        let shared = api::Fit { shared: Some(2), ..expected.clone() };
+        let none_yet = api::Fit { shared: Some(0), ..fit() };
+        assert_eq!((time(None).as_str(), time(Some(0.0126)).as_str()), ("-", "13 ms"));
         for (fit, words) in [
-            (
-                expected,
-                "lacking 1.5 cores\n95 % of its requests would take up to 110 ms (entry 3",
-            ),
-            (
-                shared,
-                "robots share 2 servants of a; one more robot needs no more capacity\n95 %",
-            ),
+            (expected, "lacking 1.5 cores\n95 % of its requests would take up to 110 ms (entry 3"),
+            (shared, "robots share 2 servants of a; one more robot needs no more capacity\n95 %"),
             (none_yet, "one more servant of a reserves"),
-            (
-                fit(),
-                "1 cores and 64M of memory; 0.5 cores and 1G are free",
-            ),
-            (
-                fit(),
-                "ended: a-1\n1 would fit, 2 would not: lacking 1.5 cores",
-            ),
-            (
-                lacking,
-                "lacking 0.5 cores; 2 already waiting\nnone would fit",
-            ),
+            (fit(), "1 cores and 64M of memory; 0.5 cores and 1G are free"),
+            (fit(), "ended: a-1\n1 would fit, 2 would not: lacking 1.5 cores"),
+            (lacking, "lacking 0.5 cores; 2 already waiting\nnone would fit"),
             (never, "it would always be refused: 64 cores"),
             (full, "it would be refused: the queue is full with 2"),
             (now, "at once\nany number"),
@@ -255,18 +187,7 @@ mod tests {
             #[command(flatten)]
             fit: FitArgs,
         }
-        let line = [
-            "fit",
-            "a b",
-            "--rrt",
-            "100ms",
-            "--memory",
-            "1G",
-            "--class",
-            "x-y",
-            "--aux",
-            "width=640",
-        ];
+        let line = ["fit", "a b", "--rrt", "100ms", "--memory", "1G", "--class", "x-y", "--aux", "width=640"];
         let path = |line: &[&str]| {
             let path = Line::parse_from(line).fit.path();
             path.map_err(|error| error.to_string())

@@ -81,9 +81,7 @@ mod tests {
         let mut archive = tar::Builder::new(file.reopen().expect("the file"));
         let mut header = tar::Header::new_gnu();
         header.set_size(2);
-        archive
-            .append_data(&mut header, name, &b"{}"[..])
-            .expect("an entry");
+        archive.append_data(&mut header, name, &b"{}"[..]).expect("an entry");
         archive.finish().expect("an archive");
         file
     }
@@ -93,10 +91,7 @@ mod tests {
         check_exported(archive("oci-layout").path()).expect("it has a layout");
         let source = check_exported(archive("adder_py/package.xml").path());
         let source = source.expect_err("a package").to_string();
-        assert!(
-            source.contains("publish a package with cloudroidctl push"),
-            "{source}"
-        );
+        assert!(source.contains("publish a package with cloudroidctl push"), "{source}");
     }
 
     #[test]
@@ -108,9 +103,7 @@ mod tests {
         let torn = archive("oci-layout");
         let torn_at = torn.as_file().set_len(513);
         torn_at.expect("it is cut");
-        let torn = check_exported(torn.path())
-            .expect_err("it is cut")
-            .to_string();
+        let torn = check_exported(torn.path()).expect_err("it is cut").to_string();
         assert!(torn.contains("it is truncated"), "{torn}");
         let missing = check_exported(Path::new("/nowhere/x.tar")).expect_err("none");
         assert!(missing.to_string().contains("cannot read /nowhere/x.tar"));

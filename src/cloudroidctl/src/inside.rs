@@ -28,21 +28,14 @@ pub async fn resolve_servant(client: &DaemonClient, named: &str) -> anyhow::Resu
     if servants.iter().any(|servant| servant.id == named) {
         return Ok(named.to_owned());
     }
-    let of_service: Vec<&Servant> = servants
-        .iter()
-        .filter(|servant| servant.service == named)
-        .collect();
+    let of_service: Vec<&Servant> = servants.iter().filter(|servant| servant.service == named).collect();
     match of_service.as_slice() {
         [only] => Ok(only.id.clone()),
         // The daemon's error lists the existing servants.
         [] => Ok(named.to_owned()),
         several => {
             let ids: Vec<&str> = several.iter().map(|servant| servant.id.as_str()).collect();
-            bail!(
-                "{named} has {} servants; name one: {}",
-                ids.len(),
-                ids.join(", ")
-            )
+            bail!("{named} has {} servants; name one: {}", ids.len(), ids.join(", "))
         }
     }
 }
@@ -58,11 +51,7 @@ pub struct FoxgloveSession<S = TokioIo<Upgraded>> {
 
 impl FoxgloveSession {
     /// Attaches to a servant; the daemon queues up to `depth` messages of each topic.
-    pub async fn attach(
-        client: &DaemonClient,
-        servant: &str,
-        depth: usize,
-    ) -> anyhow::Result<Self> {
+    pub async fn attach(client: &DaemonClient, servant: &str, depth: usize) -> anyhow::Result<Self> {
         let path = format!("/foxglove/{}?depth={depth}", percent_encode(servant));
         let socket = client.connect_websocket(&path, PROTOCOL).await?;
         let mut inside = Self::from_socket(socket);
@@ -73,11 +62,7 @@ impl FoxgloveSession {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
     fn from_socket(socket: WebSocketStream<S>) -> Self {
-        Self {
-            socket,
-            format: RecordingFormat::default(),
-            ahead: VecDeque::new(),
-        }
+        Self { socket, format: RecordingFormat::default(), ahead: VecDeque::new() }
     }
 
     /// Reads the daemon's first message, which announces the message encoding.
@@ -104,11 +89,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
         poll_fn(|cx| self.poll_send(cx, &mut waiting)).await
     }
 
-    fn poll_send(
-        &mut self,
-        cx: &mut Context<'_>,
-        waiting: &mut Option<Message>,
-    ) -> Poll<anyhow::Result<()>> {
+    fn poll_send(&mut self, cx: &mut Context<'_>, waiting: &mut Option<Message>) -> Poll<anyhow::Result<()>> {
         const BROKEN: &str = "the daemon broke the connection";
         while let Poll::Ready(came) = self.socket.poll_next_unpin(cx) {
             match came {
@@ -127,9 +108,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
         if let Some(message) = waiting.take() {
             self.socket.start_send_unpin(message).context(BROKEN)?;
         }
-        self.socket
-            .poll_flush_unpin(cx)
-            .map_err(|error| anyhow::Error::new(error).context(BROKEN))
+        self.socket.poll_flush_unpin(cx).map_err(|error| anyhow::Error::new(error).context(BROKEN))
     }
 
     /// Returns the next message; `None` if the servant has ended.
@@ -180,10 +159,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
 fn close_outcome(close: Option<CloseFrame>) -> anyhow::Result<()> {
     match close {
         Some(close) if u16::from(close.code) == 1012 => Ok(()),
-        Some(close) => Err(anyhow!(
-            "the daemon closed the connection: {}",
-            close.reason
-        )),
+        Some(close) => Err(anyhow!("the daemon closed the connection: {}", close.reason)),
         None => bail!("the daemon broke the connection"),
     }
 }
@@ -232,10 +208,7 @@ mod tests {
         let socket = WebSocketStream::from_raw_socket(ours, Role::Client, None).await;
         let mut inside = FoxgloveSession::from_socket(socket);
         let mut daemon = WebSocketStream::from_raw_socket(theirs, Role::Server, None).await;
-        let over = CloseFrame {
-            code: 1012.into(),
-            reason: "it was ended".into(),
-        };
+        let over = CloseFrame { code: 1012.into(), reason: "it was ended".into() };
         daemon.send(Message::Close(Some(over))).await.expect("sent");
         let request = Message::Binary(vec![9; 1 << 20].into());
         let told = inside.send(request).await.expect_err("ended");

@@ -46,10 +46,7 @@ pub struct CapFlags {
 
 impl From<CapFlags> for Caps {
     fn from(flags: CapFlags) -> Caps {
-        Caps {
-            cpus: flags.max_cpus,
-            memory: flags.max_memory,
-        }
+        Caps { cpus: flags.max_cpus, memory: flags.max_memory }
     }
 }
 

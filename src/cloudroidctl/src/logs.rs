@@ -24,27 +24,15 @@ impl LogsArgs {
     /// Sends the request and prints the lines.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let servant = inside::resolve_servant(client, &self.servant).await?;
-        let tail = self
-            .tail
-            .map(|lines| format!("&tail={lines}"))
-            .unwrap_or_default();
-        let path = format!(
-            "/api/v1/servants/{}/logs?follow={}{tail}",
-            percent_encode(&servant),
-            self.follow
-        );
+        let tail = self.tail.map(|lines| format!("&tail={lines}")).unwrap_or_default();
+        let path = format!("/api/v1/servants/{}/logs?follow={}{tail}", percent_encode(&servant), self.follow);
         let mut lines = client.get_lines::<LogLine>(&path).await?;
         while let Some(entry) = lines.next().await {
             let entry = entry?;
             match format {
                 OutputFormat::Json => output::json_line(&entry)?,
                 OutputFormat::Table => {
-                    output::line(&format!(
-                        "{} {} | {}",
-                        output::clock(entry.time),
-                        entry.node,
-                        entry.line
-                    ))?;
+                    output::line(&format!("{} {} | {}", output::clock(entry.time), entry.node, entry.line))?;
                 }
             }
         }

@@ -74,13 +74,7 @@ struct CtlArguments {
     #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
     server: Option<String>,
     /// Bearer token; required over TCP if the daemon has tokens configured.
-    #[arg(
-        long,
-        global = true,
-        env = "CLOUDROID_TOKEN",
-        value_name = "TOKEN",
-        hide_env_values = true
-    )]
+    #[arg(long, global = true, env = "CLOUDROID_TOKEN", value_name = "TOKEN", hide_env_values = true)]
     token: Option<String>,
     /// Output format.
     #[arg(long, global = true, value_enum, default_value_t = OutputFormat::Table)]
@@ -133,10 +127,7 @@ enum CtlCommand {
 
 fn main() -> ExitCode {
     let arguments = CtlArguments::parse();
-    let runtime = match tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-    {
+    let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => {
             eprintln!("error: cannot start: {error}");
@@ -238,32 +229,17 @@ mod tests {
     fn every_verb_explains_itself() {
         use clap::CommandFactory;
         for verb in CtlArguments::command().get_subcommands() {
-            assert!(
-                verb.get_about().is_some(),
-                "{} has no help",
-                verb.get_name()
-            );
+            assert!(verb.get_about().is_some(), "{} has no help", verb.get_name());
             for argument in verb.get_arguments() {
-                assert!(
-                    argument.get_help().is_some(),
-                    "{} {} has no help",
-                    verb.get_name(),
-                    argument.get_id()
-                );
+                assert!(argument.get_help().is_some(), "{} {} has no help", verb.get_name(), argument.get_id());
             }
         }
     }
 
     #[test]
     fn the_format_may_stand_before_or_after_the_verb() {
-        for line in [
-            ["cloudroidctl", "--format", "json", "status"],
-            ["cloudroidctl", "status", "--format", "json"],
-        ] {
-            assert_eq!(
-                CtlArguments::try_parse_from(line).expect("valid").format,
-                OutputFormat::Json
-            );
+        for line in [["cloudroidctl", "--format", "json", "status"], ["cloudroidctl", "status", "--format", "json"]] {
+            assert_eq!(CtlArguments::try_parse_from(line).expect("valid").format, OutputFormat::Json);
         }
     }
 }

@@ -42,12 +42,7 @@ impl CompletionsArgs {
     /// Prints the script.
     pub fn run<A: CommandFactory>(self) -> anyhow::Result<()> {
         let mut script = Vec::new();
-        clap_complete::generate(
-            Shell::from(self.shell),
-            &mut A::command(),
-            "cloudroidctl",
-            &mut script,
-        );
+        clap_complete::generate(Shell::from(self.shell), &mut A::command(), "cloudroidctl", &mut script);
         output::raw(&script)
     }
 }
@@ -78,7 +73,5 @@ impl ManArgs {
 
 /// Removes the `help` subcommands, which need no manual page of their own.
 fn remove_help_subcommands(command: Command) -> Command {
-    command
-        .disable_help_subcommand(true)
-        .mut_subcommands(remove_help_subcommands)
+    command.disable_help_subcommand(true).mut_subcommands(remove_help_subcommands)
 }

@@ -19,9 +19,7 @@ pub enum OutputFormat {
 
 /// Prints a value as indented JSON.
 pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
-    write_line(&terminal::escape_json(&serde_json::to_string_pretty(
-        value,
-    )?))
+    write_line(&terminal::escape_json(&serde_json::to_string_pretty(value)?))
 }
 
 /// Prints a value as one line of JSON.
@@ -62,9 +60,7 @@ fn write_line(text: &str) -> anyhow::Result<()> {
 
 /// Returns whether printing failed because the reader (`head`, for example) has closed the pipe.
 pub fn is_closed_pipe(error: &anyhow::Error) -> bool {
-    error
-        .downcast_ref::<std::io::Error>()
-        .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+    error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
 /// A table with aligned columns.
@@ -76,14 +72,7 @@ pub struct Table {
 impl Table {
     /// Creates a table with these headings.
     pub fn new(headings: &[&str]) -> Table {
-        Table {
-            rows: vec![
-                headings
-                    .iter()
-                    .map(|heading| (*heading).to_owned())
-                    .collect(),
-            ],
-        }
+        Table { rows: vec![headings.iter().map(|heading| (*heading).to_owned()).collect()] }
     }
 
     /// Adds a row.
@@ -109,26 +98,13 @@ impl Table {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let widths: Vec<usize> = (0..columns)
             .map(|column| {
-                self.rows
-                    .iter()
-                    .filter_map(|row| row.get(column))
-                    .map(|cell| cell.chars().count())
-                    .max()
-                    .unwrap_or(0)
+                self.rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max().unwrap_or(0)
             })
             .collect();
-        let pad = |cell: &String, width: &usize| {
-            format!("{cell}{}", " ".repeat(width - cell.chars().count()))
-        };
+        let pad = |cell: &String, width: &usize| format!("{cell}{}", " ".repeat(width - cell.chars().count()));
         self.rows
             .iter()
-            .map(|row| {
-                row.iter()
-                    .zip(&widths)
-                    .map(|(cell, width)| pad(cell, width))
-                    .collect::<Vec<_>>()
-                    .join("  ")
-            })
+            .map(|row| row.iter().zip(&widths).map(|(cell, width)| pad(cell, width)).collect::<Vec<_>>().join("  "))
             .map(|text| text.trim_end().to_owned())
             .collect()
     }
@@ -136,9 +112,7 @@ impl Table {
 
 /// Returns the clock of this machine.
 fn now() -> Millis {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_millis() as u64)
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
 /// Returns the time since `then`, rounded down to its largest unit.
@@ -184,13 +158,7 @@ pub fn is_past(time: Millis) -> bool {
 /// Formats the time of day, UTC.
 pub fn clock(time: Millis) -> String {
     let seconds = time / 1000 % 86_400;
-    format!(
-        "{:02}:{:02}:{:02}.{:03}",
-        seconds / 3600,
-        seconds / 60 % 60,
-        seconds % 60,
-        time % 1000
-    )
+    format!("{:02}:{:02}:{:02}.{:03}", seconds / 3600, seconds / 60 % 60, seconds % 60, time % 1000)
 }
 
 /// Formats the limits that are set, for a table cell.
@@ -209,11 +177,7 @@ pub fn limits(limits: &Limits) -> String {
             name => Some(format!("{name} {value}")),
         })
         .collect();
-    if set.is_empty() {
-        "none".to_owned()
-    } else {
-        set.join(", ")
-    }
+    if set.is_empty() { "none".to_owned() } else { set.join(", ") }
 }
 
 /// Formats the terms that a servant's robot stated and the rows that apply, for a table cell.
@@ -246,10 +210,7 @@ mod tests {
 
     #[test]
     fn spans_are_rounded_down() {
-        let spans: Vec<String> = [0, 119_999, 120_000, 7_200_000, 172_800_000]
-            .into_iter()
-            .map(span)
-            .collect();
+        let spans: Vec<String> = [0, 119_999, 120_000, 7_200_000, 172_800_000].into_iter().map(span).collect();
         assert_eq!(spans, ["0 s", "119 s", "2 min", "2 h", "2 d"]);
         assert_eq!(clock(86_400_000 + 3_723_004), "01:02:03.004");
     }

@@ -65,16 +65,10 @@ impl PairArgs {
             let left: Vec<Pairing> = client.delete(&path).await?;
             return match format {
                 OutputFormat::Json => output::json(&left),
-                OutputFormat::Table => {
-                    output::line(&format!("the pairing line for {robot} is no longer valid"))
-                }
+                OutputFormat::Table => output::line(&format!("the pairing line for {robot} is no longer valid")),
             };
         }
-        let services = if self.services.is_empty() {
-            vec!["*".to_owned()]
-        } else {
-            self.services
-        };
+        let services = if self.services.is_empty() { vec!["*".to_owned()] } else { self.services };
         let new = NewPairing {
             services: parse_patterns(&services)?,
             classes: parse_patterns(&self.classes)?,
@@ -130,11 +124,7 @@ fn print_pairing(made: &PairingMade, format: OutputFormat, qr: bool) -> anyhow::
 fn render_qr(line: &str) -> anyhow::Result<String> {
     let code = QrCode::with_error_correction_level(line, EcLevel::L)
         .context("the line is too long for a QR code; leave it out with --no-qr")?;
-    let picture = code
-        .render::<Dense1x2>()
-        .dark_color(Dense1x2::Dark)
-        .light_color(Dense1x2::Light)
-        .build();
+    let picture = code.render::<Dense1x2>().dark_color(Dense1x2::Dark).light_color(Dense1x2::Light).build();
     if picture.is_empty() {
         bail!("the QR code is empty; leave it out with --no-qr");
     }
@@ -166,10 +156,7 @@ fn list(pairings: &[Pairing], format: OutputFormat) -> anyhow::Result<()> {
 fn state(pairing: &Pairing) -> String {
     match (pairing.state, pairing.expires) {
         (PairingState::Waiting, Some(end)) => {
-            format!(
-                "line not redeemed yet, expires in {}",
-                output::time_until(end)
-            )
+            format!("line not redeemed yet, expires in {}", output::time_until(end))
         }
         (PairingState::Waiting, None) => "line not redeemed yet".into(),
         (PairingState::Paired, _) if pairing.own_certificate => "paired, own certificate".into(),
@@ -198,10 +185,7 @@ mod tests {
         );
         let drawn = render_qr(&line).expect("drawn");
         let widest = drawn.lines().map(|line| line.chars().count()).max();
-        assert!(
-            widest.is_some_and(|width| (40..80).contains(&width)),
-            "{widest:?}"
-        );
+        assert!(widest.is_some_and(|width| (40..80).contains(&width)), "{widest:?}");
         render_qr(&"x".repeat(4000)).expect_err("too long");
     }
 }

@@ -53,11 +53,7 @@ impl PolicyArgs {
                 let new = NewRule {
                     who: verb.who.parse()?,
                     services: verb.service.parse()?,
-                    allow: verb
-                        .grants
-                        .iter()
-                        .map(|text| text.parse())
-                        .collect::<Result<_, _>>()?,
+                    allow: verb.grants.iter().map(|text| text.parse()).collect::<Result<_, _>>()?,
                 };
                 client.post("/api/v1/policy", &new).await?
             }
@@ -84,17 +80,11 @@ fn list(rules: &[Rule], format: OutputFormat) -> anyhow::Result<()> {
             rule.id.to_string(),
             rule.who.to_string(),
             rule.services.to_string(),
-            if grants.is_empty() {
-                "nothing".into()
-            } else {
-                grants.join(" ")
-            },
+            if grants.is_empty() { "nothing".into() } else { grants.join(" ") },
         ]);
     }
     if table.is_empty() {
-        output::line(
-            "no rules: robots and deployers have no access; grant it with: cloudroidctl policy allow",
-        )
+        output::line("no rules: robots and deployers have no access; grant it with: cloudroidctl policy allow")
     } else {
         table.print()
     }

@@ -40,9 +40,7 @@ impl TopicsArgs {
                     topic.of,
                     format!("{:.1} Hz", topic.rate),
                     format!("{:.1} kB/s", topic.bandwidth / 1e3),
-                    topic
-                        .latency
-                        .map_or_else(|| "-".to_owned(), |age| format!("{:.1} ms", age * 1e3)),
+                    topic.latency.map_or_else(|| "-".to_owned(), |age| format!("{:.1} ms", age * 1e3)),
                 ]);
             }
             table.print()?;

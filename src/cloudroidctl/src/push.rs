@@ -110,8 +110,7 @@ pub struct PushArgs {
 fn parameter(text: &str) -> anyhow::Result<(String, serde_json::Value)> {
     let (key, value) = text.split_once('=').context("write K=V")?;
     ensure!(!key.is_empty(), "write K=V");
-    let value =
-        serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
+    let value = serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
     Ok((key.to_owned(), value))
 }
 
@@ -129,10 +128,7 @@ fn request(text: &str) -> Result<String, ParsePairError> {
 fn volume(text: &str) -> anyhow::Result<Volume> {
     match text.split_once(':') {
         Some((source, target)) if source.starts_with('/') && target.starts_with('/') => {
-            Ok(Volume {
-                source: source.to_owned(),
-                target: target.to_owned(),
-            })
+            Ok(Volume { source: source.to_owned(), target: target.to_owned() })
         }
         _ => bail!("write SOURCE:TARGET, both absolute"),
     }
@@ -140,28 +136,15 @@ fn volume(text: &str) -> anyhow::Result<Volume> {
 
 fn mapping(text: &str) -> anyhow::Result<(String, String)> {
     match text.split_once('=') {
-        Some((key, package)) if !key.is_empty() && !package.is_empty() => {
-            Ok((key.to_owned(), package.to_owned()))
-        }
+        Some((key, package)) if !key.is_empty() && !package.is_empty() => Ok((key.to_owned(), package.to_owned())),
         _ => bail!("write KEY=DEB"),
     }
 }
 
 impl PushArgs {
     /// Creates the push of a file that export has written.
-    pub fn from_export(
-        file: PathBuf,
-        name: Option<String>,
-        rollout: TermFlags,
-        wait: WaitFlag,
-    ) -> PushArgs {
-        PushArgs {
-            path: Some(file),
-            name,
-            rollout,
-            wait,
-            ..PushArgs::default()
-        }
+    pub fn from_export(file: PathBuf, name: Option<String>, rollout: TermFlags, wait: WaitFlag) -> PushArgs {
+        PushArgs { path: Some(file), name, rollout, wait, ..PushArgs::default() }
     }
 
     /// Sends the package, prints the progress, and finally the service's address and interface.
@@ -171,9 +154,7 @@ impl PushArgs {
         let service = self.publish(client, format).await?;
         let name = &service.summary.name;
         let newest = service.revisions.iter().map(|one| one.number).max();
-        if let Some(newest) =
-            newest.filter(|newest| rolls_out && *newest != service.summary.revision)
-        {
+        if let Some(newest) = newest.filter(|newest| rolls_out && *newest != service.summary.revision) {
             output::eprint_line(&format!(
                 "revision {newest} is on trial beside the current one, {}, which is described below",
                 service.summary.revision
@@ -189,48 +170,27 @@ impl PushArgs {
         let rollout = if wait.is_set() {
             rollout::wait_until_over(client, name, wait).await?
         } else {
-            client
-                .get(&format!(
-                    "/api/v1/services/{}/rollout",
-                    percent_encode(name)
-                ))
-                .await?
+            client.get(&format!("/api/v1/services/{}/rollout", percent_encode(name))).await?
         };
         if format == OutputFormat::Table {
             output::line("")?;
             rollout::show(&rollout)?;
         }
-        if wait.is_set() {
-            rollout::require_promoted(&rollout)
-        } else {
-            Ok(())
-        }
+        if wait.is_set() { rollout::require_promoted(&rollout) } else { Ok(()) }
     }
 
     /// Publishes the package under another name, without printing the service's address and interface.
-    pub async fn publish_as(
-        mut self,
-        name: &str,
-        client: &DaemonClient,
-        format: OutputFormat,
-    ) -> anyhow::Result<()> {
+    pub async fn publish_as(mut self, name: &str, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         self.name = Some(name.to_owned());
         self.publish(client, format).await.map(|_| ())
     }
 
-    async fn publish(
-        self,
-        client: &DaemonClient,
-        format: OutputFormat,
-    ) -> anyhow::Result<ServiceDetail> {
+    async fn publish(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<ServiceDetail> {
         let options = self.options()?;
         let query = serde_json::to_string(&options)?;
         let uri = format!("/api/v1/push?options={}", percent_encode(&query));
         if uri.len() > LONGEST_QUERY {
-            bail!(
-                "the options are too long, {} bytes; shorten --interface or the parameters",
-                uri.len()
-            );
+            bail!("the options are too long, {} bytes; shorten --interface or the parameters", uri.len());
         }
         let publishing = AtomicBool::new(false);
         tokio::select! {
@@ -240,13 +200,13 @@ impl PushArgs {
     }
 
     fn options(&self) -> anyhow::Result<PushOptions> {
-        let interface =
-            match &self.interface {
-                Some(path) => Some(std::fs::read_to_string(path).with_context(|| {
-                    format!("cannot read the interface file {}", path.display())
-                })?),
-                None => None,
-            };
+        let interface = match &self.interface {
+            Some(path) => Some(
+                std::fs::read_to_string(path)
+                    .with_context(|| format!("cannot read the interface file {}", path.display()))?,
+            ),
+            None => None,
+        };
         let source = match (&self.apt, &self.path) {
             (Some(package), _) => format!("--apt {package}"),
             (None, Some(path)) => path.display().to_string(),
@@ -267,11 +227,7 @@ impl PushArgs {
             with: self.with.clone(),
             limits: self.limits.into(),
             caps: self.caps.into(),
-            sla: Sla {
-                rrt: self.rrt,
-                max_rrt: self.max_rrt,
-                ..Sla::default()
-            },
+            sla: Sla { rrt: self.rrt, max_rrt: self.max_rrt, ..Sla::default() },
             grants: Grants {
                 devices: self.devices.clone(),
                 volumes: self.volumes.clone(),
@@ -323,9 +279,7 @@ async fn send(
         progress.show(&event)?;
         match event {
             // Title of the daemon's last step.
-            PushEvent::Step { title } if title == api::push::PUBLISHING => {
-                publishing.store(true, Ordering::Relaxed)
-            }
+            PushEvent::Step { title } if title == api::push::PUBLISHING => publishing.store(true, Ordering::Relaxed),
             PushEvent::Done { service, .. } => return Ok(*service),
             PushEvent::Error { problem } => {
                 return Err(packing_error(packing).unwrap_or_else(|| problem.into()));
@@ -353,8 +307,7 @@ mod tests {
     }
 
     fn parse(line: &str) -> Result<PushArgs, clap::Error> {
-        Line::try_parse_from(std::iter::once("push").chain(line.split_whitespace()))
-            .map(|line| line.push)
+        Line::try_parse_from(std::iter::once("push").chain(line.split_whitespace())).map(|line| line.push)
     }
 
     #[test]
@@ -392,21 +345,12 @@ mod tests {
             let options = options.expect(line);
             assert_eq!((options.stateful, options.stateless), said, "{line}");
         }
-        assert_eq!(
-            parse("./pkg --stateful=maybe").expect_err("no").exit_code(),
-            2
-        );
+        assert_eq!(parse("./pkg --stateful=maybe").expect_err("no").exit_code(), 2);
     }
 
     #[test]
     fn a_node_takes_arguments() {
-        let line = [
-            "push",
-            "--apt",
-            "topic_tools",
-            "--node",
-            "topic_tools/relay /in /out",
-        ];
+        let line = ["push", "--apt", "topic_tools", "--node", "topic_tools/relay /in /out"];
         let push = Line::try_parse_from(line).expect("valid").push;
         let options = push.options().expect("no file is read");
         assert_eq!(options.nodes, ["topic_tools/relay /in /out"]);
@@ -414,8 +358,7 @@ mod tests {
 
     #[test]
     fn a_launch_file_takes_arguments() {
-        let push =
-            parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:=").expect("valid");
+        let push = parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:=").expect("valid");
         let options = push.options().expect("no file is read");
         assert_eq!(options.args["word"], "bonjour");
         assert_eq!(options.args["empty"], "");
@@ -453,33 +396,22 @@ mod tests {
         // The service's own page shows the progress of a rollout while it is open.
         let needless = ["--wait"];
         let command = Line::command();
-        let flags: Vec<String> = command
-            .get_arguments()
-            .filter_map(|argument| Some(format!("--{}", argument.get_long()?)))
-            .collect();
+        let flags: Vec<String> =
+            command.get_arguments().filter_map(|argument| Some(format!("--{}", argument.get_long()?))).collect();
         for flag in &flags {
             let written = fields.iter().any(|(named, _)| named == flag);
             let is_chosen = chosen.contains(&&**flag) && FORM.contains(&**flag);
-            assert!(
-                written || is_chosen || needless.contains(&&**flag),
-                "the page does not ask for {flag}"
-            );
+            assert!(written || is_chosen || needless.contains(&&**flag), "the page does not ask for {flag}");
         }
         let written = fields.iter().map(|(flag, _)| *flag);
         for flag in written.chain(chosen).chain(needless) {
-            assert!(
-                flags.iter().any(|known| known == flag),
-                "there is no {flag}"
-            );
+            assert!(flags.iter().any(|known| known == flag), "there is no {flag}");
         }
     }
 
     #[test]
     fn the_page_names_the_defaults_that_hold() {
-        let (shared, terms) = (
-            api::Shared::default(),
-            api::rollout::RolloutTerms::default(),
-        );
+        let (shared, terms) = (api::Shared::default(), api::rollout::RolloutTerms::default());
         let hold = [
             ("--min", f64::from(shared.min)),
             ("--max", f64::from(shared.max)),

@@ -45,10 +45,7 @@ impl RecordArgs {
         let inside = FoxgloveSession::attach(client, &servant, DEPTH).await?;
         let writer = RecordingWriter::create(&self.output, inside.format)
             .context("-o must name a new file in an existing directory")?;
-        output::eprint_line(&format!(
-            "recording {servant} to {}; stop with Ctrl-C",
-            self.output.display()
-        ));
+        output::eprint_line(&format!("recording {servant} to {}; stop with Ctrl-C", self.output.display()));
         let mut recorder = Recorder {
             inside,
             writer,
@@ -150,9 +147,7 @@ impl Recorder {
         let Ok(definition) = channel.decode_schema() else {
             bail!("the daemon sent no message definition of {}", channel.topic);
         };
-        let written = self
-            .writer
-            .add_channel(&channel.topic, &channel.schema_name, &definition)?;
+        let written = self.writer.add_channel(&channel.topic, &channel.schema_name, &definition)?;
         self.last += 1;
         self.channels.insert(self.last, written);
         self.subscribed.insert(channel.id, self.last);
@@ -170,12 +165,7 @@ fn print_summary(summary: &Summary, time: Duration, format: OutputFormat) -> any
     }
     let mut table = output::Table::new(&["TOPIC", "TYPE", "MESSAGES", "BYTES"]);
     for topic in &summary.topics {
-        table.row([
-            topic.topic.clone(),
-            topic.of.clone(),
-            topic.messages.to_string(),
-            topic.bytes.to_string(),
-        ]);
+        table.row([topic.topic.clone(), topic.of.clone(), topic.messages.to_string(), topic.bytes.to_string()]);
     }
     table.print()?;
     output::line(&format!(

@@ -90,10 +90,8 @@ impl RecordingsArgs {
 impl ListRecordings {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let asked = [("service", self.service), ("robot", self.robot)];
-        let asked: Vec<String> = asked
-            .into_iter()
-            .filter_map(|(name, value)| Some(format!("{name}={}", percent_encode(&value?))))
-            .collect();
+        let asked: Vec<String> =
+            asked.into_iter().filter_map(|(name, value)| Some(format!("{name}={}", percent_encode(&value?)))).collect();
         let path = format!("/api/v1/recordings?{}", asked.join("&"));
         let all: Vec<Recording> = client.get(&path).await?;
         if all.is_empty() && format == OutputFormat::Table {
@@ -111,9 +109,7 @@ impl ListRecordings {
 
 impl GetRecording {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let target = self
-            .output
-            .unwrap_or_else(|| PathBuf::from(format!("recording-{}.mcap", self.number)));
+        let target = self.output.unwrap_or_else(|| PathBuf::from(format!("recording-{}.mcap", self.number)));
         let path = format!("/api/v1/recordings/{}", self.number);
         let answer = client.send(Method::GET, &path, empty_body()).await?;
         let half = AtomicFile::create_beside(&target)?;
@@ -123,18 +119,12 @@ impl GetRecording {
             let part = part.context("the daemon's response was cut off")?;
             let part = part.into_data().unwrap_or_default();
             bytes += part.len() as u64;
-            (&half.file)
-                .write_all(&part)
-                .with_context(|| half.error_context())?;
+            (&half.file).write_all(&part).with_context(|| half.error_context())?;
         }
         half.persist()?;
         match format {
-            OutputFormat::Json => {
-                output::json(&serde_json::json!({ "path": target, "bytes": bytes }))
-            }
-            OutputFormat::Table => {
-                output::line(&format!("{} ({})", target.display(), api::Size(bytes)))
-            }
+            OutputFormat::Json => output::json(&serde_json::json!({ "path": target, "bytes": bytes })),
+            OutputFormat::Table => output::line(&format!("{} ({})", target.display(), api::Size(bytes))),
         }
     }
 }
@@ -146,9 +136,7 @@ fn list(all: &[Recording], format: OutputFormat) -> anyhow::Result<()> {
     if all.is_empty() {
         return Ok(());
     }
-    let mut table = Table::new(&[
-        "NUMBER", "TIME", "SERVICE", "ROBOT", "SECONDS", "MESSAGES", "SIZE", "WHY",
-    ]);
+    let mut table = Table::new(&["NUMBER", "TIME", "SERVICE", "ROBOT", "SECONDS", "MESSAGES", "SIZE", "WHY"]);
     for one in all {
         table.row([
             one.number.to_string(),

@@ -52,11 +52,8 @@ impl ReplayArgs {
     /// Replays the file and prints the number of messages by topic.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         // Report an unreadable file before anything is requested.
-        if let Err(error) =
-            RecordingReader::open(&self.file).and_then(|mut file| file.next_message())
-        {
-            let hint =
-                "; create one with cloudroidctl record, or convert a bag with `mcap convert`";
+        if let Err(error) = RecordingReader::open(&self.file).and_then(|mut file| file.next_message()) {
+            let hint = "; create one with cloudroidctl record, or convert a bag with `mcap convert`";
             match error {
                 recording::Error::NoRecording { .. } => bail!("{error}{hint}"),
                 error => return Err(error.into()),
@@ -82,13 +79,7 @@ impl ReplayArgs {
             played = played => played?,
             _ = tokio::signal::ctrl_c() => {}
         }
-        let Player {
-            inside,
-            published,
-            left_out,
-            mut complaints,
-            ..
-        } = player;
+        let Player { inside, published, left_out, mut complaints, .. } = player;
         for message in inside.close().await {
             complaints += relay_status(&message);
         }
@@ -96,10 +87,7 @@ impl ReplayArgs {
             output::eprint_line(&format!("{topic} was skipped: {why}"));
         }
         if published.is_empty() {
-            bail!(
-                "nothing of {} was published: it has no messages on the selected topics",
-                self.file.display()
-            );
+            bail!("nothing of {} was published: it has no messages on the selected topics", self.file.display());
         }
         match format {
             OutputFormat::Json => output::json(&published)?,
@@ -153,9 +141,7 @@ impl Player {
             if !replay.topics.accepts(&played.topic) {
                 continue;
             }
-            let since = played
-                .time
-                .saturating_sub(*first.get_or_insert(played.time));
+            let since = played.time.saturating_sub(*first.get_or_insert(played.time));
             let due = begun + Duration::from_nanos(since).div_f64(replay.rate);
             self.relay_until(due).await?;
             self.publish(&played).await?;

@@ -15,12 +15,7 @@ pub struct RmArgs {
 impl RmArgs {
     /// Sends the request and prints the result.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let ended: Stopped = client
-            .delete(&format!(
-                "/api/v1/services/{}",
-                percent_encode(&self.service)
-            ))
-            .await?;
+        let ended: Stopped = client.delete(&format!("/api/v1/services/{}", percent_encode(&self.service))).await?;
         match format {
             OutputFormat::Json => output::json(&ended),
             OutputFormat::Table => output::line(&match ended.stopped.as_slice() {

@@ -17,26 +17,13 @@ pub struct RollbackArgs {
 impl RollbackArgs {
     /// Sends the request and prints the result.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let path = format!(
-            "/api/v1/services/{}/rollback",
-            percent_encode(&self.service)
-        );
-        let service: ServiceDetail = client
-            .post(
-                &path,
-                &api::Rollback {
-                    revision: self.revision,
-                },
-            )
-            .await?;
+        let path = format!("/api/v1/services/{}/rollback", percent_encode(&self.service));
+        let service: ServiceDetail = client.post(&path, &api::Rollback { revision: self.revision }).await?;
         match format {
             OutputFormat::Json => output::json(&service),
             OutputFormat::Table => {
                 let summary = &service.summary;
-                output::line(&format!(
-                    "{} is back at revision {}",
-                    summary.name, summary.revision
-                ))
+                output::line(&format!("{} is back at revision {}", summary.name, summary.revision))
             }
         }
     }

@@ -78,9 +78,7 @@ impl TermFlags {
 
 /// Parses `500ms`, `30s`, `5m`, `1h`, or a number of seconds.
 fn time(text: &str) -> anyhow::Result<Duration> {
-    let end = text
-        .find(|c: char| !c.is_ascii_digit() && c != '.')
-        .unwrap_or(text.len());
+    let end = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let (number, unit) = text.split_at(end);
     let factor = match unit {
         "ms" => 0.001,
@@ -104,10 +102,9 @@ impl RolloutArgs {
             RolloutCommand::Status => None,
             RolloutCommand::Promote => Some(RolloutOrder::Promote),
             RolloutCommand::Abort => Some(RolloutOrder::Abort),
-            RolloutCommand::Start { revision, terms } => Some(RolloutOrder::Start {
-                revision,
-                terms: terms.terms().unwrap_or_default(),
-            }),
+            RolloutCommand::Start { revision, terms } => {
+                Some(RolloutOrder::Start { revision, terms: terms.terms().unwrap_or_default() })
+            }
         };
         let rollout: Shown = match order {
             None => client.get(&path).await?,
@@ -129,11 +126,7 @@ fn print_rollout(rollout: &Shown, format: OutputFormat) -> anyhow::Result<()> {
 }
 
 /// Returns a service's last rollout when it has ended.
-pub async fn wait_until_over(
-    client: &DaemonClient,
-    service: &str,
-    wait: WaitFlag,
-) -> anyhow::Result<Shown> {
+pub async fn wait_until_over(client: &DaemonClient, service: &str, wait: WaitFlag) -> anyhow::Result<Shown> {
     let path = &format!("/api/v1/services/{}/rollout", percent_encode(service));
     let look = || async move {
         let rollout: Shown = client.get(path).await?;
@@ -147,15 +140,10 @@ pub async fn wait_until_over(
 
 /// Fails unless the candidate has become the current revision.
 pub fn require_promoted(rollout: &Shown) -> anyhow::Result<()> {
-    let Shown {
-        service, candidate, ..
-    } = rollout;
+    let Shown { service, candidate, .. } = rollout;
     match rollout.state {
         RolloutState::Promoted => Ok(()),
-        state => bail!(
-            "revision {candidate} of {service} was not promoted: {state}, {}",
-            rollout.reason
-        ),
+        state => bail!("revision {candidate} of {service} was not promoted: {state}, {}", rollout.reason),
     }
 }
 
@@ -176,18 +164,12 @@ fn next_in_words(rollout: &Shown) -> Vec<String> {
                 time(after),
                 terms.samples
             ),
-            (_, None) => format!(
-                "promote it with: cloudroidctl rollout {} promote",
-                rollout.service
-            ),
+            (_, None) => format!("promote it with: cloudroidctl rollout {} promote", rollout.service),
         });
     }
     let is_to_end = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
     if let Some(deadline) = terms.deadline.filter(|_| is_to_end) {
-        words.push(format!(
-            "servants of other revisions end {} after the promotion",
-            time(deadline)
-        ));
+        words.push(format!("servants of other revisions end {} after the promotion", time(deadline)));
     }
     words
 }
@@ -217,8 +199,7 @@ pub fn show(rollout: &Shown) -> anyhow::Result<()> {
             0 => all.to_string(),
             _ => format!("{all}, {failed} of them failed"),
         };
-        let time =
-            |millis: Option<f64>| millis.map_or_else(String::new, |ms| format!("{ms:.1} ms"));
+        let time = |millis: Option<f64>| millis.map_or_else(String::new, |ms| format!("{ms:.1} ms"));
         table.row([
             revision.to_string(),
             failed(arm.servants, arm.servants_failed),
@@ -250,10 +231,8 @@ mod tests {
 
     #[test]
     fn terms_are_read_as_they_are_typed() {
-        let line =
-            "s start 3 --canary 10% --bound 0.2 --samples 5 --deadline 10m --promote-after 500ms";
-        let Some(RolloutCommand::Start { revision, terms }) = parse(line).expect("valid").order
-        else {
+        let line = "s start 3 --canary 10% --bound 0.2 --samples 5 --deadline 10m --promote-after 500ms";
+        let Some(RolloutCommand::Start { revision, terms }) = parse(line).expect("valid").order else {
             panic!("it begins");
         };
         let expected = RolloutTerms {

@@ -16,20 +16,14 @@ impl ServantsArgs {
     /// Sends the requests and prints the servants.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let mut servants: Vec<Servant> = client.get("/api/v1/servants").await?;
-        servants.retain(|servant| {
-            self.service
-                .as_ref()
-                .is_none_or(|service| *service == servant.service)
-        });
+        servants.retain(|servant| self.service.as_ref().is_none_or(|service| *service == servant.service));
         if format == OutputFormat::Json {
             return output::json(&servants);
         }
         let mut failing: Vec<BackOff> = client.get("/api/v1/back-offs").await?;
         failing.retain(|one| self.service.as_ref().is_none_or(|it| *it == one.service));
         if servants.is_empty() && failing.is_empty() {
-            return output::line(
-                "no servants (instances); one starts when a robot connects to a service",
-            );
+            return output::line("no servants (instances); one starts when a robot connects to a service");
         }
         let mut table = Table::new(&[
             "SERVANT",
@@ -55,18 +49,10 @@ impl ServantsArgs {
                 state(servant),
                 output::age(servant.created),
                 servant.connections.to_string(),
-                usage
-                    .map(|usage| Size(usage.memory).to_string())
-                    .unwrap_or_default(),
-                usage
-                    .map(|usage| format!("{:.1} s", usage.cpu_usec as f64 / 1e6))
-                    .unwrap_or_default(),
-                usage
-                    .map(|usage| format!("{:.1} s", usage.throttled_usec as f64 / 1e6))
-                    .unwrap_or_default(),
-                usage
-                    .map(|usage| usage.pressure.map_or("unknown".to_owned(), pressure))
-                    .unwrap_or_default(),
+                usage.map(|usage| Size(usage.memory).to_string()).unwrap_or_default(),
+                usage.map(|usage| format!("{:.1} s", usage.cpu_usec as f64 / 1e6)).unwrap_or_default(),
+                usage.map(|usage| format!("{:.1} s", usage.throttled_usec as f64 / 1e6)).unwrap_or_default(),
+                usage.map(|usage| usage.pressure.map_or("unknown".to_owned(), pressure)).unwrap_or_default(),
                 servant.response.map(response).unwrap_or_default(),
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
                 output::terms(servant),

@@ -17,9 +17,7 @@ impl ServicesArgs {
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.name {
             Some(name) => {
-                let service: ServiceDetail = client
-                    .get(&format!("/api/v1/services/{}", percent_encode(&name)))
-                    .await?;
+                let service: ServiceDetail = client.get(&format!("/api/v1/services/{}", percent_encode(&name))).await?;
                 match format {
                     OutputFormat::Json => output::json(&service),
                     OutputFormat::Table => show(&service),
@@ -38,18 +36,9 @@ impl ServicesArgs {
 
 fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
     if services.is_empty() {
-        return output::line(
-            "no services; publish one with: cloudroidctl push PATH, or push --apt NAME",
-        );
+        return output::line("no services; publish one with: cloudroidctl push PATH, or push --apt NAME");
     }
-    let mut table = Table::new(&[
-        "SERVICE",
-        "REVISION",
-        "PUBLISHED",
-        "SERVANTS",
-        "LIMITS",
-        "ADDRESS",
-    ]);
+    let mut table = Table::new(&["SERVICE", "REVISION", "PUBLISHED", "SERVANTS", "LIMITS", "ADDRESS"]);
     for service in services {
         table.row([
             service.name.clone(),
@@ -66,10 +55,7 @@ fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
 /// Prints the details of a service. Also used at the end of a push.
 pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     let summary = &service.summary;
-    output::line(&format!(
-        "{}, revision {}: {}",
-        summary.name, summary.revision, summary.address
-    ))?;
+    output::line(&format!("{}, revision {}: {}", summary.name, summary.revision, summary.address))?;
     let mut nodes = Table::new(&["NODE", "PROGRAM"]);
     for node in &service.nodes {
         nodes.row([node.name.clone(), node.argv.join(" ")]);
@@ -85,12 +71,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
         let marks = marks.map(|(_, mark)| (*mark).to_owned());
         let qos = topic.qos.map(|qos| qos.to_string());
         let marks: Vec<String> = marks.chain(qos).collect();
-        topics.row([
-            topic.name.clone(),
-            topic.type_name.clone(),
-            direction.to_owned(),
-            marks.join(", "),
-        ]);
+        topics.row([topic.name.clone(), topic.type_name.clone(), direction.to_owned(), marks.join(", ")]);
     }
     let mut services = Table::new(&["SERVICE", "TYPE"]);
     for entry in &service.interface.services {
@@ -102,12 +83,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     }
     let mut requests = Table::new(&["REQUEST", "ANSWERED ON", "BY", ""]);
     for entry in &service.interface.requests {
-        requests.row([
-            entry.input.clone(),
-            entry.outputs.join(", "),
-            entry.by.clone(),
-            entry.reason.clone(),
-        ]);
+        requests.row([entry.input.clone(), entry.outputs.join(", "), entry.by.clone(), entry.reason.clone()]);
     }
     let mut needs = Table::new(&["NEEDS", "CALLED BY"]);
     for entry in &service.interface.needs {
@@ -122,11 +98,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
         parameters.row([
             entry.name.clone(),
             entry.value.as_ref().map(shorten).unwrap_or_default(),
-            entry
-                .descriptor
-                .as_ref()
-                .map(ToString::to_string)
-                .unwrap_or_default(),
+            entry.descriptor.as_ref().map(ToString::to_string).unwrap_or_default(),
         ]);
     }
     let mut revisions = Table::new(&["REVISION", "PUBLISHED", "", "SOURCE", "IMAGE"]);
@@ -145,17 +117,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for group in &service.groups {
         output::line(&group_in_words(group))?;
     }
-    for table in [
-        &nodes,
-        &topics,
-        &requests,
-        &services,
-        &needs,
-        &actions,
-        &lifecycle,
-        &parameters,
-        &revisions,
-    ] {
+    for table in [&nodes, &topics, &requests, &services, &needs, &actions, &lifecycle, &parameters, &revisions] {
         if !table.is_empty() {
             output::line("")?;
             table.print()?;
@@ -175,21 +137,8 @@ fn shared_in_words(shared: &Shared) -> String {
 }
 
 fn group_in_words(group: &Group) -> String {
-    let Group {
-        revision,
-        robots,
-        answered,
-        failed,
-        asked_again,
-        wasted,
-        waiting,
-        ..
-    } = group;
-    let ready = group
-        .servants
-        .iter()
-        .filter(|one| one.ready && !one.retiring)
-        .count();
+    let Group { revision, robots, answered, failed, asked_again, wasted, waiting, .. } = group;
+    let ready = group.servants.iter().filter(|one| one.ready && !one.retiring).count();
     let under_way: usize = group.servants.iter().map(|one| one.under_way).sum();
     let mut words = format!(
         "revision {revision}: {robots} robots, {ready} of {} servants ready; {under_way} requests in progress, \
@@ -207,9 +156,5 @@ fn group_in_words(group: &Group) -> String {
 
 fn shorten(value: &serde_json::Value) -> String {
     let text = value.to_string();
-    if text.chars().count() <= 60 {
-        text
-    } else {
-        text.chars().take(57).chain("...".chars()).collect()
-    }
+    if text.chars().count() <= 60 { text } else { text.chars().take(57).chain("...".chars()).collect() }
 }

@@ -76,9 +76,7 @@ impl ShadowArgs {
 
     async fn compare(&self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<Found> {
         let path = format!("/api/v1/services/{}/shadow", percent_encode(&self.service));
-        let answer = client
-            .send(Method::POST, &path, json_body(&self.options())?)
-            .await?;
+        let answer = client.send(Method::POST, &path, json_body(&self.options())?).await?;
         let mut events = client::json_lines(answer);
         while let Some(event) = events.next().await {
             match event? {
@@ -124,29 +122,15 @@ fn summary(found: &Found) -> [String; 2] {
     [
         format!(
             "revision {} of {} beside revision {}, with {} requests of robot {} in {:.1} s ({})",
-            found.candidate,
-            found.service,
-            found.revision,
-            found.given,
-            found.robot,
-            found.seconds,
-            found.ended
+            found.candidate, found.service, found.revision, found.given, found.robot, found.seconds, found.ended
         ),
         format!("{}: {}", found.verdict, found.why),
     ]
 }
 
 fn table(rows: &[Compared]) -> Table {
-    let mut table = Table::new(&[
-        "KIND",
-        "NAME",
-        "EQUAL",
-        "DIFFERENT",
-        "MISSING",
-        "SURPLUS",
-        "P50/P95 MS",
-        "CANDIDATE",
-    ]);
+    let mut table =
+        Table::new(&["KIND", "NAME", "EQUAL", "DIFFERENT", "MISSING", "SURPLUS", "P50/P95 MS", "CANDIDATE"]);
     for row in rows {
         table.row([
             row.kind.to_string(),
@@ -163,9 +147,7 @@ fn table(rows: &[Compared]) -> Table {
 }
 
 fn times(times: Option<&TimeSpread>) -> String {
-    times.map_or("-".to_owned(), |times| {
-        format!("{:.1}/{:.1}", times.p50, times.p95)
-    })
+    times.map_or("-".to_owned(), |times| format!("{:.1}/{:.1}", times.p50, times.p95))
 }
 
 /// Returns the differing fields of a topic, service or action as lines.
@@ -221,15 +203,9 @@ mod tests {
         };
         let lines = fields(&found, &row);
         assert_eq!(lines.len(), 10);
-        assert_eq!(
-            lines[1],
-            "  f0, in 2 answers: 3 of revision 1, 103 of revision 2"
-        );
+        assert_eq!(lines[1], "  f0, in 2 answers: 3 of revision 1, 103 of revision 2");
         assert!(lines[9].contains("2 more"), "{lines:?}");
-        let whole = Compared {
-            fields: vec![field("")],
-            ..row
-        };
+        let whole = Compared { fields: vec![field("")], ..row };
         assert!(fields(&found, &whole)[1].starts_with("  the whole, in 2 answers"));
         assert!(summary(&found)[0].contains("with 2 requests of robot r1"));
         assert!(summary(&found)[1].starts_with("different: 2 of 2"));

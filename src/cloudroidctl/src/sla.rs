@@ -100,10 +100,7 @@ impl SlaArgs {
                 list(&verb.service, &rows, format)
             }
             SlaCommand::Set(verb) => {
-                let new = NewRows {
-                    rows: vec![verb.row()?],
-                    replace: false,
-                };
+                let new = NewRows { rows: vec![verb.row()?], replace: false };
                 let rows: Vec<Row> = client.put(&sla_path(&verb.service, ""), &new).await?;
                 list(&verb.service, &rows, format)
             }
@@ -143,14 +140,8 @@ fn sla_path(service: &str, rest: &str) -> String {
 
 impl SetRow {
     fn row(&self) -> anyhow::Result<Row> {
-        let given = [
-            (Measure::Rrt, self.rrt),
-            (Measure::Fps, self.fps),
-            (Measure::Age, self.age),
-        ];
-        let given = given
-            .into_iter()
-            .find_map(|(measure, value)| Some((measure, value?)));
+        let given = [(Measure::Rrt, self.rrt), (Measure::Fps, self.fps), (Measure::Age, self.age)];
+        let given = given.into_iter().find_map(|(measure, value)| Some((measure, value?)));
         let Some((measure, value)) = given else {
             bail!("no goal given; pass --rrt, --fps or --age");
         };
@@ -177,19 +168,11 @@ fn parse_spread(measure: Measure, text: &str) -> anyhow::Result<Spread> {
     let [p50, p95, requests] = parts[..] else {
         bail!("--spread {text:?} does not have three parts; write P50,P95,N such as 80ms,95ms,200");
     };
-    let read = |text| {
-        measure
-            .parse_value(text)
-            .map_err(|error| anyhow::anyhow!("--spread {error}"))
-    };
+    let read = |text| measure.parse_value(text).map_err(|error| anyhow::anyhow!("--spread {error}"));
     let Ok(requests) = requests.parse() else {
         bail!("--spread: {requests:?} is not a number of requests; write one such as 200");
     };
-    Ok(Spread {
-        p50: read(p50)?,
-        p95: read(p95)?,
-        requests,
-    })
+    Ok(Spread { p50: read(p50)?, p95: read(p95)?, requests })
 }
 
 fn aux_in_words(aux: &BTreeMap<String, String>) -> String {
@@ -243,9 +226,7 @@ fn list(service: &str, rows: &[Row], format: OutputFormat) -> anyhow::Result<()>
 
 /// Returns a sentence about what the robot gets.
 fn outcome(explained: &Explained) -> String {
-    let Explained {
-        service, stated, ..
-    } = explained;
+    let Explained { service, stated, .. } = explained;
     let robot = if stated.is_empty() {
         format!("a robot without requests to {service}")
     } else {
@@ -307,8 +288,7 @@ mod tests {
     }
 
     fn parse(line: &str) -> Result<SlaCommand, clap::Error> {
-        Line::try_parse_from(std::iter::once("sla").chain(line.split_whitespace()))
-            .map(|line| line.sla.verb)
+        Line::try_parse_from(std::iter::once("sla").chain(line.split_whitespace())).map(|line| line.sla.verb)
     }
 
     #[test]
@@ -322,19 +302,13 @@ mod tests {
         assert_eq!(row.aux["width"], "640");
         assert_eq!(row.limits.memory, Some(Size(512 << 20)));
         let spread = row.spread.expect("it was measured");
-        assert_eq!(
-            (spread.p50, spread.p95, spread.requests),
-            (0.08, 0.095, 200)
-        );
+        assert_eq!((spread.p50, spread.p95, spread.requests), (0.08, 0.095, 200));
     }
 
     #[test]
     fn what_a_robot_gets_is_said_whatever_it_states() {
         let stated = api::Stated::read([("rrt", "100ms")]).expect("valid");
-        let limits = |cpus| Limits {
-            cpus,
-            ..Limits::default()
-        };
+        let limits = |cpus| Limits { cpus, ..Limits::default() };
         let said = |stated, cpus: Option<f64>, refused: Option<&str>| {
             outcome(&Explained {
                 service: "s".into(),
@@ -346,18 +320,9 @@ mod tests {
         };
         let nothing = api::Stated::default();
         for (said, expected) in [
-            (
-                said(stated.clone(), Some(1.5), None),
-                "a robot that requests rrt=100ms of s gets 1.5 cpus",
-            ),
-            (
-                said(stated.clone(), None, Some("no row")),
-                "a robot that requests rrt=100ms of s is refused: no row",
-            ),
-            (
-                said(nothing, None, None),
-                "a robot without requests to s has nothing reserved; its servant gets",
-            ),
+            (said(stated.clone(), Some(1.5), None), "a robot that requests rrt=100ms of s gets 1.5 cpus"),
+            (said(stated.clone(), None, Some("no row")), "a robot that requests rrt=100ms of s is refused: no row"),
+            (said(nothing, None, None), "a robot without requests to s has nothing reserved; its servant gets"),
         ] {
             assert!(said.starts_with(expected), "{said}");
         }
@@ -376,10 +341,7 @@ mod tests {
             panic!("another verb");
         };
         let stated = explain.stated.to_stated().expect("it can be stated");
-        assert_eq!(
-            stated.to_string(),
-            "rrt=100ms max_rrt=300ms class=urgent aux.width=640"
-        );
+        assert_eq!(stated.to_string(), "rrt=100ms max_rrt=300ms class=urgent aux.width=640");
     }
 
     #[test]
@@ -399,14 +361,8 @@ mod tests {
         for (line, words) in [
             ("set detect --rrt 1", "no limits given"),
             ("set detect --rrt 1 --cpus 1 --spread 1,2", "P50,P95,N"),
-            (
-                "set detect --rrt 1 --cpus 1 --spread 1,x,3",
-                "is not a time",
-            ),
-            (
-                "set detect --rrt 1 --cpus 1 --spread 1,2,x",
-                "number of requests",
-            ),
+            ("set detect --rrt 1 --cpus 1 --spread 1,x,3", "is not a time"),
+            ("set detect --rrt 1 --cpus 1 --spread 1,2,x", "number of requests"),
         ] {
             let SlaCommand::Set(set) = parse(line).expect(line) else {
                 panic!("another verb");
@@ -414,16 +370,10 @@ mod tests {
             let refused = set.row().expect_err(line).to_string();
             assert!(refused.contains(words), "{line}: {refused}");
         }
-        let SlaCommand::Explain(explain) =
-            parse("explain detect --rrt 2 --max-rrt 1").expect("parsed")
-        else {
+        let SlaCommand::Explain(explain) = parse("explain detect --rrt 2 --max-rrt 1").expect("parsed") else {
             panic!("another verb");
         };
-        let refused = explain
-            .stated
-            .to_stated()
-            .expect_err("in disorder")
-            .to_string();
+        let refused = explain.stated.to_stated().expect_err("in disorder").to_string();
         assert!(refused.contains("greater than max_rrt"), "{refused}");
     }
 }

@@ -78,9 +78,7 @@ impl StatedFlags {
             ("cpus", &self.cpus),
             ("memory", &self.memory),
         ];
-        let given = given
-            .into_iter()
-            .filter_map(|(key, value)| Some((key.to_owned(), value.clone()?)));
+        let given = given.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value.clone()?)));
         let aux = unique_aux(&self.aux)?.into_iter();
         let aux = aux.map(|(key, value)| (format!("{AUX}{key}"), value));
         Ok(Stated::read(given.chain(aux))?)
@@ -94,11 +92,7 @@ pub fn to_query(stated: &Stated) -> String {
         .iter()
         .map(|(key, value)| format!("{}={}", percent_encode(key), percent_encode(value)))
         .collect();
-    if pairs.is_empty() {
-        String::new()
-    } else {
-        format!("?{}", pairs.join("&"))
-    }
+    if pairs.is_empty() { String::new() } else { format!("?{}", pairs.join("&")) }
 }
 
 #[cfg(test)]
@@ -121,14 +115,8 @@ mod tests {
     #[test]
     fn what_contradicts_itself_or_is_negative_is_refused_in_words() {
         let twice = refusal(&["--aux", "width=1", "--aux", "width=2"]);
-        assert!(
-            twice.contains("--aux width=1 and --aux width=2 contradict"),
-            "{twice}"
-        );
+        assert!(twice.contains("--aux width=1 and --aux width=2 contradict"), "{twice}");
         let negative = refusal(&["--rrt", "-1"]);
-        assert!(
-            negative.contains("rrt") && negative.contains("-1"),
-            "{negative}"
-        );
+        assert!(negative.contains("rrt") && negative.contains("-1"), "{negative}");
     }
 }

@@ -40,24 +40,10 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         version => format!("{}, cgroup v{version}", status.isolation.mode),
     };
     let rows = [
-        (
-            "daemon",
-            format!(
-                "{} (pid {}), up {}",
-                status.version,
-                status.pid,
-                output::age(status.started)
-            ),
-        ),
+        ("daemon", format!("{} (pid {}), up {}", status.version, status.pid, output::age(status.started))),
         ("address", address(status)),
         ("home", status.home.clone()),
-        (
-            "default service",
-            status
-                .default_service
-                .clone()
-                .unwrap_or_else(|| "none".to_owned()),
-        ),
+        ("default service", status.default_service.clone().unwrap_or_else(|| "none".to_owned())),
         ("services", status.services.to_string()),
         (
             "servants",
@@ -102,11 +88,6 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
 fn pressure(of: Option<Pressure>) -> String {
     of.map_or_else(
         || "unknown: its kernel has no PSI".to_owned(),
-        |of| {
-            format!(
-                "cpu {:.0} %, memory {:.0} %, io {:.0} % (last 10 s)",
-                of.cpu, of.memory, of.io
-            )
-        },
+        |of| format!("cpu {:.0} %, memory {:.0} %, io {:.0} % (last 10 s)", of.cpu, of.memory, of.io),
     )
 }

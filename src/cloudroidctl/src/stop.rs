@@ -29,10 +29,7 @@ impl StopArgs {
         let paths = if self.all {
             vec!["/api/v1/servants".to_owned()]
         } else if let Some(service) = &self.service {
-            vec![format!(
-                "/api/v1/servants?service={}",
-                percent_encode(service)
-            )]
+            vec![format!("/api/v1/servants?service={}", percent_encode(service))]
         } else {
             // Resolve all names before the first servant is ended.
             let (mut ids, mut paths) = (BTreeSet::new(), Vec::new());
@@ -46,9 +43,7 @@ impl StopArgs {
             paths
         };
         for path in paths {
-            ended
-                .stopped
-                .extend(client.delete::<Stopped>(&path).await?.stopped);
+            ended.stopped.extend(client.delete::<Stopped>(&path).await?.stopped);
         }
         match format {
             OutputFormat::Json => output::json(&ended),

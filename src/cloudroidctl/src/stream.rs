@@ -53,9 +53,7 @@ pub struct LiveStream {
 impl LiveStream {
     /// Opens the stream.
     pub async fn open(client: &DaemonClient) -> anyhow::Result<LiveStream> {
-        let answer = client
-            .send(Method::GET, "/api/v1/stream", empty_body())
-            .await?;
+        let answer = client.send(Method::GET, "/api/v1/stream", empty_body()).await?;
         Ok(LiveStream {
             body: answer.into_body(),
             pending: BytesMut::new(),

@@ -62,12 +62,8 @@ impl StubArgs {
             percent_encode(parse_architecture(asked).unwrap_or(asked))
         );
         let mut answer = client.send(Method::GET, &path, empty_body()).await?;
-        let architecture = answer
-            .headers()
-            .get(ARCHITECTURE)
-            .and_then(|value| value.to_str().ok())
-            .unwrap_or(asked)
-            .to_owned();
+        let architecture =
+            answer.headers().get(ARCHITECTURE).and_then(|value| value.to_str().ok()).unwrap_or(asked).to_owned();
         let signature = answer
             .headers()
             .get(SIGNATURE)
@@ -92,9 +88,7 @@ impl StubArgs {
             bail!("the daemon sent an empty archive");
         }
         file.sync_all().with_context(failed)?;
-        let digest = std::fs::File::open(&half)
-            .and_then(|mut file| sign::digest(&mut file))
-            .with_context(failed)?;
+        let digest = std::fs::File::open(&half).and_then(|mut file| sign::digest(&mut file)).with_context(failed)?;
         if let Err(refused) = key.verify(ARCHIVE, &digest, &signature) {
             let _ = std::fs::remove_file(&half);
             return Err(anyhow::Error::new(refused).context(format!(
@@ -102,8 +96,7 @@ impl StubArgs {
             )));
         }
         let beside = self.output.join(format!("{service}.tar.gz.sig"));
-        std::fs::write(&beside, signature)
-            .with_context(|| format!("cannot write {}", beside.display()))?;
+        std::fs::write(&beside, signature).with_context(|| format!("cannot write {}", beside.display()))?;
         std::fs::rename(&half, &target).with_context(failed)?;
         let fetched = FetchedStub {
             service: service.clone(),
@@ -155,10 +148,7 @@ async fn list(client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()>
             if stubs.lacking.is_empty() {
                 return Ok(());
             }
-            output::line(&format!(
-                "missing        {} (make stub-cross builds them)",
-                list(&stubs.lacking)
-            ))
+            output::line(&format!("missing        {} (make stub-cross builds them)", list(&stubs.lacking)))
         }
     }
 }

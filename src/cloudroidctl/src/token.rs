@@ -83,10 +83,7 @@ pub fn lifetime(text: &str) -> anyhow::Result<Duration> {
 
 /// Parses patterns of services or classes.
 pub fn parse_patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
-    Ok(texts
-        .iter()
-        .map(|text| text.parse())
-        .collect::<Result<_, _>>()?)
+    Ok(texts.iter().map(|text| text.parse()).collect::<Result<_, _>>()?)
 }
 
 impl TokenArgs {
@@ -140,9 +137,7 @@ fn list(tokens: &[Token], format: OutputFormat) -> anyhow::Result<()> {
     if let OutputFormat::Json = format {
         return output::json(&tokens);
     }
-    let mut table = Table::new(&[
-        "NAME", "ROLE", "SERVICES", "ROBOT", "CLASSES", "AGE", "USED", "STATE",
-    ]);
+    let mut table = Table::new(&["NAME", "ROLE", "SERVICES", "ROBOT", "CLASSES", "AGE", "USED", "STATE"]);
     for token in tokens {
         table.row([
             token.name.clone(),
@@ -177,27 +172,11 @@ mod tests {
 
     #[test]
     fn lifetimes_are_read() {
-        for (text, seconds) in [
-            ("90s", 90),
-            ("2m", 120),
-            ("12h", 43_200),
-            ("30d", 2_592_000),
-        ] {
+        for (text, seconds) in [("90s", 90), ("2m", 120), ("12h", 43_200), ("30d", 2_592_000)] {
             let length = lifetime(text).expect(text);
             assert_eq!(length, Duration::from_secs(seconds), "{text}");
         }
-        for text in [
-            "",
-            "30",
-            "d",
-            "0d",
-            "1.5h",
-            "-1d",
-            "1w",
-            "99999999999999999999d",
-            "9999999999999999999d",
-            "1ä",
-        ] {
+        for text in ["", "30", "d", "0d", "1.5h", "-1d", "1w", "99999999999999999999d", "9999999999999999999d", "1ä"] {
             lifetime(text).expect_err(text);
         }
     }

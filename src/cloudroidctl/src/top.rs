@@ -76,10 +76,7 @@ impl TopArgs {
             return output::json(&servants);
         }
         if self.once || !stdout().is_terminal() {
-            return self
-                .lines(&stream.live)
-                .iter()
-                .try_for_each(|line| output::line(line));
+            return self.lines(&stream.live).iter().try_for_each(|line| output::line(line));
         }
         let screen = ScreenGuard::enter()?;
         let mut keys = EventStream::new();
@@ -123,24 +120,13 @@ impl TopArgs {
 
     fn lines(&self, live: &LiveState) -> Vec<String> {
         let mut lines: Vec<String> = live.machine.iter().map(|of| machine_line(of)).collect();
-        let mut table = Table::new(&[
-            "SERVICE",
-            "ROBOT",
-            "STATE",
-            "CORES",
-            "THROTTLED",
-            "MEMORY",
-            "RRT",
-            "LIMITS",
-            "AGE",
-        ]);
+        let mut table =
+            Table::new(&["SERVICE", "ROBOT", "STATE", "CORES", "THROTTLED", "MEMORY", "RRT", "LIMITS", "AGE"]);
         for served in self.sorted_servants(live) {
             table.row(servant_row(served));
         }
         lines.extend(if table.is_empty() {
-            vec![
-                "no servants (instances); one starts when a robot connects to a service".to_owned(),
-            ]
+            vec!["no servants (instances); one starts when a robot connects to a service".to_owned()]
         } else {
             table.lines()
         });
@@ -158,11 +144,7 @@ impl TopArgs {
         queue!(out, terminal::BeginSynchronizedUpdate, cursor::MoveTo(0, 0))?;
         for line in lines.iter().take(rows.saturating_sub(1)) {
             let shown: String = output::sanitize(line).chars().take(columns).collect();
-            queue!(
-                out,
-                style::Print(shown),
-                terminal::Clear(terminal::ClearType::UntilNewLine)
-            )?;
+            queue!(out, style::Print(shown), terminal::Clear(terminal::ClearType::UntilNewLine))?;
             queue!(out, style::Print("\r\n"))?;
         }
         queue!(out, terminal::Clear(terminal::ClearType::FromCursorDown))?;
@@ -206,15 +188,8 @@ fn servant_row(of: &Served) -> [String; 9] {
         servant.phase.to_string(),
         format!("{:.2}", of.cores),
         format!("{:.0} %", of.throttled * 100.0),
-        servant
-            .usage
-            .as_ref()
-            .map(|usage| Size(usage.memory).to_string())
-            .unwrap_or_default(),
-        servant
-            .response
-            .map(|times| format!("{:.1} ms", times.p95_ms))
-            .unwrap_or_default(),
+        servant.usage.as_ref().map(|usage| Size(usage.memory).to_string()).unwrap_or_default(),
+        servant.response.map(|times| format!("{:.1} ms", times.p95_ms)).unwrap_or_default(),
         output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits)),
         output::age(servant.created),
     ]

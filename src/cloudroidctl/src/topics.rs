@@ -30,9 +30,7 @@ mod tests {
 
     #[test]
     fn topics_are_wanted_by_name_or_by_beginning() {
-        let topics = |all: &[&str]| TopicFilter {
-            topics: all.iter().map(|one| (*one).to_owned()).collect(),
-        };
+        let topics = |all: &[&str]| TopicFilter { topics: all.iter().map(|one| (*one).to_owned()).collect() };
         assert!(topics(&[]).accepts("/any"));
         let some = topics(&["/tf", "/camera/*"]);
         assert!(some.accepts("/tf") && some.accepts("/camera/left/image"));

@@ -37,8 +37,7 @@ impl TryArgs {
             (None, None) => anyhow::bail!("no input given; pass --bag FILE or --image FILE"),
         };
         // Read the file before minutes are spent on building.
-        let material =
-            std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let material = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         let name = format!("try-{}", std::process::id());
         let tried = async {
             self.push.publish_as(&name, client, format).await?;
@@ -49,13 +48,10 @@ impl TryArgs {
             _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("cancelled")),
         };
         // There is no service if the push failed.
-        let removed = client
-            .delete::<Stopped>(&format!("/api/v1/services/{name}"))
-            .await;
+        let removed = client.delete::<Stopped>(&format!("/api/v1/services/{name}")).await;
         let trial = tried?;
-        removed.with_context(|| {
-            format!("cannot remove the trial's service; remove it with: cloudroidctl rm {name}")
-        })?;
+        removed
+            .with_context(|| format!("cannot remove the trial's service; remove it with: cloudroidctl rm {name}"))?;
         match format {
             OutputFormat::Json => output::json(&trial),
             OutputFormat::Table => print(&trial, path),
@@ -63,15 +59,8 @@ impl TryArgs {
     }
 }
 
-async fn run_trial(
-    client: &DaemonClient,
-    name: &str,
-    kind: &str,
-    material: Vec<u8>,
-) -> anyhow::Result<Trial> {
-    let body = Full::new(material.into())
-        .map_err(|never| match never {})
-        .boxed_unsync();
+async fn run_trial(client: &DaemonClient, name: &str, kind: &str, material: Vec<u8>) -> anyhow::Result<Trial> {
+    let body = Full::new(material.into()).map_err(|never| match never {}).boxed_unsync();
     let path = format!("/api/v1/services/{name}/trial?kind={kind}");
     client::read_json(client.send(Method::POST, &path, body).await?).await
 }
@@ -79,12 +68,7 @@ async fn run_trial(
 fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
     let mut table = Table::new(&["TOPIC", "TYPE", "", "LAST"]);
     for input in &trial.inputs {
-        table.row([
-            input.topic.clone(),
-            input.type_name.clone(),
-            format!("{} sent", input.sent),
-            String::new(),
-        ]);
+        table.row([input.topic.clone(), input.type_name.clone(), format!("{} sent", input.sent), String::new()]);
     }
     for output in &trial.outputs {
         let last = output.last.as_ref().map(ToString::to_string);

@@ -23,20 +23,13 @@ impl TrustArgs {
     /// Stores the fingerprint.
     pub fn run(&self) -> anyhow::Result<()> {
         let ServerAddress::Tls(server) = ServerAddress::parse(&self.address)? else {
-            bail!(
-                "{} does not use TLS, so it has no certificate; write https://HOST:PORT",
-                self.address
-            );
+            bail!("{} does not use TLS, so it has no certificate; write https://HOST:PORT", self.address);
         };
-        let known = KnownServers::for_user()
-            .context("neither XDG_CONFIG_HOME nor HOME is set; set one of them")?;
+        let known = KnownServers::for_user().context("neither XDG_CONFIG_HOME nor HOME is set; set one of them")?;
         known
             .remember(&server, KnownIdentity::Certificate(self.fingerprint))
             .context("cannot store the certificate")?;
-        println!(
-            "{server} is now trusted with the certificate {}",
-            self.fingerprint
-        );
+        println!("{server} is now trusted with the certificate {}", self.fingerprint);
         Ok(())
     }
 }

@@ -78,11 +78,9 @@ mod tests {
 
     #[test]
     fn a_time_is_written_with_an_equals_sign() {
-        for (words, expected) in [
-            (&[][..], None),
-            (&["--wait"], Some(None)),
-            (&["--wait=90s"], Some(Some(Duration::from_secs(90)))),
-        ] {
+        for (words, expected) in
+            [(&[][..], None), (&["--wait"], Some(None)), (&["--wait=90s"], Some(Some(Duration::from_secs(90))))]
+        {
             assert_eq!(parse(words).expect("valid").wait.wait, expected);
         }
         // A following word is another argument, not the time.
@@ -106,9 +104,7 @@ mod tests {
         assert_eq!(forever.poll_until(&mut third).await.expect("found"), 3);
 
         let never = || async { Ok(Err::<(), _>("still at work".to_owned())) };
-        let over = WaitFlag {
-            wait: Some(Some(Duration::ZERO)),
-        };
+        let over = WaitFlag { wait: Some(Some(Duration::ZERO)) };
         let late = over.poll_until(never).await.expect_err("time is up");
         assert!(late.is::<WaitTimedOut>());
         assert!(late.to_string().contains("still at work"), "{late}");

@@ -17,20 +17,12 @@ impl AtomicFile {
     /// Creates the temporary file in the directory of `target`, which stays as it is.
     pub fn create_beside(target: &Path) -> anyhow::Result<AtomicFile> {
         let Some(name) = target.file_name() else {
-            bail!(
-                "{} is not a file name; pass one with -o FILE",
-                target.display()
-            );
+            bail!("{} is not a file name; pass one with -o FILE", target.display());
         };
         let part = format!(".{}.{}.part", name.to_string_lossy(), std::process::id());
         let path = target.with_file_name(part);
-        let file =
-            File::create(&path).with_context(|| format!("cannot write {}", target.display()))?;
-        Ok(AtomicFile {
-            file,
-            path,
-            target: target.to_owned(),
-        })
+        let file = File::create(&path).with_context(|| format!("cannot write {}", target.display()))?;
+        Ok(AtomicFile { file, path, target: target.to_owned() })
     }
 
     /// Returns the context for write errors.

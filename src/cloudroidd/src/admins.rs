@@ -49,18 +49,14 @@ fn find_group(written: &str) -> anyhow::Result<Option<Gid>> {
     if let Ok(number) = written.parse() {
         return Ok(Some(Gid::from_raw(number)));
     }
-    let group = Group::from_name(written)
-        .with_context(|| format!("cannot look up the group {written:?}"))?;
+    let group = Group::from_name(written).with_context(|| format!("cannot look up the group {written:?}"))?;
     Ok(group.map(|group| group.gid))
 }
 
 impl AdminSocket {
     /// Returns the admin socket of the configuration, if any. `runtime` is the directory that systemd made for the
     /// service.
-    pub fn from_config(
-        config: &Config,
-        runtime: Option<PathBuf>,
-    ) -> anyhow::Result<Option<AdminSocket>> {
+    pub fn from_config(config: &Config, runtime: Option<PathBuf>) -> anyhow::Result<Option<AdminSocket>> {
         let path = match (&config.admin_socket, &config.admin_group, runtime) {
             (Some(path), ..) => path.clone(),
             (None, _, Some(directory)) => directory.join("daemon.sock"),
@@ -105,12 +101,7 @@ impl AdminSocket {
 
 /// Serves the admin socket until the daemon ends.
 pub async fn serve(app: Arc<App>, router: Router, admins: Option<AdminListener>) {
-    let Some(AdminListener {
-        listener,
-        group,
-        file,
-    }) = admins
-    else {
+    let Some(AdminListener { listener, group, file }) = admins else {
         return;
     };
     portal::serve_unix(app, router, listener, Some(group)).await;
@@ -123,16 +114,10 @@ fn remove_stale_socket(path: &Path) -> anyhow::Result<()> {
         return Ok(());
     };
     if !about.file_type().is_socket() {
-        bail!(
-            "{} exists and is not a socket; choose another admin_socket",
-            path.display()
-        );
+        bail!("{} exists and is not a socket; choose another admin_socket", path.display());
     }
     if UnixStream::connect(path).is_ok() {
-        bail!(
-            "another program listens on {}; choose another admin_socket",
-            path.display()
-        );
+        bail!("another program listens on {}; choose another admin_socket", path.display());
     }
     std::fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display()))
 }
@@ -149,34 +134,18 @@ mod tests {
     fn the_group_is_the_one_that_was_named_and_nobody_is_admin_unasked() {
         let runtime = || Some(PathBuf::from("/run/cloudroid"));
         let of = |text: &str, runtime| AdminSocket::from_config(&config(text), runtime);
-        let admins = |path: &str, number| {
-            Some(AdminSocket {
-                path: path.into(),
-                group: Gid::from_raw(number),
-            })
-        };
+        let admins = |path: &str, number| Some(AdminSocket { path: path.into(), group: Gid::from_raw(number) });
         assert_eq!(of("", None).expect("good"), None);
-        assert_eq!(
-            of("admin_group = \"4711\"", runtime()).expect("good"),
-            admins("/run/cloudroid/daemon.sock", 4711)
-        );
-        assert_eq!(
-            of("admin_group = \"root\"\nadmin_socket = \"/x/y\"", None).expect("good"),
-            admins("/x/y", 0)
-        );
+        assert_eq!(of("admin_group = \"4711\"", runtime()).expect("good"), admins("/run/cloudroid/daemon.sock", 4711));
+        assert_eq!(of("admin_group = \"root\"\nadmin_socket = \"/x/y\"", None).expect("good"), admins("/x/y", 0));
         for (text, words) in [
             ("admin_group = \"root\"", "needs a socket"),
-            (
-                "admin_group = \"no such group\"\nadmin_socket = \"/x/y\"",
-                "no group",
-            ),
+            ("admin_group = \"no such group\"\nadmin_socket = \"/x/y\"", "no group"),
         ] {
             let refused = of(text, None).expect_err(text).to_string();
             assert!(refused.contains(words), "{refused}");
         }
-        let refused = of("admin_group = \"no such group\"", runtime())
-            .expect_err("named")
-            .to_string();
+        let refused = of("admin_group = \"no such group\"", runtime()).expect_err("named").to_string();
         assert!(refused.contains("groupadd"), "{refused}");
     }
 
@@ -184,10 +153,7 @@ mod tests {
     async fn only_what_a_killed_daemon_left_is_replaced() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("below/daemon.sock");
-        let admins = AdminSocket {
-            path: path.clone(),
-            group: Gid::current(),
-        };
+        let admins = AdminSocket { path: path.clone(), group: Gid::current() };
         let first = admins.listen().expect("listens");
         let mode = path.metadata().expect("there").permissions().mode() & 0o777;
         assert_eq!(mode, 0o660);
@@ -203,9 +169,6 @@ mod tests {
         std::fs::write(&path, "precious").expect("written");
         let refused = admins.listen().err().expect("no socket").to_string();
         assert!(refused.contains("is not a socket"), "{refused}");
-        assert_eq!(
-            std::fs::read_to_string(&path).expect("left alone"),
-            "precious"
-        );
+        assert_eq!(std::fs::read_to_string(&path).expect("left alone"), "precious");
     }
 }

@@ -14,26 +14,11 @@ const BUILT_IN: [(&str, &str); 6] = [
         "bookworm-jazzy-wheels.build.requirements.txt",
         include_str!("../../../images/bookworm-jazzy-wheels.build.requirements.txt"),
     ),
-    (
-        "bookworm-jazzy-wheels.requirements.txt",
-        include_str!("../../../images/bookworm-jazzy-wheels.requirements.txt"),
-    ),
-    (
-        "bookworm-jazzy-wheels.toml",
-        include_str!("../../../images/bookworm-jazzy-wheels.toml"),
-    ),
-    (
-        "bookworm-ros1.toml",
-        include_str!("../../../images/bookworm-ros1.toml"),
-    ),
-    (
-        "jammy-humble.toml",
-        include_str!("../../../images/jammy-humble.toml"),
-    ),
-    (
-        "noble-jazzy.toml",
-        include_str!("../../../images/noble-jazzy.toml"),
-    ),
+    ("bookworm-jazzy-wheels.requirements.txt", include_str!("../../../images/bookworm-jazzy-wheels.requirements.txt")),
+    ("bookworm-jazzy-wheels.toml", include_str!("../../../images/bookworm-jazzy-wheels.toml")),
+    ("bookworm-ros1.toml", include_str!("../../../images/bookworm-ros1.toml")),
+    ("jammy-humble.toml", include_str!("../../../images/jammy-humble.toml")),
+    ("noble-jazzy.toml", include_str!("../../../images/noble-jazzy.toml")),
 ];
 
 /// Returns whether a file is a definition or the requirements of one.
@@ -45,12 +30,7 @@ fn is_definition_file(name: &str) -> bool {
 /// built-in one of the same name.
 pub fn write_definitions(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
     let directory = home.path().join("definitions");
-    let made = || {
-        format!(
-            "cannot write the base definitions to {}",
-            directory.display()
-        )
-    };
+    let made = || format!("cannot write the base definitions to {}", directory.display());
     if directory.exists() {
         std::fs::remove_dir_all(&directory).with_context(made)?;
     }
@@ -82,13 +62,7 @@ mod tests {
         let images = concat!(env!("CARGO_MANIFEST_DIR"), "/../../images");
         let mut there: Vec<String> = std::fs::read_dir(images)
             .expect("the repository's definitions")
-            .map(|entry| {
-                entry
-                    .expect("readable")
-                    .file_name()
-                    .to_string_lossy()
-                    .into_owned()
-            })
+            .map(|entry| entry.expect("readable").file_name().to_string_lossy().into_owned())
             .filter(|name| is_definition_file(name))
             .collect();
         there.sort();
@@ -104,10 +78,7 @@ mod tests {
         std::fs::write(theirs.path().join("notes.txt"), "no definition").expect("written");
         let parent = tempfile::tempdir().expect("a directory");
         let home = Home::open(parent.path()).expect("free");
-        let config = Config {
-            definitions: Some(theirs.path().to_owned()),
-            ..Config::default()
-        };
+        let config = Config { definitions: Some(theirs.path().to_owned()), ..Config::default() };
         let directory = super::write_definitions(&config, &home).expect("made");
         let read = |name: &str| std::fs::read_to_string(directory.join(name)).ok();
         assert_eq!(read("bookworm-ros1.toml").as_deref(), Some("mine"));

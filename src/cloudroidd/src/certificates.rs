@@ -14,9 +14,7 @@ use authority::Authority;
 use portal::{RobotAuthority, Tls};
 use store::private;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
-use tokio_rustls::rustls::pki_types::{
-    CertificateDer, CertificateRevocationListDer, PrivateKeyDer,
-};
+use tokio_rustls::rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer};
 
 use crate::config;
 use crate::home::Home;
@@ -57,9 +55,7 @@ pub enum Error {
         source: portal::TlsError,
     },
     /// The daemon's own certificate cannot be made.
-    #[error(
-        "cannot create a certificate for {names}: {source}; correct names in [tls] of the configuration"
-    )]
+    #[error("cannot create a certificate for {names}: {source}; correct names in [tls] of the configuration")]
     Unmade {
         /// Names that the certificate was to have.
         names: String,
@@ -88,11 +84,7 @@ fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error>
     let read = CertificateDer::pem_file_iter(path)
         .and_then(Iterator::collect::<Result<Vec<_>, _>>)
         .map_err(unreadable("certificate", path))?;
-    if read.is_empty() {
-        Err(Error::None(path.to_owned()))
-    } else {
-        Ok(read)
-    }
+    if read.is_empty() { Err(Error::None(path.to_owned())) } else { Ok(read) }
 }
 
 /// Loads revocation lists from a file; certificates that they name are refused from then on.
@@ -103,11 +95,7 @@ fn load_revocation_lists(tls: &Tls, path: &Path) -> Result<(), Error> {
     if lists.is_empty() {
         return Err(Error::NoList(path.to_owned()));
     }
-    tls.set_revocation_lists(lists)
-        .map_err(|source| Error::Unusable {
-            path: path.to_owned(),
-            source,
-        })
+    tls.set_revocation_lists(lists).map_err(|source| Error::Unusable { path: path.to_owned(), source })
 }
 
 fn read_chain_and_key(certificate: &Path, key: &Path) -> Result<ChainAndKey, Error> {
@@ -126,8 +114,7 @@ pub fn open_robot_authority(
         return Ok(None);
     }
     let directory = home.path().join(DIRECTORY);
-    private::make_directory(&directory)
-        .with_context(|| format!("cannot create {}", directory.display()))?;
+    private::make_directory(&directory).with_context(|| format!("cannot create {}", directory.display()))?;
     Ok(Some(RobotAuthority {
         authority: Authority::load_or_create(&directory.join(AUTHORITY))?,
         lifetime: config.robot_certificates.0,
@@ -156,10 +143,7 @@ pub fn build_tls(
         },
         (None, None) => own::load_or_create(&directory, config, listen)?,
     };
-    let unusable = |source| Error::Unusable {
-        path: certificate,
-        source,
-    };
+    let unusable = |source| Error::Unusable { path: certificate, source };
     let others = match &config.client_authorities {
         Some(path) => read_certificates(path)?,
         None => Vec::new(),

@@ -175,8 +175,7 @@ impl Config {
         };
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
-        Config::parse(&text)
-            .with_context(|| format!("cannot use the configuration {}", path.display()))
+        Config::parse(&text).with_context(|| format!("cannot use the configuration {}", path.display()))
     }
 
     fn parse(text: &str) -> anyhow::Result<Config> {
@@ -207,47 +206,29 @@ impl Config {
                 self.listen.port()
             );
         }
-        self.proxies()
-            .context("trusted_proxies of the configuration")?;
+        self.proxies().context("trusted_proxies of the configuration")?;
         self.tls.check().context("[tls] of the configuration")?;
-        self.people
-            .check()
-            .context("[people] of the configuration")?;
+        self.people.check().context("[people] of the configuration")?;
         if let Some(oidc) = &self.oidc {
             oidc.check().context("[oidc] of the configuration")?;
         }
-        self.limits
-            .check()
-            .context("[limits] of the configuration")?;
+        self.limits.check().context("[limits] of the configuration")?;
         self.servant.check()?;
         for (name, class) in &self.class {
-            class
-                .check(name)
-                .with_context(|| format!("[class.{name}] of the configuration"))?;
+            class.check(name).with_context(|| format!("[class.{name}] of the configuration"))?;
         }
-        reach::egress::validate(&self.allow.egress)
-            .context("egress in [allow] of the configuration")?;
-        self.black_box
-            .check(self.memory.servant)
-            .context("[black_box] of the configuration")?;
+        reach::egress::validate(&self.allow.egress).context("egress in [allow] of the configuration")?;
+        self.black_box.check(self.memory.servant).context("[black_box] of the configuration")?;
         self.push.check().context("[push] of the configuration")?;
-        self.archives
-            .check()
-            .context("[archives] of the configuration")?;
-        self.capacity
-            .check()
-            .context("[capacity] of the configuration")?;
+        self.archives.check().context("[archives] of the configuration")?;
+        self.capacity.check().context("[capacity] of the configuration")?;
         if let Some(service) = &self.default_service {
-            catalogue::names::validate_service(service)
-                .context("default_service of the configuration")?;
+            catalogue::names::validate_service(service).context("default_service of the configuration")?;
         }
         if let Some(robot) = &self.default_robot {
-            catalogue::names::validate_robot(robot)
-                .context("default_robot of the configuration")?;
+            catalogue::names::validate_robot(robot).context("default_robot of the configuration")?;
         }
-        self.memory
-            .check()
-            .context("[memory] of the configuration")?;
+        self.memory.check().context("[memory] of the configuration")?;
         self.portal.check()?;
         Ok(())
     }
@@ -260,17 +241,14 @@ impl Config {
 
     /// Returns whether servants are kept when this daemon ends.
     pub fn keeps_servants(&self) -> bool {
-        self.keep_servants
-            .unwrap_or_else(|| std::env::var_os("NOTIFY_SOCKET").is_some())
+        self.keep_servants.unwrap_or_else(|| std::env::var_os("NOTIFY_SOCKET").is_some())
     }
 }
 
 /// Refuses a duration of zero; `right` is an example of a valid one for the error message.
 fn check_nonzero(key: &str, time: Time, right: &str) -> anyhow::Result<()> {
     if time.0.is_zero() {
-        bail!(
-            "{key} = 0 in the configuration would always time out at once; write a time such as \"{right}\""
-        );
+        bail!("{key} = 0 in the configuration would always time out at once; write a time such as \"{right}\"");
     }
     Ok(())
 }
@@ -282,18 +260,13 @@ mod tests {
     #[test]
     fn nothing_written_means_the_defaults() {
         assert_eq!(Config::parse("").expect("empty"), Config::default());
-        Config::default()
-            .check()
-            .expect("the defaults work together");
+        Config::default().check().expect("the defaults work together");
     }
 
     #[test]
     fn the_example_says_the_defaults() {
         let example = include_str!("../../../systemd/cloudroid.example.toml");
-        assert_eq!(
-            Config::parse(example).expect("comments only"),
-            Config::default()
-        );
+        assert_eq!(Config::parse(example).expect("comments only"), Config::default());
         let uncommented: String = example
             .lines()
             .map(|line| line.strip_prefix("#: ").unwrap_or(line))
@@ -302,63 +275,36 @@ mod tests {
         let written = Config::parse(&uncommented).expect("every example value is valid");
         assert_eq!(
             written.capacity,
-            CapacityConfig {
-                cpus: Some(2.0),
-                memory: Some(Size(4 << 30)),
-                ..CapacityConfig::default()
-            }
+            CapacityConfig { cpus: Some(2.0), memory: Some(Size(4 << 30)), ..CapacityConfig::default() }
         );
-        let servant = ServantConfig {
-            scratch: Some(Size(512 << 20)),
-            ..ServantConfig::default()
-        };
+        let servant = ServantConfig { scratch: Some(Size(512 << 20)), ..ServantConfig::default() };
         assert_eq!(written.servant, servant);
         assert_eq!(written.portal, PortalConfig::default());
-        let memory = MemoryConfig {
-            daemon: Some(Size(1 << 30)),
-            ..MemoryConfig::default()
-        };
+        let memory = MemoryConfig { daemon: Some(Size(1 << 30)), ..MemoryConfig::default() };
         assert_eq!(written.memory, memory);
-        assert_eq!(
-            written.push,
-            PushConfig {
-                cpus: Some(2.0),
-                memory: Some(Size(4 << 30)),
-                ..PushConfig::default()
-            }
-        );
+        assert_eq!(written.push, PushConfig { cpus: Some(2.0), memory: Some(Size(4 << 30)), ..PushConfig::default() });
         assert_eq!(written.limits.memory, Config::default().limits.memory);
     }
 
     #[test]
     fn what_is_no_proxys_address_is_named() {
-        let config =
-            Config::parse("trusted_proxies = [\"10.0.0.0/8\", \"proxy.lab\"]").expect("read");
+        let config = Config::parse("trusted_proxies = [\"10.0.0.0/8\", \"proxy.lab\"]").expect("read");
         let refused = format!("{:#}", config.check().expect_err("a name"));
-        assert!(
-            refused.contains("trusted_proxies") && refused.contains("proxy.lab"),
-            "{refused}"
-        );
+        assert!(refused.contains("trusted_proxies") && refused.contains("proxy.lab"), "{refused}");
     }
 
     #[test]
     fn a_log_format_that_does_not_exist_is_refused_with_those_that_do() {
         let refused = Config::parse("log_format = \"xml\"").expect_err("no such format");
         let refused = format!("{refused:#}");
-        assert!(
-            refused.contains("text") && refused.contains("json"),
-            "{refused}"
-        );
+        assert!(refused.contains("text") && refused.contains("json"), "{refused}");
         let config = Config::parse("log_format = \"json\"").expect("a format");
         assert_eq!(config.log_format, LogFormat::Json);
     }
 
     #[test]
     fn a_misspelt_key_is_named() {
-        for (text, key) in [
-            ("lsiten = \"127.0.0.1:1\"", "lsiten"),
-            ("[servant]\ngarce = \"1s\"", "garce"),
-        ] {
+        for (text, key) in [("lsiten = \"127.0.0.1:1\"", "lsiten"), ("[servant]\ngarce = \"1s\"", "garce")] {
             let refused = format!("{:#}", Config::parse(text).expect_err(key));
             assert!(refused.contains(key), "{refused}");
         }
@@ -375,35 +321,15 @@ mod tests {
 
     #[test]
     fn the_network_needs_a_token() {
-        let open = Config {
-            listen: "0.0.0.0:9090".parse().expect("an address"),
-            ..Config::default()
-        };
-        let refused = open
-            .check()
-            .expect_err("anyone could drive the robots")
-            .to_string();
-        assert!(
-            refused.contains("0.0.0.0:9090") && refused.contains("tokens ="),
-            "{refused}"
-        );
-        Config {
-            tokens: vec!["a-long-secret".into()],
-            ..open
-        }
-        .check()
-        .expect("a token is there");
+        let open = Config { listen: "0.0.0.0:9090".parse().expect("an address"), ..Config::default() };
+        let refused = open.check().expect_err("anyone could drive the robots").to_string();
+        assert!(refused.contains("0.0.0.0:9090") && refused.contains("tokens ="), "{refused}");
+        Config { tokens: vec!["a-long-secret".into()], ..open }.check().expect("a token is there");
     }
 
     #[test]
     fn limits_that_no_kernel_takes_are_refused() {
-        for text in [
-            "cpus = 0.0",
-            "cpus = nan",
-            "cpu_weight = 0",
-            "memory = \"1K\"",
-            "pids = 1",
-        ] {
+        for text in ["cpus = 0.0", "cpus = nan", "cpu_weight = 0", "memory = \"1K\"", "pids = 1"] {
             let config = Config::parse(&format!("[limits]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[limits]"), "{refused}");
@@ -412,14 +338,9 @@ mod tests {
 
     #[test]
     fn memory_that_nothing_works_with_is_refused() {
-        for text in [
-            "client = \"10K\"",
-            "servant = 0",
-            "daemon = 0",
-            "shim = \"4M\"",
-            "shim_cpus = 0.0",
-            "unfinished = \"0s\"",
-        ] {
+        for text in
+            ["client = \"10K\"", "servant = 0", "daemon = 0", "shim = \"4M\"", "shim_cpus = 0.0", "unfinished = \"0s\""]
+        {
             let config = Config::parse(&format!("[memory]\n{text}")).expect("well-formed");
             let refused = format!("{:#}", config.check().expect_err(text));
             assert!(refused.contains("[memory]"), "{refused}");
@@ -464,12 +385,6 @@ mod tests {
     #[test]
     fn a_limit_not_written_keeps_its_default() {
         let config = Config::parse("[limits]\nmemory = \"2G\"").expect("valid");
-        assert_eq!(
-            config.limits,
-            Limits {
-                memory: Some(Size(2 << 30)),
-                ..Config::default().limits
-            }
-        );
+        assert_eq!(config.limits, Limits { memory: Some(Size(2 << 30)), ..Config::default().limits });
     }
 }

@@ -18,24 +18,12 @@ const SPACE_WANTED: u64 = 10 << 30;
 /// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are settings
 /// that exceed this machine.
 pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) -> Doctor {
-    let mut checks = vec![
-        root(),
-        kernel(),
-        overlay(),
-        user_namespaces(),
-        idmapped_mounts(home),
-        seccomp(),
-        landlock(),
-    ];
+    let mut checks = vec![root(), kernel(), overlay(), user_namespaces(), idmapped_mounts(home), seccomp(), landlock()];
     checks.push(cgroups::check());
     checks.push(program("mmdebstrap", "mmdebstrap", "makes base images"));
     checks.push(program("apt-get", "apt", "resolves and fetches packages"));
     checks.push(program("dpkg-deb", "dpkg", "unpacks packages"));
-    checks.push(optional(program(
-        "pip3",
-        "python3-pip",
-        "fetches the Python wheels for some ROS 2 base images",
-    )));
+    checks.push(optional(program("pip3", "python3-pip", "fetches the Python wheels for some ROS 2 base images")));
     checks.push(apt_lists());
     checks.push(disk_space(home));
     checks.push(init());
@@ -46,42 +34,19 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
 
 /// Returns the state of the machine while the daemon runs, and the failed checks that keep it from starting.
 pub fn check_requirements(home: &Path) -> (MachineChecks, Vec<Check>) {
-    let checks = [
-        root(),
-        kernel(),
-        overlay(),
-        user_namespaces(),
-        idmapped_mounts(home),
-        seccomp(),
-        init(),
-    ];
-    let missing = checks
-        .into_iter()
-        .filter(|check| check.status == CheckStatus::Missing)
-        .collect();
+    let checks = [root(), kernel(), overlay(), user_namespaces(), idmapped_mounts(home), seccomp(), init()];
+    let missing = checks.into_iter().filter(|check| check.status == CheckStatus::Missing).collect();
     let found = cgroups::detect();
     let mut warnings = Vec::new();
     if !found.missing.is_empty() {
-        warnings.push(format!(
-            "no limits for servants on {}: {}",
-            found.missing.join(", "),
-            found.why
-        ));
+        warnings.push(format!("no limits for servants on {}: {}", found.missing.join(", "), found.why));
     }
-    for check in [
-        program("mmdebstrap", "mmdebstrap", ""),
-        apt_lists(),
-        disk_space(home),
-    ] {
+    for check in [program("mmdebstrap", "mmdebstrap", ""), apt_lists(), disk_space(home)] {
         if check.status != CheckStatus::Ok {
             warnings.push(format!("{}: {}", check.name, check.found));
         }
     }
-    let machine = MachineChecks {
-        cgroup_version: found.version,
-        missing_limits: found.missing,
-        warnings,
-    };
+    let machine = MachineChecks { cgroup_version: found.version, missing_limits: found.missing, warnings };
     (machine, missing)
 }
 
@@ -89,9 +54,7 @@ pub fn check_requirements(home: &Path) -> (MachineChecks, Vec<Check>) {
 pub fn find_init() -> Option<PathBuf> {
     let named = std::env::var_os("CLOUDROID_INIT").map(PathBuf::from);
     // In the build directory, and installed below any prefix.
-    let directory = std::env::current_exe()
-        .ok()
-        .and_then(|path| Some(path.parent()?.to_owned()));
+    let directory = std::env::current_exe().ok().and_then(|path| Some(path.parent()?.to_owned()));
     let near = ["cloudroid-init", "../lib/cloudroid/cloudroid-init"]
         .iter()
         .filter_map(|name| Some(directory.as_ref()?.join(name)));
@@ -109,30 +72,15 @@ pub fn list(checks: &[Check]) -> String {
 }
 
 fn ok(name: &str, found: impl Into<String>) -> Check {
-    Check {
-        name: name.to_owned(),
-        status: CheckStatus::Ok,
-        found: found.into(),
-        fix: None,
-    }
+    Check { name: name.to_owned(), status: CheckStatus::Ok, found: found.into(), fix: None }
 }
 
 fn missing(name: &str, found: impl Into<String>, fix: impl Into<String>) -> Check {
-    Check {
-        name: name.to_owned(),
-        status: CheckStatus::Missing,
-        found: found.into(),
-        fix: Some(fix.into()),
-    }
+    Check { name: name.to_owned(), status: CheckStatus::Missing, found: found.into(), fix: Some(fix.into()) }
 }
 
 fn warning(name: &str, found: impl Into<String>, fix: impl Into<String>) -> Check {
-    Check {
-        name: name.to_owned(),
-        status: CheckStatus::Warning,
-        found: found.into(),
-        fix: Some(fix.into()),
-    }
+    Check { name: name.to_owned(), status: CheckStatus::Warning, found: found.into(), fix: Some(fix.into()) }
 }
 
 fn root() -> Check {
@@ -140,11 +88,7 @@ fn root() -> Check {
     if uid.is_root() {
         ok("root", "running as root")
     } else {
-        missing(
-            "root",
-            format!("running as user {uid}; creating containers needs root"),
-            "sudo cloudroidd",
-        )
+        missing("root", format!("running as user {uid}; creating containers needs root"), "sudo cloudroidd")
     }
 }
 
@@ -155,10 +99,7 @@ fn kernel() -> Check {
         Some(found) if found >= OLDEST_KERNEL => ok("kernel", format!("Linux {release}")),
         Some(_) => missing(
             "kernel",
-            format!(
-                "Linux {release} is older than {}.{}",
-                OLDEST_KERNEL.0, OLDEST_KERNEL.1
-            ),
+            format!("Linux {release} is older than {}.{}", OLDEST_KERNEL.0, OLDEST_KERNEL.1),
             "install a newer kernel, such as Debian 12's or Ubuntu's linux-generic-hwe, and reboot",
         ),
         None => warning("kernel", format!("unknown version {release:?}"), "uname -r"),
@@ -172,28 +113,17 @@ fn version(release: &str) -> Option<(u32, u32)> {
 
 fn overlay() -> Check {
     let known = std::fs::read_to_string("/proc/filesystems").unwrap_or_default();
-    if known
-        .lines()
-        .any(|line| line.split_whitespace().last() == Some("overlay"))
-    {
+    if known.lines().any(|line| line.split_whitespace().last() == Some("overlay")) {
         ok("overlay", "overlay file systems are supported")
     } else {
-        missing(
-            "overlay",
-            "the kernel has no overlay file system",
-            "modprobe overlay",
-        )
+        missing("overlay", "the kernel has no overlay file system", "modprobe overlay")
     }
 }
 
 fn user_namespaces() -> Check {
     let limit = std::fs::read_to_string("/proc/sys/user/max_user_namespaces").ok();
     match limit.and_then(|text| text.trim().parse::<u64>().ok()) {
-        Some(0) => missing(
-            "user namespaces",
-            "none allowed",
-            "sysctl -w user.max_user_namespaces=15000",
-        ),
+        Some(0) => missing("user namespaces", "none allowed", "sysctl -w user.max_user_namespaces=15000"),
         Some(limit) => ok("user namespaces", format!("{limit} allowed")),
         None => missing(
             "user namespaces",
@@ -216,10 +146,7 @@ fn seccomp() -> Check {
 
 fn landlock() -> Check {
     if servant::shim::can_restrict_files() {
-        return ok(
-            "landlock",
-            "the servants' ROS Masters are confined to their own files",
-        );
+        return ok("landlock", "the servants' ROS Masters are confined to their own files");
     }
     warning(
         "landlock",
@@ -241,16 +168,10 @@ fn idmapped_mounts(home: &Path) -> Check {
         return warning(NAME, "can only be tested as root", "sudo cloudroidd doctor");
     }
     match servant::idmap::check_idmap_support(existing) {
-        Ok(()) => ok(
-            NAME,
-            format!("supported by the file system of {}", existing.display()),
-        ),
+        Ok(()) => ok(NAME, format!("supported by the file system of {}", existing.display())),
         Err(error) => missing(
             NAME,
-            format!(
-                "not supported by the file system of {}: {error}",
-                existing.display()
-            ),
+            format!("not supported by the file system of {}: {error}", existing.display()),
             "choose a state directory on ext4, xfs or btrfs with --home, or install a newer kernel",
         ),
     }
@@ -258,16 +179,9 @@ fn idmapped_mounts(home: &Path) -> Check {
 
 fn program(name: &str, package: &str, what_for: &str) -> Check {
     let path = std::env::var_os("PATH").unwrap_or_default();
-    match std::env::split_paths(&path)
-        .map(|directory| directory.join(name))
-        .find(|path| path.is_file())
-    {
+    match std::env::split_paths(&path).map(|directory| directory.join(name)).find(|path| path.is_file()) {
         Some(path) => ok(name, path.display().to_string()),
-        None => missing(
-            name,
-            format!("not installed; it {what_for}"),
-            format!("apt-get install {package}"),
-        ),
+        None => missing(name, format!("not installed; it {what_for}"), format!("apt-get install {package}")),
     }
 }
 
@@ -284,19 +198,12 @@ fn apt_lists() -> Check {
     const NAME: &str = "apt lists";
     let directory = "/var/lib/apt/lists";
     let count = std::fs::read_dir(directory).map_or(0, |entries| {
-        entries
-            .flatten()
-            .filter(|entry| entry.file_name().to_string_lossy().contains("_Packages"))
-            .count()
+        entries.flatten().filter(|entry| entry.file_name().to_string_lossy().contains("_Packages")).count()
     });
     if count > 0 {
         ok(NAME, format!("{count} package lists in {directory}"))
     } else {
-        warning(
-            NAME,
-            format!("no package lists in {directory}"),
-            "apt-get update",
-        )
+        warning(NAME, format!("no package lists in {directory}"), "apt-get update")
     }
 }
 
@@ -304,21 +211,13 @@ fn disk_space(home: &Path) -> Check {
     const NAME: &str = "disk space";
     let existing = find_existing(home);
     let Ok(found) = nix::sys::statvfs::statvfs(existing) else {
-        return warning(
-            NAME,
-            format!("unknown for {}", existing.display()),
-            format!("df -h {}", existing.display()),
-        );
+        return warning(NAME, format!("unknown for {}", existing.display()), format!("df -h {}", existing.display()));
     };
     let free = found.blocks_available() * found.fragment_size();
     let text = format!("{} free at {}", Size(free), existing.display());
     let fix = "free some space, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {
-        _ if free < ROOM_NEEDED => missing(
-            NAME,
-            format!("{text}; a first push needs {}", Size(ROOM_NEEDED)),
-            fix,
-        ),
+        _ if free < ROOM_NEEDED => missing(NAME, format!("{text}; a first push needs {}", Size(ROOM_NEEDED)), fix),
         _ if free < SPACE_WANTED => warning(NAME, text, fix),
         _ => ok(NAME, text),
     }
@@ -339,11 +238,7 @@ fn init() -> Check {
 fn configuration(doubts: &[String]) -> Check {
     match doubts {
         [] => ok("configuration", "fits this machine's resources"),
-        doubts => warning(
-            "configuration",
-            doubts.join("; "),
-            "change it, and start the daemon again",
-        ),
+        doubts => warning("configuration", doubts.join("; "), "change it, and start the daemon again"),
     }
 }
 
@@ -382,10 +277,7 @@ mod tests {
     fn every_need_that_is_not_met_says_how_to_mend_it() {
         let doctor = examine(Path::new("/nonexistent/home"), None, &[]);
         for check in doctor.checks {
-            assert!(
-                check.status == CheckStatus::Ok || check.fix.is_some(),
-                "{check:?}"
-            );
+            assert!(check.status == CheckStatus::Ok || check.fix.is_some(), "{check:?}");
         }
     }
 

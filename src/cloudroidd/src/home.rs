@@ -42,9 +42,7 @@ pub enum HomeError {
         way: String,
     },
     /// No default directory can be determined.
-    #[error(
-        "neither CLOUDROID_HOME nor XDG_DATA_HOME nor HOME is set; name a state directory with --home"
-    )]
+    #[error("neither CLOUDROID_HOME nor XDG_DATA_HOME nor HOME is set; name a state directory with --home")]
     Nowhere,
     /// A file system operation failed.
     #[error("cannot {action} {path}: {source}")]
@@ -69,14 +67,8 @@ pub struct Home {
 }
 
 /// Returns the default state directory: `$CLOUDROID_HOME`, otherwise `cloudroid` in the user's data directory.
-pub fn default_path(
-    variable: impl Fn(&str) -> Option<std::ffi::OsString>,
-) -> Result<PathBuf, HomeError> {
-    let set = |name| {
-        variable(name)
-            .filter(|value| !value.is_empty())
-            .map(PathBuf::from)
-    };
+pub fn default_path(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Result<PathBuf, HomeError> {
+    let set = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set("CLOUDROID_HOME")
         .or_else(|| set("XDG_DATA_HOME").map(|data| data.join("cloudroid")))
         .or_else(|| set("HOME").map(|user| user.join(".local/share/cloudroid")))
@@ -87,17 +79,10 @@ impl Home {
     /// Returns the cache directory, which daemons share: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; in the
     /// home if neither variable is set.
     pub fn cache(&self) -> PathBuf {
-        let variable = |name| {
-            std::env::var_os(name)
-                .filter(|value| !value.is_empty())
-                .map(PathBuf::from)
-        };
+        let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
         variable("XDG_CACHE_HOME")
             .or_else(|| variable("HOME").map(|user| user.join(".cache")))
-            .map_or_else(
-                || self.path().join("cache"),
-                |cache| cache.join("cloudroid"),
-            )
+            .map_or_else(|| self.path().join("cache"), |cache| cache.join("cloudroid"))
     }
 
     /// Creates what is missing of the directory and locks it.
@@ -108,8 +93,7 @@ impl Home {
         let home = Home { path, _lock: lock };
         for name in ["images", "layers", "run", "servants", "build", "logs"] {
             let directory = home.path.join(name);
-            private::make_directory(&directory)
-                .map_err(io_error("create the directory", &directory))?;
+            private::make_directory(&directory).map_err(io_error("create the directory", &directory))?;
         }
         home.restrict_permissions()?;
         Ok(home)
@@ -132,15 +116,8 @@ impl Home {
         closed("layers", 0, &nothing)?;
         closed("build", 1, &nothing)?;
         // The only root file system below a servant's directory is its topmost layer.
-        closed("servants", 2, &|path| {
-            path.is_dir() && path.ends_with("skeleton")
-        })?;
-        for name in [
-            "cloudroid.db",
-            "cloudroid.db-wal",
-            "cloudroid.db-shm",
-            "signing.pem",
-        ] {
+        closed("servants", 2, &|path| path.is_dir() && path.ends_with("skeleton"))?;
+        for name in ["cloudroid.db", "cloudroid.db-wal", "cloudroid.db-shm", "signing.pem"] {
             closed(name, 0, &nothing)?;
         }
         if !is_exclusive(&self.path).map_err(io_error(CLOSE, &self.path))? {
@@ -151,8 +128,7 @@ impl Home {
             );
             return Ok(());
         }
-        private::restrict_tree(&self.path, 1, &|path| path.is_dir())
-            .map_err(io_error(CLOSE, &self.path))
+        private::restrict_tree(&self.path, 1, &|path| path.is_dir()).map_err(io_error(CLOSE, &self.path))
     }
 
     /// Returns the path of the directory.
@@ -190,8 +166,7 @@ impl Home {
         // Through a descriptor of its directory, because the path may be longer than a socket address allows.
         let address = format!("/proc/self/fd/{}/daemon.sock", opened.as_raw_fd());
         let listener = UnixListener::bind(address).map_err(io_error("listen on", &path))?;
-        std::fs::set_permissions(&path, Permissions::from_mode(0o600))
-            .map_err(io_error("protect", &path))?;
+        std::fs::set_permissions(&path, Permissions::from_mode(0o600)).map_err(io_error("protect", &path))?;
         Ok(listener)
     }
 
@@ -224,18 +199,8 @@ pub fn sweep_builds(half_made: &[PathBuf]) {
 }
 
 /// Directories that a daemon, or a new file system, makes in a home.
-const DIRECTORIES: [&str; 10] = [
-    "images",
-    "layers",
-    "run",
-    "servants",
-    "build",
-    "logs",
-    "tls",
-    "definitions",
-    "cache",
-    "lost+found",
-];
+const DIRECTORIES: [&str; 10] =
+    ["images", "layers", "run", "servants", "build", "logs", "tls", "definitions", "cache", "lost+found"];
 
 /// Returns whether a directory is used by a daemon only: it belongs to this user and contains no other directories.
 fn is_exclusive(path: &Path) -> std::io::Result<bool> {
@@ -274,8 +239,7 @@ fn try_lock(home: &Path) -> Result<Flock<File>, HomeError> {
     let file = private::open(&path).map_err(io_error("open", &path))?;
     match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
         Ok(mut locked) => {
-            let holder = ProcessIdentity::from_pid(std::process::id() as i32)
-                .map_err(io_error("look at", &path))?;
+            let holder = ProcessIdentity::from_pid(std::process::id() as i32).map_err(io_error("look at", &path))?;
             locked.set_len(0).map_err(io_error("write", &path))?;
             locked.rewind().map_err(io_error("write", &path))?;
             let record = serde_json::to_string(&holder).unwrap_or_default();
@@ -287,11 +251,7 @@ fn try_lock(home: &Path) -> Result<Flock<File>, HomeError> {
             let _ = file.read_to_string(&mut record);
             Err(taken_error(home, &record))
         }
-        Err((_, errno)) => Err(HomeError::Io {
-            action: "lock",
-            path,
-            source: errno.into(),
-        }),
+        Err((_, errno)) => Err(HomeError::Io { action: "lock", path, source: errno.into() }),
     }
 }
 
@@ -308,59 +268,31 @@ fn taken_error(home: &Path, record: &str) -> HomeError {
             (String::new(), way)
         }
     };
-    HomeError::Taken {
-        home: home.to_owned(),
-        pid,
-        way,
-    }
+    HomeError::Taken { home: home.to_owned(), pid, way }
 }
 
 fn io_error(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> HomeError {
     let path = path.to_owned();
-    move |source| HomeError::Io {
-        action,
-        path,
-        source,
-    }
+    move |source| HomeError::Io { action, path, source }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn variables(
-        set: &'static [(&'static str, &'static str)],
-    ) -> impl Fn(&str) -> Option<std::ffi::OsString> {
-        move |name| {
-            set.iter()
-                .find(|(known, _)| *known == name)
-                .map(|(_, value)| (*value).into())
-        }
+    fn variables(set: &'static [(&'static str, &'static str)]) -> impl Fn(&str) -> Option<std::ffi::OsString> {
+        move |name| set.iter().find(|(known, _)| *known == name).map(|(_, value)| (*value).into())
     }
 
     #[test]
     fn the_default_is_below_the_users_data() {
-        let all = variables(&[
-            ("CLOUDROID_HOME", "/c"),
-            ("XDG_DATA_HOME", "/x"),
-            ("HOME", "/h"),
-        ]);
+        let all = variables(&[("CLOUDROID_HOME", "/c"), ("XDG_DATA_HOME", "/x"), ("HOME", "/h")]);
         assert_eq!(default_path(all).expect("set"), Path::new("/c"));
-        let xdg = variables(&[
-            ("CLOUDROID_HOME", ""),
-            ("XDG_DATA_HOME", "/x"),
-            ("HOME", "/h"),
-        ]);
+        let xdg = variables(&[("CLOUDROID_HOME", ""), ("XDG_DATA_HOME", "/x"), ("HOME", "/h")]);
         assert_eq!(default_path(xdg).expect("set"), Path::new("/x/cloudroid"));
         let home = variables(&[("HOME", "/h")]);
-        assert_eq!(
-            default_path(home).expect("set"),
-            Path::new("/h/.local/share/cloudroid")
-        );
-        assert!(matches!(
-            default_path(variables(&[])),
-            Err(HomeError::Nowhere)
-        ));
+        assert_eq!(default_path(home).expect("set"), Path::new("/h/.local/share/cloudroid"));
+        assert!(matches!(default_path(variables(&[])), Err(HomeError::Nowhere)));
     }
 
     #[test]
@@ -368,10 +300,7 @@ mod tests {
         let parent = tempfile::tempdir().expect("a directory");
         let first = Home::open(&parent.path().join("home")).expect("free");
         let refused = Home::open(first.path()).expect_err("taken").to_string();
-        assert!(
-            refused.contains(&format!("(pid {})", std::process::id())),
-            "{refused}"
-        );
+        assert!(refused.contains(&format!("(pid {})", std::process::id())), "{refused}");
         assert!(refused.contains("--home"), "{refused}");
         let path = first.path().to_owned();
         drop(first);
@@ -405,24 +334,15 @@ mod tests {
     #[test]
     fn a_process_that_only_has_the_number_is_not_named() {
         let own = ProcessIdentity::from_pid(std::process::id() as i32).expect("this process");
-        let later = ProcessIdentity {
-            start: own.start + 1,
-            ..own
-        };
-        let before = ProcessIdentity {
-            boot: own.boot ^ 1,
-            ..own
-        };
+        let later = ProcessIdentity { start: own.start + 1, ..own };
+        let before = ProcessIdentity { boot: own.boot ^ 1, ..own };
         let home = Path::new("/home/of/a/daemon");
         let text = |holder: &ProcessIdentity| serde_json::to_string(holder).expect("JSON");
         for record in [text(&later), text(&before), "1\n".to_owned(), String::new()] {
             let refused = taken_error(home, &record).to_string();
             assert!(!refused.contains("kill"), "{record}: {refused}");
             assert!(!refused.contains("pid"), "{record}: {refused}");
-            assert!(
-                refused.contains("fuser -v /home/of/a/daemon/lock"),
-                "{refused}"
-            );
+            assert!(refused.contains("fuser -v /home/of/a/daemon/lock"), "{refused}");
         }
         let known = taken_error(home, &text(&own)).to_string();
         assert!(known.contains(&format!("kill {}", own.pid)), "{known}");
@@ -506,9 +426,7 @@ mod tests {
         // Opens it a second time, when the daemon's own files exist.
         let home = Home::open(parent.path()).expect("free");
         assert_eq!((mode(parent.path()), mode(&theirs)), (0o755, rights));
-        for name in [
-            "lock", "images", "layers", "servants", "run", "build", "logs",
-        ] {
+        for name in ["lock", "images", "layers", "servants", "run", "build", "logs"] {
             assert_eq!(mode(&home.path().join(name)) & 0o077, 0, "{name}");
         }
     }

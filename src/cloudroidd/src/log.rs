@@ -23,24 +23,15 @@ pub enum LogFormat {
 
 /// Starts writing the log to standard error: what `CLOUDROID_LOG` selects, from level `info` by default.
 pub fn start(format: LogFormat) {
-    let filter =
-        EnvFilter::try_from_env("CLOUDROID_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
+    let filter = EnvFilter::try_from_env("CLOUDROID_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
     let has_colours = std::io::stderr().is_terminal();
     let writer = BoxMakeWriter::new(std::io::stderr);
     make_log(format, filter, writer, has_colours).init();
 }
 
-fn make_log(
-    format: LogFormat,
-    filter: EnvFilter,
-    writer: BoxMakeWriter,
-    has_colours: bool,
-) -> Dispatch {
-    let lines = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(writer)
-        .with_ansi(has_colours)
-        .with_target(false);
+fn make_log(format: LogFormat, filter: EnvFilter, writer: BoxMakeWriter, has_colours: bool) -> Dispatch {
+    let lines =
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(writer).with_ansi(has_colours).with_target(false);
     match format {
         LogFormat::Text => Dispatch::new(lines.finish()),
         LogFormat::Json => Dispatch::new(lines.json().finish()),

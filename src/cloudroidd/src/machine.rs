@@ -21,10 +21,7 @@ pub fn cores() -> f64 {
 
 /// Returns the resources of this machine.
 pub fn resources() -> MachineResources {
-    MachineResources {
-        cores: cores(),
-        memory: servant::host::total_memory().unwrap_or(u64::MAX),
-    }
+    MachineResources { cores: cores(), memory: servant::host::total_memory().unwrap_or(u64::MAX) }
 }
 
 /// Returns nine tenths of the machine's memory.

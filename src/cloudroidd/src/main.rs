@@ -119,9 +119,7 @@ fn start_threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::r
         .thread_name("portal")
         .on_thread_start(move || {
             if let Err(error) = privilege::confine(account) {
-                tracing::error!(
-                    "{error}; stopping, because threads that serve clients must not keep privileges"
-                );
+                tracing::error!("{error}; stopping, because threads that serve clients must not keep privileges");
                 std::process::abort();
             }
         })
@@ -154,18 +152,11 @@ fn examine(arguments: &DaemonArguments, config: &Config, json: bool) -> anyhow::
             println!("    {fix}");
         }
     }
-    if doctor.is_healthy() {
-        Ok(())
-    } else {
-        bail!("requirements are missing")
-    }
+    if doctor.is_healthy() { Ok(()) } else { bail!("requirements are missing") }
 }
 
 /// Makes all checks that need no change except to the state directory.
-fn prepare(
-    arguments: DaemonArguments,
-    mut config: Config,
-) -> anyhow::Result<(Config, Home, MachineChecks)> {
+fn prepare(arguments: DaemonArguments, mut config: Config) -> anyhow::Result<(Config, Home, MachineChecks)> {
     if let Err(error) = machine::raise_descriptor_limit() {
         tracing::warn!("cannot raise the limit of open files: {error}");
     }
@@ -175,14 +166,9 @@ fn prepare(
     require_root(nix::unistd::geteuid())?;
     let home = Home::open(&path)?;
     let (mut machine, missing) = doctor::check_requirements(home.path());
-    machine
-        .warnings
-        .extend(config.machine_warnings(machine::resources()));
+    machine.warnings.extend(config.machine_warnings(machine::resources()));
     if !missing.is_empty() {
-        bail!(
-            "this machine lacks requirements for servants:\n{}",
-            doctor::list(&missing)
-        );
+        bail!("this machine lacks requirements for servants:\n{}", doctor::list(&missing));
     }
     if config.isolation == IsolationMode::Require && !machine.missing_limits.is_empty() {
         bail!(
@@ -196,10 +182,7 @@ fn prepare(
 
 fn require_root(user: nix::unistd::Uid) -> anyhow::Result<()> {
     if !user.is_root() {
-        bail!(
-            "creating servants needs root, but this is user {user}; run:\n    {}",
-            sudo_command()
-        );
+        bail!("creating servants needs root, but this is user {user}; run:\n    {}", sudo_command());
     }
     Ok(())
 }
@@ -208,15 +191,8 @@ fn require_root(user: nix::unistd::Uid) -> anyhow::Result<()> {
 fn sudo_command() -> String {
     let quoted = |word: OsString| {
         let text = word.to_string_lossy().into_owned();
-        let plain = !text.is_empty()
-            && text
-                .chars()
-                .all(|c| c.is_ascii_alphanumeric() || "/._-=:,@".contains(c));
-        if plain {
-            text
-        } else {
-            format!("'{}'", text.replace('\'', "'\\''"))
-        }
+        let plain = !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "/._-=:,@".contains(c));
+        if plain { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
     };
     let command: Vec<String> = std::env::args_os().map(quoted).collect();
     format!("sudo {}", command.join(" "))
@@ -237,31 +213,14 @@ async fn run(config: Config, home: Home, machine: MachineChecks) -> anyhow::Resu
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
     }
-    app.catalogue
-        .repair_tags()
-        .await
-        .context("cannot repair the image store")?;
-    app.choreographer
-        .keep_rollouts()
-        .context("cannot resume the rollouts of a previous daemon")?;
+    app.catalogue.repair_tags().await.context("cannot repair the image store")?;
+    app.choreographer.keep_rollouts().context("cannot resume the rollouts of a previous daemon")?;
     let half_made = home.leftover_builds();
-    let choreographer::AdoptionResult { adopted, removal } = app
-        .choreographer
-        .adopt()
-        .await
-        .context("cannot adopt the servants of a previous daemon")?;
+    let choreographer::AdoptionResult { adopted, removal } =
+        app.choreographer.adopt().await.context("cannot adopt the servants of a previous daemon")?;
     let router = portal::router(Arc::clone(&app));
-    let tcp = tokio::spawn(portal::serve_tcp(
-        Arc::clone(&app),
-        router.clone(),
-        listener,
-    ));
-    let unix = tokio::spawn(portal::serve_unix(
-        Arc::clone(&app),
-        router.clone(),
-        socket,
-        None,
-    ));
+    let tcp = tokio::spawn(portal::serve_tcp(Arc::clone(&app), router.clone(), listener));
+    let unix = tokio::spawn(portal::serve_unix(Arc::clone(&app), router.clone(), socket, None));
     let history = tokio::spawn(portal::keep_history(Arc::clone(&app)));
     let observers = tokio::spawn(portal::keep_observers(Arc::clone(&app)));
     let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
@@ -318,20 +277,16 @@ async fn remove_leftovers(app: Arc<portal::App>, removal: JoinHandle<()>, half_m
 }
 
 async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
-    TcpListener::bind(address)
-        .await
-        .map_err(|error| match error.kind() {
-            std::io::ErrorKind::AddrInUse => anyhow::anyhow!(
-                "{address} is used by another program (ss -ltnp 'sport = :{}' shows which); stop it, or choose another \
+    TcpListener::bind(address).await.map_err(|error| match error.kind() {
+        std::io::ErrorKind::AddrInUse => anyhow::anyhow!(
+            "{address} is used by another program (ss -ltnp 'sport = :{}' shows which); stop it, or choose another \
                     port with --listen {}:{}",
-                address.port(),
-                address.ip(),
-                address.port().checked_add(1).unwrap_or(9090)
-            ),
-            _ => anyhow::Error::new(error).context(format!(
-                "cannot listen on {address}; choose another with --listen"
-            )),
-        })
+            address.port(),
+            address.ip(),
+            address.port().checked_add(1).unwrap_or(9090)
+        ),
+        _ => anyhow::Error::new(error).context(format!("cannot listen on {address}; choose another with --listen")),
+    })
 }
 
 #[cfg(test)]
@@ -346,40 +301,26 @@ mod tests {
 
     #[test]
     fn a_log_format_that_does_not_exist_is_refused_with_those_that_do() {
-        let parse =
-            |format: &str| DaemonArguments::try_parse_from(["cloudroidd", "--log-format", format]);
+        let parse = |format: &str| DaemonArguments::try_parse_from(["cloudroidd", "--log-format", format]);
         let refused = parse("xml").expect_err("no such format").to_string();
-        assert!(
-            refused.contains("text") && refused.contains("json"),
-            "{refused}"
-        );
+        assert!(refused.contains("text") && refused.contains("json"), "{refused}");
         let arguments = parse("json").expect("a format");
         assert_eq!(arguments.log_format, Some(LogFormat::Json));
     }
 
     #[test]
     fn without_root_the_command_that_has_it_is_named() {
-        let refused = require_root(nix::unistd::Uid::from_raw(1000))
-            .expect_err("not root")
-            .to_string();
+        let refused = require_root(nix::unistd::Uid::from_raw(1000)).expect_err("not root").to_string();
         let this = std::env::args().next().expect("this program");
-        assert!(
-            refused.contains("user 1000") && refused.contains(&format!("sudo {this}")),
-            "{refused}"
-        );
+        assert!(refused.contains("user 1000") && refused.contains(&format!("sudo {this}")), "{refused}");
         require_root(nix::unistd::Uid::from_raw(0)).expect("root");
     }
 
     #[tokio::test]
     async fn a_taken_port_is_named_with_the_way_out() {
-        let holder = listen("127.0.0.1:0".parse().expect("an address"))
-            .await
-            .expect("a free port");
+        let holder = listen("127.0.0.1:0".parse().expect("an address")).await.expect("a free port");
         let address = holder.local_addr().expect("bound");
         let refused = listen(address).await.expect_err("taken").to_string();
-        assert!(
-            refused.contains(&address.to_string()) && refused.contains("--listen"),
-            "{refused}"
-        );
+        assert!(refused.contains(&address.to_string()) && refused.contains("--listen"), "{refused}");
     }
 }

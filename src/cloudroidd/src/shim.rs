@@ -33,14 +33,9 @@ impl Resident for MasterResident {
             }
             // The shim's thread is in the servant's network namespace.
             let listener = TcpListener::bind(master::ADDRESS).await?;
-            let master = Master::new(MasterOptions {
-                parameters: config.parameters,
-                ..MasterOptions::default()
-            });
+            let master = Master::new(MasterOptions { parameters: config.parameters, ..MasterOptions::default() });
             self.master = Some(master.clone());
-            tokio::task::spawn_local(async move {
-                master.serve(listener, Arc::new(LoopbackSockets)).await
-            });
+            tokio::task::spawn_local(async move { master.serve(listener, Arc::new(LoopbackSockets)).await });
             Ok(())
         })
     }

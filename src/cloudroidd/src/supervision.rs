@@ -9,9 +9,7 @@ use tokio_util::sync::CancellationToken;
 /// Handles the signals that ask the daemon to end: the first one cancels the returned token. The second one ends the
 /// process at once, whatever it is doing, after `at_once`; servants go on, and the next daemon removes what is
 /// unfinished.
-pub fn termination_token(
-    at_once: impl FnOnce() + Send + 'static,
-) -> std::io::Result<CancellationToken> {
+pub fn termination_token(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<CancellationToken> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let asked = CancellationToken::new();

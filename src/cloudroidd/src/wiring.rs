@@ -27,12 +27,7 @@ use crate::{bases, certificates, doctor, machine};
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Builds the daemon with all its components; only the watch over the database runs yet.
-pub fn build(
-    config: &Config,
-    home: &Home,
-    machine: MachineChecks,
-    listen: SocketAddr,
-) -> anyhow::Result<Arc<App>> {
+pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: SocketAddr) -> anyhow::Result<Arc<App>> {
     let state = Arc::new(State::open(&home.database())?);
     tokio::spawn(store::flush_pending_writes(Arc::clone(&state)));
     let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?
@@ -44,17 +39,12 @@ pub fn build(
     let principals = principals.with_provider(known)?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
-    let resources = EngineResources {
-        catalogue: Arc::clone(&catalogue),
-        egress: config.allow.egress.clone(),
-    };
+    let resources = EngineResources { catalogue: Arc::clone(&catalogue), egress: config.allow.egress.clone() };
     let local = LocalEngine::new(engine_config(config, home)?)?.with_resources(Arc::new(resources));
     let engine: Arc<dyn Engine> = Arc::new(local.clone());
     let opener = Arc::new(LocalOpener::new(local.clone(), config.allow.egress.clone()));
     let promised = &config.capacity;
-    let memory = promised
-        .memory
-        .map_or_else(machine::usable_memory, |size| size.0);
+    let memory = promised.memory.map_or_else(machine::usable_memory, |size| size.0);
     let capacity = Amount::new(promised.cores() * promised.overcommit, memory);
     let choreographer = Choreographer::new(
         config.choreographer_options(),
@@ -65,13 +55,7 @@ pub fn build(
         Admission::new(capacity, promised.queue),
     );
     let definitions = bases::write_definitions(config, home)?;
-    let builder = image_builder(
-        config,
-        home,
-        definitions,
-        catalogue.images(),
-        Arc::new(local),
-    )?;
+    let builder = image_builder(config, home, definitions, catalogue.images(), Arc::new(local))?;
     let parts = push::PusherParts {
         builder: Arc::new(builder),
         catalogue: Arc::clone(&catalogue),
@@ -162,11 +146,8 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
     let servants = home.path().join("servants");
     let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
     engine.default_limits = config.limits;
-    engine.shim_limits = api::Limits {
-        cpus: Some(config.memory.shim_cpus),
-        memory: Some(config.memory.shim),
-        ..api::Limits::default()
-    };
+    engine.shim_limits =
+        api::Limits { cpus: Some(config.memory.shim_cpus), memory: Some(config.memory.shim), ..api::Limits::default() };
     engine.quotas = servant::quotas::Quotas {
         scratch: config.servant.scratch.map(|size| size.0),
         inodes: config.servant.inodes,
@@ -186,20 +167,14 @@ pub async fn drain(app: &App, keep_servants: bool) {
     app.pusher.cancel_all(app.options.drain).await;
     app.choreographer.end_warm_pool().await;
     if keep_servants {
-        tracing::info!(
-            "stopping; {} servants keep running",
-            app.choreographer.servants().len()
-        );
+        tracing::info!("stopping; {} servants keep running", app.choreographer.servants().len());
         for handle in app.choreographer.servants() {
             if let Some(reach) = handle.reach() {
                 reach.close_sessions("the daemon is being restarted; connect again");
             }
         }
     } else {
-        let ended = app
-            .choreographer
-            .stop("the daemon is shutting down", |_| true)
-            .await;
+        let ended = app.choreographer.stop("the daemon is shutting down", |_| true).await;
         tracing::info!("stopping; {} servants ended", ended.len());
     }
     app.sessions.close();

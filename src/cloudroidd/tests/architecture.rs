@@ -14,10 +14,7 @@ const LARGEST_CIRCLE: usize = 5;
 
 /// Returns the root of the repository.
 fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../..")
-        .canonicalize()
-        .expect("two levels up")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().expect("two levels up")
 }
 
 fn read(path: &Path) -> toml::Table {
@@ -28,9 +25,7 @@ fn read(path: &Path) -> toml::Table {
 /// Returns the names of all crates of the workspace by their directories.
 fn members() -> BTreeMap<String, String> {
     let workspace = read(&root().join("Cargo.toml"));
-    let members = workspace["workspace"]["members"]
-        .as_array()
-        .expect("a list");
+    let members = workspace["workspace"]["members"].as_array().expect("a list");
     let directories = members.iter().filter_map(|member| member.as_str());
     directories
         .map(|directory| {
@@ -47,18 +42,14 @@ fn dependencies(directory: &str, known: &BTreeSet<&str>) -> BTreeSet<String> {
     let Some(dependencies) = manifest.get("dependencies").and_then(|all| all.as_table()) else {
         return BTreeSet::new();
     };
-    let ours = dependencies
-        .keys()
-        .filter(|name| known.contains(name.as_str()));
+    let ours = dependencies.keys().filter(|name| known.contains(name.as_str()));
     ours.cloned().collect()
 }
 
 /// Returns the rows of the map: the path in the first column and the crates that it uses.
 fn rows() -> Vec<(String, BTreeSet<String>)> {
     let text = std::fs::read_to_string(root().join("ARCHITECTURE.md")).expect("it is there");
-    let (_, map) = text
-        .split_once("\n| where | what it is | uses |")
-        .expect("the map");
+    let (_, map) = text.split_once("\n| where | what it is | uses |").expect("the map");
     let (map, _) = map.split_once("\n\n").expect("its end");
     let rows = map.lines().filter(|line| line.starts_with("| `"));
     rows.map(|line| {
@@ -81,30 +72,16 @@ fn the_map_says_what_the_manifests_say() {
     let rows = rows();
     let mut above = BTreeSet::new();
     for (place, told) in &rows {
-        let inside = |directory: &&String| {
-            *directory == place || directory.starts_with(&format!("{place}/"))
-        };
+        let inside = |directory: &&String| *directory == place || directory.starts_with(&format!("{place}/"));
         let crates: Vec<&String> = members.keys().filter(inside).collect();
-        let found: BTreeSet<String> = crates
-            .iter()
-            .flat_map(|directory| dependencies(directory, &known))
-            .collect();
-        assert_eq!(
-            *told, found,
-            "what {place} uses, in the map and in its manifest"
-        );
+        let found: BTreeSet<String> = crates.iter().flat_map(|directory| dependencies(directory, &known)).collect();
+        assert_eq!(*told, found, "what {place} uses, in the map and in its manifest");
         for used in &found {
-            assert!(
-                above.contains(used.as_str()),
-                "{place} uses {used}, which stands below it: imports run one way"
-            );
+            assert!(above.contains(used.as_str()), "{place} uses {used}, which stands below it: imports run one way");
         }
         above.extend(crates.iter().map(|directory| members[*directory].as_str()));
     }
-    let untold: Vec<&&str> = known
-        .iter()
-        .filter(|name| !above.contains(**name))
-        .collect();
+    let untold: Vec<&&str> = known.iter().filter(|name| !above.contains(**name)).collect();
     assert!(untold.is_empty(), "the map has no row for {untold:?}");
 }
 
@@ -160,9 +137,7 @@ fn is_tested(cell: &str) -> bool {
         let (directory, _) = directory.expect(cell);
         let mut files = Vec::new();
         sources(&root().join(directory), &mut files);
-        let text = files
-            .iter()
-            .map(|file| std::fs::read_to_string(file).expect("text"));
+        let text = files.iter().map(|file| std::fs::read_to_string(file).expect("text"));
         let text: String = text.collect();
         for test in before.split('`').skip(1).step_by(2) {
             let is_there = test.contains("::") || text.contains(&format!("fn {test}("));
@@ -184,22 +159,15 @@ fn the_stories_that_security_rests_on_exist() {
     for row in table.lines().filter(|line| line.starts_with("| ")) {
         let cells: Vec<&str> = row.trim_matches('|').split(" | ").collect();
         assert_eq!(cells.len(), 4, "{row}");
-        let stories: Vec<&str> = cells[3]
-            .split('`')
-            .filter(|text| text.contains("::"))
-            .collect();
+        let stories: Vec<&str> = cells[3].split('`').filter(|text| text.contains("::")).collect();
         // A limit that one crate enforces is covered by a test of that crate.
         let tested = is_tested(cells[3]);
         assert!(!stories.is_empty() || tested, "nothing shows: {row}");
         for story in stories {
             let (module, name) = story.split_once("::").expect("a module");
             let of_module = registered.split_once(&format!("stories![{module}:"));
-            let (of_module, _) = of_module
-                .and_then(|(_, rest)| rest.split_once("],"))
-                .expect(story);
-            let is_there = of_module
-                .lines()
-                .any(|line| line.trim().trim_end_matches(',') == name);
+            let (of_module, _) = of_module.and_then(|(_, rest)| rest.split_once("],")).expect(story);
+            let is_there = of_module.lines().any(|line| line.trim().trim_end_matches(',') == name);
             assert!(is_there, "tests/main.rs has no {story}");
             named += 1;
         }
@@ -217,9 +185,9 @@ fn the_stories_that_security_rests_on_exist() {
     });
     let mut counted = 0;
     for (name, least) in rows {
-        let holds = stories.iter().any(|story| {
-            story.contains(&format!("pub fn {name}()")) && story.contains(&format!("> {least}, "))
-        });
+        let holds = stories
+            .iter()
+            .any(|story| story.contains(&format!("pub fn {name}()")) && story.contains(&format!("> {least}, ")));
         assert!(holds, "{name} does not hold itself to {least} attempts");
         counted += 1;
     }
@@ -236,10 +204,7 @@ fn every_module_of_stories_and_every_crate_has_a_subject() {
         .map(|path| path.file_stem().expect("a name").display().to_string())
         .collect();
     let told: Vec<&str> = subjects::SUBJECTS.iter().map(|row| row.0).collect();
-    assert!(
-        told.is_sorted_by(|one, other| one < other),
-        "rows stand in the order of their names, each once: {told:?}"
-    );
+    assert!(told.is_sorted_by(|one, other| one < other), "rows stand in the order of their names, each once: {told:?}");
     for module in &modules {
         assert!(
             told.contains(&module.as_str()),
@@ -289,9 +254,7 @@ fn words(line: &str) -> Vec<String> {
         Some(("crate" | "self" | "super", rest)) => rest.rsplit("::").next(),
         Some(_) => None,
     });
-    own.filter(|word| !word.is_empty())
-        .map(str::to_owned)
-        .collect()
+    own.filter(|word| !word.is_empty()).map(str::to_owned).collect()
 }
 
 /// Returns the types declared in a file, found by the layout of rustfmt.
@@ -304,9 +267,7 @@ fn types(file: &Path) -> Vec<TypeDefinition> {
         let indent = line.len() - declared.len();
         let mut head = words(declared).into_iter();
         let is_type = |word: &String| word == "struct" || word == "enum";
-        let keyword = head
-            .by_ref()
-            .find(|word| !matches!(word.as_str(), "pub" | "crate" | "super"));
+        let keyword = head.by_ref().find(|word| !matches!(word.as_str(), "pub" | "crate" | "super"));
         let (true, Some(name)) = (keyword.as_ref().is_some_and(is_type), head.next()) else {
             continue;
         };
@@ -315,8 +276,7 @@ fn types(file: &Path) -> Vec<TypeDefinition> {
             !(line.is_empty() || line.ends_with(';') || line == "}")
         });
         let is_code = |line: &&&str| !line.trim_start().starts_with("//");
-        let ends =
-            |line: &&str| line.len() - line.trim_start().len() == indent && line.trim() == "}";
+        let ends = |line: &&str| line.len() - line.trim_start().len() == indent && line.trim() == "}";
         let body = lines[at + 1..].iter().take_while(|line| !ends(line));
         // A type on one line has no body.
         let body = body.take(if line.ends_with('{') { usize::MAX } else { 0 });
@@ -324,9 +284,7 @@ fn types(file: &Path) -> Vec<TypeDefinition> {
             file: file.to_owned(),
             name,
             attributes: above.filter(is_code).copied().collect(),
-            words: head
-                .chain(body.filter(is_code).flat_map(|line| words(line)))
-                .collect(),
+            words: head.chain(body.filter(is_code).flat_map(|line| words(line))).collect(),
         });
     }
     types
@@ -364,9 +322,8 @@ fn no_untagged_enum_is_read_that_holds_itself() {
             let words = one.words.iter().map(String::as_str);
             holds.entry(&one.name).or_default().extend(words);
         }
-        let is_read_untagged = |one: &&TypeDefinition| {
-            one.attributes.contains("untagged") && one.attributes.contains("Deserialize")
-        };
+        let is_read_untagged =
+            |one: &&TypeDefinition| one.attributes.contains("untagged") && one.attributes.contains("Deserialize");
         for one in types.iter().filter(is_read_untagged) {
             untagged += 1;
             let mut reached = BTreeSet::new();

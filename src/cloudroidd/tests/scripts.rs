@@ -19,11 +19,7 @@ fn run_parts(parts: &[&str]) -> Output {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let place = tempfile::tempdir().expect("a directory");
     std::fs::create_dir(place.path().join("scripts")).expect("a directory");
-    std::fs::copy(
-        root.join("scripts/parts"),
-        place.path().join("scripts/parts"),
-    )
-    .expect("a copy");
+    std::fs::copy(root.join("scripts/parts"), place.path().join("scripts/parts")).expect("a copy");
     std::fs::write(place.path().join("Makefile"), MAKEFILE).expect("a file");
     Command::new(place.path().join("scripts/parts"))
         .args(parts)
@@ -52,10 +48,7 @@ fn a_part_that_failed_is_named_with_the_end_of_its_log() {
     let output = run_parts(&["room", "lint"]);
     let text = lines(&output);
     assert_eq!(output.status.code(), Some(1), "{text}");
-    assert!(
-        text.contains("== lint failed; the end of target/parts/lint.log:\na line is too long"),
-        "{text}"
-    );
+    assert!(text.contains("== lint failed; the end of target/parts/lint.log:\na line is too long"), "{text}");
     assert!(text.ends_with("failed: lint\n"), "{text}");
 }
 
@@ -64,8 +57,5 @@ fn an_unknown_part_is_refused_with_those_that_there_are() {
     let output = run_parts(&["nothing"]);
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{text}");
-    assert!(
-        text.contains("knows no part nothing") && text.contains("unit"),
-        "{text}"
-    );
+    assert!(text.contains("knows no part nothing") && text.contains("unit"), "{text}");
 }

@@ -106,12 +106,7 @@ impl CodecSelector {
 
     /// Creates a selector among `codecs`; the first one is used until more is known.
     pub fn with_candidates(codecs: &[Codec]) -> Self {
-        let estimate = |&codec| CodecEstimate {
-            codec,
-            ratio: 1.0,
-            nanoseconds_per_byte: 0.0,
-            samples: 0,
-        };
+        let estimate = |&codec| CodecEstimate { codec, ratio: 1.0, nanoseconds_per_byte: 0.0, samples: 0 };
         let mut candidates: Vec<_> = codecs.iter().map(estimate).collect();
         if candidates.is_empty() {
             candidates.push(estimate(&Codec::Zstd(3)));
@@ -136,50 +131,32 @@ impl CodecSelector {
     pub fn set_deadline(&mut self, deadline: Option<Duration>) {
         let lossy = |candidate: &CodecEstimate| !candidate.codec.is_lossless();
         let has_lossy = self.candidates.iter().any(lossy);
-        self.deadline = deadline
-            .filter(|_| has_lossy)
-            .map(|deadline| deadline.as_secs_f64());
+        self.deadline = deadline.filter(|_| has_lossy).map(|deadline| deadline.as_secs_f64());
     }
 
     /// Returns the codec for the next message: the current one, or one to be tried.
     pub fn choose(&mut self) -> Codec {
         self.messages += 1;
-        let untried = self
-            .candidates
-            .iter()
-            .position(|candidate| candidate.samples == 0);
+        let untried = self.candidates.iter().position(|candidate| candidate.samples == 0);
         if let Some(untried) = untried {
             return self.candidates[untried].codec;
         }
         if self.messages % PROBE_EVERY == 0 && self.candidates.len() > 1 {
             self.probes += 1;
             let others = self.candidates.len() - 1;
-            return self.candidates
-                [(self.current + 1 + self.probes % others) % self.candidates.len()]
-            .codec;
+            return self.candidates[(self.current + 1 + self.probes % others) % self.candidates.len()].codec;
         }
         self.candidates[self.current].codec
     }
 
     /// Records that a message of `message` bytes arrived at `now` (by any steady clock), and that encoding took `cpu`
     /// and produced `frame` bytes.
-    pub fn record_encoding(
-        &mut self,
-        codec: Codec,
-        message: usize,
-        frame: usize,
-        cpu: Duration,
-        now: Duration,
-    ) {
+    pub fn record_encoding(&mut self, codec: Codec, message: usize, frame: usize, cpu: Duration, now: Duration) {
         if let Some(last) = self.last.replace(now) {
             update_average(&mut self.period, now.saturating_sub(last).as_secs_f64());
         }
         let size = message.max(1) as f64;
-        let Some(candidate) = self
-            .candidates
-            .iter_mut()
-            .find(|candidate| candidate.codec == codec)
-        else {
+        let Some(candidate) = self.candidates.iter_mut().find(|candidate| candidate.codec == codec) else {
             return;
         };
         let (ratio, cost) = (frame as f64 / size, cpu.as_nanos() as f64 / size);
@@ -187,11 +164,8 @@ impl CodecSelector {
         candidate.ratio += weight * (ratio - candidate.ratio);
         candidate.nanoseconds_per_byte += weight * (cost - candidate.nanoseconds_per_byte);
         candidate.samples += 1;
-        self.usual_size = if self.usual_size == 0.0 {
-            size
-        } else {
-            self.usual_size + NEWEST * (size - self.usual_size)
-        };
+        self.usual_size =
+            if self.usual_size == 0.0 { size } else { self.usual_size + NEWEST * (size - self.usual_size) };
         self.decide();
     }
 
@@ -230,21 +204,14 @@ impl CodecSelector {
         let expected = self
             .candidates
             .iter()
-            .map(|candidate| {
-                (
-                    *candidate,
-                    Duration::from_secs_f64(self.expected_latency(candidate).clamp(0.0, 1e6)),
-                )
-            })
+            .map(|candidate| (*candidate, Duration::from_secs_f64(self.expected_latency(candidate).clamp(0.0, 1e6))))
             .collect();
         CodecChoice {
             codec: self.candidates[self.current].codec,
             reason: self.reason,
             switches: self.switches,
             link: self.throughput(),
-            period: self
-                .period
-                .map(|period| Duration::from_secs_f64(period.clamp(0.0, 1e6))),
+            period: self.period.map(|period| Duration::from_secs_f64(period.clamp(0.0, 1e6))),
             expected,
         }
     }
@@ -268,34 +235,22 @@ impl CodecSelector {
 
     /// Returns true if encoding and sending each finish before the next message, and together before the deadline.
     fn keeps_up(&self, candidate: &CodecEstimate) -> bool {
-        if self
-            .deadline
-            .is_some_and(|deadline| self.expected_latency(candidate) > deadline)
-        {
+        if self.deadline.is_some_and(|deadline| self.expected_latency(candidate) > deadline) {
             return false;
         }
         let Some(period) = self.period else {
             return true;
         };
-        self.encoding_time(candidate)
-            .max(self.transfer_time(candidate))
-            <= SHARE * period
+        self.encoding_time(candidate).max(self.transfer_time(candidate)) <= SHARE * period
     }
 
     /// Returns the best candidate by the current measurements.
     fn best(&self) -> (usize, Reason) {
-        let tried = || {
-            self.candidates
-                .iter()
-                .enumerate()
-                .filter(|(_, candidate)| candidate.samples > 0)
-        };
+        let tried = || self.candidates.iter().enumerate().filter(|(_, candidate)| candidate.samples > 0);
         let soonest = |index: &usize, other: &usize| {
-            self.expected_latency(&self.candidates[*index])
-                .total_cmp(&self.expected_latency(&self.candidates[*other]))
+            self.expected_latency(&self.candidates[*index]).total_cmp(&self.expected_latency(&self.candidates[*other]))
         };
-        let lossless = tried()
-            .filter(|(_, candidate)| candidate.codec.is_lossless() && self.keeps_up(candidate));
+        let lossless = tried().filter(|(_, candidate)| candidate.codec.is_lossless() && self.keeps_up(candidate));
         if let Some(best) = lossless.map(|(index, _)| index).min_by(soonest) {
             return (best, Reason::Fastest);
         }
@@ -304,10 +259,7 @@ impl CodecSelector {
             return (best, Reason::OnlyOneThatKeepsUp);
         }
         let least = tried().map(|(index, _)| index).min_by(|&index, &other| {
-            let late = |candidate: &CodecEstimate| {
-                self.encoding_time(candidate)
-                    .max(self.transfer_time(candidate))
-            };
+            let late = |candidate: &CodecEstimate| self.encoding_time(candidate).max(self.transfer_time(candidate));
             late(&self.candidates[index]).total_cmp(&late(&self.candidates[other]))
         });
         (least.unwrap_or(self.current), Reason::LeastLate)
@@ -376,15 +328,9 @@ mod tests {
         let mut auto = CodecSelector::new(Schema::Image, Some(Codec::Video));
         let mut clock = 0;
         run_messages(&mut auto, 60, 1e9, &mut clock);
-        assert_eq!(
-            (auto.choice().codec, auto.choice().reason),
-            (Codec::Raw, Reason::Fastest)
-        );
+        assert_eq!((auto.choice().codec, auto.choice().reason), (Codec::Raw, Reason::Fastest));
         run_messages(&mut auto, 60, 20e6, &mut clock);
-        assert_eq!(
-            (auto.choice().codec, auto.choice().reason),
-            (Codec::Image, Reason::Fastest)
-        );
+        assert_eq!((auto.choice().codec, auto.choice().reason), (Codec::Image, Reason::Fastest));
         assert_eq!(auto.choice().expected.len(), 4);
     }
 
@@ -393,18 +339,12 @@ mod tests {
         let mut clock = 0;
         let mut auto = CodecSelector::new(Schema::Image, Some(Codec::Video));
         run_messages(&mut auto, 60, 2e6, &mut clock);
-        assert_eq!(
-            (auto.choice().codec, auto.choice().reason),
-            (Codec::Video, Reason::OnlyOneThatKeepsUp)
-        );
+        assert_eq!((auto.choice().codec, auto.choice().reason), (Codec::Video, Reason::OnlyOneThatKeepsUp));
         run_messages(&mut auto, 120, 40e6, &mut clock);
         assert_eq!(auto.choice().codec, Codec::Image);
         let mut lossless = CodecSelector::new(Schema::Image, None);
         run_messages(&mut lossless, 60, 2e6, &mut clock);
-        assert_eq!(
-            (lossless.choice().codec, lossless.choice().reason),
-            (Codec::Image, Reason::LeastLate)
-        );
+        assert_eq!((lossless.choice().codec, lossless.choice().reason), (Codec::Image, Reason::LeastLate));
     }
 
     #[test]
@@ -416,10 +356,7 @@ mod tests {
         assert_eq!(auto.choice().codec, Codec::Image);
         auto.set_deadline(Some(Duration::from_millis(15)));
         run_messages(&mut auto, 60, 10.5e6, &mut clock);
-        assert_eq!(
-            (auto.choice().codec, auto.choice().reason),
-            (Codec::Jpeg, Reason::OnlyOneThatKeepsUp)
-        );
+        assert_eq!((auto.choice().codec, auto.choice().reason), (Codec::Jpeg, Reason::OnlyOneThatKeepsUp));
         // Over a faster link nothing need be lost.
         run_messages(&mut auto, 120, 60e6, &mut clock);
         assert_eq!(auto.choice().codec, Codec::Image);
@@ -436,12 +373,7 @@ mod tests {
         let mut clock = 0;
         // Around the point where raw and image take the same time: 1 MB / 150 MB/s = 6.7 ms.
         for round in 0..200 {
-            run_messages(
-                &mut auto,
-                3,
-                if round % 2 == 0 { 140e6 } else { 165e6 },
-                &mut clock,
-            );
+            run_messages(&mut auto, 3, if round % 2 == 0 { 140e6 } else { 165e6 }, &mut clock);
         }
         assert!(auto.choice().switches <= 1, "{}", auto.choice().switches);
     }
@@ -451,19 +383,9 @@ mod tests {
         let mut auto = CodecSelector::new(Schema::Other, None);
         let mut clock = 0;
         run_messages(&mut auto, 4, 10e6, &mut clock);
-        assert!(
-            auto.choice()
-                .expected
-                .iter()
-                .all(|(estimate, _)| estimate.samples == 1)
-        );
+        assert!(auto.choice().expected.iter().all(|(estimate, _)| estimate.samples == 1));
         run_messages(&mut auto, 400, 10e6, &mut clock);
-        assert!(
-            auto.choice()
-                .expected
-                .iter()
-                .all(|(estimate, _)| estimate.samples > 1)
-        );
+        assert!(auto.choice().expected.iter().all(|(estimate, _)| estimate.samples > 1));
     }
 
     #[test]
@@ -473,12 +395,7 @@ mod tests {
         let mut decoder = crate::Decoder::new(1000);
         for round in 0..10 {
             let mut frame = Vec::new();
-            auto.encode(
-                &mut encoder,
-                &[7; 1000],
-                || Duration::from_millis(round),
-                &mut frame,
-            );
+            auto.encode(&mut encoder, &[7; 1000], || Duration::from_millis(round), &mut frame);
             let mut back = Vec::new();
             decoder.decode(&frame, &mut back).unwrap();
             assert_eq!(back, [7; 1000]);

@@ -34,8 +34,7 @@ pub(crate) fn encode(message: &[u8], layout: &CloudLayout, out: &mut Vec<u8>) {
     let points: &[u8] = if row == layout.row_step {
         data
     } else {
-        data.chunks_exact(layout.row_step)
-            .for_each(|line| packed.extend_from_slice(&line[..row]));
+        data.chunks_exact(layout.row_step).for_each(|line| packed.extend_from_slice(&line[..row]));
         &packed
     };
     for offset in gap_offsets(layout) {
@@ -56,29 +55,21 @@ pub(crate) fn encode(message: &[u8], layout: &CloudLayout, out: &mut Vec<u8>) {
                 column::encode_words(&read_words(points, layout, field.offset), shape, out);
             }
             (_, NumberType::Short) => {
-                let at = |point: &[u8]| {
-                    u16::from_le_bytes([point[field.offset], point[field.offset + 1]])
-                };
+                let at = |point: &[u8]| u16::from_le_bytes([point[field.offset], point[field.offset + 1]]);
                 let samples: Vec<u16> = points.chunks_exact(layout.point_step).map(at).collect();
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
             (_, NumberType::Byte) => {
-                let samples: Vec<u16> = points
-                    .chunks_exact(layout.point_step)
-                    .map(|point| point[field.offset].into())
-                    .collect();
+                let samples: Vec<u16> =
+                    points.chunks_exact(layout.point_step).map(|point| point[field.offset].into()).collect();
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
             (_, NumberType::Double) => {
                 for offset in [0, 4] {
                     out.push(NUMBERS);
-                    column::encode_words(
-                        &read_words(points, layout, field.offset + offset),
-                        shape,
-                        out,
-                    );
+                    column::encode_words(&read_words(points, layout, field.offset + offset), shape, out);
                 }
             }
         }
@@ -86,11 +77,7 @@ pub(crate) fn encode(message: &[u8], layout: &CloudLayout, out: &mut Vec<u8>) {
 }
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
-pub(crate) fn decode(
-    input: &mut FrameCursor<'_>,
-    total: usize,
-    out: &mut Vec<u8>,
-) -> Result<(), Error> {
+pub(crate) fn decode(input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
     let (layout, ends) = take_ends(input, "a head that is not a cloud's", |ends| {
         let layout = CloudLayout::read(ends, total)?;
         let (head, tail) = (layout.head, layout.tail);
@@ -102,10 +89,7 @@ pub(crate) fn decode(
     dense.copy_from_slice(&[input.byte()?]);
     let row = layout.width * layout.point_step;
     take_padding(input, data, row, layout.row_step)?;
-    let mut points = PointWriter {
-        data,
-        layout: &layout,
-    };
+    let mut points = PointWriter { data, layout: &layout };
     for offset in gap_offsets(&layout) {
         take_gap(input, &mut points, offset)?;
     }
@@ -126,10 +110,7 @@ pub(crate) fn decode(
             }
             (_, NumberType::Short) => {
                 let samples = take_shorts(input, shape)?;
-                points.put(
-                    field.offset,
-                    samples.iter().map(|sample| sample.to_le_bytes()),
-                );
+                points.put(field.offset, samples.iter().map(|sample| sample.to_le_bytes()));
                 known.add_ring(field, samples);
             }
             (_, NumberType::Byte) => {
@@ -141,10 +122,7 @@ pub(crate) fn decode(
                 for offset in [0, 4] {
                     expect_numbers(input)?;
                     let samples = column::decode_words(input, shape)?;
-                    points.put(
-                        field.offset + offset,
-                        samples.into_iter().map(u32::to_le_bytes),
-                    );
+                    points.put(field.offset + offset, samples.into_iter().map(u32::to_le_bytes));
                 }
             }
         }
@@ -153,19 +131,12 @@ pub(crate) fn decode(
 }
 
 fn expect_numbers(input: &mut FrameCursor<'_>) -> Result<(), Error> {
-    if input.byte()? == NUMBERS {
-        Ok(())
-    } else {
-        Err(Error::Corrupt("a column told in an unknown way"))
-    }
+    if input.byte()? == NUMBERS { Ok(()) } else { Err(Error::Corrupt("a column told in an unknown way")) }
 }
 
 fn column_shape(layout: &CloudLayout) -> Shape {
     if layout.height > 1 {
-        Shape::Picture {
-            width: layout.width,
-            height: layout.height,
-        }
+        Shape::Picture { width: layout.width, height: layout.height }
     } else {
         Shape::Sequence(layout.width)
     }
@@ -193,9 +164,7 @@ fn gap_offsets(layout: &CloudLayout) -> Vec<usize> {
     for field in &layout.fields {
         free[field.offset..field.offset + field.number.bytes()].fill(false);
     }
-    (0..layout.point_step)
-        .filter(|&offset| free[offset])
-        .collect()
+    (0..layout.point_step).filter(|&offset| free[offset]).collect()
 }
 
 fn read_words(points: &[u8], layout: &CloudLayout, offset: usize) -> Vec<u32> {
@@ -218,10 +187,7 @@ impl PointWriter<'_> {
     fn put<const N: usize>(&mut self, offset: usize, mut samples: impl Iterator<Item = [u8; N]>) {
         let row = self.layout.width * self.layout.point_step;
         for line in self.data.chunks_exact_mut(self.layout.row_step) {
-            for (point, sample) in line[..row]
-                .chunks_exact_mut(self.layout.point_step)
-                .zip(&mut samples)
-            {
+            for (point, sample) in line[..row].chunks_exact_mut(self.layout.point_step).zip(&mut samples) {
                 point[offset..offset + N].copy_from_slice(&sample);
             }
         }
@@ -230,31 +196,18 @@ impl PointWriter<'_> {
 
 /// Appends one byte of every point that no field describes; mostly constant.
 fn put_gap(points: &[u8], layout: &CloudLayout, offset: usize, out: &mut Vec<u8>) {
-    let mut bytes = points
-        .iter()
-        .skip(offset)
-        .step_by(layout.point_step)
-        .copied();
+    let mut bytes = points.iter().skip(offset).step_by(layout.point_step).copied();
     let first = bytes.clone().next().unwrap_or(0);
     if bytes.all(|byte| byte == first) {
         out.extend_from_slice(&[0, first]);
     } else {
         out.push(1);
-        let bytes: Vec<u8> = points
-            .iter()
-            .skip(offset)
-            .step_by(layout.point_step)
-            .copied()
-            .collect();
+        let bytes: Vec<u8> = points.iter().skip(offset).step_by(layout.point_step).copied().collect();
         put_packed(&bytes, out);
     }
 }
 
-fn take_gap(
-    input: &mut FrameCursor<'_>,
-    points: &mut PointWriter<'_>,
-    offset: usize,
-) -> Result<(), Error> {
+fn take_gap(input: &mut FrameCursor<'_>, points: &mut PointWriter<'_>, offset: usize) -> Result<(), Error> {
     match input.byte()? {
         0 => {
             let byte = input.byte()?;
@@ -279,12 +232,7 @@ fn put_colours(points: &[u8], layout: &CloudLayout, offset: usize, out: &mut Vec
         let (x, y) = (index % layout.width, index / layout.width);
         let colour = &point[offset..offset + 4];
         let green = colour[1];
-        let planes = [
-            colour[0].wrapping_sub(green),
-            green,
-            colour[2].wrapping_sub(green),
-            colour[3],
-        ];
+        let planes = [colour[0].wrapping_sub(green), green, colour[2].wrapping_sub(green), colour[3]];
         for (plane, value) in planes.into_iter().enumerate() {
             lanes.row_mut(plane, y)[x] = value;
         }
@@ -293,18 +241,10 @@ fn put_colours(points: &[u8], layout: &CloudLayout, offset: usize, out: &mut Vec
 }
 
 fn colour_lanes(layout: &CloudLayout) -> Lanes<u8> {
-    if layout.height > 1 {
-        Lanes::pictures(4, layout.width, layout.height)
-    } else {
-        Lanes::sequences(4, layout.width)
-    }
+    if layout.height > 1 { Lanes::pictures(4, layout.width, layout.height) } else { Lanes::sequences(4, layout.width) }
 }
 
-fn take_colours(
-    input: &mut FrameCursor<'_>,
-    points: &mut PointWriter<'_>,
-    offset: usize,
-) -> Result<(), Error> {
+fn take_colours(input: &mut FrameCursor<'_>, points: &mut PointWriter<'_>, offset: usize) -> Result<(), Error> {
     let mut lanes = colour_lanes(points.layout);
     plane8::decode(input, &mut lanes, 4)?;
     let (width, height) = (points.layout.width, points.layout.height);
@@ -315,12 +255,7 @@ fn take_colours(
             let rows: [&[u8]; 4] = std::array::from_fn(|plane| lanes.row(plane, y));
             (0..width).map(move |x| {
                 let green = rows[1][x];
-                [
-                    rows[0][x].wrapping_add(green),
-                    green,
-                    rows[2][x].wrapping_add(green),
-                    rows[3][x],
-                ]
+                [rows[0][x].wrapping_add(green), green, rows[2][x].wrapping_add(green), rows[3][x]]
             })
         }),
     );
@@ -337,11 +272,7 @@ fn successor_codes(samples: &[u16]) -> Option<Vec<u32>> {
             let guess = std::mem::replace(&mut next[usize::from(last)], sample);
             last = sample;
             hits += usize::from(guess == sample);
-            if guess == sample {
-                0
-            } else {
-                u32::from(sample) + 1
-            }
+            if guess == sample { 0 } else { u32::from(sample) + 1 }
         })
         .collect();
     (hits * 8 > samples.len() * 7).then_some(differences)
@@ -393,10 +324,7 @@ struct ReferenceColumns {
 
 impl ReferenceColumns {
     fn add(&mut self, field: PointField, bits: Vec<u32>) {
-        if matches!(
-            field.meaning,
-            FieldMeaning::X | FieldMeaning::Y | FieldMeaning::Z
-        ) {
+        if matches!(field.meaning, FieldMeaning::X | FieldMeaning::Y | FieldMeaning::Z) {
             self.coordinates.push(bits);
         }
     }
@@ -423,11 +351,7 @@ fn put_floats(bits: &[u32], known: &ReferenceColumns, shape: Shape, out: &mut Ve
     }
 }
 
-fn take_floats(
-    input: &mut FrameCursor<'_>,
-    known: &ReferenceColumns,
-    shape: Shape,
-) -> Result<Vec<u32>, Error> {
+fn take_floats(input: &mut FrameCursor<'_>, known: &ReferenceColumns, shape: Shape) -> Result<Vec<u32>, Error> {
     match input.byte()? {
         NUMBERS => column::decode_floats(input, shape),
         GUESSED => {

@@ -89,10 +89,7 @@ impl Codec {
 
     /// Returns the codec with this tag; levels are not on the wire, so it has its default level.
     pub fn from_tag(tag: u8) -> Option<Self> {
-        CODECS
-            .iter()
-            .find(|&&(known, ..)| known == tag)
-            .map(|&(.., codec)| codec)
+        CODECS.iter().find(|&&(known, ..)| known == tag).map(|&(.., codec)| codec)
     }
 
     /// Returns the lossless codec for messages of `schema`; zstd if there is no specific one.
@@ -131,9 +128,7 @@ impl fmt::Display for Codec {
 
 /// The error of an unknown codec name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud, jpeg or video"
-)]
+#[error("`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud, jpeg or video")]
 pub struct UnknownCodec(pub String);
 
 impl FromStr for Codec {
@@ -145,11 +140,7 @@ impl FromStr for Codec {
             Some((name, level)) => (name, Some(level.parse::<i8>().map_err(|_| unknown())?)),
             None => (text, None),
         };
-        let named = CODECS
-            .iter()
-            .find(|&&(_, known, _)| known == name)
-            .ok_or_else(unknown)?
-            .2;
+        let named = CODECS.iter().find(|&&(_, known, _)| known == name).ok_or_else(unknown)?.2;
         let Some(level) = level else { return Ok(named) };
         match named {
             Self::Zlib(_) if (0..=9).contains(&level) => Ok(Self::Zlib(level as u8)),
@@ -166,27 +157,15 @@ mod tests {
 
     #[test]
     fn names_and_tags_come_back() {
-        for name in [
-            "raw",
-            "zlib:9",
-            "deflate:0",
-            "zstd:-7",
-            "zstd:22",
-            "image",
-            "grid",
-            "scan",
-            "cloud",
-            "video",
-            "jpeg",
-        ] {
+        for name in
+            ["raw", "zlib:9", "deflate:0", "zstd:-7", "zstd:22", "image", "grid", "scan", "cloud", "video", "jpeg"]
+        {
             let codec: Codec = name.parse().unwrap();
             assert_eq!(codec.to_string(), name);
             assert_eq!(Codec::from_tag(codec.tag()).unwrap().name(), codec.name());
         }
         assert_eq!("zlib".parse(), Ok(Codec::Zlib(6)));
-        for name in [
-            "", "gzip", "zlib:10", "zlib:-1", "zstd:23", "image:1", "zstd:x",
-        ] {
+        for name in ["", "gzip", "zlib:10", "zlib:-1", "zstd:23", "image:1", "zstd:x"] {
             assert_eq!(name.parse::<Codec>(), Err(UnknownCodec(name.to_owned())));
         }
         assert_eq!(Codec::from_tag(0xff), None);

@@ -50,14 +50,7 @@ impl Shape {
 
     fn kinds(self) -> &'static [Kind] {
         match self {
-            Self::Picture { .. } => &[
-                Kind::West,
-                Kind::North,
-                Kind::Slope,
-                Kind::Plane,
-                Kind::Median,
-                Kind::Middle,
-            ],
+            Self::Picture { .. } => &[Kind::West, Kind::North, Kind::Slope, Kind::Plane, Kind::Median, Kind::Middle],
             Self::Sequence(_) => &[Kind::West, Kind::Line],
         }
     }
@@ -66,21 +59,13 @@ impl Shape {
 /// Maps a float's bits to an integer such that the order of floats is kept.
 #[inline]
 pub(crate) fn to_ordered_bits(bits: u32) -> u32 {
-    if bits >> 31 == 0 {
-        bits | 1 << 31
-    } else {
-        !bits
-    }
+    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
 }
 
 /// The inverse of [`to_ordered_bits`].
 #[inline]
 pub(crate) fn from_ordered_bits(order: u32) -> u32 {
-    if order >> 31 == 0 {
-        !order
-    } else {
-        order & !(1 << 31)
-    }
+    if order >> 31 == 0 { !order } else { order & !(1 << 31) }
 }
 
 /// Encodes 16-bit integers. Zero counts as "nothing measured" if all others are far from it.
@@ -108,9 +93,7 @@ fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<
     // Missing samples are recorded in the upper half, so that no check is needed before.
     let mut present = vec![false; 1 << 17];
     match missing {
-        None => samples
-            .iter()
-            .for_each(|&sample| present[usize::from(sample)] = true),
+        None => samples.iter().for_each(|&sample| present[usize::from(sample)] = true),
         Some(missing) => {
             let mut rest = samples;
             for gaps in missing.rows() {
@@ -122,9 +105,7 @@ fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<
             }
         }
     }
-    let values: Vec<u16> = (0..=u16::MAX)
-        .filter(|&value| present[usize::from(value)])
-        .collect();
+    let values: Vec<u16> = (0..=u16::MAX).filter(|&value| present[usize::from(value)]).collect();
     let (first, last) = (values.first()?, values.last()?);
     let span = usize::from(last - first) + 1;
     if values.len() * 4 > span * 3 || values.len() * 8 > samples.len() {
@@ -166,11 +147,7 @@ fn encode_plane16(
             lanes.fill(samples, |sample| sample);
         }
     }
-    Wide {
-        samples: lanes,
-        missing,
-    }
-    .encode(shape.kinds(), out);
+    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
 }
 
 /// Encodes 32-bit integers.
@@ -180,21 +157,14 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut preamble = Vec::new();
     put_varint(&mut preamble, zigzag(i64::from(smallest)));
     if largest - smallest < 1 << 16 {
-        let samples: Vec<u16> = samples
-            .iter()
-            .map(|&sample| (sample - smallest) as u16)
-            .collect();
+        let samples: Vec<u16> = samples.iter().map(|&sample| (sample - smallest) as u16).collect();
         encode_plane16(&samples, None, 0, &preamble, shape, out);
     } else {
         out.push(WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
         lanes.fill(samples, |sample| sample - smallest);
-        Wide {
-            samples: lanes,
-            missing: None,
-        }
-        .encode(shape.kinds(), out);
+        Wide { samples: lanes, missing: None }.encode(shape.kinds(), out);
     }
 }
 
@@ -202,18 +172,11 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
 pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut lanes = shape.lanes();
     lanes.fill(samples, |sample| sample);
-    Wide {
-        samples: lanes,
-        missing: None,
-    }
-    .encode(&[Kind::Zero], out);
+    Wide { samples: lanes, missing: None }.encode(&[Kind::Zero], out);
 }
 
 /// Decodes what [`encode_differences`] wrote.
-pub(crate) fn decode_differences(
-    input: &mut FrameCursor<'_>,
-    shape: Shape,
-) -> Result<Vec<u32>, Error> {
+pub(crate) fn decode_differences(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
     decode_plane(input, shape, None::<Lanes<u8>>).map(|(samples, _)| samples)
 }
 
@@ -236,11 +199,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     }
     if zeros > 0 && nearest >= 15 {
         for multiple in &mut multiples {
-            *multiple = if *multiple == 0 {
-                Scale::NONE
-            } else {
-                *multiple
-            };
+            *multiple = if *multiple == 0 { Scale::NONE } else { *multiple };
         }
     }
     let fits = |multiple: i32| multiple != Scale::NONE;
@@ -278,14 +237,8 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
         out.push(flags | WIDE);
         out.extend_from_slice(&preamble);
         let mut lanes = shape.lanes();
-        lanes.fill(&multiples, |multiple| {
-            multiple.wrapping_sub(smallest) as u32
-        });
-        Wide {
-            samples: lanes,
-            missing,
-        }
-        .encode(shape.kinds(), out);
+        lanes.fill(&multiples, |multiple| multiple.wrapping_sub(smallest) as u32);
+        Wide { samples: lanes, missing }.encode(shape.kinds(), out);
     }
 }
 
@@ -293,20 +246,13 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
 /// pay off.
 fn put_unscaled(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -> bool {
     let pairs = || bits.iter().zip(multiples);
-    let first = pairs()
-        .find(|&(_, &multiple)| multiple == Scale::NONE)
-        .map_or(0, |(&bits, _)| bits);
-    let same =
-        |(&bits, &multiple): (&u32, &i32)| u32::from((multiple == Scale::NONE) & (bits == first));
+    let first = pairs().find(|&(_, &multiple)| multiple == Scale::NONE).map_or(0, |(&bits, _)| bits);
+    let same = |(&bits, &multiple): (&u32, &i32)| u32::from((multiple == Scale::NONE) & (bits == first));
     if pairs().map(same).sum::<u32>() as usize == unfit {
         put_run(first, unfit as u32, out);
         return !is_measured(first) || unfit * 16 <= bits.len();
     }
-    let apart = || {
-        pairs()
-            .filter(|&(_, &multiple)| multiple == Scale::NONE)
-            .map(|(&bits, _)| bits)
-    };
+    let apart = || pairs().filter(|&(_, &multiple)| multiple == Scale::NONE).map(|(&bits, _)| bits);
     put_exceptions(apart(), out);
     apart().filter(|&bits| is_measured(bits)).count() * 16 <= bits.len()
 }
@@ -333,11 +279,7 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     out.extend_from_slice(&preamble);
     let mut lanes = shape.lanes();
     lanes.fill(bits, to_ordered_bits);
-    Wide {
-        samples: lanes,
-        missing,
-    }
-    .encode(shape.kinds(), out);
+    Wide { samples: lanes, missing }.encode(shape.kinds(), out);
 }
 
 /// Appends the `unfit` floats that are no measurements.
@@ -421,15 +363,10 @@ fn decode_plane<T: PlaneSample>(
     shape: Shape,
     missing: Option<Lanes<u8>>,
 ) -> Result<(Vec<T>, Option<Lanes<u8>>), Error> {
-    let mut wide = Wide {
-        samples: shape.lanes::<T>(),
-        missing,
-    };
+    let mut wide = Wide { samples: shape.lanes::<T>(), missing };
     wide.decode(input)?;
     let mut samples = Vec::with_capacity(shape.count());
-    wide.samples
-        .rows()
-        .for_each(|row| samples.extend_from_slice(row));
+    wide.samples.rows().for_each(|row| samples.extend_from_slice(row));
     samples.truncate(shape.count());
     Ok((samples, wide.missing))
 }
@@ -445,59 +382,30 @@ struct DecodedColumn {
 }
 
 /// Reads a column; `allowed` are the flags its type can have, `listed` whether missing values are listed.
-fn decode(
-    input: &mut FrameCursor<'_>,
-    shape: Shape,
-    allowed: u8,
-    listed: bool,
-) -> Result<DecodedColumn, Error> {
+fn decode(input: &mut FrameCursor<'_>, shape: Shape, allowed: u8, listed: bool) -> Result<DecodedColumn, Error> {
     let flags = input.byte()?;
     if flags & !allowed != 0 {
         return Err(Error::Corrupt("a column of another type"));
     }
-    let scale = if flags & SCALED != 0 {
-        Some(Scale::from_name(input.byte()?)?)
-    } else {
-        None
-    };
+    let scale = if flags & SCALED != 0 { Some(Scale::from_name(input.byte()?)?) } else { None };
     let gaps = flags & MISSING != 0;
-    let apart = if gaps && listed {
-        take_exceptions(input, shape.count())?
-    } else {
-        Vec::new()
-    };
-    let offset = if allowed & WIDE != 0 {
-        unzigzag(input.varint()?)
-    } else {
-        0
-    };
+    let apart = if gaps && listed { take_exceptions(input, shape.count())? } else { Vec::new() };
+    let offset = if allowed & WIDE != 0 { unzigzag(input.varint()?) } else { 0 };
     let missing = gaps.then(|| shape.lanes());
     let (samples, missing) = if flags & WIDE != 0 {
         decode_plane::<u32>(input, shape, missing)?
     } else {
-        let values = if flags & RANKS != 0 {
-            Some(take_ranks(input)?)
-        } else {
-            None
-        };
+        let values = if flags & RANKS != 0 { Some(take_ranks(input)?) } else { None };
         let (samples, missing) = decode_plane::<u16>(input, shape, missing)?;
         let samples = match values {
             None => samples.into_iter().map(u32::from).collect(),
-            Some(values) => samples
-                .into_iter()
-                .map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen())
-                .collect(),
+            Some(values) => {
+                samples.into_iter().map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen()).collect()
+            }
         };
         (samples, missing)
     };
-    Ok(DecodedColumn {
-        flags,
-        scale,
-        apart,
-        offset,
-        samples,
-        missing,
-    })
+    Ok(DecodedColumn { flags, scale, apart, offset, samples, missing })
 }
 
 fn take_ranks(input: &mut FrameCursor<'_>) -> Result<Vec<u16>, Error> {
@@ -525,9 +433,7 @@ impl DecodedColumn {
         for (sample, &gap) in self.samples.into_iter().zip(missing.rows().flatten()) {
             values.push(match gap {
                 0 => number(sample),
-                _ => apart
-                    .next()
-                    .ok_or(Error::Corrupt("fewer values apart than are missing"))?,
+                _ => apart.next().ok_or(Error::Corrupt("fewer values apart than are missing"))?,
             });
         }
         Ok(values)
@@ -537,11 +443,7 @@ impl DecodedColumn {
 /// Decodes what [`encode_shorts`] wrote.
 pub(crate) fn decode_shorts(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
     let decoded = decode(input, shape, MISSING | RANKS, false)?;
-    let mut samples: Vec<u16> = decoded
-        .samples
-        .iter()
-        .map(|&sample| sample as u16)
-        .collect();
+    let mut samples: Vec<u16> = decoded.samples.iter().map(|&sample| sample as u16).collect();
     if let Some(missing) = &decoded.missing {
         for (sample, &gap) in samples.iter_mut().zip(missing.rows().flatten()) {
             if gap != 0 {
@@ -561,17 +463,10 @@ pub(crate) fn decode_words(input: &mut FrameCursor<'_>, shape: Shape) -> Result<
 
 /// Decodes what [`encode_floats`] wrote.
 pub(crate) fn decode_floats(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
-    let decoded = decode(
-        input,
-        shape,
-        MISSING | RANKS | WIDE | SCALED | ORDERED,
-        true,
-    )?;
+    let decoded = decode(input, shape, MISSING | RANKS | WIDE | SCALED | ORDERED, true)?;
     let offset = decoded.offset as i32;
     match (decoded.scale, decoded.flags & ORDERED != 0) {
-        (Some(scale), false) => {
-            decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset)))
-        }
+        (Some(scale), false) => decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset))),
         (None, true) => decoded.restore(from_ordered_bits),
         _ => Err(Error::Corrupt("a column of floats without a mapping")),
     }
@@ -581,10 +476,7 @@ pub(crate) fn decode_floats(input: &mut FrameCursor<'_>, shape: Shape) -> Result
 mod tests {
     use super::*;
 
-    const PICTURE: Shape = Shape::Picture {
-        width: 40,
-        height: 50,
-    };
+    const PICTURE: Shape = Shape::Picture { width: 40, height: 50 };
 
     fn round_trip_floats(values: &[f32], shape: Shape) -> usize {
         let bits: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
@@ -598,20 +490,10 @@ mod tests {
 
     #[test]
     fn shorts_with_holes_and_steps_come_back() {
-        let picture = Shape::Picture {
-            width: 80,
-            height: 100,
-        };
+        let picture = Shape::Picture { width: 80, height: 100 };
         for shape in [picture, Shape::Sequence(8000)] {
-            let samples: Vec<u16> = (0..8000u16)
-                .map(|index| {
-                    if index % 11 == 0 {
-                        0
-                    } else {
-                        400 + index / 14 * 5
-                    }
-                })
-                .collect();
+            let samples: Vec<u16> =
+                (0..8000u16).map(|index| if index % 11 == 0 { 0 } else { 400 + index / 14 * 5 }).collect();
             let mut bytes = Vec::new();
             encode_shorts(&samples, shape, &mut bytes);
             assert_eq!(bytes[0], MISSING | RANKS);
@@ -624,9 +506,7 @@ mod tests {
     #[test]
     fn words_come_back() {
         for spread in [1u32, 1000, 2_000_000] {
-            let samples: Vec<u32> = (0..2000u32)
-                .map(|index| u32::MAX - index * spread)
-                .collect();
+            let samples: Vec<u32> = (0..2000u32).map(|index| u32::MAX - index * spread).collect();
             let mut bytes = Vec::new();
             encode_words(&samples, PICTURE, &mut bytes);
             let mut input = FrameCursor::new(&bytes);
@@ -637,15 +517,10 @@ mod tests {
 
     #[test]
     fn floats_of_all_sorts_come_back() {
-        let millimetres: Vec<f32> = (0..2000)
-            .map(|index| (1000 + index % 300) as f32 * 0.001)
-            .collect();
+        let millimetres: Vec<f32> = (0..2000).map(|index| (1000 + index % 300) as f32 * 0.001).collect();
         assert!(round_trip_floats(&millimetres, PICTURE) < 800);
         let mut holes = millimetres.clone();
-        holes
-            .iter_mut()
-            .step_by(9)
-            .for_each(|value| *value = f32::NAN);
+        holes.iter_mut().step_by(9).for_each(|value| *value = f32::NAN);
         holes[3] = f32::from_bits(0x7fc0_1234);
         holes[4] = f32::NEG_INFINITY;
         holes[5] = 1.234_567_9;
@@ -654,10 +529,7 @@ mod tests {
         let rough: Vec<f32> = (0..2000).map(|index| (index as f32).sin() * 1e10).collect();
         round_trip_floats(&rough, PICTURE);
         round_trip_floats(&rough, Shape::Sequence(2000));
-        round_trip_floats(
-            &[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX],
-            Shape::Sequence(4),
-        );
+        round_trip_floats(&[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX], Shape::Sequence(4));
         round_trip_floats(&[], Shape::Sequence(0));
     }
 
@@ -673,16 +545,7 @@ mod tests {
 
     #[test]
     fn the_order_of_floats_is_kept() {
-        let values = [
-            f32::NEG_INFINITY,
-            -2.0,
-            -1.0,
-            -0.0,
-            0.0,
-            1e-30,
-            1.0,
-            f32::INFINITY,
-        ];
+        let values = [f32::NEG_INFINITY, -2.0, -1.0, -0.0, 0.0, 1e-30, 1.0, f32::INFINITY];
         let orders = values.map(|value| to_ordered_bits(value.to_bits()));
         assert!(orders.windows(2).all(|pair| pair[0] < pair[1]));
         assert_eq!(orders.map(from_ordered_bits), values.map(f32::to_bits));

@@ -81,9 +81,7 @@ impl Sender {
         let choosing = match policy {
             CodecPolicy::AsIs => CodecSelection::Fixed(Codec::Raw),
             CodecPolicy::Always(codec) => CodecSelection::Fixed(codec),
-            CodecPolicy::Lossless | CodecPolicy::Lossy(_) => {
-                CodecSelection::Auto(CodecSelector::new(schema, lossy))
-            }
+            CodecPolicy::Lossless | CodecPolicy::Lossy(_) => CodecSelection::Auto(CodecSelector::new(schema, lossy)),
         };
         Self { encoder, choosing }
     }
@@ -98,12 +96,7 @@ impl Sender {
     }
 
     /// Appends the frame of `message` to `out`. `clock` is any steady clock; CPU time serves best.
-    pub fn encode(
-        &mut self,
-        message: &[u8],
-        clock: impl Fn() -> Duration,
-        out: &mut Vec<u8>,
-    ) -> EncodedFrame {
+    pub fn encode(&mut self, message: &[u8], clock: impl Fn() -> Duration, out: &mut Vec<u8>) -> EncodedFrame {
         match &mut self.choosing {
             CodecSelection::Fixed(codec) => self.encoder.encode(*codec, message, out),
             CodecSelection::Auto(auto) => auto.encode(&mut self.encoder, message, clock, out),
@@ -164,11 +157,7 @@ pub struct Receiver {
 impl Receiver {
     /// Creates a receiver for messages of at most `limit` bytes.
     pub fn new(limit: usize) -> Self {
-        Self {
-            limit,
-            decoder: Decoder::new(limit),
-            waiting: None,
-        }
+        Self { limit, decoder: Decoder::new(limit), waiting: None }
     }
 
     /// Appends the message of `frame` to `out`; on an error `out` is unchanged. The feedback, if any, is to be sent to
@@ -189,9 +178,7 @@ impl Receiver {
                 self.waiting = Some(waiting);
                 (waiting == 0).then_some(ReceiverFeedback::Keyframe)
             }
-            Err(error) => error
-                .wants_another_codec()
-                .then_some(ReceiverFeedback::Damaged),
+            Err(error) => error.wants_another_codec().then_some(ReceiverFeedback::Damaged),
         };
         (result, answer)
     }
@@ -237,8 +224,7 @@ mod tests {
                 // The frame's own number does not matter.
                 (Ok(_), None) => assert_eq!(back, grid(800), "byte {at}"),
                 (Err(error), answer) => {
-                    let asks = matches!(error, Error::TooLarge { .. })
-                        || answer == Some(ReceiverFeedback::Damaged);
+                    let asks = matches!(error, Error::TooLarge { .. }) || answer == Some(ReceiverFeedback::Damaged);
                     assert!(asks && back.is_empty(), "byte {at}: {error}");
                 }
                 (Ok(_), answer) => panic!("{answer:?}"),
@@ -292,25 +278,15 @@ mod tests {
         let lossless = Sender::new(Schema::Image, CodecPolicy::Lossless);
         let candidates = |sender: &Sender| -> Vec<Codec> {
             let expected = sender.choice().unwrap().expected;
-            expected
-                .iter()
-                .map(|(estimate, _)| estimate.codec)
-                .collect()
+            expected.iter().map(|(estimate, _)| estimate.codec).collect()
         };
-        assert!(
-            candidates(&lossless)
-                .iter()
-                .all(|codec| codec.is_lossless())
-        );
+        assert!(candidates(&lossless).iter().all(|codec| codec.is_lossless()));
         let jpeg = CodecPolicy::Lossy(LossyCodec::Jpeg(JpegOptions::default()));
         let lossy = Sender::new(Schema::Image, jpeg);
         assert!(candidates(&lossy).contains(&Codec::Jpeg));
         let video = CodecPolicy::Lossy(LossyCodec::Video(VideoOptions::default()));
         let lossy = Sender::new(Schema::Image, video);
-        assert_eq!(
-            candidates(&lossy).contains(&Codec::Video),
-            cfg!(feature = "video")
-        );
+        assert_eq!(candidates(&lossy).contains(&Codec::Video), cfg!(feature = "video"));
     }
 
     #[test]

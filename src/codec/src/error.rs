@@ -13,9 +13,7 @@ pub enum Error {
     #[error("unknown codec tag {0:#04x}; the peer speaks a newer protocol, update this side")]
     UnknownTag(u8),
     /// The codec is known, but not its version.
-    #[error(
-        "codec `{codec}` in version {version}; this side knows version {known}, update the older side"
-    )]
+    #[error("codec `{codec}` in version {version}; this side knows version {known}, update the older side")]
     Version {
         /// The codec's name.
         codec: &'static str,
@@ -25,9 +23,7 @@ pub enum Error {
         known: u8,
     },
     /// The message would be larger than allowed. Nothing was allocated for it.
-    #[error(
-        "frame declares a message of {declared} bytes, the limit is {limit}; raise the limit or drop the sender"
-    )]
+    #[error("frame declares a message of {declared} bytes, the limit is {limit}; raise the limit or drop the sender")]
     TooLarge {
         /// The size declared in the frame.
         declared: u64,
@@ -35,9 +31,7 @@ pub enum Error {
         limit: usize,
     },
     /// The checksum of the decoded message is wrong. The message is not returned.
-    #[error(
-        "message decoded by `{codec}` has another checksum than the one sent; send it another way and report this"
-    )]
+    #[error("message decoded by `{codec}` has another checksum than the one sent; send it another way and report this")]
     Checksum {
         /// The codec's name.
         codec: &'static str,

@@ -20,12 +20,7 @@ pub(crate) fn deflate(message: &[u8], level: u32, header: bool, out: &mut Vec<u8
 }
 
 /// Decompresses exactly `length` bytes and appends them to `out`.
-pub(crate) fn inflate(
-    data: &[u8],
-    length: usize,
-    header: bool,
-    out: &mut Vec<u8>,
-) -> Result<(), Error> {
+pub(crate) fn inflate(data: &[u8], length: usize, header: bool, out: &mut Vec<u8>) -> Result<(), Error> {
     const BAD: Error = Error::Corrupt("a deflate stream that does not hold what it declares");
     let mut stream = Decompress::new(header);
     let first = out.len();
@@ -37,9 +32,8 @@ pub(crate) fn inflate(
     out.reserve_exact(length + 1);
     loop {
         let before = (stream.total_in(), stream.total_out());
-        let status = stream
-            .decompress_vec(&data[before.0 as usize..], out, FlushDecompress::Finish)
-            .map_err(|_| BAD)?;
+        let status =
+            stream.decompress_vec(&data[before.0 as usize..], out, FlushDecompress::Finish).map_err(|_| BAD)?;
         if status == Status::StreamEnd {
             break;
         }
@@ -47,11 +41,7 @@ pub(crate) fn inflate(
             return Err(BAD);
         }
     }
-    if out.len() - first == length && stream.total_in() as usize == data.len() {
-        Ok(())
-    } else {
-        Err(BAD)
-    }
+    if out.len() - first == length && stream.total_in() as usize == data.len() { Ok(()) } else { Err(BAD) }
 }
 
 /// A zstd context that is reused: setting one up costs more than a small message.
@@ -63,11 +53,7 @@ pub(crate) struct ZstdCompressor {
 impl ZstdCompressor {
     /// Appends `message` compressed at `level` to `out`.
     pub(crate) fn compress(&mut self, message: &[u8], level: i32, out: &mut Vec<u8>) {
-        if self
-            .context
-            .as_ref()
-            .is_none_or(|(current, _)| *current != level)
-        {
+        if self.context.as_ref().is_none_or(|(current, _)| *current != level) {
             match zstd::bulk::Compressor::new(level) {
                 Ok(compressor) => self.context = Some((level, compressor)),
                 Err(error) => {
@@ -75,9 +61,7 @@ impl ZstdCompressor {
                 }
             }
         }
-        let Some((_, compressor)) = &mut self.context else {
-            unreachable!("set above")
-        };
+        let Some((_, compressor)) = &mut self.context else { unreachable!("set above") };
         let first = out.len();
         out.resize(first + zstd::zstd_safe::compress_bound(message.len()), 0);
         match compressor.compress_to_buffer(message, &mut out[first..]) {
@@ -113,12 +97,7 @@ mod tests {
 
     #[test]
     fn bytes_come_back() {
-        for message in [
-            &b""[..],
-            b"a",
-            &[7; 100_000],
-            &(0..=255).collect::<Vec<u8>>(),
-        ] {
+        for message in [&b""[..], b"a", &[7; 100_000], &(0..=255).collect::<Vec<u8>>()] {
             for header in [false, true] {
                 let mut frame = Vec::new();
                 deflate(message, 6, header, &mut frame);

@@ -29,12 +29,7 @@ const DEAR: usize = 20;
 const LEVELS: [i32; 2] = [1, 3];
 
 /// Appends the body of `message`, which has `layout`, to `out`.
-pub(crate) fn encode(
-    message: &[u8],
-    layout: &GridLayout,
-    zstd: &mut ZstdCompressor,
-    out: &mut Vec<u8>,
-) {
+pub(crate) fn encode(message: &[u8], layout: &GridLayout, zstd: &mut ZstdCompressor, out: &mut Vec<u8>) {
     let cells = &message[layout.head..message.len() - layout.tail];
     MessageEnds::from_message(message, layout.head, layout.tail).put(out);
     let background = background(cells);
@@ -83,17 +78,11 @@ fn background(cells: &[u8]) -> u8 {
     for &cell in cells.iter().step_by((cells.len() / 4096).max(1)) {
         seen[usize::from(cell)] += 1;
     }
-    (0..=255u8)
-        .max_by_key(|&cell| seen[usize::from(cell)])
-        .unwrap_or(0)
+    (0..=255u8).max_by_key(|&cell| seen[usize::from(cell)]).unwrap_or(0)
 }
 
 /// Decodes a message of `total` bytes and appends it to `out`.
-pub(crate) fn decode(
-    input: &mut FrameCursor<'_>,
-    total: usize,
-    out: &mut Vec<u8>,
-) -> Result<(), Error> {
+pub(crate) fn decode(input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
     let (layout, ends) = take_ends(input, "a head that is not a grid's", |ends| {
         let layout = GridLayout::read(ends, total)?;
         Some((layout, layout.head, layout.tail))
@@ -179,9 +168,7 @@ mod tests {
 
     #[test]
     fn shades_and_odd_values_come_back() {
-        let mut shades: Vec<u8> = (0..120 * 100)
-            .map(|index| (index % 120 + index / 120 / 2) as u8 % 101)
-            .collect();
+        let mut shades: Vec<u8> = (0..120 * 100).map(|index| (index % 120 + index / 120 / 2) as u8 % 101).collect();
         round_trip_size(&message(120, 100, &shades));
         shades[500] = 77;
         shades[501..700].fill(3);
@@ -200,11 +187,7 @@ mod tests {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 let near = RUNGS.len() * (x.min(size - x) + y.min(size - y)) / (2 * size);
                 let rung = (near + (state >> 29) as usize % 4).min(RUNGS.len() - 1);
-                let cell = if state >> 22 & 63 == 0 {
-                    255
-                } else {
-                    RUNGS[rung]
-                };
+                let cell = if state >> 22 & 63 == 0 { 255 } else { RUNGS[rung] };
                 cells[(y + 30) * width + x + 30] = cell;
             }
         }
@@ -224,11 +207,7 @@ mod tests {
     #[test]
     fn a_map_in_noisy_shades_is_a_fifth_smaller_than_by_zstd() {
         for (width, height) in [(300, 280), (1000, 900)] {
-            let message = message(
-                width,
-                height,
-                &noisy_cells(width as usize, height as usize, 240),
-            );
+            let message = message(width, height, &noisy_cells(width as usize, height as usize, 240));
             let (sent, packed) = (round_trip_size(&message), zstd_size(&message));
             assert!(sent * 5 < packed * 4, "{sent} and {packed}");
         }

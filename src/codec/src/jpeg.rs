@@ -40,12 +40,7 @@ fn channels(layout: &ImageLayout) -> Option<usize> {
 }
 
 /// Appends the body of `message`; `None` if its encoding is not a camera's.
-pub(crate) fn encode(
-    message: &[u8],
-    layout: &ImageLayout,
-    options: JpegOptions,
-    out: &mut Vec<u8>,
-) -> Option<()> {
+pub(crate) fn encode(message: &[u8], layout: &ImageLayout, options: JpegOptions, out: &mut Vec<u8>) -> Option<()> {
     let channels = channels(layout)?;
     let data = layout.data(message);
     MessageEnds::from_message(message, layout.head, layout.tail).put(out);
@@ -58,10 +53,7 @@ pub(crate) fn encode(
         data
     } else {
         let rows = data.chunks_exact(layout.step);
-        packed = rows
-            .flat_map(|row| &row[..layout.row_bytes()])
-            .copied()
-            .collect();
+        packed = rows.flat_map(|row| &row[..layout.row_bytes()]).copied().collect();
         &packed
     };
     let colour = match (channels, layout.red_first) {
@@ -71,21 +63,12 @@ pub(crate) fn encode(
         (_, true) => ColorType::Rgba,
         (_, false) => ColorType::Bgra,
     };
-    let (width, height) = (
-        u16::try_from(layout.width).ok()?,
-        u16::try_from(layout.height).ok()?,
-    );
-    jpeg_encoder::Encoder::new(out, options.quality.clamp(1, 100))
-        .encode(pixels, width, height, colour)
-        .ok()
+    let (width, height) = (u16::try_from(layout.width).ok()?, u16::try_from(layout.height).ok()?);
+    jpeg_encoder::Encoder::new(out, options.quality.clamp(1, 100)).encode(pixels, width, height, colour).ok()
 }
 
 /// Decodes a message of `total` bytes and appends it to `out`.
-pub(crate) fn decode(
-    input: &mut FrameCursor<'_>,
-    total: usize,
-    out: &mut Vec<u8>,
-) -> Result<(), Error> {
+pub(crate) fn decode(input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
     let (layout, ends) = ImageLayout::take(input, total)?;
     let channels = channels(&layout).ok_or(Error::Corrupt("a JPEG of pictures that are none"))?;
     let colours = channels.min(3);
@@ -97,11 +80,7 @@ pub(crate) fn decode(
     let stream = input.take_rest();
     // Before the library allocates anything.
     guard::check(stream, layout.width, layout.height, colours)?;
-    let space = if colours == 1 {
-        ColorSpace::Luma
-    } else {
-        ColorSpace::RGB
-    };
+    let space = if colours == 1 { ColorSpace::Luma } else { ColorSpace::RGB };
     let options = DecoderOptions::default()
         .set_max_width(layout.width)
         .set_max_height(layout.height)

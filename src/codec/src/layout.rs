@@ -31,34 +31,22 @@ pub enum Schema {
 const KNOWN: [(&str, [&str; 2], Schema); 4] = [
     (
         "sensor_msgs/Image",
-        [
-            "060021388200f6f0f447d0fcd9c64743",
-            "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
-        ],
+        ["060021388200f6f0f447d0fcd9c64743", "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"],
         Schema::Image,
     ),
     (
         "nav_msgs/OccupancyGrid",
-        [
-            "3381f2d731d4076ec5c71b0759edbe4e",
-            "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
-        ],
+        ["3381f2d731d4076ec5c71b0759edbe4e", "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"],
         Schema::OccupancyGrid,
     ),
     (
         "sensor_msgs/LaserScan",
-        [
-            "90c7ef2dc6895d81024acba2ac42f369",
-            "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
-        ],
+        ["90c7ef2dc6895d81024acba2ac42f369", "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"],
         Schema::LaserScan,
     ),
     (
         "sensor_msgs/PointCloud2",
-        [
-            "1158d486dd51d683ce2f1be655c3c181",
-            "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
-        ],
+        ["1158d486dd51d683ce2f1be655c3c181", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"],
         Schema::PointCloud2,
     ),
 ];
@@ -150,30 +138,15 @@ impl ImageLayout {
         let data = input.size()?;
         let head = input.bytes_read();
         let tail = input.tail_length(data, total)?;
-        let fits = width > 0
-            && height > 0
-            && width.checked_mul(pixel.bytes())? <= step
-            && step.checked_mul(height)? == data;
+        let fits =
+            width > 0 && height > 0 && width.checked_mul(pixel.bytes())? <= step && step.checked_mul(height)? == data;
         let red_first = !encoding.starts_with(b"bgr");
         let seen = [&b"mono8"[..], b"rgb8", b"bgr8", b"rgba8", b"bgra8"].contains(&encoding);
-        fits.then_some(Self {
-            head,
-            tail,
-            width,
-            height,
-            step,
-            big_endian,
-            pixel,
-            red_first,
-            seen,
-        })
+        fits.then_some(Self { head, tail, width, height, step, big_endian, pixel, red_first, seen })
     }
 
     /// Reads the head and tail of an image from a frame.
-    pub(crate) fn take<'a>(
-        input: &mut FrameCursor<'a>,
-        total: usize,
-    ) -> Result<(Self, MessageEnds<'a>), Error> {
+    pub(crate) fn take<'a>(input: &mut FrameCursor<'a>, total: usize) -> Result<(Self, MessageEnds<'a>), Error> {
         take_ends(input, "a head that is not an image's", |ends| {
             let layout = Self::read(ends, total)?;
             Some((layout, layout.head, layout.tail))
@@ -199,9 +172,8 @@ pub(crate) fn take_ends<'a, L>(
     read: impl FnOnce(&[u8]) -> Option<(L, usize, usize)>,
 ) -> Result<(L, MessageEnds<'a>), Error> {
     let ends = input.block()?;
-    let (layout, head, _) = read(ends)
-        .filter(|(_, head, tail)| head + tail == ends.len())
-        .ok_or(Error::Corrupt(wrong))?;
+    let (layout, head, _) =
+        read(ends).filter(|(_, head, tail)| head + tail == ends.len()).ok_or(Error::Corrupt(wrong))?;
     Ok((layout, MessageEnds::from_joined(ends, head)))
 }
 
@@ -233,12 +205,7 @@ impl GridLayout {
         let head = input.bytes_read();
         let tail = input.tail_length(cells, total)?;
         let fits = width > 0 && height > 0 && width.checked_mul(height)? == cells;
-        fits.then_some(Self {
-            head,
-            tail,
-            width,
-            height,
-        })
+        fits.then_some(Self { head, tail, width, height })
     }
 }
 
@@ -262,15 +229,8 @@ impl ScanLayout {
         input.skip_words(7)?;
         let ranges = input.size()?;
         let head = input.bytes_read();
-        let rest = total
-            .checked_sub(head)?
-            .checked_sub(ranges.checked_mul(4)?)?
-            .checked_sub(4)?;
-        (rest % 4 == 0).then_some(Self {
-            head,
-            ranges,
-            intensities: rest / 4,
-        })
+        let rest = total.checked_sub(head)?.checked_sub(ranges.checked_mul(4)?)?.checked_sub(4)?;
+        (rest % 4 == 0).then_some(Self { head, ranges, intensities: rest / 4 })
     }
 
     /// Returns the offset of the intensities' length.
@@ -360,12 +320,8 @@ impl CloudLayout {
         let head = input.bytes_read();
         let tail = input.tail_length(data.checked_add(1)?, total)?;
         fields.sort_by_key(|field| field.offset);
-        let apart = fields
-            .windows(2)
-            .all(|pair| pair[0].offset + pair[0].number.bytes() <= pair[1].offset);
-        let inside = fields
-            .last()
-            .is_none_or(|last| last.offset + last.number.bytes() <= point_step);
+        let apart = fields.windows(2).all(|pair| pair[0].offset + pair[0].number.bytes() <= pair[1].offset);
+        let inside = fields.last().is_none_or(|last| last.offset + last.number.bytes() <= point_step);
         let fits = !big_endian
             && apart
             && inside
@@ -374,15 +330,7 @@ impl CloudLayout {
             && point_step > 0
             && width.checked_mul(point_step)? <= row_step
             && row_step.checked_mul(height)? == data;
-        fits.then_some(Self {
-            head,
-            tail,
-            width,
-            height,
-            point_step,
-            row_step,
-            fields,
-        })
+        fits.then_some(Self { head, tail, width, height, point_step, row_step, fields })
     }
 
     fn read_field(input: &mut FieldReader<'_>, fields: &mut Vec<PointField>) -> Option<()> {
@@ -402,9 +350,7 @@ impl CloudLayout {
             (b"y", NumberType::Float, 1) => FieldMeaning::Y,
             (b"z", NumberType::Float, 1) => FieldMeaning::Z,
             (b"rgb" | b"rgba", NumberType::Float | NumberType::Word, 1) => FieldMeaning::Colour,
-            (b"ring" | b"channel" | b"line", NumberType::Byte | NumberType::Short, 1) => {
-                FieldMeaning::Ring
-            }
+            (b"ring" | b"channel" | b"line", NumberType::Byte | NumberType::Short, 1) => FieldMeaning::Ring,
             _ => FieldMeaning::Plain,
         };
         for index in 0..count {
@@ -412,11 +358,7 @@ impl CloudLayout {
                 return None;
             }
             let offset = offset.checked_add(index * number.bytes())?;
-            fields.push(PointField {
-                offset,
-                number,
-                meaning,
-            });
+            fields.push(PointField { offset, number, meaning });
         }
         Some(())
     }
@@ -435,18 +377,9 @@ mod tests {
         let md5 = "060021388200f6f0f447d0fcd9c64743";
         let hash = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47";
         assert_eq!(Schema::for_type("sensor_msgs/Image", md5), Schema::Image);
-        assert_eq!(
-            Schema::for_type("sensor_msgs/msg/Image", hash),
-            Schema::Image
-        );
-        assert_eq!(
-            Schema::for_type("sensor_msgs/LaserScan", md5),
-            Schema::Other
-        );
-        assert_eq!(
-            Schema::for_type("sensor_msgs/msg/Image", &hash[1..]),
-            Schema::Other
-        );
+        assert_eq!(Schema::for_type("sensor_msgs/msg/Image", hash), Schema::Image);
+        assert_eq!(Schema::for_type("sensor_msgs/LaserScan", md5), Schema::Other);
+        assert_eq!(Schema::for_type("sensor_msgs/msg/Image", &hash[1..]), Schema::Other);
         assert_eq!(Schema::for_type("my_msgs/msg/Image", hash), Schema::Other);
     }
 }

@@ -19,21 +19,11 @@ pub(crate) struct Padded<T> {
 impl<T: Copy + Default> Padded<T> {
     pub(crate) fn picture(width: usize, height: usize) -> Self {
         let lag = width + 2;
-        Self {
-            width,
-            height,
-            lag,
-            samples: vec![T::default(); lag * (height + 1) + 2],
-        }
+        Self { width, height, lag, samples: vec![T::default(); lag * (height + 1) + 2] }
     }
 
     pub(crate) fn sequence(length: usize) -> Self {
-        Self {
-            width: length,
-            height: usize::from(length > 0),
-            lag: 2,
-            samples: vec![T::default(); length + 4],
-        }
+        Self { width: length, height: usize::from(length > 0), lag: 2, samples: vec![T::default(); length + 4] }
     }
 
     pub(crate) fn is_sequence(&self) -> bool {
@@ -61,11 +51,7 @@ impl<T: Copy + Default> Padded<T> {
     pub(crate) fn close_row(&mut self, y: usize) {
         if self.height > 1 && self.width > 0 {
             let start = self.start(y);
-            self.samples[start - 1] = if y > 0 {
-                self.samples[start - self.lag]
-            } else {
-                T::default()
-            };
+            self.samples[start - 1] = if y > 0 { self.samples[start - self.lag] } else { T::default() };
             self.samples[start + self.width] = self.samples[start + self.width - 1];
         }
     }
@@ -93,13 +79,7 @@ impl<T: Copy + Default> Padded<T> {
     pub(crate) fn neighbours(&self, y: usize) -> [&[T]; 5] {
         let (start, lag, width) = (self.start(y), self.lag, self.width);
         let from = |first: usize| &self.samples[first..first + width];
-        [
-            from(start - 1),
-            from(start - lag),
-            from(start - lag - 1),
-            from(start - lag + 1),
-            from(start),
-        ]
+        [from(start - 1), from(start - lag), from(start - lag - 1), from(start - lag + 1), from(start)]
     }
 }
 
@@ -119,64 +99,36 @@ pub(crate) const STRIPES: usize = 4;
 impl<T: Copy + Default> Lanes<T> {
     pub(crate) fn pictures(planes: usize, width: usize, height: usize) -> Self {
         if planes != 1 || height < 8 * STRIPES {
-            let lanes = (0..planes)
-                .map(|_| Padded::picture(width, height))
-                .collect();
-            return Self {
-                lanes,
-                stripe: height.max(1),
-                stripes: 1,
-            };
+            let lanes = (0..planes).map(|_| Padded::picture(width, height)).collect();
+            return Self { lanes, stripe: height.max(1), stripes: 1 };
         }
         let stripe = height / STRIPES;
-        let mut lanes: Vec<_> = (0..STRIPES)
-            .map(|_| Padded::picture(width, stripe))
-            .collect();
+        let mut lanes: Vec<_> = (0..STRIPES).map(|_| Padded::picture(width, stripe)).collect();
         if height % STRIPES > 0 {
             lanes.push(Padded::picture(width, height % STRIPES));
         }
-        Self {
-            stripes: lanes.len(),
-            lanes,
-            stripe,
-        }
+        Self { stripes: lanes.len(), lanes, stripe }
     }
 
     pub(crate) fn sequence(length: usize) -> Self {
         if length < 1024 {
-            return Self {
-                lanes: vec![Padded::sequence(length)],
-                stripe: length.max(1),
-                stripes: 1,
-            };
+            return Self { lanes: vec![Padded::sequence(length)], stripe: length.max(1), stripes: 1 };
         }
         // A remainder is padded rather than coded separately.
         let stripe = length.div_ceil(STRIPES);
-        Self {
-            lanes: (0..STRIPES).map(|_| Padded::sequence(stripe)).collect(),
-            stripe,
-            stripes: STRIPES,
-        }
+        Self { lanes: (0..STRIPES).map(|_| Padded::sequence(stripe)).collect(), stripe, stripes: STRIPES }
     }
 
     /// Creates several sequences of one length, one lane each.
     pub(crate) fn sequences(count: usize, length: usize) -> Self {
         let lanes = (0..count).map(|_| Padded::sequence(length)).collect();
-        Self {
-            lanes,
-            stripe: 1,
-            stripes: 1,
-        }
+        Self { lanes, stripe: 1, stripes: 1 }
     }
 
     /// Returns the ranges of lanes that run in lockstep: groups of equal shape.
     pub(crate) fn groups(&self) -> Vec<std::ops::Range<usize>> {
         let count = self.lanes.len();
-        if self.stripes > STRIPES {
-            vec![0..STRIPES, STRIPES..count]
-        } else {
-            std::iter::once(0..count).collect()
-        }
+        if self.stripes > STRIPES { vec![0..STRIPES, STRIPES..count] } else { std::iter::once(0..count).collect() }
     }
 
     pub(crate) fn row(&self, plane: usize, y: usize) -> &[T] {
@@ -217,9 +169,7 @@ impl<T: Copy + Default> Lanes<T> {
 
     /// Returns all samples, lane by lane and row by row: for a single plane or sequence this is their order.
     pub(crate) fn rows(&self) -> impl Iterator<Item = &[T]> {
-        self.lanes
-            .iter()
-            .flat_map(|lane| (0..lane.height).map(move |y| lane.row(y)))
+        self.lanes.iter().flat_map(|lane| (0..lane.height).map(move |y| lane.row(y)))
     }
 
     pub(crate) fn count(&self) -> usize {
@@ -257,14 +207,8 @@ mod tests {
         plane.row_mut(1).copy_from_slice(&[4, 5, 6]);
         plane.close_row(0);
         plane.close_row(1);
-        assert_eq!(
-            plane.neighbours(0),
-            [&[0, 1, 2], &[0, 0, 0], &[0, 0, 0], &[0, 0, 0], &[1, 2, 3]]
-        );
-        assert_eq!(
-            plane.neighbours(1),
-            [&[1, 4, 5], &[1, 2, 3], &[0, 1, 2], &[2, 3, 3], &[4, 5, 6]]
-        );
+        assert_eq!(plane.neighbours(0), [&[0, 1, 2], &[0, 0, 0], &[0, 0, 0], &[0, 0, 0], &[1, 2, 3]]);
+        assert_eq!(plane.neighbours(1), [&[1, 4, 5], &[1, 2, 3], &[0, 1, 2], &[2, 3, 3], &[4, 5, 6]]);
     }
 
     #[test]
@@ -273,12 +217,7 @@ mod tests {
             let samples: Vec<u32> = (0..length).collect();
             let mut lanes = Lanes::sequence(samples.len());
             lanes.fill(&samples, |sample| sample);
-            let back: Vec<u32> = lanes
-                .rows()
-                .flatten()
-                .copied()
-                .take(samples.len())
-                .collect();
+            let back: Vec<u32> = lanes.rows().flatten().copied().take(samples.len()).collect();
             assert_eq!(back, samples);
             assert!(lanes.count() < samples.len() + 4);
         }

@@ -46,11 +46,7 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
         .iter()
         .enumerate()
         .map(|(index, lane)| {
-            let first = if planes > 1 {
-                (index * CONTEXTS) as u16
-            } else {
-                0
-            };
+            let first = if planes > 1 { (index * CONTEXTS) as u16 } else { 0 };
             let mut keys = vec![0u16; lane.width * lane.height];
             for (y, keys) in keys.chunks_exact_mut(lane.width.max(1)).enumerate() {
                 let kind = if y == 0 { Kind::West } else { kind };
@@ -68,22 +64,10 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
     for group in lanes.groups() {
         let keys = &keys[group];
         match *keys {
-            [ref a] => encoder
-                .encode([a])
-                .iter()
-                .for_each(|lane| put_block(out, lane)),
-            [ref a, ref b] => encoder
-                .encode([a, b])
-                .iter()
-                .for_each(|lane| put_block(out, lane)),
-            [ref a, ref b, ref c] => encoder
-                .encode([a, b, c])
-                .iter()
-                .for_each(|lane| put_block(out, lane)),
-            [ref a, ref b, ref c, ref d] => encoder
-                .encode([a, b, c, d])
-                .iter()
-                .for_each(|lane| put_block(out, lane)),
+            [ref a] => encoder.encode([a]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b] => encoder.encode([a, b]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c] => encoder.encode([a, b, c]).iter().for_each(|lane| put_block(out, lane)),
+            [ref a, ref b, ref c, ref d] => encoder.encode([a, b, c, d]).iter().for_each(|lane| put_block(out, lane)),
             _ => unreachable!("a group has one to four lanes"),
         }
     }
@@ -102,11 +86,7 @@ fn choose_predictor(lanes: &Lanes<u8>) -> Kind {
             costs[1] += row_cost::<predict::Slope>(lane, y);
         }
     }
-    if costs[0] < costs[1] {
-        Kind::Median
-    } else {
-        Kind::Slope
-    }
+    if costs[0] < costs[1] { Kind::Median } else { Kind::Slope }
 }
 
 fn row_cost<P: Predictor>(lane: &Padded<u8>, y: usize) -> u64 {
@@ -134,13 +114,7 @@ fn guess<P: Predictor>(a: i16, b: i16, c: i16, d: i16) -> i16 {
 fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, keys: &mut [u16]) {
     let [a, b, c, d, v] = lane.neighbours(y);
     let width = keys.len();
-    let (a, b, c, d, v) = (
-        &a[..width],
-        &b[..width],
-        &c[..width],
-        &d[..width],
-        &v[..width],
-    );
+    let (a, b, c, d, v) = (&a[..width], &b[..width], &c[..width], &d[..width], &v[..width]);
     for x in 0..width {
         let [a, b, c, d, v] = [a[x], b[x], c[x], d[x], v[x]].map(i16::from);
         let unease = unease(a, b, c, d);
@@ -154,27 +128,19 @@ fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, k
 }
 
 /// Decodes into lanes of the shape they were encoded with.
-pub(crate) fn decode(
-    input: &mut FrameCursor<'_>,
-    lanes: &mut Lanes<u8>,
-    planes: usize,
-) -> Result<(), Error> {
+pub(crate) fn decode(input: &mut FrameCursor<'_>, lanes: &mut Lanes<u8>, planes: usize) -> Result<(), Error> {
     let kind = Kind::read(input.byte()?)?;
     if !matches!(kind, Kind::Median | Kind::Slope) {
         return Err(Error::Corrupt("a predictor that 8-bit planes do not use"));
     }
     let shift = merge_shift(lanes.count() / planes.max(1));
     let mut rest = *input;
-    let (tables, used) =
-        TansDecoder::read(rest.take_rest(), contexts(planes), SymbolOrder::Signed)?;
+    let (tables, used) = TansDecoder::read(rest.take_rest(), contexts(planes), SymbolOrder::Signed)?;
     input.take(used)?;
     let bases: Vec<[u16; 1024]> = (0..planes.max(1))
         .map(|plane| {
             std::array::from_fn(|unease| {
-                let context = THRESHOLDS
-                    .iter()
-                    .filter(|&&threshold| unease >= usize::from(threshold))
-                    .count();
+                let context = THRESHOLDS.iter().filter(|&&threshold| unease >= usize::from(threshold)).count();
                 tables.base(plane * CONTEXTS + (context >> shift))
             })
         })
@@ -203,9 +169,7 @@ fn decode_group<const N: usize>(
     for _ in 0..N {
         lanes.push(tables.lane(input.block()?)?);
     }
-    let Ok(mut lanes) = <[LaneReader<'_>; N]>::try_from(lanes) else {
-        unreachable!("N lanes were pushed")
-    };
+    let Ok(mut lanes) = <[LaneReader<'_>; N]>::try_from(lanes) else { unreachable!("N lanes were pushed") };
     let bases: [&[u16; 1024]; N] = std::array::from_fn(|index| &bases[index.min(bases.len() - 1)]);
     if planes[0].is_sequence() {
         decode_sequence(tables, bases, &mut planes, &mut lanes);
@@ -213,12 +177,8 @@ fn decode_group<const N: usize>(
     }
     for y in 0..planes[0].height {
         match if y == 0 { Kind::West } else { kind } {
-            Kind::Median => {
-                decode_row::<predict::Median, N>(tables, bases, &mut planes, &mut lanes, y)
-            }
-            Kind::Slope => {
-                decode_row::<predict::Slope, N>(tables, bases, &mut planes, &mut lanes, y)
-            }
+            Kind::Median => decode_row::<predict::Median, N>(tables, bases, &mut planes, &mut lanes, y),
+            Kind::Slope => decode_row::<predict::Slope, N>(tables, bases, &mut planes, &mut lanes, y),
             _ => decode_row::<predict::West, N>(tables, bases, &mut planes, &mut lanes, y),
         }
     }
@@ -268,12 +228,7 @@ struct RowAbove {
 }
 
 impl RowAbove {
-    const NONE: Self = Self {
-        ease: [0; CHUNK],
-        corner: [0; CHUNK],
-        north: [0; CHUNK],
-        tilt: [0; CHUNK],
-    };
+    const NONE: Self = Self { ease: [0; CHUNK], corner: [0; CHUNK], north: [0; CHUNK], tilt: [0; CHUNK] };
 
     /// Loads the row above; `row` begins one sample left of the chunk and ends one to the right.
     #[inline(always)]
@@ -335,8 +290,7 @@ fn decode_row<P: Predictor, const N: usize>(
             }
         }
         for lane in 0..N {
-            planes[lane].samples[start + x..start + x + length]
-                .copy_from_slice(&here[lane][..length]);
+            planes[lane].samples[start + x..start + x + length].copy_from_slice(&here[lane][..length]);
         }
         x += length;
     }
@@ -349,12 +303,7 @@ fn decode_row<P: Predictor, const N: usize>(
 mod tests {
     use super::*;
 
-    fn round_trip(
-        planes: usize,
-        width: usize,
-        height: usize,
-        sample: impl Fn(usize, usize, usize) -> u8,
-    ) -> usize {
+    fn round_trip(planes: usize, width: usize, height: usize, sample: impl Fn(usize, usize, usize) -> u8) -> usize {
         let mut lanes = Lanes::pictures(planes, width, height);
         for plane in 0..planes {
             for y in 0..height {
@@ -371,11 +320,7 @@ mod tests {
         input.finish().unwrap();
         for plane in 0..planes {
             for y in 0..height {
-                assert_eq!(
-                    back.row(plane, y),
-                    lanes.row(plane, y),
-                    "plane {plane}, row {y}"
-                );
+                assert_eq!(back.row(plane, y), lanes.row(plane, y), "plane {plane}, row {y}");
             }
         }
         bytes.len()
@@ -384,21 +329,9 @@ mod tests {
     #[test]
     fn pictures_of_all_shapes_come_back() {
         for planes in 1..=4 {
-            for (width, height) in [
-                (1, 1),
-                (1, 7),
-                (7, 1),
-                (2, 2),
-                (33, 35),
-                (64, 32),
-                (100, 131),
-            ] {
-                round_trip(planes, width, height, |plane, x, y| {
-                    (x * y * (plane + 3) + x) as u8
-                });
-                round_trip(planes, width, height, |_, x, y| {
-                    ((x * 2_654_435_761 + y * 40_503) >> 7) as u8
-                });
+            for (width, height) in [(1, 1), (1, 7), (7, 1), (2, 2), (33, 35), (64, 32), (100, 131)] {
+                round_trip(planes, width, height, |plane, x, y| (x * y * (plane + 3) + x) as u8);
+                round_trip(planes, width, height, |_, x, y| ((x * 2_654_435_761 + y * 40_503) >> 7) as u8);
             }
         }
     }
@@ -413,20 +346,13 @@ mod tests {
     fn a_cut_stream_is_an_error() {
         let mut lanes = Lanes::pictures(1, 40, 40);
         for y in 0..40 {
-            lanes
-                .row_mut(0, y)
-                .iter_mut()
-                .enumerate()
-                .for_each(|(x, slot)| *slot = (x * y) as u8);
+            lanes.row_mut(0, y).iter_mut().enumerate().for_each(|(x, slot)| *slot = (x * y) as u8);
         }
         let mut bytes = Vec::new();
         encode(&mut lanes, 1, &mut bytes);
         for length in 0..bytes.len() {
             let mut back = Lanes::pictures(1, 40, 40);
-            assert!(
-                decode(&mut FrameCursor::new(&bytes[..length]), &mut back, 1).is_err(),
-                "{length}"
-            );
+            assert!(decode(&mut FrameCursor::new(&bytes[..length]), &mut back, 1).is_err(), "{length}");
         }
     }
 }

@@ -25,22 +25,11 @@ pub(crate) enum Kind {
 }
 
 impl Kind {
-    pub(crate) const ALL: [Self; 8] = [
-        Self::Zero,
-        Self::West,
-        Self::North,
-        Self::Slope,
-        Self::Plane,
-        Self::Median,
-        Self::Middle,
-        Self::Line,
-    ];
+    pub(crate) const ALL: [Self; 8] =
+        [Self::Zero, Self::West, Self::North, Self::Slope, Self::Plane, Self::Median, Self::Middle, Self::Line];
 
     pub(crate) fn read(byte: u8) -> Result<Self, Error> {
-        Self::ALL
-            .get(usize::from(byte))
-            .copied()
-            .ok_or(Error::Corrupt("an unknown predictor"))
+        Self::ALL.get(usize::from(byte)).copied().ok_or(Error::Corrupt("an unknown predictor"))
     }
 }
 
@@ -117,9 +106,7 @@ pub(crate) fn guess<P: Predictor>(a: i32, b: i32, c: i32, d: i32) -> i32 {
         Kind::Slope => ((a + b) >> 1) + ((d - c) >> 2),
         Kind::Plane => a + b - c,
         Kind::Median => (a + b - c).clamp(a.min(b), a.max(b)),
-        Kind::Middle => {
-            median_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)])
-        }
+        Kind::Middle => median_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)]),
         Kind::Line => 2 * a - b,
     }
 }
@@ -144,11 +131,7 @@ const fn half_octave(unease: u32) -> u8 {
     }
     let octave = unease.ilog2();
     let context = 2 * octave + ((unease >> (octave - 1)) & 1);
-    if context < EASE as u32 {
-        context as u8
-    } else {
-        EASE as u8 - 1
-    }
+    if context < EASE as u32 { context as u8 } else { EASE as u8 - 1 }
 }
 
 /// Returns the binary logarithm of a number, times 2^`fraction`, rounded down; any value for zero. The first bits of a
@@ -192,11 +175,7 @@ impl PlaneSample for u16 {
 
     #[inline(always)]
     fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32 {
-        let left = if matches!(P::KIND, Kind::Zero) {
-            a
-        } else {
-            a.abs_diff(c)
-        };
+        let left = if matches!(P::KIND, Kind::Zero) { a } else { a.abs_diff(c) };
         ease + u32::from(left)
     }
 
@@ -211,11 +190,7 @@ impl PlaneSample for u16 {
     #[inline(always)]
     fn branchless_context(unease: u32) -> u16 {
         let unease = unease.min(1 << (EASE / 2));
-        let context = if unease < 2 {
-            unease
-        } else {
-            scaled_log(unease, 1)
-        };
+        let context = if unease < 2 { unease } else { scaled_log(unease, 1) };
         context as u16
     }
 
@@ -240,20 +215,12 @@ impl PlaneSample for u32 {
 
     #[inline(always)]
     fn ease<P: Predictor>(b: Self, c: Self, d: Self) -> u32 {
-        if matches!(P::KIND, Kind::Zero) {
-            b
-        } else {
-            c.abs_diff(b).saturating_add(b.abs_diff(d))
-        }
+        if matches!(P::KIND, Kind::Zero) { b } else { c.abs_diff(b).saturating_add(b.abs_diff(d)) }
     }
 
     #[inline(always)]
     fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32 {
-        ease.saturating_add(if matches!(P::KIND, Kind::Zero) {
-            a
-        } else {
-            a.abs_diff(c)
-        })
+        ease.saturating_add(if matches!(P::KIND, Kind::Zero) { a } else { a.abs_diff(c) })
     }
 
     #[inline(always)]
@@ -263,11 +230,7 @@ impl PlaneSample for u32 {
 
     #[inline(always)]
     fn branchless_context(unease: u32) -> u16 {
-        let context = if unease == 0 {
-            0
-        } else {
-            scaled_log(unease, 0) + 1
-        };
+        let context = if unease == 0 { 0 } else { scaled_log(unease, 0) + 1 };
         (context as u16).min(EASE - 1)
     }
 
@@ -315,19 +278,11 @@ mod tests {
                 for &b in &samples {
                     for &c in &samples {
                         let d = a ^ b;
-                        assert_eq!(
-                            u32::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d),
-                            v
-                        );
+                        assert_eq!(u32::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d), v);
                         let [v, a, b, c, d] = [v, a, b, c, d].map(|sample| sample as u16);
-                        assert_eq!(
-                            u16::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d),
-                            v
-                        );
+                        assert_eq!(u16::restore::<P>(v.residual::<P>(a, b, c, d), a, b, c, d), v);
                         let unease = u16::unease::<P>(u16::ease::<P>(b, c, d), a, c);
-                        assert!(
-                            u16::context(unease) < EASE && u32::context(u32::MAX - unease) < EASE
-                        );
+                        assert!(u16::context(unease) < EASE && u32::context(u32::MAX - unease) < EASE);
                     }
                 }
             }
@@ -347,16 +302,8 @@ mod tests {
     fn contexts_of_many_are_as_those_of_one() {
         let edges = (2..32).flat_map(|bit| [(1u32 << bit) - 1, 1 << bit, 3 << (bit - 1)]);
         for unease in (0..300_000).chain(edges).chain([u32::MAX]) {
-            assert_eq!(
-                u16::branchless_context(unease),
-                u16::context(unease),
-                "{unease}"
-            );
-            assert_eq!(
-                u32::branchless_context(unease),
-                u32::context(unease),
-                "{unease}"
-            );
+            assert_eq!(u16::branchless_context(unease), u16::context(unease), "{unease}");
+            assert_eq!(u32::branchless_context(unease), u32::context(unease), "{unease}");
         }
     }
 

@@ -52,14 +52,8 @@ impl Scale {
     const ROUND: f32 = 12_582_912.0;
 
     pub(crate) fn from_name(name: u8) -> Result<Self, Error> {
-        let &(divisor, factor) = SCALES
-            .get(usize::from(name))
-            .ok_or(Error::Corrupt("an unknown scale"))?;
-        Ok(Self {
-            name,
-            divisor,
-            factor,
-        })
+        let &(divisor, factor) = SCALES.get(usize::from(name)).ok_or(Error::Corrupt("an unknown scale"))?;
+        Ok(Self { name, divisor, factor })
     }
 
     pub(crate) fn name(self) -> u8 {
@@ -70,11 +64,7 @@ impl Scale {
     #[inline]
     pub(crate) fn value(self, multiple: i32) -> u32 {
         let multiple = multiple as f32;
-        let value = if self.factor == 0.0 {
-            multiple / self.divisor
-        } else {
-            multiple * self.factor
-        };
+        let value = if self.factor == 0.0 { multiple / self.divisor } else { multiple * self.factor };
         value.to_bits()
     }
 
@@ -86,14 +76,8 @@ impl Scale {
         // NaN fails the comparison, too.
         let near = scaled.abs() <= Self::LARGEST;
         // The sum's last bits are the integer; a conversion would check for values that it cannot convert.
-        let multiple = (scaled + Self::ROUND)
-            .to_bits()
-            .wrapping_sub(Self::ROUND.to_bits()) as i32;
-        if near & (self.value(multiple) == bits) {
-            multiple
-        } else {
-            Self::NONE
-        }
+        let multiple = (scaled + Self::ROUND).to_bits().wrapping_sub(Self::ROUND.to_bits()) as i32;
+        if near & (self.value(multiple) == bits) { multiple } else { Self::NONE }
     }
 
     /// Returns [`Scale::multiple`] of each.
@@ -101,19 +85,10 @@ impl Scale {
         let mut multiples = vec![0; bits.len()];
         // Whether to divide or multiply is decided once.
         if self.factor == 0.0 {
-            let scale = Self {
-                factor: 0.0,
-                ..self
-            };
-            multiples
-                .iter_mut()
-                .zip(bits)
-                .for_each(|(multiple, &bits)| *multiple = scale.multiple(bits));
+            let scale = Self { factor: 0.0, ..self };
+            multiples.iter_mut().zip(bits).for_each(|(multiple, &bits)| *multiple = scale.multiple(bits));
         } else {
-            multiples
-                .iter_mut()
-                .zip(bits)
-                .for_each(|(multiple, &bits)| *multiple = self.multiple(bits));
+            multiples.iter_mut().zip(bits).for_each(|(multiple, &bits)| *multiple = self.multiple(bits));
         }
         multiples
     }
@@ -132,15 +107,10 @@ impl Scale {
             .collect();
         let misses = sample.len() / 16;
         let fits = |scale: &Self| {
-            let unfit = sample
-                .iter()
-                .filter(|&&bits| scale.multiple(bits) == Self::NONE);
+            let unfit = sample.iter().filter(|&&bits| scale.multiple(bits) == Self::NONE);
             unfit.take(misses + 1).count() <= misses
         };
-        (0..SCALES.len() as u8)
-            .filter_map(|name| Self::from_name(name).ok())
-            .find(fits)
-            .filter(|_| !sample.is_empty())
+        (0..SCALES.len() as u8).filter_map(|name| Self::from_name(name).ok()).find(fits).filter(|_| !sample.is_empty())
     }
 }
 
@@ -168,10 +138,7 @@ mod tests {
         assert_eq!(find(|count| count as f32 * 0.001), Some((1000.0, 0.001)));
         assert_eq!(find(|count| count as f32 / 1000.0), Some((1000.0, 0.0)));
         assert_eq!(find(|count| count as f32), Some((1.0, 0.0)));
-        assert_eq!(
-            find(|count| count as f32 / 4.0 / 1000.0),
-            Some((4000.0, 0.0))
-        );
+        assert_eq!(find(|count| count as f32 / 4.0 / 1000.0), Some((4000.0, 0.0)));
         assert_eq!(find(|count| (count as f32).sqrt() / 77.0), None);
         assert_eq!(find(|_| f32::NAN), None);
     }

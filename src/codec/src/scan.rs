@@ -15,25 +15,13 @@ pub(crate) fn encode(message: &[u8], layout: &ScanLayout, out: &mut Vec<u8>) -> 
         return None;
     }
     put_block(out, &message[..layout.head]);
-    column::encode_floats(
-        &read_words(&message[layout.head..middle]),
-        Shape::Sequence(layout.ranges),
-        out,
-    );
-    column::encode_floats(
-        &read_words(&message[middle + 4..]),
-        Shape::Sequence(layout.intensities),
-        out,
-    );
+    column::encode_floats(&read_words(&message[layout.head..middle]), Shape::Sequence(layout.ranges), out);
+    column::encode_floats(&read_words(&message[middle + 4..]), Shape::Sequence(layout.intensities), out);
     Some(())
 }
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
-pub(crate) fn decode(
-    input: &mut FrameCursor<'_>,
-    total: usize,
-    out: &mut Vec<u8>,
-) -> Result<(), Error> {
+pub(crate) fn decode(input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
     let head = input.block()?;
     let layout = ScanLayout::read(head, total)
         .filter(|layout| layout.head == head.len())
@@ -48,8 +36,5 @@ pub(crate) fn decode(
 }
 
 pub(crate) fn read_words(bytes: &[u8]) -> Vec<u32> {
-    bytes
-        .chunks_exact(4)
-        .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
-        .collect()
+    bytes.chunks_exact(4).map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])).collect()
 }

@@ -38,13 +38,7 @@ pub struct Encoder {
 impl Encoder {
     /// Creates an encoder for messages of `schema`. Lossy codecs fall back until they are allowed.
     pub fn new(schema: Schema) -> Self {
-        Self {
-            schema,
-            sequence: 0,
-            zstd: ZstdCompressor::default(),
-            jpeg: None,
-            video: None,
-        }
+        Self { schema, sequence: 0, zstd: ZstdCompressor::default(), jpeg: None, video: None }
     }
 
     /// Allows JPEG.
@@ -87,11 +81,7 @@ impl Encoder {
             self.put_header(used, message, out);
             out.extend_from_slice(message);
         }
-        EncodedFrame {
-            codec: used,
-            sequence: self.sequence,
-            bytes: out.len() - first,
-        }
+        EncodedFrame { codec: used, sequence: self.sequence, bytes: out.len() - first }
     }
 
     fn put_header(&self, codec: Codec, message: &[u8], out: &mut Vec<u8>) {
@@ -111,35 +101,17 @@ impl Encoder {
             (Codec::Zlib(level), _) => generic::deflate(message, level.into(), true, out),
             (Codec::Deflate(level), _) => generic::deflate(message, level.into(), false, out),
             (Codec::Zstd(level), _) => self.zstd.compress(message, level.into(), out),
-            (Codec::Image, Schema::Image) => {
-                image::encode(message, &ImageLayout::read(message, total)?, out)
-            }
+            (Codec::Image, Schema::Image) => image::encode(message, &ImageLayout::read(message, total)?, out),
             (Codec::Grid, Schema::OccupancyGrid) => {
-                grid::encode(
-                    message,
-                    &GridLayout::read(message, total)?,
-                    &mut self.zstd,
-                    out,
-                );
+                grid::encode(message, &GridLayout::read(message, total)?, &mut self.zstd, out);
             }
-            (Codec::Scan, Schema::LaserScan) => {
-                scan::encode(message, &ScanLayout::read(message, total)?, out)?
-            }
-            (Codec::Cloud, Schema::PointCloud2) => {
-                cloud::encode(message, &CloudLayout::read(message, total)?, out)
-            }
+            (Codec::Scan, Schema::LaserScan) => scan::encode(message, &ScanLayout::read(message, total)?, out)?,
+            (Codec::Cloud, Schema::PointCloud2) => cloud::encode(message, &CloudLayout::read(message, total)?, out),
             (Codec::Jpeg, Schema::Image) => {
-                jpeg::encode(
-                    message,
-                    &ImageLayout::read(message, total)?,
-                    self.jpeg?,
-                    out,
-                )?;
+                jpeg::encode(message, &ImageLayout::read(message, total)?, self.jpeg?, out)?;
             }
             (Codec::Video, Schema::Image) => {
-                self.video
-                    .as_mut()?
-                    .encode(message, &ImageLayout::read(message, total)?, out)?;
+                self.video.as_mut()?.encode(message, &ImageLayout::read(message, total)?, out)?;
             }
             _ => return None,
         }
@@ -184,10 +156,7 @@ pub struct Decoder {
 impl Decoder {
     /// Creates a decoder for messages of at most `limit` bytes.
     pub fn new(limit: usize) -> Self {
-        Self {
-            limit,
-            video: VideoDecoder::default(),
-        }
+        Self { limit, video: VideoDecoder::default() }
     }
 
     /// Appends the message of `frame` to `out`; on an error `out` is unchanged.
@@ -205,24 +174,13 @@ impl Decoder {
         let (decoded, version) = read_header(&mut input)?;
         let (codec, total) = (decoded.codec, decoded.bytes);
         if version != codec.version() {
-            return Err(Error::Version {
-                codec: codec.name(),
-                version,
-                known: codec.version(),
-            });
+            return Err(Error::Version { codec: codec.name(), version, known: codec.version() });
         }
         if total > self.limit {
-            return Err(Error::TooLarge {
-                declared: total as u64,
-                limit: self.limit,
-            });
+            return Err(Error::TooLarge { declared: total as u64, limit: self.limit });
         }
         let first = out.len();
-        let checksum = if codec.has_checksum() {
-            Some(input.u32()?)
-        } else {
-            None
-        };
+        let checksum = if codec.has_checksum() { Some(input.u32()?) } else { None };
         match codec {
             Codec::Raw => out.extend_from_slice(input.take(total)?),
             Codec::Zlib(_) => generic::inflate(input.take_rest(), total, true, out)?,
@@ -240,9 +198,7 @@ impl Decoder {
             return Err(Error::Corrupt("a message of another size than declared"));
         }
         match checksum {
-            Some(sent) if crc32fast::hash(&out[first..]) != sent => Err(Error::Checksum {
-                codec: codec.name(),
-            }),
+            Some(sent) if crc32fast::hash(&out[first..]) != sent => Err(Error::Checksum { codec: codec.name() }),
             _ => Ok(decoded),
         }
     }
@@ -260,12 +216,5 @@ fn read_header(input: &mut FrameCursor<'_>) -> Result<(DecodedFrame, u8), Error>
     let version = input.byte()?;
     let sequence = input.varint()?;
     let bytes = usize::try_from(input.varint()?).unwrap_or(usize::MAX);
-    Ok((
-        DecodedFrame {
-            codec,
-            sequence,
-            bytes,
-        },
-        version,
-    ))
+    Ok((DecodedFrame { codec, sequence, bytes }, version))
 }

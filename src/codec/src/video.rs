@@ -49,12 +49,7 @@ impl VideoEncoder {
 
     /// Appends the body of `message`; `None` if it is no colour picture or the library refuses it.
     #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
-    pub(crate) fn encode(
-        &mut self,
-        message: &[u8],
-        layout: &ImageLayout,
-        out: &mut Vec<u8>,
-    ) -> Option<()> {
+    pub(crate) fn encode(&mut self, message: &[u8], layout: &ImageLayout, out: &mut Vec<u8>) -> Option<()> {
         #[cfg(feature = "video")]
         return self.inner.encode(message, layout, out);
         #[cfg(not(feature = "video"))]
@@ -78,12 +73,7 @@ pub(crate) struct VideoDecoder {
 impl VideoDecoder {
     /// Decodes a message of `total` bytes and appends it to `out`.
     #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
-    pub(crate) fn decode(
-        &mut self,
-        input: &mut FrameCursor<'_>,
-        total: usize,
-        out: &mut Vec<u8>,
-    ) -> Result<(), Error> {
+    pub(crate) fn decode(&mut self, input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
         #[cfg(feature = "video")]
         return self.inner.decode(input, total, out);
         #[cfg(not(feature = "video"))]

@@ -43,11 +43,7 @@ const RESIDUALS: [(u32, u32); 256] = {
 #[inline(always)]
 fn tokenise(residual: u32) -> (u32, u32) {
     let log = scaled_log(residual, 2);
-    if residual < EXACT {
-        (residual, 0)
-    } else {
-        (log, (log >> 2) - 2)
-    }
+    if residual < EXACT { (residual, 0) } else { (log, (log >> 2) - 2) }
 }
 
 /// Shift that merges all contexts into one.
@@ -149,21 +145,13 @@ impl<T: PlaneSample> Wide<T> {
             }
             cost
         };
-        kinds
-            .iter()
-            .copied()
-            .min_by_key(|&kind| cost(kind))
-            .unwrap_or(Kind::West)
+        kinds.iter().copied().min_by_key(|&kind| cost(kind)).unwrap_or(Kind::West)
     }
 }
 
 /// Returns the predictor for a row: in the first row of a picture there is nothing above to predict from.
 fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
-    if y == 0 && height > 1 && kind != Kind::Zero {
-        Kind::West
-    } else {
-        kind
-    }
+    if y == 0 && height > 1 && kind != Kind::Zero { Kind::West } else { kind }
 }
 
 fn row_cost<P: Predictor, T: PlaneSample>(plane: &Padded<T>, y: usize, some: usize) -> u64 {
@@ -172,11 +160,7 @@ fn row_cost<P: Predictor, T: PlaneSample>(plane: &Padded<T>, y: usize, some: usi
     let mut sum = 0u32;
     for x in 0..length {
         let residual = v[x].residual::<P>(a[x], b[x], c[x], d[x]) & T::RESIDUAL;
-        sum += if residual == 0 {
-            0
-        } else {
-            scaled_log(residual, 0) + 1
-        };
+        sum += if residual == 0 { 0 } else { scaled_log(residual, 0) + 1 };
     }
     sum.into()
 }
@@ -250,14 +234,7 @@ mod tests {
     use super::*;
     use crate::wire::FrameCursor;
 
-    const PICTURE: [Kind; 6] = [
-        Kind::West,
-        Kind::North,
-        Kind::Slope,
-        Kind::Plane,
-        Kind::Median,
-        Kind::Middle,
-    ];
+    const PICTURE: [Kind; 6] = [Kind::West, Kind::North, Kind::Slope, Kind::Plane, Kind::Median, Kind::Middle];
     const SEQUENCE: [Kind; 2] = [Kind::West, Kind::Line];
 
     /// Returns the token of a difference.
@@ -288,10 +265,7 @@ mod tests {
         kinds: &[Kind],
         sample: impl Fn(usize) -> Option<T>,
     ) -> usize {
-        let mut wide = Wide {
-            samples: shape(),
-            missing: gaps(),
-        };
+        let mut wide = Wide { samples: shape(), missing: gaps() };
         let mut index = 0;
         for lane in 0..wide.samples.lanes.len() {
             for y in 0..wide.samples.lanes[lane].height {
@@ -307,20 +281,11 @@ mod tests {
         }
         let mut bytes = Vec::new();
         wide.encode(kinds, &mut bytes);
-        let mut back = Wide {
-            samples: shape(),
-            missing: gaps(),
-        };
+        let mut back = Wide { samples: shape(), missing: gaps() };
         let mut input = FrameCursor::new(&bytes);
         back.decode(&mut input).unwrap();
         input.finish().unwrap();
-        let gaps: Vec<u8> = back
-            .missing
-            .iter()
-            .flat_map(Lanes::rows)
-            .flatten()
-            .copied()
-            .collect();
+        let gaps: Vec<u8> = back.missing.iter().flat_map(Lanes::rows).flatten().copied().collect();
         for (index, &value) in back.samples.rows().flatten().enumerate() {
             if gaps.get(index).is_some_and(|&gap| gap != 0) {
                 assert_eq!(sample(index), None);
@@ -343,12 +308,7 @@ mod tests {
                     &[kind],
                     |index| Some((noise(index) >> 20) as u16 + index as u16),
                 );
-                round_trip(
-                    || Lanes::pictures(1, width, height),
-                    || None,
-                    &[kind],
-                    |index| Some(noise(index)),
-                );
+                round_trip(|| Lanes::pictures(1, width, height), || None, &[kind], |index| Some(noise(index)));
                 round_trip(
                     || Lanes::pictures(1, width, height),
                     || Some(Lanes::pictures(1, width, height)),
@@ -373,8 +333,7 @@ mod tests {
             &PICTURE,
             |index| {
                 let (x, y) = (index % 640, index / 640);
-                (!(200..300).contains(&x) || !(100..200).contains(&y))
-                    .then_some((3 * x + 5 * y) as u16)
+                (!(200..300).contains(&x) || !(100..200).contains(&y)).then_some((3 * x + 5 * y) as u16)
             },
         );
         assert!(size < 5000, "{size}");
@@ -382,29 +341,15 @@ mod tests {
 
     #[test]
     fn a_cut_stream_is_an_error() {
-        let mut wide = Wide {
-            samples: Lanes::pictures(1, 40, 40),
-            missing: None,
-        };
+        let mut wide = Wide { samples: Lanes::pictures(1, 40, 40), missing: None };
         for y in 0..40 {
-            wide.samples
-                .row_mut(0, y)
-                .iter_mut()
-                .enumerate()
-                .for_each(|(x, slot)| *slot = (x * y * y) as u16);
+            wide.samples.row_mut(0, y).iter_mut().enumerate().for_each(|(x, slot)| *slot = (x * y * y) as u16);
         }
         let mut bytes = Vec::new();
         wide.encode(&PICTURE, &mut bytes);
         for length in 0..bytes.len() {
-            let mut back = Wide {
-                samples: Lanes::<u16>::pictures(1, 40, 40),
-                missing: None,
-            };
-            assert!(
-                back.decode(&mut FrameCursor::new(&bytes[..length]))
-                    .is_err(),
-                "{length}"
-            );
+            let mut back = Wide { samples: Lanes::<u16>::pictures(1, 40, 40), missing: None };
+            assert!(back.decode(&mut FrameCursor::new(&bytes[..length])).is_err(), "{length}");
         }
     }
 }

@@ -43,10 +43,7 @@ impl<'a> MessageEnds<'a> {
 
     /// Takes the first `head` bytes of `message`, and the last `tail`.
     pub(crate) fn from_message(message: &'a [u8], head: usize, tail: usize) -> Self {
-        Self {
-            head: &message[..head],
-            tail: &message[message.len() - tail..],
-        }
+        Self { head: &message[..head], tail: &message[message.len() - tail..] }
     }
 
     /// Appends both, preceded by their length.
@@ -145,11 +142,7 @@ impl<'a> FrameCursor<'a> {
 
     /// Fails if bytes are left over: a frame is read to its end or not at all.
     pub(crate) fn finish(self) -> Result<(), Error> {
-        if self.rest.is_empty() {
-            Ok(())
-        } else {
-            Err(Error::Corrupt("bytes after the end"))
-        }
+        if self.rest.is_empty() { Ok(()) } else { Err(Error::Corrupt("bytes after the end")) }
     }
 }
 
@@ -179,17 +172,8 @@ mod tests {
         let mut bytes = Vec::new();
         put_varint(&mut bytes, 10);
         bytes.extend_from_slice(b"short");
-        assert!(matches!(
-            FrameCursor::new(&bytes).block(),
-            Err(Error::Corrupt(_))
-        ));
-        assert!(matches!(
-            FrameCursor::new(&[0x80; 12]).varint(),
-            Err(Error::Corrupt(_))
-        ));
-        assert!(matches!(
-            FrameCursor::new(&[0x80]).varint(),
-            Err(Error::Truncated)
-        ));
+        assert!(matches!(FrameCursor::new(&bytes).block(), Err(Error::Corrupt(_))));
+        assert!(matches!(FrameCursor::new(&[0x80; 12]).varint(), Err(Error::Corrupt(_))));
+        assert!(matches!(FrameCursor::new(&[0x80]).varint(), Err(Error::Truncated)));
     }
 }

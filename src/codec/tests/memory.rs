@@ -132,19 +132,12 @@ fn messages() -> Vec<(Schema, Vec<u8>)> {
 #[test]
 fn decoding_takes_memory_in_proportion_to_the_message() {
     for (schema, message) in messages() {
-        for codec in [
-            Codec::for_schema(schema),
-            Codec::Zlib(1),
-            Codec::Zstd(1),
-            Codec::Raw,
-        ] {
+        for codec in [Codec::for_schema(schema), Codec::Zlib(1), Codec::Zstd(1), Codec::Raw] {
             let mut frame = Vec::new();
             let encoded = Encoder::new(schema).encode(codec, &message, &mut frame);
             let (back, taken) = peak(|| {
                 let mut out = Vec::new();
-                Decoder::new(message.len())
-                    .decode(&frame, &mut out)
-                    .unwrap();
+                Decoder::new(message.len()).decode(&frame, &mut out).unwrap();
                 out
             });
             assert_eq!(back, message);
@@ -165,17 +158,12 @@ fn a_frame_that_lies_takes_no_more() {
         Encoder::new(schema).encode(Codec::for_schema(schema), &message, &mut frame);
         // Cut short at many places, and with one byte changed.
         for part in (1..40).step_by(3) {
-            let at = if part < 20 {
-                part * 8
-            } else {
-                frame.len() * part / 40
-            };
+            let at = if part < 20 { part * 8 } else { frame.len() * part / 40 };
             let at = at.min(frame.len() - 1);
             let mut damaged = frame.clone();
             damaged[at] ^= 0x55;
             for frame in [&frame[..at], &damaged] {
-                let (_, taken) =
-                    peak(|| Decoder::new(message.len()).decode(frame, &mut Vec::new()));
+                let (_, taken) = peak(|| Decoder::new(message.len()).decode(frame, &mut Vec::new()));
                 assert!(
                     taken <= FACTOR * message.len() + TABLES,
                     "{schema:?} of {} bytes at {at}: {taken}",
@@ -199,13 +187,8 @@ fn a_jpeg_takes_no_more_than_its_picture_and_one_that_lies_neither() {
             let mut damaged = frame.clone();
             damaged[at] ^= [0, 0x55][usize::from(part > 0)];
             for frame in [&frame[..at], &damaged] {
-                let (_, taken) =
-                    peak(|| Decoder::new(message.len()).decode(frame, &mut Vec::new()));
-                assert!(
-                    taken <= FACTOR * message.len() + TABLES,
-                    "{} bytes at {at}: {taken}",
-                    message.len()
-                );
+                let (_, taken) = peak(|| Decoder::new(message.len()).decode(frame, &mut Vec::new()));
+                assert!(taken <= FACTOR * message.len() + TABLES, "{} bytes at {at}: {taken}", message.len());
             }
         }
     }
@@ -213,22 +196,14 @@ fn a_jpeg_takes_no_more_than_its_picture_and_one_that_lies_neither() {
 
 #[test]
 fn what_is_too_large_takes_nothing() {
-    for codec in [
-        "raw", "zlib", "deflate", "zstd", "image", "grid", "scan", "cloud", "video", "jpeg",
-    ] {
+    for codec in ["raw", "zlib", "deflate", "zstd", "image", "grid", "scan", "cloud", "video", "jpeg"] {
         let parsed = codec.parse::<Codec>().unwrap();
         let (tag, version) = (parsed.tag(), parsed.version());
         // A message of 2^56 bytes, and one of a byte more than allowed.
-        for declared in [
-            &[0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 1][..],
-            &[0x81, 8],
-        ] {
+        for declared in [&[0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 0x80, 1][..], &[0x81, 8]] {
             let frame = [&[tag, version, 1], declared, &[0; 100]].concat();
             let (result, taken) = peak(|| Decoder::new(1024).decode(&frame, &mut Vec::new()));
-            assert!(
-                matches!(result, Err(Error::TooLarge { limit: 1024, .. })),
-                "{codec}"
-            );
+            assert!(matches!(result, Err(Error::TooLarge { limit: 1024, .. })), "{codec}");
             assert_eq!(taken, 0, "{codec}");
         }
     }

@@ -15,13 +15,8 @@ const CODECS: [Codec; 9] = [
     Codec::Cloud,
     Codec::Zstd(9),
 ];
-const SCHEMAS: [Schema; 5] = [
-    Schema::Image,
-    Schema::OccupancyGrid,
-    Schema::LaserScan,
-    Schema::PointCloud2,
-    Schema::Other,
-];
+const SCHEMAS: [Schema; 5] =
+    [Schema::Image, Schema::OccupancyGrid, Schema::LaserScan, Schema::PointCloud2, Schema::Other];
 const LIMIT: usize = 1 << 22;
 
 /// Serialization format of a message.
@@ -122,48 +117,28 @@ fn image() -> impl Strategy<Value = Vec<u8>> {
         "rgb16",
     ]);
     let noise = prop::sample::select(vec![0u8, 1, 3, 0x7f, 0xff]);
-    (
-        encodings,
-        1usize..70,
-        1usize..70,
-        0usize..9,
-        any::<bool>(),
-        any::<u64>(),
-        noise,
-        (format(), 0usize..9),
+    (encodings, 1usize..70, 1usize..70, 0usize..9, any::<bool>(), any::<u64>(), noise, (format(), 0usize..9)).prop_map(
+        |(encoding, width, height, padding, big_endian, seed, noise, (format, name))| {
+            let pixel = match encoding {
+                "rgb8" | "bgr8" => 3,
+                "rgba8" | "bgra8" | "32FC1" | "32SC1" => 4,
+                "mono16" | "16UC1" | "bayer_rggb16" | "8UC2" | "yuv422" => 2,
+                "64FC1" => 8,
+                "rgb16" => 6,
+                _ => 1,
+            };
+            let step = width * pixel + padding;
+            let message = Message::new(format, name).u32(height as u32).u32(width as u32).string(encoding);
+            let message = message.raw(&[big_endian.into()]).u32(step as u32);
+            message.bytes(&samples(step * height, seed, noise)).finish()
+        },
     )
-        .prop_map(
-            |(encoding, width, height, padding, big_endian, seed, noise, (format, name))| {
-                let pixel = match encoding {
-                    "rgb8" | "bgr8" => 3,
-                    "rgba8" | "bgra8" | "32FC1" | "32SC1" => 4,
-                    "mono16" | "16UC1" | "bayer_rggb16" | "8UC2" | "yuv422" => 2,
-                    "64FC1" => 8,
-                    "rgb16" => 6,
-                    _ => 1,
-                };
-                let step = width * pixel + padding;
-                let message = Message::new(format, name)
-                    .u32(height as u32)
-                    .u32(width as u32)
-                    .string(encoding);
-                let message = message.raw(&[big_endian.into()]).u32(step as u32);
-                message.bytes(&samples(step * height, seed, noise)).finish()
-            },
-        )
 }
 
 fn grid() -> impl Strategy<Value = Vec<u8>> {
     let format = (format(), 0usize..9);
-    (
-        1usize..150,
-        1usize..150,
-        any::<u64>(),
-        0u32..5,
-        0u8..5,
-        format,
-    )
-        .prop_map(|(width, height, seed, shift, kind, (format, name))| {
+    (1usize..150, 1usize..150, any::<u64>(), 0u32..5, 0u8..5, format).prop_map(
+        |(width, height, seed, shift, kind, (format, name))| {
             let cells: Vec<u8> = samples(width * height, seed, if kind == 3 { 0xff } else { 7 })
                 .iter()
                 .map(|&value| match kind {
@@ -175,14 +150,10 @@ fn grid() -> impl Strategy<Value = Vec<u8>> {
                 .collect();
             let origin = f64::from(shift) * 0.5;
             let message = Message::new(format, name).u32(0).u32(0);
-            let message = message
-                .u32(0.5f32.to_bits())
-                .u32(width as u32)
-                .u32(height as u32)
-                .f64(origin)
-                .raw(&[0; 48]);
+            let message = message.u32(0.5f32.to_bits()).u32(width as u32).u32(height as u32).f64(origin).raw(&[0; 48]);
             message.bytes(&cells).finish()
-        })
+        },
+    )
 }
 
 /// Floats of many kinds: measured in millimetres, rough, missing.
@@ -195,19 +166,10 @@ fn float() -> impl Strategy<Value = f32> {
 }
 
 fn scan() -> impl Strategy<Value = Vec<u8>> {
-    let parts = (
-        vec(float(), 0..1500),
-        vec(any::<f32>(), 0..1500),
-        format(),
-        0usize..9,
-    );
+    let parts = (vec(float(), 0..1500), vec(any::<f32>(), 0..1500), format(), 0usize..9);
     parts.prop_map(|(ranges, intensities, format, name)| {
         let floats = |message: Message, values: &[f32]| {
-            values
-                .iter()
-                .fold(message.u32(values.len() as u32), |message, value| {
-                    message.raw(&value.to_le_bytes())
-                })
+            values.iter().fold(message.u32(values.len() as u32), |message, value| message.raw(&value.to_le_bytes()))
         };
         let message = Message::new(format, name).align(4).raw(&[1; 28]);
         floats(floats(message, &ranges), &intensities).finish()
@@ -227,47 +189,31 @@ fn cloud() -> impl Strategy<Value = Vec<u8>> {
         vec(float(), 1..60),
         (format(), 0usize..9),
     )
-        .prop_map(
-            |(fields, width, height, tail, padding, seed, floats, (format, name))| {
-                let mut offset = 0;
-                let mut message = Message::new(format, name)
-                    .u32(height as u32)
-                    .u32(width as u32)
-                    .u32(fields.len() as u32);
-                let mut float_offsets = Vec::new();
-                for (name, number, gap, count) in fields {
-                    offset += gap;
-                    message = message
-                        .string(name)
-                        .u32(offset as u32)
-                        .raw(&[number])
-                        .u32(count);
-                    if number == 7 && count == 1 {
-                        float_offsets.push(offset);
-                    }
-                    offset += [0, 1, 1, 2, 2, 4, 4, 4, 8][usize::from(number)] * count as usize;
+        .prop_map(|(fields, width, height, tail, padding, seed, floats, (format, name))| {
+            let mut offset = 0;
+            let mut message = Message::new(format, name).u32(height as u32).u32(width as u32).u32(fields.len() as u32);
+            let mut float_offsets = Vec::new();
+            for (name, number, gap, count) in fields {
+                offset += gap;
+                message = message.string(name).u32(offset as u32).raw(&[number]).u32(count);
+                if number == 7 && count == 1 {
+                    float_offsets.push(offset);
                 }
-                let step = offset + tail + 1;
-                let row = step * width + padding;
-                let mut data = samples(row * height, seed, 0x0f);
-                for y in 0..height {
-                    for x in 0..width {
-                        for (index, &offset) in float_offsets.iter().enumerate() {
-                            let value = floats[(x + y + index) % floats.len()] * (x + 1) as f32;
-                            data[y * row + x * step + offset..][..4]
-                                .copy_from_slice(&value.to_le_bytes());
-                        }
+                offset += [0, 1, 1, 2, 2, 4, 4, 4, 8][usize::from(number)] * count as usize;
+            }
+            let step = offset + tail + 1;
+            let row = step * width + padding;
+            let mut data = samples(row * height, seed, 0x0f);
+            for y in 0..height {
+                for x in 0..width {
+                    for (index, &offset) in float_offsets.iter().enumerate() {
+                        let value = floats[(x + y + index) % floats.len()] * (x + 1) as f32;
+                        data[y * row + x * step + offset..][..4].copy_from_slice(&value.to_le_bytes());
                     }
                 }
-                message
-                    .raw(&[0])
-                    .u32(step as u32)
-                    .u32(row as u32)
-                    .bytes(&data)
-                    .raw(&[1])
-                    .finish()
-            },
-        )
+            }
+            message.raw(&[0]).u32(step as u32).u32(row as u32).bytes(&data).raw(&[1]).finish()
+        })
 }
 
 fn any_message() -> impl Strategy<Value = (Schema, Vec<u8>)> {
@@ -276,10 +222,7 @@ fn any_message() -> impl Strategy<Value = (Schema, Vec<u8>)> {
         grid().prop_map(|message| (Schema::OccupancyGrid, message)),
         scan().prop_map(|message| (Schema::LaserScan, message)),
         cloud().prop_map(|message| (Schema::PointCloud2, message)),
-        (
-            prop::sample::select(SCHEMAS.to_vec()),
-            vec(any::<u8>(), 0..300)
-        ),
+        (prop::sample::select(SCHEMAS.to_vec()), vec(any::<u8>(), 0..300)),
     ]
 }
 
@@ -352,25 +295,13 @@ fn scene_in(format: Format, encoding: &str, channels: usize, round: usize) -> Ve
     let mut data = Vec::new();
     for y in 0..height {
         for x in 0..width {
-            let colour = [
-                (x * 3 + round) as u8,
-                (y * 4) as u8,
-                (x + y) as u8,
-                (x ^ y) as u8,
-            ];
+            let colour = [(x * 3 + round) as u8, (y * 4) as u8, (x + y) as u8, (x ^ y) as u8];
             data.extend_from_slice(&colour[..channels]);
         }
         data.extend_from_slice(&[round as u8; 5]);
     }
-    let message = Message::new(format, 5)
-        .u32(height as u32)
-        .u32(width as u32)
-        .string(encoding);
-    message
-        .raw(&[0])
-        .u32((width * channels + padding) as u32)
-        .bytes(&data)
-        .finish()
+    let message = Message::new(format, 5).u32(height as u32).u32(width as u32).string(encoding);
+    message.raw(&[0]).u32((width * channels + padding) as u32).bytes(&data).finish()
 }
 
 /// Messages as nodes send them use the codec of their type, in both formats and with any padding.
@@ -380,19 +311,12 @@ fn each_schema_is_told_by_its_own_codec_in_both_formats() {
         for length in 0..8 {
             let message = || Message::new(format, length);
             let cells = samples(21 * (3 + length), 7, 0);
-            let image = message()
-                .u32(3 + length as u32)
-                .u32(7)
-                .string("rgb8")
-                .raw(&[0])
-                .u32(21)
-                .bytes(&cells);
+            let image = message().u32(3 + length as u32).u32(7).string("rgb8").raw(&[0]).u32(21).bytes(&cells);
             let grid = message().u32(1).u32(2).u32(3).u32(21);
             let grid = grid.u32(3 + length as u32).f64(1.0).raw(&[0; 48]);
             let scan = message().align(4).raw(&[1; 28]);
             let scan = scan.u32(64).raw(&samples(256, 3, 0)).u32(0);
-            let field =
-                |message: Message, name, offset| message.string(name).u32(offset).raw(&[7]).u32(1);
+            let field = |message: Message, name, offset| message.string(name).u32(offset).raw(&[7]).u32(1);
             let cloud = field(field(message().u32(1).u32(32).u32(2), "x", 0), "y", 4);
             let cloud = cloud.raw(&[0]).u32(8).u32(256).bytes(&samples(256, 5, 0));
             for (schema, message) in [
@@ -432,24 +356,13 @@ fn assert_lossy(back: &[u8], message: &[u8], channels: usize, most: u8) {
     assert_eq!(back.len(), message.len());
     let head = message.len() - 48 * (64 * channels + 5);
     assert_eq!(back[..head], message[..head]);
-    let lines = |bytes: &[u8]| {
-        bytes[head..]
-            .chunks(64 * channels + 5)
-            .map(<[u8]>::to_vec)
-            .collect::<Vec<_>>()
-    };
+    let lines = |bytes: &[u8]| bytes[head..].chunks(64 * channels + 5).map(<[u8]>::to_vec).collect::<Vec<_>>();
     for (new, old) in lines(back).iter().zip(lines(message)) {
         assert_eq!(new[64 * channels..], old[64 * channels..], "padding");
-        for (new, old) in new[..64 * channels]
-            .chunks(channels)
-            .zip(old.chunks(channels))
-        {
+        for (new, old) in new[..64 * channels].chunks(channels).zip(old.chunks(channels)) {
             assert_eq!(new[colours..], old[colours..], "alpha");
             let near = |(new, old): (&u8, &u8)| new.abs_diff(*old) < most;
-            assert!(
-                new[..colours].iter().zip(&old[..colours]).all(near),
-                "{new:?} {old:?}"
-            );
+            assert!(new[..colours].iter().zip(&old[..colours]).all(near), "{new:?} {old:?}");
         }
     }
 }
@@ -520,10 +433,7 @@ fn a_jpeg_that_is_cut_changed_or_of_another_size_is_refused_or_a_picture() {
     let size = at.unwrap() + 5;
     frame[size..size + 4].copy_from_slice(&[0xff; 4]);
     let refused = Decoder::new(LIMIT).decode(&frame, &mut Vec::new());
-    assert_eq!(
-        refused.err(),
-        Some(Error::Corrupt("a JPEG of another size than declared"))
-    );
+    assert_eq!(refused.err(), Some(Error::Corrupt("a JPEG of another size than declared")));
 }
 
 #[cfg(feature = "video")]
@@ -566,10 +476,5 @@ fn a_build_without_video_falls_back() {
     let message = scene("rgb8", 3, 0);
     let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
     assert!(!Codec::Video.is_available());
-    assert_eq!(
-        encoder
-            .encode(Codec::Video, &message, &mut Vec::new())
-            .codec,
-        Codec::Zstd(3)
-    );
+    assert_eq!(encoder.encode(Codec::Video, &message, &mut Vec::new()).codec, Codec::Zstd(3));
 }

@@ -75,8 +75,7 @@ pub fn current() -> Option<Cancel> {
 
 /// Fails if the current thread's work was cancelled.
 pub fn check() -> Result<(), Cancelled> {
-    let cancelled =
-        CURRENT.with_borrow(|current| current.as_ref().is_some_and(Cancel::is_cancelled));
+    let cancelled = CURRENT.with_borrow(|current| current.as_ref().is_some_and(Cancel::is_cancelled));
     if cancelled { Err(Cancelled) } else { Ok(()) }
 }
 

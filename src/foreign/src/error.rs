@@ -64,11 +64,7 @@ pub enum Error {
 
 impl Error {
     pub(crate) fn file(action: &'static str, path: &Path, source: impl Into<io::Error>) -> Self {
-        Self::File {
-            action,
-            path: path.to_owned(),
-            source: source.into(),
-        }
+        Self::File { action, path: path.to_owned(), source: source.into() }
     }
 }
 

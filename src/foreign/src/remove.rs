@@ -153,18 +153,11 @@ impl Remover<'_> {
     }
 
     fn stat(&self, directory: &OwnedFd, stack: &[RemovalLevel]) -> Result<Stat, Error> {
-        rustix::fs::fstat(directory)
-            .map_err(|error| self.error_at("look at", stack, &[c"."], error))
+        rustix::fs::fstat(directory).map_err(|error| self.error_at("look at", stack, &[c"."], error))
     }
 
     /// Builds the error of a system call on the path made of `names`, below the directories of the stack.
-    fn error_at(
-        &self,
-        action: &'static str,
-        stack: &[RemovalLevel],
-        names: &[&CStr],
-        error: Errno,
-    ) -> Error {
+    fn error_at(&self, action: &'static str, stack: &[RemovalLevel], names: &[&CStr], error: Errno) -> Error {
         use std::os::unix::ffi::OsStrExt;
         let mut path = PathBuf::from(self.root);
         let above = stack.iter().map(|level| level.name.as_c_str());
@@ -241,10 +234,7 @@ mod tests {
             let told = Command::new("unshare")
                 .args(["--map-root-user", "--mount"])
                 .arg(std::env::current_exe().expect("this test"))
-                .args([
-                    "--exact",
-                    "remove::tests::what_is_mounted_in_a_tree_stays_and_is_named",
-                ])
+                .args(["--exact", "remove::tests::what_is_mounted_in_a_tree_stays_and_is_named"])
                 .env(INSIDE, place.path())
                 .output()
                 .expect("unshare, of util-linux");
@@ -261,15 +251,9 @@ mod tests {
             // Entries that are not directories are removed first.
             std::fs::write(root.join("f"), "").expect("written");
             let point = root.join(point);
-            let mounted = Command::new("mount")
-                .arg("--bind")
-                .arg(what)
-                .arg(&point)
-                .status();
+            let mounted = Command::new("mount").arg("--bind").arg(what).arg(&point).status();
             assert!(mounted.expect("mount, of util-linux").success());
-            let refused = remove(&root)
-                .expect_err("something is mounted there")
-                .to_string();
+            let refused = remove(&root).expect_err("something is mounted there").to_string();
             let expected = format!("a file system is mounted at {}; detach it", point.display());
             assert!(refused.starts_with(&expected), "{refused}");
             assert!(outside.join("f").exists());

@@ -98,15 +98,8 @@ mod tests {
     #[test]
     fn colours_stay_on_a_terminal_and_end_with_their_line() {
         let text = "\x1b[01;31merror\x1b[0m: x\nnext \x1b[1mbold\nplain";
-        assert_eq!(
-            escape(text, true),
-            "\x1b[01;31merror\x1b[0m: x\x1b[0m\nnext \x1b[1mbold\x1b[0m\nplain"
-        );
-        assert_eq!(
-            escape("\x1b[31mred", false),
-            "\\u{1b}[31mred",
-            "a file has no colours"
-        );
+        assert_eq!(escape(text, true), "\x1b[01;31merror\x1b[0m: x\x1b[0m\nnext \x1b[1mbold\x1b[0m\nplain");
+        assert_eq!(escape("\x1b[31mred", false), "\\u{1b}[31mred", "a file has no colours");
     }
 
     #[test]

@@ -12,19 +12,13 @@ use rustix::io::Errno;
 use crate::Error;
 
 /// Resolves paths inside the tree only, and through no link.
-pub(crate) const INSIDE: ResolveFlags = ResolveFlags::BENEATH
-    .union(ResolveFlags::NO_SYMLINKS)
-    .union(ResolveFlags::NO_MAGICLINKS);
+pub(crate) const INSIDE: ResolveFlags =
+    ResolveFlags::BENEATH.union(ResolveFlags::NO_SYMLINKS).union(ResolveFlags::NO_MAGICLINKS);
 /// Non-blocking, because opening a pipe would wait for its other end.
-pub(crate) const FILE: OFlags = OFlags::RDONLY
-    .union(OFlags::NOFOLLOW)
-    .union(OFlags::NONBLOCK)
-    .union(OFlags::NOCTTY)
-    .union(OFlags::CLOEXEC);
-pub(crate) const DIRECTORY: OFlags = OFlags::RDONLY
-    .union(OFlags::DIRECTORY)
-    .union(OFlags::NOFOLLOW)
-    .union(OFlags::CLOEXEC);
+pub(crate) const FILE: OFlags =
+    OFlags::RDONLY.union(OFlags::NOFOLLOW).union(OFlags::NONBLOCK).union(OFlags::NOCTTY).union(OFlags::CLOEXEC);
+pub(crate) const DIRECTORY: OFlags =
+    OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC);
 
 /// A directory of a tree, held by its descriptor, so that renames and links above it have no effect.
 #[derive(Debug)]
@@ -57,12 +51,9 @@ impl Tree {
     /// Opens the root of a tree. The path is trusted and may contain links.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
-        let directory = rustix::fs::open(path, flags, Mode::empty())
-            .map_err(|error| Error::file("open", path, error))?;
-        Ok(Self {
-            directory,
-            path: path.to_owned(),
-        })
+        let directory =
+            rustix::fs::open(path, flags, Mode::empty()).map_err(|error| Error::file("open", path, error))?;
+        Ok(Self { directory, path: path.to_owned() })
     }
 
     /// Returns the path of the tree, for messages only.
@@ -87,17 +78,8 @@ impl Tree {
     /// Opens the directory at `path` in this one.
     pub fn open_directory(&self, path: impl AsRef<Path>) -> Result<DirectoryLookup, Error> {
         let shown = self.path.join(path.as_ref());
-        match rustix::fs::openat2(
-            &self.directory,
-            path.as_ref(),
-            DIRECTORY,
-            Mode::empty(),
-            INSIDE,
-        ) {
-            Ok(directory) => Ok(DirectoryLookup::Directory(Self {
-                directory,
-                path: shown,
-            })),
+        match rustix::fs::openat2(&self.directory, path.as_ref(), DIRECTORY, Mode::empty(), INSIDE) {
+            Ok(directory) => Ok(DirectoryLookup::Directory(Self { directory, path: shown })),
             Err(Errno::NOENT) => Ok(DirectoryLookup::Nothing),
             Err(error) if is_something_else(error) => Ok(DirectoryLookup::SomethingElse),
             Err(error) => Err(Error::file("open", &shown, error)),
@@ -115,12 +97,9 @@ impl Tree {
 
     /// Returns the names in the directory, without `.` and `..`, unordered.
     pub fn names(&self) -> Result<Vec<OsString>, Error> {
-        let names = crate::walk::names(&self.directory)
-            .map_err(|error| Error::file("list", &self.path, error))?;
+        let names = crate::walk::names(&self.directory).map_err(|error| Error::file("list", &self.path, error))?;
         let names = names.into_iter();
-        Ok(names
-            .map(|name| OsString::from_vec(name.into_bytes()))
-            .collect())
+        Ok(names.map(|name| OsString::from_vec(name.into_bytes())).collect())
     }
 
     /// Returns whether a regular file is at `path`, behind no link.
@@ -132,11 +111,7 @@ impl Tree {
     }
 
     /// Reads a file like [`Tree::read_file`], but follows symbolic links that stay in the tree.
-    pub fn read_file_following(
-        &self,
-        path: impl AsRef<Path>,
-        limit: u64,
-    ) -> Result<Option<File>, Error> {
+    pub fn read_file_following(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
         let resolve = ResolveFlags::BENEATH | ResolveFlags::NO_MAGICLINKS;
         self.open_and_read(path.as_ref(), limit, resolve)
     }
@@ -151,39 +126,25 @@ impl Tree {
             return Ok(None);
         };
         let shown = self.path.join(path);
-        let stat =
-            rustix::fs::fstat(&file).map_err(|error| Error::file("look at", &shown, error))?;
+        let stat = rustix::fs::fstat(&file).map_err(|error| Error::file("look at", &shown, error))?;
         match FileType::from_raw_mode(stat.st_mode) {
             FileType::RegularFile => Ok(Some(file)),
             _ => Err(Error::NotAFile { path: shown }),
         }
     }
 
-    fn open_and_read(
-        &self,
-        path: &Path,
-        limit: u64,
-        resolve: ResolveFlags,
-    ) -> Result<Option<File>, Error> {
+    fn open_and_read(&self, path: &Path, limit: u64, resolve: ResolveFlags) -> Result<Option<File>, Error> {
         let file = self.open_beneath(path, resolve)?;
-        file.map(|file| read(file, &self.path.join(path), limit))
-            .transpose()
+        file.map(|file| read(file, &self.path.join(path), limit)).transpose()
     }
 
     fn open_beneath(&self, path: &Path, resolve: ResolveFlags) -> Result<Option<OwnedFd>, Error> {
         let shown = self.path.join(path);
-        let flags = if resolve.contains(ResolveFlags::NO_SYMLINKS) {
-            FILE
-        } else {
-            FILE.difference(OFlags::NOFOLLOW)
-        };
+        let flags = if resolve.contains(ResolveFlags::NO_SYMLINKS) { FILE } else { FILE.difference(OFlags::NOFOLLOW) };
         match rustix::fs::openat2(&self.directory, path, flags, Mode::empty(), resolve) {
             Ok(file) => Ok(Some(file)),
             Err(Errno::NOENT) => Ok(None),
-            Err(Errno::XDEV) => Err(Error::Outside {
-                path: shown,
-                root: self.path.clone(),
-            }),
+            Err(Errno::XDEV) => Err(Error::Outside { path: shown, root: self.path.clone() }),
             Err(error) if is_something_else(error) => Err(Error::NotAFile { path: shown }),
             Err(error) => Err(Error::file("open", &shown, error)),
         }
@@ -193,24 +154,16 @@ impl Tree {
 /// Returns whether `openat2` failed because the name is a link, not a directory, outside the tree, or a device or
 /// socket that cannot be opened.
 pub(crate) fn is_something_else(error: Errno) -> bool {
-    matches!(
-        error,
-        Errno::NOENT | Errno::LOOP | Errno::NOTDIR | Errno::XDEV | Errno::NXIO | Errno::NODEV
-    )
+    matches!(error, Errno::NOENT | Errno::LOOP | Errno::NOTDIR | Errno::XDEV | Errno::NXIO | Errno::NODEV)
 }
 
 /// Reads an open regular file, of at most `limit` bytes.
 pub(crate) fn read(file: OwnedFd, path: &Path, limit: u64) -> Result<File, Error> {
     let stat = rustix::fs::fstat(&file).map_err(|error| Error::file("look at", path, error))?;
     if FileType::from_raw_mode(stat.st_mode) != FileType::RegularFile {
-        return Err(Error::NotAFile {
-            path: path.to_owned(),
-        });
+        return Err(Error::NotAFile { path: path.to_owned() });
     }
-    let too_large = || Error::TooLarge {
-        path: path.to_owned(),
-        limit,
-    };
+    let too_large = || Error::TooLarge { path: path.to_owned(), limit };
     if u64::try_from(stat.st_size).is_ok_and(|size| size > limit) {
         return Err(too_large());
     }
@@ -222,10 +175,7 @@ pub(crate) fn read(file: OwnedFd, path: &Path, limit: u64) -> Result<File, Error
     if bytes.len() as u64 > limit {
         return Err(too_large());
     }
-    Ok(File {
-        bytes,
-        executable: stat.st_mode & 0o111 != 0,
-    })
+    Ok(File { bytes, executable: stat.st_mode & 0o111 != 0 })
 }
 
 #[cfg(test)]
@@ -255,16 +205,7 @@ mod tests {
         assert!(tree.read_file("d/none", 10).expect("looked").is_none());
         let there = ["d/f", "d", "into/f", "out", "d/none"].map(|path| tree.has_file(path));
         assert_eq!(there, [true, false, false, false, false]);
-        for path in [
-            "out",
-            "absolute",
-            "into/f",
-            "../secret",
-            "/etc/passwd",
-            "d",
-            "d/../../secret",
-            "magic",
-        ] {
+        for path in ["out", "absolute", "into/f", "../secret", "/etc/passwd", "d", "d/../../secret", "magic"] {
             let refused = tree.read_file(path, 10).expect_err(path);
             let expected = if path.contains("..") || path.starts_with('/') {
                 matches!(refused, Error::Outside { .. })
@@ -273,12 +214,7 @@ mod tests {
             };
             assert!(expected, "{path}: {refused}");
         }
-        for (path, expected) in [
-            ("into", "else"),
-            ("..", "else"),
-            ("x", "nothing"),
-            ("d", "it"),
-        ] {
+        for (path, expected) in [("into", "else"), ("..", "else"), ("x", "nothing"), ("d", "it")] {
             let found = match tree.open_directory(path).expect(path) {
                 DirectoryLookup::Directory(_) => "it",
                 DirectoryLookup::SomethingElse => "else",
@@ -312,14 +248,7 @@ mod tests {
     fn a_pipe_stops_nobody() {
         let (place, tree) = world();
         let mode = Mode::from_raw_mode(0o600);
-        rustix::fs::mknodat(
-            rustix::fs::CWD,
-            place.path().join("tree/pipe"),
-            FileType::Fifo,
-            mode,
-            0,
-        )
-        .expect("made");
+        rustix::fs::mknodat(rustix::fs::CWD, place.path().join("tree/pipe"), FileType::Fifo, mode, 0).expect("made");
         let refused = tree.read_file("pipe", 10).expect_err("no file");
         assert!(matches!(refused, Error::NotAFile { .. }), "{refused}");
     }

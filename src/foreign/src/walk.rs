@@ -48,28 +48,17 @@ impl WalkEntry<'_> {
 
     /// Returns the full path, for messages only: a component of it may have become a link meanwhile.
     pub fn display_path(&self) -> PathBuf {
-        if self.path.as_os_str().is_empty() {
-            self.root.to_owned()
-        } else {
-            self.root.join(self.path)
-        }
+        if self.path.as_os_str().is_empty() { self.root.to_owned() } else { self.root.join(self.path) }
     }
 
     /// Opens the file or directory for reading: the one that was visited, or an error.
     pub fn open(&self) -> Result<std::fs::File, Error> {
         let failed = |error: Errno| Error::file("open", &self.display_path(), error);
-        let flags = if self.kind() == FileType::Directory {
-            DIRECTORY
-        } else {
-            FILE
-        };
-        let file = rustix::fs::openat2(self.parent, self.name, flags, Mode::empty(), INSIDE)
-            .map_err(failed)?;
+        let flags = if self.kind() == FileType::Directory { DIRECTORY } else { FILE };
+        let file = rustix::fs::openat2(self.parent, self.name, flags, Mode::empty(), INSIDE).map_err(failed)?;
         let now = rustix::fs::fstat(&file).map_err(failed)?;
         if (now.st_dev, now.st_ino) != (self.stat.st_dev, self.stat.st_ino) {
-            return Err(Error::NotAFile {
-                path: self.display_path(),
-            });
+            return Err(Error::NotAFile { path: self.display_path() });
         }
         Ok(file.into())
     }
@@ -93,16 +82,8 @@ impl WalkEntry<'_> {
 /// # Errors
 /// [`Error::TooDeep`] below [`MAX_DEPTH`] directories, the first error of the system or of `visit`, and
 /// [`Error::Cancelled`].
-pub fn walk<E: From<Error>>(
-    root: &Path,
-    visit: impl FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
-) -> Result<(), E> {
-    Walker {
-        root,
-        changing: false,
-        visit,
-    }
-    .run()
+pub fn walk<E: From<Error>>(root: &Path, visit: impl FnMut(&WalkEntry<'_>) -> Result<Visit, E>) -> Result<(), E> {
+    Walker { root, changing: false, visit }.run()
 }
 
 /// Walks like [`walk`] a tree that other processes change meanwhile: entries that disappear after they were listed are
@@ -111,12 +92,7 @@ pub fn walk_changing<E: From<Error>>(
     root: &Path,
     visit: impl FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
 ) -> Result<(), E> {
-    Walker {
-        root,
-        changing: true,
-        visit,
-    }
-    .run()
+    Walker { root, changing: true, visit }.run()
 }
 
 struct Walker<'a, V> {
@@ -151,10 +127,7 @@ impl<V> Walker<'_, V> {
         if (self.visit)(&entry)? == Visit::Skip {
             return Ok(());
         }
-        let mut stack = vec![WalkLevel {
-            left: self.names(&top, &path)?,
-            directory: top,
-        }];
+        let mut stack = vec![WalkLevel { left: self.names(&top, &path)?, directory: top }];
         while let Some(level) = stack.last_mut() {
             let Some(name) = level.left.pop() else {
                 stack.pop();
@@ -166,16 +139,9 @@ impl<V> Walker<'_, V> {
             let below = self.visit_child::<E>(&level.directory, &name, &path)?;
             match below {
                 Some(_) if stack.len() >= MAX_DEPTH => {
-                    return Err(Error::TooDeep {
-                        path: self.root.join(&path),
-                        limit: MAX_DEPTH,
-                    }
-                    .into());
+                    return Err(Error::TooDeep { path: self.root.join(&path), limit: MAX_DEPTH }.into());
                 }
-                Some(directory) => stack.push(WalkLevel {
-                    left: self.names(&directory, &path)?,
-                    directory,
-                }),
+                Some(directory) => stack.push(WalkLevel { left: self.names(&directory, &path)?, directory }),
                 None => {
                     path.pop();
                 }
@@ -199,13 +165,7 @@ impl<V> Walker<'_, V> {
             Err(Errno::NOENT) if self.changing => return Ok(None),
             Err(error) => return Err(Error::file("look at", &self.root.join(path), error).into()),
         };
-        let entry = WalkEntry {
-            parent: parent.as_fd(),
-            name,
-            path,
-            stat,
-            root: self.root,
-        };
+        let entry = WalkEntry { parent: parent.as_fd(), name, path, stat, root: self.root };
         let visit = (self.visit)(&entry)?;
         if visit == Visit::Skip || entry.kind() != FileType::Directory {
             return Ok(None);
@@ -218,8 +178,7 @@ impl<V> Walker<'_, V> {
     }
 
     fn names(&self, directory: &OwnedFd, path: &Path) -> Result<Vec<CString>, Error> {
-        let mut names =
-            names(directory).map_err(|error| Error::file("list", &self.root.join(path), error))?;
+        let mut names = names(directory).map_err(|error| Error::file("list", &self.root.join(path), error))?;
         names.sort_unstable_by(|a, b| b.cmp(a));
         Ok(names)
     }
@@ -247,11 +206,7 @@ mod tests {
         let mut seen = Vec::new();
         walk(root, |entry| {
             seen.push(entry.path.display().to_string());
-            Ok::<_, Error>(if entry.name() == "skipped" {
-                Visit::Skip
-            } else {
-                Visit::Into
-            })
+            Ok::<_, Error>(if entry.name() == "skipped" { Visit::Skip } else { Visit::Into })
         })?;
         Ok(seen)
     }
@@ -274,10 +229,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let levels = |count: usize| vec!["d"; count].join("/");
         std::fs::create_dir_all(place.path().join(levels(MAX_DEPTH - 1))).expect("made");
-        assert_eq!(
-            visited_paths(place.path()).expect("walked").len(),
-            MAX_DEPTH
-        );
+        assert_eq!(visited_paths(place.path()).expect("walked").len(), MAX_DEPTH);
         std::fs::create_dir_all(place.path().join(levels(MAX_DEPTH))).expect("made");
         let refused = visited_paths(place.path()).expect_err("too deep");
         assert!(matches!(refused, Error::TooDeep { .. }), "{refused}");

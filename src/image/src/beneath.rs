@@ -20,9 +20,7 @@ pub(crate) struct ConfinedRoot {
     last: Option<(Vec<u8>, Rc<OwnedFd>)>,
 }
 
-const DIRECTORY: OFlags = OFlags::RDONLY
-    .union(OFlags::DIRECTORY)
-    .union(OFlags::CLOEXEC);
+const DIRECTORY: OFlags = OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
 
 impl ConfinedRoot {
     /// Opens a root in which symbolic links in the middle of a path are resolved as if `root` were `/`.
@@ -37,11 +35,7 @@ impl ConfinedRoot {
 
     fn new(root: &Path, resolve: ResolveFlags) -> Result<Self, Errno> {
         let root = rustix::fs::open(root, DIRECTORY | OFlags::NOFOLLOW, Mode::empty())?;
-        Ok(Self {
-            root,
-            resolve,
-            last: None,
-        })
+        Ok(Self { root, resolve, last: None })
     }
 
     pub(crate) fn root(&self) -> BorrowedFd<'_> {
@@ -56,13 +50,7 @@ impl ConfinedRoot {
             }
         }
         let name = if path.is_empty() { &b"."[..] } else { path };
-        let directory = Rc::new(rustix::fs::openat2(
-            &self.root,
-            name,
-            DIRECTORY,
-            Mode::empty(),
-            self.resolve,
-        )?);
+        let directory = Rc::new(rustix::fs::openat2(&self.root, name, DIRECTORY, Mode::empty(), self.resolve)?);
         self.last = Some((path.to_vec(), Rc::clone(&directory)));
         Ok(directory)
     }

@@ -14,11 +14,7 @@ const SIZE_3: usize = 24;
 
 /// Converts a value to version 2; `None` if it is of another version, or bound to another root id than `root`.
 pub(crate) fn as_version_2(value: &[u8], root: u32) -> Option<Vec<u8>> {
-    let word = |at: usize| {
-        value
-            .get(at..at + 4)
-            .map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-    };
+    let word = |at: usize| value.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let magic = word(0)?;
     match (magic & REVISION_MASK, value.len()) {
         (REVISION_2, SIZE_2) => Some(value.to_vec()),

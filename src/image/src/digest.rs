@@ -52,11 +52,7 @@ impl FromStr for Digest {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self, Error> {
-        text.strip_prefix("sha256:")
-            .and_then(Self::from_hex)
-            .ok_or_else(|| Error::BadDigest {
-                text: text.to_owned(),
-            })
+        text.strip_prefix("sha256:").and_then(Self::from_hex).ok_or_else(|| Error::BadDigest { text: text.to_owned() })
     }
 }
 
@@ -68,9 +64,7 @@ impl Serialize for Digest {
 
 impl<'de> Deserialize<'de> for Digest {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        String::deserialize(deserializer)?
-            .parse()
-            .map_err(serde::de::Error::custom)
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -84,20 +78,12 @@ pub(crate) struct HashingStream<T> {
 
 impl<T> HashingStream<T> {
     pub(crate) fn new(inner: T) -> Self {
-        Self {
-            inner,
-            hasher: sha2::Sha256::new(),
-            bytes: 0,
-        }
+        Self { inner, hasher: sha2::Sha256::new(), bytes: 0 }
     }
 
     /// Returns the wrapped value, the digest of all bytes passed, and their number.
     pub(crate) fn finish(self) -> (T, Digest, u64) {
-        (
-            self.inner,
-            Digest(self.hasher.finalize().into()),
-            self.bytes,
-        )
+        (self.inner, Digest(self.hasher.finalize().into()), self.bytes)
     }
 }
 
@@ -139,15 +125,9 @@ mod tests {
 
     #[test]
     fn refuses_other_algorithms_lengths_and_capitals() {
-        for bad in [
-            "",
-            "sha256:",
-            "sha512:00",
-            "sha256:e3b0",
-            &EMPTY.to_uppercase(),
-            &EMPTY[7..],
-            "sha256:../../etc/passwd",
-        ] {
+        for bad in
+            ["", "sha256:", "sha512:00", "sha256:e3b0", &EMPTY.to_uppercase(), &EMPTY[7..], "sha256:../../etc/passwd"]
+        {
             let error = bad.parse::<Digest>().unwrap_err().to_string();
             assert!(error.contains("is not a digest"), "{error}");
         }

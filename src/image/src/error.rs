@@ -54,9 +54,7 @@ pub enum Error {
         text: String,
     },
     /// The tag violates the grammar of the image specification.
-    #[error(
-        "{name:?} is not a tag: 1 to 255 of the characters A-Z a-z 0-9 . _ : @ + / -, the first a letter or digit"
-    )]
+    #[error("{name:?} is not a tag: 1 to 255 of the characters A-Z a-z 0-9 . _ : @ + / -, the first a letter or digit")]
     BadTag {
         /// Tag that was given.
         name: String,
@@ -122,12 +120,7 @@ impl std::fmt::Display for FreeSpace {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match (self.needed, self.free) {
             (Some(needed), Some(free)) => {
-                write!(
-                    f,
-                    "{} are needed and {} are free",
-                    Bytes(needed),
-                    Bytes(free)
-                )
+                write!(f, "{} are needed and {} are free", Bytes(needed), Bytes(free))
             }
             (Some(needed), None) => write!(f, "{} are needed", Bytes(needed)),
             (None, Some(free)) => write!(f, "only {} are free", Bytes(free)),
@@ -152,39 +145,20 @@ impl std::fmt::Display for Bytes {
 
 impl Error {
     /// Creates the error of a failed file operation; a full disk becomes [`Error::DiskFull`].
-    pub(crate) fn file(
-        action: &'static str,
-        path: impl AsRef<Path>,
-        source: impl Into<io::Error>,
-    ) -> Self {
+    pub(crate) fn file(action: &'static str, path: impl AsRef<Path>, source: impl Into<io::Error>) -> Self {
         let (path, source) = (path.as_ref().to_owned(), source.into());
-        if is_disk_full(&source) {
-            Self::disk_full(&path, None)
-        } else {
-            Self::File {
-                action,
-                path,
-                source,
-            }
-        }
+        if is_disk_full(&source) { Self::disk_full(&path, None) } else { Self::File { action, path, source } }
     }
 
     /// Creates the error of a full disk while writing `path`, which needs `needed` bytes.
     pub(crate) fn disk_full(path: &Path, needed: Option<u64>) -> Self {
-        Self::DiskFull {
-            path: path.to_owned(),
-            needed,
-            free: free_bytes(path),
-        }
+        Self::DiskFull { path: path.to_owned(), needed, free: free_bytes(path) }
     }
 
     /// Creates the error of an interrupted read of an archive.
     pub(crate) fn from_stop(archive: &str, path: &Path, stop: ReadStop) -> Self {
         match stop {
-            ReadStop::Refused(problem) => Self::Archive {
-                archive: archive.to_owned(),
-                problem,
-            },
+            ReadStop::Refused(problem) => Self::Archive { archive: archive.to_owned(), problem },
             ReadStop::Source(error) => Self::file("read", path, error),
         }
     }
@@ -192,15 +166,7 @@ impl Error {
     /// Adds the total number of bytes needed, if the error is a full disk.
     pub(crate) fn with_needed_bytes(self, needed: u64) -> Self {
         match self {
-            Self::DiskFull {
-                path,
-                needed: None,
-                free,
-            } => Self::DiskFull {
-                path,
-                needed: Some(needed),
-                free,
-            },
+            Self::DiskFull { path, needed: None, free } => Self::DiskFull { path, needed: Some(needed), free },
             other => other,
         }
     }
@@ -208,10 +174,7 @@ impl Error {
 
 /// Returns whether the error is a full disk or an exhausted quota.
 pub(crate) fn is_disk_full(error: &io::Error) -> bool {
-    matches!(
-        error.kind(),
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded
-    )
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
 /// Returns the free bytes of the file system that contains `path` or would contain it.
@@ -228,13 +191,8 @@ mod tests {
     #[test]
     fn a_full_disk_is_told_with_the_space_needed_and_left() {
         let error = std::fs::write("/dev/full", "x").unwrap_err();
-        let text = Error::file("write", "/dev/full", error)
-            .with_needed_bytes(230_000_000)
-            .to_string();
-        assert!(
-            text.starts_with("no space to write /dev/full: 230 MB are needed and "),
-            "{text}"
-        );
+        let text = Error::file("write", "/dev/full", error).with_needed_bytes(230_000_000).to_string();
+        assert!(text.starts_with("no space to write /dev/full: 230 MB are needed and "), "{text}");
         assert!(text.contains(" are free; free some space there"), "{text}");
     }
 }

@@ -34,24 +34,14 @@ impl Store {
         }
         let _hold = self.hold()?;
         let turn = {
-            let mut extracting = self
-                .extracting
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner);
+            let mut extracting = self.extracting.lock().unwrap_or_else(PoisonError::into_inner);
             Arc::clone(extracting.entry(*diff_id).or_default())
         };
         let result = {
             let _turn = turn.lock().unwrap_or_else(PoisonError::into_inner);
-            if tree.exists() {
-                Ok(tree)
-            } else {
-                self.extract(diff_id, tree)
-            }
+            if tree.exists() { Ok(tree) } else { self.extract(diff_id, tree) }
         };
-        self.extracting
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .remove(diff_id);
+        self.extracting.lock().unwrap_or_else(PoisonError::into_inner).remove(diff_id);
         result
     }
 
@@ -62,8 +52,7 @@ impl Store {
     fn extract(&self, diff_id: &Digest, tree: PathBuf) -> Result<PathBuf, Error> {
         let layer = self.existing_layer(diff_id)?;
         let half_made = TemporaryTree::create(self.layers_dir())?;
-        self.extract_into(&half_made.path, &layer)
-            .map_err(|error| error.with_needed_bytes(layer.unpacked))?;
+        self.extract_into(&half_made.path, &layer).map_err(|error| error.with_needed_bytes(layer.unpacked))?;
         self.publish_tree(half_made, diff_id)?;
         Ok(tree)
     }
@@ -73,16 +62,9 @@ impl Store {
         let label = format!("layer {}", layer.diff_id);
         let blob = File::open(&path).map_err(|error| Error::file("open", &path, error))?;
         let content = gzip::decoder(blob).map_err(|error| Error::file("read", &path, error))?;
-        let found = gzip::read_ahead(content, |content| {
-            extract_stream(tree, content, &label, &path)
-        })?
-        .0;
+        let found = gzip::read_ahead(content, |content| extract_stream(tree, content, &label, &path))?.0;
         if found != layer.diff_id {
-            return Err(Error::Damaged {
-                path,
-                expected: layer.diff_id,
-                found,
-            });
+            return Err(Error::Damaged { path, expected: layer.diff_id, found });
         }
         Ok(())
     }
@@ -98,25 +80,16 @@ impl Store {
         let pack = |output: &mut dyn std::io::Write| {
             let mut packer = Packer::new(TarWriter::new(output), options);
             packer.pack(tree)?;
-            packer
-                .finish()
-                .map(drop)
-                .map_err(|error| Error::file("pack", tree, error))
+            packer.finish().map(drop).map_err(|error| Error::file("pack", tree, error))
         };
         let into = &half_made.path;
-        let ((), (diff_id, bytes)) = pipe(pack, |content| {
-            extract_stream(into, content, "the new layer", tree)
-        })?;
+        let ((), (diff_id, bytes)) = pipe(pack, |content| extract_stream(into, content, "the new layer", tree))?;
         self.publish_tree(half_made, &diff_id)?;
         Ok((diff_id, bytes))
     }
 
     /// Renames a complete tree to its final name.
-    pub(crate) fn publish_tree(
-        &self,
-        half_made: TemporaryTree,
-        diff_id: &Digest,
-    ) -> Result<(), Error> {
+    pub(crate) fn publish_tree(&self, half_made: TemporaryTree, diff_id: &Digest) -> Result<(), Error> {
         let tree = self.tree_path(diff_id);
         if tree.exists() {
             return Ok(());
@@ -131,8 +104,7 @@ impl Store {
     }
 
     fn volatile_path(&self, diff_id: &Digest) -> PathBuf {
-        self.layers_dir()
-            .join(format!("{}.{VOLATILE}", diff_id.hex()))
+        self.layers_dir().join(format!("{}.{VOLATILE}", diff_id.hex()))
     }
 
     fn mark_volatile(&self, diff_id: &Digest) -> Result<(), Error> {
@@ -145,8 +117,7 @@ impl Store {
         let span = tracing::Span::current();
         let flush = move || {
             let _entered = span.entered();
-            let flushed =
-                File::open(&layers).and_then(|directory| Ok(rustix::fs::syncfs(&directory)?));
+            let flushed = File::open(&layers).and_then(|directory| Ok(rustix::fs::syncfs(&directory)?));
             match flushed.and_then(|()| std::fs::remove_file(&mark)) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                     tracing::warn!(path = %layers.display(), %error, "cannot flush an extracted layer to disk");
@@ -154,10 +125,7 @@ impl Store {
                 _ => {}
             }
         };
-        if let Err(error) = std::thread::Builder::new()
-            .name("flush layers".to_owned())
-            .spawn(flush)
-        {
+        if let Err(error) = std::thread::Builder::new().name("flush layers".to_owned()).spawn(flush) {
             tracing::warn!(%error, "cannot start a thread to flush an extracted layer");
         }
     }
@@ -168,10 +136,7 @@ impl Store {
         for entry in files::list(self.layers_dir())? {
             let path = entry.path();
             let name = entry.file_name();
-            let Some(hex) = name
-                .to_str()
-                .and_then(|name| name.strip_suffix(".volatile"))
-            else {
+            let Some(hex) = name.to_str().and_then(|name| name.strip_suffix(".volatile")) else {
                 continue;
             };
             let Some(diff_id) = Digest::from_hex(hex) else {
@@ -228,18 +193,13 @@ pub(crate) fn extract_stream(
     let mut reader = TarReader::new(HashingStream::new(content));
     let mut writer = LayerWriter::new(tree)?;
     loop {
-        let entry = reader
-            .next_entry()
-            .map_err(|stop| Error::from_stop(label, path, stop))?;
+        let entry = reader.next_entry().map_err(|stop| Error::from_stop(label, path, stop))?;
         let Some(entry) = entry else { break };
-        writer
-            .write_entry(&entry, &mut reader)
-            .map_err(|failed| failed.into_error(label, tree, &reader))?;
+        writer.write_entry(&entry, &mut reader).map_err(|failed| failed.into_error(label, tree, &reader))?;
     }
     writer.finish()?;
     let mut rest = reader.into_inner();
-    std::io::copy(&mut rest, &mut std::io::sink())
-        .map_err(|error| Error::file("read", path, error))?;
+    std::io::copy(&mut rest, &mut std::io::sink()).map_err(|error| Error::file("read", path, error))?;
     let (_, digest, bytes) = rest.finish();
     Ok((digest, bytes))
 }
@@ -260,10 +220,7 @@ impl TemporaryTree {
     pub(crate) fn create(directory: &Path) -> Result<Self, Error> {
         loop {
             let path = directory.join(files::temporary_name());
-            debug_assert!(
-                path.file_name()
-                    .is_some_and(|name| name.to_string_lossy().starts_with(HALF_MADE))
-            );
+            debug_assert!(path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(HALF_MADE)));
             std::fs::DirBuilder::new()
                 .mode(0o700)
                 .create(&path)

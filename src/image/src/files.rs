@@ -18,15 +18,9 @@ pub(crate) const HALF_MADE: &str = "tmp-";
 /// Generates a name that is unique in its directory.
 pub(crate) fn temporary_name() -> String {
     static NEXT: AtomicU64 = AtomicU64::new(0);
-    let time = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)
-        .unwrap_or_default();
+    let time = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     let next = NEXT.fetch_add(1, Ordering::Relaxed);
-    format!(
-        "{HALF_MADE}{}-{:x}-{next}",
-        std::process::id(),
-        time.as_nanos()
-    )
+    format!("{HALF_MADE}{}-{:x}-{next}", std::process::id(), time.as_nanos())
 }
 
 /// A lock on a directory or file, held until it is dropped or the process ends.
@@ -65,9 +59,8 @@ impl Lock {
                 Ok(()) => return Ok(Self { _file: file }),
                 Err(Errno::INTR) => {}
                 Err(Errno::WOULDBLOCK) => {
-                    foreign::cancel::check().map_err(|cancelled| {
-                        Error::file("lock", path, io::Error::from(cancelled))
-                    })?;
+                    foreign::cancel::check()
+                        .map_err(|cancelled| Error::file("lock", path, io::Error::from(cancelled)))?;
                     std::thread::sleep(pause);
                     pause = (pause * 2).min(Duration::from_millis(50));
                 }
@@ -106,11 +99,7 @@ impl NewFile {
                 .mode(0o600)
                 .open(&path)
                 .map_err(|error| Error::file("create", &path, error))?;
-            let new = Self {
-                file,
-                path,
-                published: false,
-            };
+            let new = Self { file, path, published: false };
             let locked = rustix::fs::flock(&new.file, FlockOperation::NonBlockingLockExclusive);
             // A sweep may have removed it between creation and locking.
             let there = rustix::fs::fstat(&new.file).is_ok_and(|stat| stat.st_nlink > 0);
@@ -131,11 +120,8 @@ impl NewFile {
 
     /// Flushes the content, renames the file to `target`, and flushes the directory.
     pub(crate) fn publish(mut self, target: &Path) -> Result<(), Error> {
-        self.file
-            .sync_data()
-            .map_err(|error| Error::file("flush", target, error))?;
-        std::fs::rename(&self.path, target)
-            .map_err(|error| Error::file("create", target, error))?;
+        self.file.sync_data().map_err(|error| Error::file("flush", target, error))?;
+        std::fs::rename(&self.path, target).map_err(|error| Error::file("create", target, error))?;
         self.published = true;
         sync_directory(directory_of(target))
     }
@@ -171,9 +157,7 @@ pub(crate) fn directory_of(path: &Path) -> &Path {
 
 /// Flushes the entries of a directory.
 pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
-    open(directory)?
-        .sync_all()
-        .map_err(|error| Error::file("flush", directory, error))
+    open(directory)?.sync_all().map_err(|error| Error::file("flush", directory, error))
 }
 
 /// Writes a small file of mode 0600 atomically and durably: content and name are flushed.
@@ -182,9 +166,9 @@ pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
 /// If the file cannot be written; with the bytes needed and free if the disk is full.
 pub fn write_atomically(target: &Path, bytes: &[u8]) -> Result<(), Error> {
     let new = NewFile::create(directory_of(target))?;
-    (&new).write_all(bytes).map_err(|error| {
-        Error::file("write", target, error).with_needed_bytes(bytes.len() as u64)
-    })?;
+    (&new)
+        .write_all(bytes)
+        .map_err(|error| Error::file("write", target, error).with_needed_bytes(bytes.len() as u64))?;
     new.publish(target)
 }
 
@@ -196,14 +180,9 @@ pub(crate) fn read_limited(path: &Path, most: u64) -> Result<Option<Vec<u8>>, Er
         Err(error) => return Err(Error::file("open", path, error)),
     };
     let mut bytes = Vec::new();
-    file.take(most + 1)
-        .read_to_end(&mut bytes)
-        .map_err(|error| Error::file("read", path, error))?;
+    file.take(most + 1).read_to_end(&mut bytes).map_err(|error| Error::file("read", path, error))?;
     if bytes.len() as u64 > most {
-        let error = io::Error::new(
-            io::ErrorKind::InvalidData,
-            format!("it is longer than {most} bytes"),
-        );
+        let error = io::Error::new(io::ErrorKind::InvalidData, format!("it is longer than {most} bytes"));
         return Err(Error::file("read", path, error));
     }
     Ok(Some(bytes))
@@ -254,9 +233,7 @@ pub(crate) fn sweep_temporary(directory: &Path) -> Result<u64, Error> {
 
 /// Returns the entries of a directory.
 pub(crate) fn list(directory: &Path) -> Result<Vec<std::fs::DirEntry>, Error> {
-    std::fs::read_dir(directory)
-        .and_then(Iterator::collect)
-        .map_err(|error| Error::file("list", directory, error))
+    std::fs::read_dir(directory).and_then(Iterator::collect).map_err(|error| Error::file("list", directory, error))
 }
 
 #[cfg(test)]
@@ -279,14 +256,8 @@ mod tests {
         std::fs::write(directory.path().join("other"), "whole").unwrap();
         assert_eq!(sweep_temporary(directory.path()).unwrap(), 2);
         assert!(being_written.path().exists());
-        being_written
-            .publish(&directory.path().join("done"))
-            .unwrap();
-        let mut names: Vec<_> = list(directory.path())
-            .unwrap()
-            .iter()
-            .map(|e| e.file_name())
-            .collect();
+        being_written.publish(&directory.path().join("done")).unwrap();
+        let mut names: Vec<_> = list(directory.path()).unwrap().iter().map(|e| e.file_name()).collect();
         names.sort();
         assert_eq!(names, ["done", "other"]);
     }
@@ -308,22 +279,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let first = Lock::lock_shared(directory.path()).unwrap();
         let _second = Lock::lock_shared(directory.path()).unwrap();
-        assert!(
-            Lock::try_lock_exclusive(directory.path())
-                .unwrap()
-                .is_none()
-        );
+        assert!(Lock::try_lock_exclusive(directory.path()).unwrap().is_none());
         drop(first);
-        assert!(
-            Lock::try_lock_exclusive(directory.path())
-                .unwrap()
-                .is_none()
-        );
+        assert!(Lock::try_lock_exclusive(directory.path()).unwrap().is_none());
         drop(_second);
-        assert!(
-            Lock::try_lock_exclusive(directory.path())
-                .unwrap()
-                .is_some()
-        );
+        assert!(Lock::try_lock_exclusive(directory.path()).unwrap().is_some());
     }
 }

@@ -44,21 +44,15 @@ impl Store {
     /// While anyone holds the store (see [`Store::hold`]; every call that writes does), only leftovers of crashes are
     /// removed and `deferred` is set: call again later.
     pub fn gc(&self, keep: &BTreeSet<Digest>) -> Result<GcReport, Error> {
-        let leftovers =
-            files::sweep_temporary(self.images_dir())? + files::sweep_temporary(self.layers_dir())?;
-        let mut swept = GcReport {
-            leftovers,
-            ..GcReport::default()
-        };
+        let leftovers = files::sweep_temporary(self.images_dir())? + files::sweep_temporary(self.layers_dir())?;
+        let mut swept = GcReport { leftovers, ..GcReport::default() };
         let Some(_alone) = Lock::try_lock_exclusive(self.layers_dir())? else {
             swept.deferred = true;
             return Ok(swept);
         };
         let listed = self.change_index(|index| {
             let before = index.manifests.len();
-            index
-                .manifests
-                .retain(|entry| entry.tag().is_some() || keep.contains(&entry.digest));
+            index.manifests.retain(|entry| entry.tag().is_some() || keep.contains(&entry.digest));
             let listed: BTreeSet<_> = index.manifests.iter().map(|entry| entry.digest).collect();
             Ok((index.manifests.len() != before, listed))
         })?;
@@ -131,8 +125,7 @@ impl Store {
                 }
                 "json" => {
                     let path = entry.path();
-                    std::fs::remove_file(&path)
-                        .map_err(|error| Error::file("remove", &path, error))?;
+                    std::fs::remove_file(&path).map_err(|error| Error::file("remove", &path, error))?;
                 }
                 _ => {}
             }
@@ -146,10 +139,7 @@ impl Store {
         let mut damages = Vec::new();
         for entry in files::list(&self.blobs_dir())? {
             if let Some(problem) = check_blob(&entry) {
-                damages.push(Damage {
-                    path: entry.path(),
-                    problem,
-                });
+                damages.push(Damage { path: entry.path(), problem });
             }
         }
         for image in self.images()? {
@@ -162,10 +152,7 @@ impl Store {
 
     fn check_image(&self, image: &Digest, damages: &mut Vec<Damage>) {
         let mut damage = |digest: &Digest, problem: String| {
-            damages.push(Damage {
-                path: self.blob_path(digest),
-                problem,
-            });
+            damages.push(Damage { path: self.blob_path(digest), problem });
         };
         let missing = |what: &str| format!("{what} of image {image} is missing");
         let manifest = match self.read_manifest(image) {
@@ -183,13 +170,7 @@ impl Store {
         };
         if config.rootfs.diff_ids.len() != manifest.layers.len() {
             let counts = (config.rootfs.diff_ids.len(), manifest.layers.len());
-            damage(
-                image,
-                format!(
-                    "it has {} layers, but its configuration names {}",
-                    counts.1, counts.0
-                ),
-            );
+            damage(image, format!("it has {} layers, but its configuration names {}", counts.1, counts.0));
         }
         for (layer, diff_id) in manifest.layers.iter().zip(&config.rootfs.diff_ids) {
             let Ok(blob) = File::open(self.blob_path(&layer.digest)) else {
@@ -198,10 +179,7 @@ impl Store {
             };
             match gunzip_and_hash(blob) {
                 Ok((found, _)) if found == *diff_id => {}
-                Ok((found, _)) => damage(
-                    &layer.digest,
-                    format!("its content is {found}, not {diff_id}"),
-                ),
+                Ok((found, _)) => damage(&layer.digest, format!("its content is {found}, not {diff_id}")),
                 Err(error) => damage(&layer.digest, format!("it does not unpack: {error}")),
             }
         }
@@ -210,27 +188,13 @@ impl Store {
 
 /// Returns the digests of the descriptors in a manifest or index.
 fn named_digests(document: &Value) -> Vec<Digest> {
-    let list = |key: &str| {
-        document
-            .get(key)
-            .and_then(Value::as_array)
-            .into_iter()
-            .flatten()
-    };
+    let list = |key: &str| document.get(key).and_then(Value::as_array).into_iter().flatten();
     let single = |key: &str| document.get(key).into_iter();
-    let descriptors = list("manifests")
-        .chain(list("layers"))
-        .chain(single("config"))
-        .chain(single("subject"));
-    let mut digests: Vec<Digest> = descriptors
-        .filter_map(|descriptor| descriptor.get("digest")?.as_str()?.parse().ok())
-        .collect();
+    let descriptors = list("manifests").chain(list("layers")).chain(single("config")).chain(single("subject"));
+    let mut digests: Vec<Digest> =
+        descriptors.filter_map(|descriptor| descriptor.get("digest")?.as_str()?.parse().ok()).collect();
     // The extracted layers are referenced by a configuration.
-    let diff_ids = document
-        .pointer("/rootfs/diff_ids")
-        .and_then(Value::as_array)
-        .into_iter()
-        .flatten();
+    let diff_ids = document.pointer("/rootfs/diff_ids").and_then(Value::as_array).into_iter().flatten();
     digests.extend(diff_ids.filter_map(|diff_id| diff_id.as_str()?.parse::<Digest>().ok()));
     digests
 }

@@ -36,21 +36,14 @@ fn matches(pattern: &[u8], text: &[u8]) -> bool {
         [] => text.is_empty(),
         [b'*', b'*', rest @ ..] => {
             // `a/**/b` also matches `a/b`.
-            let without_slash = rest
-                .strip_prefix(b"/")
-                .is_some_and(|rest| matches(rest, text));
+            let without_slash = rest.strip_prefix(b"/").is_some_and(|rest| matches(rest, text));
             without_slash || (0..=text.len()).any(|at| matches(rest, &text[at..]))
         }
         [b'*', rest @ ..] => {
-            let end = text
-                .iter()
-                .position(|&byte| byte == b'/')
-                .unwrap_or(text.len());
+            let end = text.iter().position(|&byte| byte == b'/').unwrap_or(text.len());
             (0..=end).any(|at| matches(rest, &text[at..]))
         }
-        [b'?', rest @ ..] => {
-            text.first().is_some_and(|&byte| byte != b'/') && matches(rest, &text[1..])
-        }
+        [b'?', rest @ ..] => text.first().is_some_and(|&byte| byte != b'/') && matches(rest, &text[1..]),
         [byte, rest @ ..] => text.first() == Some(byte) && matches(rest, &text[1..]),
     }
 }

@@ -41,16 +41,10 @@ where
             scope.spawn(|| compress_jobs(&waiting, level));
         }
         let writing = scope.spawn(move || write_in_order(output, &results));
-        let mut pieces = PieceWriter {
-            buffer: Vec::with_capacity(PIECE),
-            jobs,
-            order,
-        };
+        let mut pieces = PieceWriter { buffer: Vec::with_capacity(PIECE), jobs, order };
         let filled = fill(&mut pieces);
         let closed = pieces.close();
-        let written = writing
-            .join()
-            .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let written = writing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         // If the output failed, the error of `fill` is only a broken pipe.
         let output = written.map_err(CompressError::Output)?;
         let filled = filled.map_err(CompressError::Fill)?;
@@ -67,10 +61,7 @@ pub(crate) enum CompressError<E> {
 
 fn compress_jobs(waiting: &Mutex<Receiver<Job>>, level: u32) {
     loop {
-        let job = waiting
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .recv();
+        let job = waiting.lock().unwrap_or_else(PoisonError::into_inner).recv();
         let Ok((piece, result)) = job else { return };
         // If the output has failed, the receiver is gone and nobody needs the piece.
         let _ = result.send(compress_member(&piece, level));
@@ -80,21 +71,14 @@ fn compress_jobs(waiting: &Mutex<Receiver<Job>>, level: u32) {
 /// Compresses a gzip member without name, time or operating system.
 fn compress_member(piece: &[u8], level: u32) -> Vec<u8> {
     let output = Vec::with_capacity(piece.len() / 2);
-    let mut encoder = GzBuilder::new()
-        .mtime(0)
-        .operating_system(255)
-        .write(output, Compression::new(level.clamp(1, 9)));
-    encoder
-        .write_all(piece)
-        .and_then(|()| encoder.finish())
-        .expect("writing to memory does not fail")
+    let mut encoder =
+        GzBuilder::new().mtime(0).operating_system(255).write(output, Compression::new(level.clamp(1, 9)));
+    encoder.write_all(piece).and_then(|()| encoder.finish()).expect("writing to memory does not fail")
 }
 
 fn write_in_order<W: Write>(mut output: W, results: &Receiver<Receiver<Vec<u8>>>) -> io::Result<W> {
     for result in results {
-        let member = result
-            .recv()
-            .map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))?;
+        let member = result.recv().map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))?;
         output.write_all(&member)?;
     }
     Ok(output)
@@ -113,17 +97,11 @@ impl PieceWriter {
         let (result, awaited) = sync_channel(1);
         let broken = |_| io::Error::from(io::ErrorKind::BrokenPipe);
         self.order.send(awaited).map_err(broken)?;
-        self.jobs
-            .send((piece, result))
-            .map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))
+        self.jobs.send((piece, result)).map_err(|_| io::Error::from(io::ErrorKind::BrokenPipe))
     }
 
     fn close(mut self) -> io::Result<()> {
-        if self.buffer.is_empty() {
-            Ok(())
-        } else {
-            self.send()
-        }
+        if self.buffer.is_empty() { Ok(()) } else { self.send() }
     }
 }
 
@@ -167,19 +145,15 @@ pub(crate) fn decoder<'a>(input: impl Read + Send + 'a) -> io::Result<Box<dyn Re
     match detect_format(&mut input)? {
         Format::Gzip => Ok(Box::new(MultiGzDecoder::new(input))),
         Format::Plain => Ok(Box::new(input)),
-        Format::Zstd => Err(io::Error::new(
-            io::ErrorKind::InvalidData,
-            "it is compressed with zstd; only gzip is supported",
-        )),
+        Format::Zstd => {
+            Err(io::Error::new(io::ErrorKind::InvalidData, "it is compressed with zstd; only gzip is supported"))
+        }
     }
 }
 
 /// Runs `consume` with a reader that is filled by another thread from `input`. That thread has no other privileges than
 /// reading, because it decompresses untrusted data.
-pub(crate) fn read_ahead<R: Read + Send, T>(
-    mut input: R,
-    consume: impl FnOnce(&mut dyn Read) -> T,
-) -> T {
+pub(crate) fn read_ahead<R: Read + Send, T>(mut input: R, consume: impl FnOnce(&mut dyn Read) -> T) -> T {
     let (chunks, received) = sync_channel::<io::Result<Vec<u8>>>(8);
     thread::scope(|scope| {
         privilege::spawn_reader(scope, move || {
@@ -196,11 +170,7 @@ pub(crate) fn read_ahead<R: Read + Send, T>(
                 }
             }
         });
-        consume(&mut ReadAhead {
-            received,
-            chunk: Vec::new(),
-            at: 0,
-        })
+        consume(&mut ReadAhead { received, chunk: Vec::new(), at: 0 })
     })
 }
 
@@ -297,10 +267,7 @@ mod tests {
 
     #[test]
     fn a_full_disk_is_reported_as_such_and_ends_the_work() {
-        let full = std::fs::File::options()
-            .write(true)
-            .open("/dev/full")
-            .unwrap();
+        let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
         let bytes = pattern(40 * PIECE);
         match compress(full, 1, |out| out.write_all(&bytes)) {
             Err(CompressError::Output(error)) => {
@@ -315,10 +282,7 @@ mod tests {
     fn a_cut_stream_is_an_error() {
         let packed = compress_to_vec(&pattern(100_000));
         let mut back = Vec::new();
-        let error = decoder(&packed[..packed.len() - 5])
-            .unwrap()
-            .read_to_end(&mut back)
-            .unwrap_err();
+        let error = decoder(&packed[..packed.len() - 5]).unwrap().read_to_end(&mut back).unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::UnexpectedEof);
     }
 

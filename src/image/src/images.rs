@@ -28,18 +28,12 @@ pub struct ImageSpec {
 
 impl ImageSpec {
     /// Creates the specification from a configuration, a manifest and their layers.
-    pub(crate) fn from_documents(
-        layers: Vec<LayerInfo>,
-        config: Config,
-        manifest: oci::Manifest,
-    ) -> Self {
+    pub(crate) fn from_documents(layers: Vec<LayerInfo>, config: Config, manifest: oci::Manifest) -> Self {
         let process = config.config;
         let env = process.env.iter().filter_map(|pair| pair.split_once('='));
         ImageSpec {
             layers,
-            env: env
-                .map(|(name, value)| (name.to_owned(), value.to_owned()))
-                .collect(),
+            env: env.map(|(name, value)| (name.to_owned(), value.to_owned())).collect(),
             cmd: process.cmd,
             working_dir: process.working_dir,
             labels: process.labels,
@@ -76,18 +70,11 @@ impl Store {
         let _hold = self.hold()?;
         for layer in &spec.layers {
             if !self.blob_path(&layer.digest).exists() {
-                return Err(Error::UnknownLayer {
-                    diff_id: layer.diff_id,
-                    store: self.images_dir().to_owned(),
-                });
+                return Err(Error::UnknownLayer { diff_id: layer.diff_id, store: self.images_dir().to_owned() });
             }
         }
         let config = to_json(&make_config(spec));
-        let config = Descriptor::new(
-            oci::MEDIA_CONFIG,
-            self.put_blob(&config)?,
-            config.len() as u64,
-        );
+        let config = Descriptor::new(oci::MEDIA_CONFIG, self.put_blob(&config)?, config.len() as u64);
         let manifest = to_json(&make_manifest(spec, config));
         let digest = self.put_blob(&manifest)?;
         let descriptor = Descriptor::new(oci::MEDIA_MANIFEST, digest, manifest.len() as u64);
@@ -102,45 +89,24 @@ impl Store {
 
     /// Reads an image.
     pub fn image(&self, image: &Digest) -> Result<Image, Error> {
-        let unknown = || Error::UnknownImage {
-            digest: *image,
-            store: self.images_dir().to_owned(),
-        };
+        let unknown = || Error::UnknownImage { digest: *image, store: self.images_dir().to_owned() };
         let manifest = self.read_manifest(image)?.ok_or_else(unknown)?;
-        let config = self
-            .read_config(&manifest.config.digest)?
-            .ok_or_else(unknown)?;
+        let config = self.read_config(&manifest.config.digest)?.ok_or_else(unknown)?;
         let layers = manifest
             .layers
             .iter()
             .zip(&config.rootfs.diff_ids)
             .map(|(blob, &diff_id)| {
-                let unpacked = self
-                    .layer_record(&diff_id)?
-                    .map_or(0, |record| record.unpacked);
-                Ok(LayerInfo {
-                    digest: blob.digest,
-                    diff_id,
-                    size: blob.size,
-                    unpacked,
-                })
+                let unpacked = self.layer_record(&diff_id)?.map_or(0, |record| record.unpacked);
+                Ok(LayerInfo { digest: blob.digest, diff_id, size: blob.size, unpacked })
             })
             .collect::<Result<_, Error>>()?;
-        Ok(Image {
-            digest: *image,
-            spec: ImageSpec::from_documents(layers, config, manifest),
-        })
+        Ok(Image { digest: *image, spec: ImageSpec::from_documents(layers, config, manifest) })
     }
 
     /// Returns all images, tagged or not.
     pub fn images(&self) -> Result<BTreeSet<Digest>, Error> {
-        Ok(self
-            .read_index()?
-            .unwrap_or_default()
-            .manifests
-            .iter()
-            .map(|entry| entry.digest)
-            .collect())
+        Ok(self.read_index()?.unwrap_or_default().manifests.iter().map(|entry| entry.digest).collect())
     }
 
     /// Tags an image with a name such as `opencv_apps:3`, which is removed from another image if that had it.
@@ -148,28 +114,19 @@ impl Store {
         check_tag(name)?;
         self.change_index(|index| {
             let Some(known) = index.manifests.iter().find(|entry| entry.digest == *image) else {
-                return Err(Error::UnknownImage {
-                    digest: *image,
-                    store: self.images_dir().to_owned(),
-                });
+                return Err(Error::UnknownImage { digest: *image, store: self.images_dir().to_owned() });
             };
             let mut of_image = index.manifests.iter().filter(|it| it.digest == *image);
             if of_image.any(|entry| entry.tag() == Some(name)) {
                 return Ok((false, ()));
             }
             let mut tagged = known.clone();
-            tagged
-                .annotations
-                .insert(REF_NAME.to_owned(), name.to_owned());
-            let loser = index
-                .manifests
-                .iter()
-                .find(|entry| entry.tag() == Some(name))
-                .map(|entry| entry.digest);
+            tagged.annotations.insert(REF_NAME.to_owned(), name.to_owned());
+            let loser = index.manifests.iter().find(|entry| entry.tag() == Some(name)).map(|entry| entry.digest);
             // The untagged entry of the image is no longer needed.
-            index.manifests.retain(|entry| {
-                entry.tag() != Some(name) && !(entry.digest == *image && entry.tag().is_none())
-            });
+            index
+                .manifests
+                .retain(|entry| entry.tag() != Some(name) && !(entry.digest == *image && entry.tag().is_none()));
             index.manifests.push(tagged);
             if let Some(loser) = loser {
                 ensure_listed(index, loser, self)?;
@@ -182,11 +139,7 @@ impl Store {
     /// Removes a tag; returns false if it did not exist. The image stays until [`Store::gc`].
     pub fn untag(&self, name: &str) -> Result<bool, Error> {
         self.change_index(|index| {
-            let Some(at) = index
-                .manifests
-                .iter()
-                .position(|entry| entry.tag() == Some(name))
-            else {
+            let Some(at) = index.manifests.iter().position(|entry| entry.tag() == Some(name)) else {
                 return Ok((false, false));
             };
             let loser = index.manifests.remove(at).digest;
@@ -199,10 +152,7 @@ impl Store {
     /// Returns all tags.
     pub fn tags(&self) -> Result<BTreeMap<String, Digest>, Error> {
         let index = self.read_index()?.unwrap_or_default();
-        let tagged = index
-            .manifests
-            .iter()
-            .filter_map(|entry| Some((entry.tag()?.to_owned(), entry.digest)));
+        let tagged = index.manifests.iter().filter_map(|entry| Some((entry.tag()?.to_owned(), entry.digest)));
         Ok(tagged.collect())
     }
 
@@ -211,8 +161,7 @@ impl Store {
         let index = self.read_index()?.unwrap_or_default();
         let digest = reference.parse::<Digest>().ok();
         let mut entries = index.manifests.iter();
-        let found =
-            entries.find(|entry| Some(entry.digest) == digest || entry.tag() == Some(reference));
+        let found = entries.find(|entry| Some(entry.digest) == digest || entry.tag() == Some(reference));
         Ok(found.map(|entry| entry.digest))
     }
 
@@ -225,17 +174,9 @@ impl Store {
             return Ok(None);
         };
         let index = self.read_index()?.unwrap_or_default();
-        let media_type = index
-            .manifests
-            .into_iter()
-            .find(|entry| entry.digest == digest);
-        let media_type =
-            media_type.map_or_else(|| oci::MEDIA_MANIFEST.to_owned(), |entry| entry.media_type);
-        Ok(Some(Manifest {
-            digest,
-            media_type,
-            bytes,
-        }))
+        let media_type = index.manifests.into_iter().find(|entry| entry.digest == digest);
+        let media_type = media_type.map_or_else(|| oci::MEDIA_MANIFEST.to_owned(), |entry| entry.media_type);
+        Ok(Some(Manifest { digest, media_type, bytes }))
     }
 
     /// Returns whether a blob is part of an image: its manifest, its configuration or one of its layers. Digests
@@ -259,18 +200,12 @@ impl Store {
         self.parse_document(digest)
     }
 
-    fn parse_document<T: serde::de::DeserializeOwned>(
-        &self,
-        digest: &Digest,
-    ) -> Result<Option<T>, Error> {
+    fn parse_document<T: serde::de::DeserializeOwned>(&self, digest: &Digest) -> Result<Option<T>, Error> {
         let Some(bytes) = self.read_document(digest)? else {
             return Ok(None);
         };
         let parsed = serde_json::from_slice(&bytes);
-        parsed.map(Some).map_err(|source| Error::Json {
-            path: self.blob_path(digest),
-            source,
-        })
+        parsed.map(Some).map_err(|source| Error::Json { path: self.blob_path(digest), source })
     }
 }
 
@@ -280,20 +215,14 @@ fn ensure_listed(index: &mut oci::Index, image: Digest, store: &Store) -> Result
         return Ok(());
     }
     if let Some(bytes) = store.read_document(&image)? {
-        index.manifests.push(Descriptor::new(
-            oci::MEDIA_MANIFEST,
-            image,
-            bytes.len() as u64,
-        ));
+        index.manifests.push(Descriptor::new(oci::MEDIA_MANIFEST, image, bytes.len() as u64));
     }
     Ok(())
 }
 
 /// Sorts the index, so that it does not depend on the order of calls.
 fn sort_index(index: &mut oci::Index) {
-    index
-        .manifests
-        .sort_by(|a, b| (a.tag(), a.digest).cmp(&(b.tag(), b.digest)));
+    index.manifests.sort_by(|a, b| (a.tag(), a.digest).cmp(&(b.tag(), b.digest)));
 }
 
 /// Validates a tag: `ref.name` of the image layout specification, extended because ROS names may contain `__`.
@@ -304,9 +233,7 @@ fn check_tag(name: &str) -> Result<(), Error> {
     if begins && name.len() <= 255 && name.chars().all(fits) && name.parse::<Digest>().is_err() {
         return Ok(());
     }
-    Err(Error::BadTag {
-        name: name.to_owned(),
-    })
+    Err(Error::BadTag { name: name.to_owned() })
 }
 
 fn make_config(spec: &ImageSpec) -> Config {
@@ -317,26 +244,16 @@ fn make_config(spec: &ImageSpec) -> Config {
         variant: variant.map(str::to_owned),
         os: "linux".to_owned(),
         config: Process {
-            env: spec
-                .env
-                .iter()
-                .map(|(name, value)| format!("{name}={value}"))
-                .collect(),
+            env: spec.env.iter().map(|(name, value)| format!("{name}={value}")).collect(),
             cmd: spec.cmd.clone(),
             working_dir: spec.working_dir.clone(),
             labels: spec.labels.clone(),
         },
-        rootfs: RootFs {
-            kind: "layers".to_owned(),
-            diff_ids: spec.layers.iter().map(|layer| layer.diff_id).collect(),
-        },
+        rootfs: RootFs { kind: "layers".to_owned(), diff_ids: spec.layers.iter().map(|layer| layer.diff_id).collect() },
         history: spec
             .layers
             .iter()
-            .map(|_| History {
-                created: EPOCH.to_owned(),
-                created_by: "cloudroid".to_owned(),
-            })
+            .map(|_| History { created: EPOCH.to_owned(), created_by: "cloudroid".to_owned() })
             .collect(),
     }
 }
@@ -373,11 +290,7 @@ mod tests {
         };
         let (own, other) = (layer("own"), layer("other"));
         let annotations = BTreeMap::from([("note".to_owned(), other.digest.to_string())]);
-        let spec = ImageSpec {
-            layers: vec![own],
-            annotations,
-            ..ImageSpec::default()
-        };
+        let spec = ImageSpec { layers: vec![own], annotations, ..ImageSpec::default() };
         let image = store.put_image(&spec).expect("an image");
         let manifest = store.manifest(&image.to_string()).expect("read");
         let text = String::from_utf8(manifest.expect("there").bytes).expect("text");

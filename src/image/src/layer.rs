@@ -61,13 +61,7 @@ pub enum Mtime {
 
 impl Default for TreeOptions {
     fn default() -> Self {
-        Self {
-            uid_offset: 0,
-            exclude: Vec::new(),
-            overlay_upper: false,
-            mtime: Mtime::Fixed(0),
-            level: 6,
-        }
+        Self { uid_offset: 0, exclude: Vec::new(), overlay_upper: false, mtime: Mtime::Fixed(0), level: 6 }
     }
 }
 
@@ -82,25 +76,16 @@ impl Store {
         let packed = gzip::compress(HashingStream::new(&blob), options.level, |output| {
             let mut packer = Packer::new(TarWriter::new(HashingStream::new(output)), options);
             packer.pack(tree)?;
-            let finished = packer
-                .finish()
-                .map_err(|error| Error::file("pack", tree, error))?;
+            let finished = packer.finish().map_err(|error| Error::file("pack", tree, error))?;
             let (_, diff_id, unpacked) = finished.finish();
             Ok((diff_id, unpacked))
         });
         let (output, (diff_id, unpacked)) = packed.map_err(|failed| match failed {
-            CompressError::Output(error) => {
-                Error::file("write a layer to", self.images_dir(), error)
-            }
+            CompressError::Output(error) => Error::file("write a layer to", self.images_dir(), error),
             CompressError::Fill(error) => error,
         })?;
         let (_, digest, size) = output.finish();
-        let layer = LayerInfo {
-            digest,
-            diff_id,
-            size,
-            unpacked,
-        };
+        let layer = LayerInfo { digest, diff_id, size, unpacked };
         self.publish_layer(blob, &layer)?;
         Ok(layer)
     }
@@ -113,16 +98,12 @@ impl Store {
         let _hold = self.hold()?;
         let tree = TemporaryTree::create(self.layers_dir())?;
         let read = |copy: &mut Tee<File, HashingStream<&NewFile>>| {
-            let content =
-                gzip::decoder(copy).map_err(|error| Error::file("read", archive, error))?;
-            gzip::read_ahead(content, |content| {
-                extract_stream(&tree.path, content, &label, archive)
-            })
-            .map_err(|error| match error {
-                Error::File { source, .. } if is_corruption(&source) => {
-                    malformed_archive(archive, source)
+            let content = gzip::decoder(copy).map_err(|error| Error::file("read", archive, error))?;
+            gzip::read_ahead(content, |content| extract_stream(&tree.path, content, &label, archive)).map_err(|error| {
+                match error {
+                    Error::File { source, .. } if is_corruption(&source) => malformed_archive(archive, source),
+                    error => error,
                 }
-                error => error,
             })
         };
         let layer = self.copy_layer(file, archive, read, |_| Ok(()))?;
@@ -142,8 +123,7 @@ impl Store {
         let mut entries = 0;
         let read = |copy: &mut Tee<File, HashingStream<&NewFile>>| {
             let (digest, bytes, counted) = run_as_reader(|| {
-                let content =
-                    gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
+                let content = gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
                 gzip::read_ahead(content, |content| scan_layer(content, label, limits))
             })?;
             entries = counted;
@@ -166,25 +146,14 @@ impl Store {
         let needed = file.metadata().map_or(0, |metadata| metadata.len());
         check_gzip(&file, archive)?;
         let blob = self.new_blob()?;
-        let mut copy = Tee {
-            from: file,
-            to: HashingStream::new(&blob),
-            failed: None,
-        };
+        let mut copy = Tee { from: file, to: HashingStream::new(&blob), failed: None };
         let read = read(&mut copy);
         if let Some(error) = copy.failed.take() {
-            return Err(
-                Error::file("write a layer to", self.images_dir(), error).with_needed_bytes(needed)
-            );
+            return Err(Error::file("write a layer to", self.images_dir(), error).with_needed_bytes(needed));
         }
         let (diff_id, unpacked) = read?;
         let (_, digest, size) = copy.to.finish();
-        let layer = LayerInfo {
-            digest,
-            diff_id,
-            size,
-            unpacked,
-        };
+        let layer = LayerInfo { digest, diff_id, size, unpacked };
         accept(&layer)?;
         self.publish_layer(blob, &layer)?;
         Ok(layer)
@@ -219,11 +188,7 @@ impl Store {
             let Some(config) = self.read_config(&manifest.config.digest)? else {
                 continue;
             };
-            let at = config
-                .rootfs
-                .diff_ids
-                .iter()
-                .position(|found| found == diff_id);
+            let at = config.rootfs.diff_ids.iter().position(|found| found == diff_id);
             if let Some(blob) = at.and_then(|at| manifest.layers.get(at)) {
                 if self.blob_path(&blob.digest).exists() {
                     return Ok(Some(LayerInfo {
@@ -239,10 +204,7 @@ impl Store {
     }
 
     pub(crate) fn existing_layer(&self, diff_id: &Digest) -> Result<LayerInfo, Error> {
-        let unknown = || Error::UnknownLayer {
-            diff_id: *diff_id,
-            store: self.images_dir().to_owned(),
-        };
+        let unknown = || Error::UnknownLayer { diff_id: *diff_id, store: self.images_dir().to_owned() };
         self.layer(diff_id)?.ok_or_else(unknown)
     }
 
@@ -257,9 +219,7 @@ impl Store {
             return Ok(None);
         };
         // A record can be recreated; one that cannot be parsed counts as missing.
-        Ok(serde_json::from_slice(&bytes)
-            .ok()
-            .filter(|layer: &LayerInfo| layer.diff_id == *diff_id))
+        Ok(serde_json::from_slice(&bytes).ok().filter(|layer: &LayerInfo| layer.diff_id == *diff_id))
     }
 
     /// Publishes the blob before the record, so that a record never names a missing blob. An existing record is kept:
@@ -294,15 +254,8 @@ pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, 
 
 /// Reads the content of an untrusted layer to its end; returns the digest and size of the tar stream and the number of
 /// its headers.
-fn scan_layer(
-    content: &mut dyn Read,
-    label: &Path,
-    limits: &Limits,
-) -> Result<(Digest, u64, u64), Error> {
-    let refused = |problem| Error::Archive {
-        archive: label.display().to_string(),
-        problem,
-    };
+fn scan_layer(content: &mut dyn Read, label: &Path, limits: &Limits) -> Result<(Digest, u64, u64), Error> {
+    let refused = |problem| Error::Archive { archive: label.display().to_string(), problem };
     let most = limits.bytes.saturating_add(1);
     let mut reader = TarReader::new(HashingStream::new(content.take(most)));
     let mut last = String::new();
@@ -312,10 +265,7 @@ fn scan_layer(
             Ok(Some(entry)) => {
                 last = display_name(&entry.name);
                 if reader.headers() > limits.entries {
-                    return Err(refused(Refusal::TooManyEntries {
-                        entry: last,
-                        limit: limits.entries,
-                    }));
+                    return Err(refused(Refusal::TooManyEntries { entry: last, limit: limits.entries }));
                 }
             }
             Err(stop) => break Err(Error::from_stop(&label.display().to_string(), label, stop)),
@@ -324,17 +274,10 @@ fn scan_layer(
     let headers = reader.headers();
     let mut rest = reader.into_inner();
     // Data after the end mark is part of the digest.
-    let read = if walked.is_ok() {
-        io::copy(&mut rest, &mut io::sink())
-    } else {
-        Ok(0)
-    };
+    let read = if walked.is_ok() { io::copy(&mut rest, &mut io::sink()) } else { Ok(0) };
     let (_, digest, bytes) = rest.finish();
     if bytes > limits.bytes {
-        return Err(refused(Refusal::TooLarge {
-            entry: last,
-            limit: limits.bytes,
-        }));
+        return Err(refused(Refusal::TooLarge { entry: last, limit: limits.bytes }));
     }
     walked?;
     read.map_err(|error| malformed_archive(label, error))?;
@@ -358,14 +301,8 @@ fn is_corruption(error: &io::Error) -> bool {
 }
 
 fn malformed_archive(archive: &Path, problem: impl ToString) -> Error {
-    let problem = Refusal::Malformed {
-        after: String::new(),
-        problem: problem.to_string(),
-    };
-    Error::Archive {
-        archive: archive.display().to_string(),
-        problem,
-    }
+    let problem = Refusal::Malformed { after: String::new(), problem: problem.to_string() };
+    Error::Archive { archive: archive.display().to_string(), problem }
 }
 
 /// Reader that copies all it reads to a writer.

@@ -50,12 +50,7 @@ impl WriteFailure {
     }
 
     /// Converts to an error that names the archive and the tree.
-    pub(crate) fn into_error<R: Read>(
-        self,
-        archive: &str,
-        tree: &Path,
-        reader: &TarReader<R>,
-    ) -> Error {
+    pub(crate) fn into_error<R: Read>(self, archive: &str, tree: &Path, reader: &TarReader<R>) -> Error {
         use std::os::unix::ffi::OsStrExt;
         match self {
             Self::Refused(refusal) => Error::from_stop(archive, tree, ReadStop::Refused(refusal)),
@@ -76,14 +71,9 @@ impl From<Refusal> for WriteFailure {
 impl LayerWriter {
     /// Creates a writer for `tree`, an empty directory.
     pub(crate) fn new(tree: &Path) -> Result<Self, Error> {
-        let beneath = ConfinedRoot::following_links(tree)
-            .map_err(|error| Error::file("open the directory", tree, error))?;
-        let root = Metadata {
-            mode: 0o755,
-            uid: 0,
-            gid: 0,
-            mtime: 0,
-        };
+        let beneath =
+            ConfinedRoot::following_links(tree).map_err(|error| Error::file("open the directory", tree, error))?;
+        let root = Metadata { mode: 0o755, uid: 0, gid: 0, mtime: 0 };
         Ok(Self {
             beneath,
             directories: BTreeMap::from([(Vec::new(), root)]),
@@ -94,11 +84,7 @@ impl LayerWriter {
     }
 
     /// Writes an entry; `content` is its data.
-    pub(crate) fn write_entry(
-        &mut self,
-        entry: &Entry,
-        content: &mut impl Read,
-    ) -> Result<(), WriteFailure> {
+    pub(crate) fn write_entry(&mut self, entry: &Entry, content: &mut impl Read) -> Result<(), WriteFailure> {
         let path = names::normalize(&entry.name, MAX_PATH)?;
         let metadata = read_metadata(entry)?;
         if path.is_empty() {
@@ -108,10 +94,7 @@ impl LayerWriter {
             return Ok(());
         }
         let (above, name) = split(&path);
-        let parent = self
-            .beneath
-            .make_directory(above)
-            .map_err(|error| WriteFailure::file("create", above, error))?;
+        let parent = self.beneath.make_directory(above).map_err(|error| WriteFailure::file("create", above, error))?;
         if let Some(hidden) = name.strip_prefix(WHITEOUT) {
             return self.create_whiteout(&parent, above, name, hidden);
         }
@@ -119,45 +102,28 @@ impl LayerWriter {
         match entry.kind {
             Kind::Directory => return self.create_directory(&parent, &path, name, entry, metadata),
             Kind::File => {
-                let file =
-                    self.replace_existing(&parent, &path, || beneath::create(&parent, name))?;
+                let file = self.replace_existing(&parent, &path, || beneath::create(&parent, name))?;
                 self.copy_content(&file, &path, content)?;
                 self.set_metadata(&file, &path, metadata, entry)?;
             }
             Kind::Symlink => {
-                self.replace_existing(&parent, &path, || {
-                    rustix::fs::symlinkat(&entry.link[..], &parent, name)
-                })?;
-                self.set_metadata_at(&parent, name, metadata)
-                    .map_err(failed)?;
+                self.replace_existing(&parent, &path, || rustix::fs::symlinkat(&entry.link[..], &parent, name))?;
+                self.set_metadata_at(&parent, name, metadata).map_err(failed)?;
             }
             Kind::Hardlink => self.create_hardlink(&parent, &path, entry)?,
             Kind::Fifo => {
                 let fifo = || rustix::fs::mkfifoat(&parent, name, Mode::from_raw_mode(0o600));
                 self.replace_existing(&parent, &path, fifo)?;
-                rustix::fs::chmodat(
-                    &parent,
-                    name,
-                    Mode::from_raw_mode(metadata.mode & 0o777),
-                    AtFlags::empty(),
-                )
-                .map_err(failed)?;
-                self.set_metadata_at(&parent, name, metadata)
+                rustix::fs::chmodat(&parent, name, Mode::from_raw_mode(metadata.mode & 0o777), AtFlags::empty())
                     .map_err(failed)?;
+                self.set_metadata_at(&parent, name, metadata).map_err(failed)?;
             }
             // A container has its own /dev; an untrusted device node would give access to the host's disks.
             Kind::Character | Kind::Block => {
-                tracing::debug!(
-                    entry = display_name(&entry.name),
-                    "skipped a device node of a layer"
-                );
+                tracing::debug!(entry = display_name(&entry.name), "skipped a device node of a layer");
             }
             Kind::Other(flag) => {
-                tracing::debug!(
-                    entry = display_name(&entry.name),
-                    flag,
-                    "skipped an unknown entry of a layer"
-                );
+                tracing::debug!(entry = display_name(&entry.name), flag, "skipped an unknown entry of a layer");
             }
         }
         Ok(())
@@ -170,24 +136,16 @@ impl LayerWriter {
         for (path, metadata) in directories.iter().rev() {
             let failed = |error| {
                 use std::os::unix::ffi::OsStrExt;
-                Error::file(
-                    "set the rights of",
-                    self.tree.join(std::ffi::OsStr::from_bytes(path)),
-                    error,
-                )
+                Error::file("set the rights of", self.tree.join(std::ffi::OsStr::from_bytes(path)), error)
             };
             let (above, name) = split(path);
             let opened = if path.is_empty() {
                 rustix::io::fcntl_dupfd_cloexec(self.beneath.root(), 0)
             } else {
-                self.beneath
-                    .directory(above)
-                    .and_then(|parent| beneath::open_directory(&parent, name))
+                self.beneath.directory(above).and_then(|parent| beneath::open_directory(&parent, name))
             };
             match opened {
-                Ok(directory) => self
-                    .set_owner_and_times(&directory, *metadata)
-                    .map_err(failed)?,
+                Ok(directory) => self.set_owner_and_times(&directory, *metadata).map_err(failed)?,
                 // A later entry has replaced it.
                 Err(Errno::NOENT | Errno::NOTDIR | Errno::LOOP) => {}
                 Err(error) => return Err(failed(error)),
@@ -196,28 +154,16 @@ impl LayerWriter {
         Ok(())
     }
 
-    fn create_hardlink(
-        &mut self,
-        parent: &OwnedFd,
-        path: &[u8],
-        entry: &Entry,
-    ) -> Result<(), WriteFailure> {
+    fn create_hardlink(&mut self, parent: &OwnedFd, path: &[u8], entry: &Entry) -> Result<(), WriteFailure> {
         let target = names::normalize(&entry.link, MAX_PATH)?;
         if path == target {
             return Ok(());
         }
-        let nothing = || Refusal::LinkToNothing {
-            entry: display_name(&entry.name),
-            target: display_name(&entry.link),
-        };
+        let nothing = || Refusal::LinkToNothing { entry: display_name(&entry.name), target: display_name(&entry.link) };
         let (above, name) = split(&target);
         let from = self.beneath.directory(above).map_err(|_| nothing())?;
         // The kernel does not allow hard links to directories.
-        if stat_entry(&from, name)
-            .ok()
-            .flatten()
-            .is_none_or(|stat| is_kind(&stat, FileType::Directory))
-        {
+        if stat_entry(&from, name).ok().flatten().is_none_or(|stat| is_kind(&stat, FileType::Directory)) {
             return Err(nothing().into());
         }
         let link = || rustix::fs::linkat(&from, name, parent, split(path).1, AtFlags::empty());
@@ -311,50 +257,32 @@ impl LayerWriter {
         }
         let (_, name) = split(path);
         self.beneath.invalidate_cache();
-        if stat_entry(parent, name)
-            .map_err(failed)?
-            .is_some_and(|stat| is_kind(&stat, FileType::Directory))
-        {
+        if stat_entry(parent, name).map_err(failed)?.is_some_and(|stat| is_kind(&stat, FileType::Directory)) {
             use std::os::unix::ffi::OsStrExt;
             let within = format!("/proc/self/fd/{}", parent.as_raw_fd());
             let within = Path::new(&within).join(std::ffi::OsStr::from_bytes(name));
-            foreign::remove(&within)
-                .map_err(|error| WriteFailure::File("replace", path.to_vec(), error.into()))?;
+            foreign::remove(&within).map_err(|error| WriteFailure::File("replace", path.to_vec(), error.into()))?;
         } else {
             rustix::fs::unlinkat(parent, name, AtFlags::empty()).map_err(failed)?;
         }
         make().map_err(failed)
     }
 
-    fn copy_content(
-        &mut self,
-        file: &OwnedFd,
-        path: &[u8],
-        content: &mut impl Read,
-    ) -> Result<(), WriteFailure> {
-        let mut file = File::from(
-            file.try_clone()
-                .map_err(|error| WriteFailure::File("create", path.to_vec(), error))?,
-        );
+    fn copy_content(&mut self, file: &OwnedFd, path: &[u8], content: &mut impl Read) -> Result<(), WriteFailure> {
+        let mut file =
+            File::from(file.try_clone().map_err(|error| WriteFailure::File("create", path.to_vec(), error))?);
         loop {
             let read = content.read(&mut self.buffer).map_err(WriteFailure::Read)?;
             if read == 0 {
                 return Ok(());
             }
-            file.write_all(&self.buffer[..read])
-                .map_err(|error| WriteFailure::File("write", path.to_vec(), error))?;
+            file.write_all(&self.buffer[..read]).map_err(|error| WriteFailure::File("write", path.to_vec(), error))?;
         }
     }
 
     /// Sets owner, permissions, attributes and time of an open file, in this order, since changing the owner clears
     /// set-id bits and capabilities.
-    fn set_metadata(
-        &self,
-        file: &OwnedFd,
-        path: &[u8],
-        metadata: Metadata,
-        entry: &Entry,
-    ) -> Result<(), WriteFailure> {
+    fn set_metadata(&self, file: &OwnedFd, path: &[u8], metadata: Metadata, entry: &Entry) -> Result<(), WriteFailure> {
         self.set_owner_and_mode(file, metadata)
             .map_err(|error| WriteFailure::file("set the rights of", path, error))?;
         self.set_xattrs(file, path, entry)?;
@@ -376,28 +304,12 @@ impl LayerWriter {
     }
 
     /// Sets owner and time of a file that cannot be opened.
-    fn set_metadata_at(
-        &self,
-        parent: &OwnedFd,
-        name: &[u8],
-        metadata: Metadata,
-    ) -> Result<(), Errno> {
+    fn set_metadata_at(&self, parent: &OwnedFd, name: &[u8], metadata: Metadata) -> Result<(), Errno> {
         if self.privileged {
             let (uid, gid) = (Uid::from_raw(metadata.uid), Gid::from_raw(metadata.gid));
-            rustix::fs::chownat(
-                parent,
-                name,
-                Some(uid),
-                Some(gid),
-                AtFlags::SYMLINK_NOFOLLOW,
-            )?;
+            rustix::fs::chownat(parent, name, Some(uid), Some(gid), AtFlags::SYMLINK_NOFOLLOW)?;
         }
-        rustix::fs::utimensat(
-            parent,
-            name,
-            &timestamps(metadata),
-            AtFlags::SYMLINK_NOFOLLOW,
-        )
+        rustix::fs::utimensat(parent, name, &timestamps(metadata), AtFlags::SYMLINK_NOFOLLOW)
     }
 
     /// Sets file capabilities and user attributes only, since overlay attributes would redirect lookups.
@@ -424,29 +336,15 @@ impl LayerWriter {
 fn read_metadata(entry: &Entry) -> Result<Metadata, Refusal> {
     let id = |value: u64| {
         // The highest id means "unchanged" to the kernel.
-        u32::try_from(value)
-            .ok()
-            .filter(|&id| id != u32::MAX)
-            .ok_or_else(|| Refusal::Malformed {
-                after: display_name(&entry.name),
-                problem: format!("owner {value} is out of range"),
-            })
+        u32::try_from(value).ok().filter(|&id| id != u32::MAX).ok_or_else(|| Refusal::Malformed {
+            after: display_name(&entry.name),
+            problem: format!("owner {value} is out of range"),
+        })
     };
-    Ok(Metadata {
-        mode: entry.mode & 0o7777,
-        uid: id(entry.uid)?,
-        gid: id(entry.gid)?,
-        mtime: entry.mtime,
-    })
+    Ok(Metadata { mode: entry.mode & 0o7777, uid: id(entry.uid)?, gid: id(entry.gid)?, mtime: entry.mtime })
 }
 
 fn timestamps(metadata: Metadata) -> Timestamps {
-    let time = Timespec {
-        tv_sec: i64::try_from(metadata.mtime).unwrap_or(0),
-        tv_nsec: 0,
-    };
-    Timestamps {
-        last_access: time,
-        last_modification: time,
-    }
+    let time = Timespec { tv_sec: i64::try_from(metadata.mtime).unwrap_or(0), tv_nsec: 0 };
+    Timestamps { last_access: time, last_modification: time }
 }

@@ -15,18 +15,12 @@ const MAX_NAME: usize = 255;
 /// Normalizes a path: `./a//b/` becomes `a/b`, without `.`, `..` and empty components; empty for the root itself. A
 /// leading `/` is dropped; callers that reject absolute paths check before.
 pub(crate) fn normalize(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
-    let bad = |problem: String| Refusal::BadName {
-        entry: display_name(name),
-        problem,
-    };
+    let bad = |problem: String| Refusal::BadName { entry: display_name(name), problem };
     if name.contains(&0) {
         return Err(bad("it contains a NUL byte".to_owned()));
     }
     if name.len() > longest {
-        return Err(bad(format!(
-            "it is {} bytes long; the limit is {longest}",
-            name.len()
-        )));
+        return Err(bad(format!("it is {} bytes long; the limit is {longest}", name.len())));
     }
     let mut path = Vec::with_capacity(name.len());
     let mut depth = 0;
@@ -34,15 +28,10 @@ pub(crate) fn normalize(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal>
         match part {
             b"" | b"." => continue,
             b".." => {
-                return Err(Refusal::ParentDirectory {
-                    entry: display_name(name),
-                });
+                return Err(Refusal::ParentDirectory { entry: display_name(name) });
             }
             long if long.len() > MAX_NAME => {
-                return Err(bad(format!(
-                    "one part is {} bytes long; the limit is {MAX_NAME}",
-                    long.len()
-                )));
+                return Err(bad(format!("one part is {} bytes long; the limit is {MAX_NAME}", long.len())));
             }
             part => {
                 if !path.is_empty() {
@@ -54,9 +43,7 @@ pub(crate) fn normalize(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal>
         }
     }
     if depth > MAX_DEPTH {
-        return Err(bad(format!(
-            "it is {depth} directories deep; the limit is {MAX_DEPTH}"
-        )));
+        return Err(bad(format!("it is {depth} directories deep; the limit is {MAX_DEPTH}")));
     }
     Ok(path)
 }

@@ -47,13 +47,7 @@ pub(crate) struct Descriptor {
 
 impl Descriptor {
     pub(crate) fn new(media_type: &str, digest: Digest, size: u64) -> Self {
-        Self {
-            media_type: media_type.to_owned(),
-            digest,
-            size,
-            annotations: BTreeMap::new(),
-            other: BTreeMap::new(),
-        }
+        Self { media_type: media_type.to_owned(), digest, size, annotations: BTreeMap::new(), other: BTreeMap::new() }
     }
 
     /// Returns the tag of an index entry.
@@ -81,12 +75,7 @@ fn media_index() -> String {
 
 impl Default for Index {
     fn default() -> Self {
-        Self {
-            schema_version: 2,
-            media_type: media_index(),
-            manifests: Vec::new(),
-            other: BTreeMap::new(),
-        }
+        Self { schema_version: 2, media_type: media_index(), manifests: Vec::new(), other: BTreeMap::new() }
     }
 }
 

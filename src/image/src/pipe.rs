@@ -19,18 +19,8 @@ pub(crate) fn pipe<T, U: Send, E: Send>(
 ) -> Result<(T, U), E> {
     let (chunks, received) = sync_channel(WAITING);
     thread::scope(|scope| {
-        let consuming = scope.spawn(move || {
-            consume(&mut ChunkReader {
-                received,
-                chunk: Vec::new(),
-                at: 0,
-            })
-        });
-        let mut input = ChunkWriter {
-            chunks,
-            chunk: Vec::with_capacity(CHUNK),
-            broken: false,
-        };
+        let consuming = scope.spawn(move || consume(&mut ChunkReader { received, chunk: Vec::new(), at: 0 }));
+        let mut input = ChunkWriter { chunks, chunk: Vec::with_capacity(CHUNK), broken: false };
         let filled = fill(&mut input);
         if filled.is_ok() {
             // A reader that has gone reports its own error.
@@ -38,9 +28,7 @@ pub(crate) fn pipe<T, U: Send, E: Send>(
         }
         let broken = input.broken;
         drop(input);
-        let consumed = consuming
-            .join()
-            .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let consumed = consuming.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         match (filled, consumed) {
             (Ok(filled), Ok(consumed)) => Ok((filled, consumed)),
             (Err(_), Err(error)) if broken => Err(error),

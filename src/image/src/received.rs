@@ -44,9 +44,7 @@ pub fn read_layout_document(layout: &Tree, digest: &Digest) -> Result<Vec<u8>, E
     let bytes = read(layout, &path)?;
     let found = Digest::compute(&bytes);
     if found != *digest {
-        return Err(unreceivable_error(format!(
-            "its blob {digest} has the content of {found}"
-        )));
+        return Err(unreceivable_error(format!("its blob {digest} has the content of {found}")));
     }
     Ok(bytes)
 }
@@ -59,11 +57,7 @@ impl Store {
     /// [`Error::Unreceivable`] for an invalid layout, [`Error::Archive`] if layers exceed `limits` or cannot be read.
     pub fn receive(&self, layout: &Tree, limits: &Limits) -> Result<ReceivedImage, Error> {
         let _hold = self.hold()?;
-        let LayoutDocuments {
-            entry,
-            manifest,
-            config,
-        } = run_as_reader(|| LayoutDocuments::read(layout))?;
+        let LayoutDocuments { entry, manifest, config } = run_as_reader(|| LayoutDocuments::read(layout))?;
         let mut left = *limits;
         let mut known = Vec::new();
         let mut layers = Vec::new();
@@ -79,10 +73,7 @@ impl Store {
         }
         let spec = ImageSpec::from_documents(layers, config, manifest);
         Ok(ReceivedImage {
-            image: Image {
-                digest: self.put_image(&spec)?,
-                spec,
-            },
+            image: Image { digest: self.put_image(&spec)?, spec },
             known,
             annotations: entry.annotations.clone(),
         })
@@ -144,9 +135,7 @@ impl LayoutDocuments {
         let mut index: Index = parse_json("index.json", &read(layout, "index.json")?)?;
         let images = index.manifests.len();
         let (1, Some(entry)) = (images, index.manifests.pop()) else {
-            return Err(unreceivable_error(format!(
-                "it contains {images} images instead of one"
-            )));
+            return Err(unreceivable_error(format!("it contains {images} images instead of one")));
         };
         if entry.media_type != oci::MEDIA_MANIFEST {
             return Err(unreceivable_error(format!(
@@ -155,14 +144,8 @@ impl LayoutDocuments {
                 oci::MEDIA_MANIFEST
             )));
         }
-        let manifest: Manifest = parse_json(
-            "its manifest",
-            &read_layout_document(layout, &entry.digest)?,
-        )?;
-        let config: Config = parse_json(
-            "its config",
-            &read_layout_document(layout, &manifest.config.digest)?,
-        )?;
+        let manifest: Manifest = parse_json("its manifest", &read_layout_document(layout, &entry.digest)?)?;
+        let config: Config = parse_json("its config", &read_layout_document(layout, &manifest.config.digest)?)?;
         let diff_ids = &config.rootfs.diff_ids;
         if manifest.layers.len() != diff_ids.len() || diff_ids.len() > MOST_LAYERS {
             return Err(unreceivable_error(format!(
@@ -174,9 +157,7 @@ impl LayoutDocuments {
         // An overlay accepts each layer once, and each is read and verified.
         let distinct: BTreeSet<&Digest> = diff_ids.iter().collect();
         if distinct.len() != diff_ids.len() {
-            return Err(unreceivable_error(
-                "it lists the same layer twice".to_owned(),
-            ));
+            return Err(unreceivable_error("it lists the same layer twice".to_owned()));
         }
         let (architecture, _) = oci::platform();
         if config.architecture != architecture {
@@ -185,11 +166,7 @@ impl LayoutDocuments {
                 config.architecture
             )));
         }
-        Ok(Self {
-            entry,
-            manifest,
-            config,
-        })
+        Ok(Self { entry, manifest, config })
     }
 }
 
@@ -201,15 +178,12 @@ fn blob_path(digest: &Digest) -> String {
 fn check_blob(layout: &Tree, digest: &Digest) -> Result<(), Error> {
     let path = blob_path(digest);
     let mut content = HashingStream::new(open(layout, &path)?);
-    io::copy(&mut content, &mut io::sink())
-        .map_err(|error| Error::file("read", Path::new(&path), error))?;
+    io::copy(&mut content, &mut io::sink()).map_err(|error| Error::file("read", Path::new(&path), error))?;
     let (_, found, _) = content.finish();
     if found == *digest {
         Ok(())
     } else {
-        Err(unreceivable_error(format!(
-            "its blob {digest} has the content of {found}"
-        )))
+        Err(unreceivable_error(format!("its blob {digest} has the content of {found}")))
     }
 }
 
@@ -224,8 +198,7 @@ fn read(layout: &Tree, path: &str) -> Result<Vec<u8>, Error> {
 }
 
 fn parse_json<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
-    serde_json::from_slice(bytes)
-        .map_err(|error| unreceivable_error(format!("{what} cannot be read: {error}")))
+    serde_json::from_slice(bytes).map_err(|error| unreceivable_error(format!("{what} cannot be read: {error}")))
 }
 
 fn missing_file(path: &str) -> Error {

@@ -13,9 +13,7 @@ pub enum Refusal {
         entry: String,
     },
     /// A name begins with `/`.
-    #[error(
-        "entry {entry:?} has an absolute path; pack the directory so that every name is relative to it"
-    )]
+    #[error("entry {entry:?} has an absolute path; pack the directory so that every name is relative to it")]
     AbsolutePath {
         /// Path of the entry in the archive.
         entry: String,
@@ -39,9 +37,7 @@ pub enum Refusal {
         target: String,
     },
     /// A hard link does not point to an earlier file of the archive.
-    #[error(
-        "entry {entry:?} is a hard link to {target:?}, which is no earlier file of the archive; pack it as a file"
-    )]
+    #[error("entry {entry:?} is a hard link to {target:?}, which is no earlier file of the archive; pack it as a file")]
     LinkToNothing {
         /// Path of the entry in the archive.
         entry: String,
@@ -49,9 +45,7 @@ pub enum Refusal {
         target: String,
     },
     /// A directory of the path is an earlier symbolic link.
-    #[error(
-        "entry {entry:?} lies behind the symbolic link {link:?}; pack what the link points to under its own name"
-    )]
+    #[error("entry {entry:?} lies behind the symbolic link {link:?}; pack what the link points to under its own name")]
     BehindLink {
         /// Path of the entry in the archive.
         entry: String,
@@ -73,9 +67,7 @@ pub enum Refusal {
         problem: String,
     },
     /// Too many entries.
-    #[error(
-        "entry {entry:?} exceeds the limit of {limit} entries; leave out build and devel directories"
-    )]
+    #[error("entry {entry:?} exceeds the limit of {limit} entries; leave out build and devel directories")]
     TooManyEntries {
         /// First entry beyond the limit.
         entry: String,
@@ -98,9 +90,7 @@ pub enum Refusal {
         after: String,
     },
     /// The archive is not valid tar or gzip.
-    #[error(
-        "cannot read the archive after entry {after:?}: {problem}; pack it again as tar or tar.gz"
-    )]
+    #[error("cannot read the archive after entry {after:?}: {problem}; pack it again as tar or tar.gz")]
     Malformed {
         /// Last entry that was read.
         after: String,
@@ -119,9 +109,6 @@ impl Refusal {
             Kind::Fifo => "fifo".to_owned(),
             other => format!("entry of type {:?}", char::from(other.typeflag())),
         };
-        Self::Special {
-            entry: display_name(entry),
-            kind,
-        }
+        Self::Special { entry: display_name(entry), kind }
     }
 }

@@ -59,11 +59,7 @@ impl Store {
             rustix::fs::chmod(private, rustix::fs::Mode::RWXU)
                 .map_err(|error| Error::file("change the rights of", private, error))?;
         }
-        let store = Self {
-            images: images.to_owned(),
-            layers: layers.to_owned(),
-            extracting: Mutex::default(),
-        };
+        let store = Self { images: images.to_owned(), layers: layers.to_owned(), extracting: Mutex::default() };
         {
             let _lock = Lock::lock_exclusive(images)?;
             store.init_layout()?;
@@ -77,39 +73,24 @@ impl Store {
     /// Creates the missing parts of a layout, and checks the existing ones.
     fn init_layout(&self) -> Result<(), Error> {
         let marker = self.images.join("oci-layout");
-        let wrong = |path: &Path, problem: String| Error::NotALayout {
-            path: path.to_owned(),
-            problem,
-        };
+        let wrong = |path: &Path, problem: String| Error::NotALayout { path: path.to_owned(), problem };
         match files::read_limited(&marker, MAX_DOCUMENT)? {
             Some(bytes) => {
-                let layout: Layout = serde_json::from_slice(&bytes)
-                    .map_err(|error| wrong(&marker, error.to_string()))?;
+                let layout: Layout =
+                    serde_json::from_slice(&bytes).map_err(|error| wrong(&marker, error.to_string()))?;
                 if !layout.image_layout_version.starts_with("1.") {
-                    return Err(wrong(
-                        &marker,
-                        format!("its version is {:?}", layout.image_layout_version),
-                    ));
+                    return Err(wrong(&marker, format!("its version is {:?}", layout.image_layout_version)));
                 }
             }
             None => {
                 // A crash may have occurred before the marker was written; other files are not ours.
-                let ours = |name: &str| {
-                    name == "blobs" || name == "index.json" || name.starts_with(files::HALF_MADE)
-                };
+                let ours = |name: &str| name == "blobs" || name == "index.json" || name.starts_with(files::HALF_MADE);
                 let foreign = files::list(&self.images)?;
-                let foreign = foreign
-                    .iter()
-                    .map(|entry| entry.file_name().to_string_lossy().into_owned());
+                let foreign = foreign.iter().map(|entry| entry.file_name().to_string_lossy().into_owned());
                 if let Some(name) = foreign.into_iter().find(|name| !ours(name)) {
-                    return Err(wrong(
-                        &self.images,
-                        format!("it holds {name:?} and no oci-layout"),
-                    ));
+                    return Err(wrong(&self.images, format!("it holds {name:?} and no oci-layout")));
                 }
-                let layout = Layout {
-                    image_layout_version: oci::LAYOUT_VERSION.to_owned(),
-                };
+                let layout = Layout { image_layout_version: oci::LAYOUT_VERSION.to_owned() };
                 files::write_atomically(&marker, &to_json(&layout))?;
             }
         }
@@ -133,9 +114,7 @@ impl Store {
 
     /// Prevents [`Store::gc`], in this process and others, from removing untagged images and layers.
     pub fn hold(&self) -> Result<GcHold, Error> {
-        Ok(GcHold {
-            _lock: Lock::lock_shared(&self.layers)?,
-        })
+        Ok(GcHold { _lock: Lock::lock_shared(&self.layers)? })
     }
 
     /// Opens a blob, for `/v2/NAME/blobs/DIGEST`.
@@ -168,11 +147,7 @@ impl Store {
     /// Renames a written blob to its digest; an existing one is kept.
     pub(crate) fn publish_blob(&self, blob: NewFile, digest: &Digest) -> Result<(), Error> {
         let path = self.blob_path(digest);
-        if path.exists() {
-            Ok(())
-        } else {
-            blob.publish(&path)
-        }
+        if path.exists() { Ok(()) } else { blob.publish(&path) }
     }
 
     /// Writes a small blob.
@@ -181,9 +156,9 @@ impl Store {
         let path = self.blob_path(&digest);
         if !path.exists() {
             let blob = self.new_blob()?;
-            (&blob).write_all(bytes).map_err(|error| {
-                Error::file("write", &path, error).with_needed_bytes(bytes.len() as u64)
-            })?;
+            (&blob)
+                .write_all(bytes)
+                .map_err(|error| Error::file("write", &path, error).with_needed_bytes(bytes.len() as u64))?;
             blob.publish(&path)?;
         }
         Ok(digest)
@@ -197,11 +172,7 @@ impl Store {
         };
         let found = Digest::compute(&bytes);
         if found != *digest {
-            return Err(Error::Damaged {
-                path,
-                expected: *digest,
-                found,
-            });
+            return Err(Error::Damaged { path, expected: *digest, found });
         }
         Ok(Some(bytes))
     }
@@ -212,9 +183,7 @@ impl Store {
         let Some(bytes) = files::read_limited(&path, MAX_DOCUMENT)? else {
             return Ok(None);
         };
-        serde_json::from_slice(&bytes)
-            .map(Some)
-            .map_err(|source| Error::Json { path, source })
+        serde_json::from_slice(&bytes).map(Some).map_err(|source| Error::Json { path, source })
     }
 
     /// Modifies `index.json` under an exclusive lock. `change` returns whether it changed anything.

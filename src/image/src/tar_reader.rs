@@ -68,13 +68,7 @@ struct ExtendedHeaders {
 
 impl<R: Read> TarReader<R> {
     pub(crate) fn new(input: R) -> Self {
-        Self {
-            input,
-            remaining: 0,
-            padding: 0,
-            headers: 0,
-            last: Vec::new(),
-        }
+        Self { input, remaining: 0, padding: 0, headers: 0, last: Vec::new() }
     }
 
     /// Returns the number of headers read, including extended ones, each of which costs as much work as an entry.
@@ -90,15 +84,12 @@ impl<R: Read> TarReader<R> {
             let Some(header) = self.read_header()? else {
                 return Ok(None);
             };
-            let size = header
-                .entry_size()
-                .map_err(|error| self.malformed_archive(error))?;
+            let size = header.entry_size().map_err(|error| self.malformed_archive(error))?;
             let kind = header.entry_type().as_byte();
             if matches!(kind, b'L' | b'K' | b'x' | b'g') {
                 extension.headers += 1;
                 if extension.headers > MAX_EXTENSIONS {
-                    let problem =
-                        format!("an entry of more than {MAX_EXTENSIONS} extended headers");
+                    let problem = format!("an entry of more than {MAX_EXTENSIONS} extended headers");
                     return Err(self.malformed_archive(problem));
                 }
             }
@@ -112,9 +103,7 @@ impl<R: Read> TarReader<R> {
                 // Global headers contain comments (git archive); nobody puts paths there.
                 b'g' => self.begin_content(size),
                 b'S' => {
-                    return Err(self.malformed_archive(
-                        "sparse files are not supported; pack without --sparse",
-                    ));
+                    return Err(self.malformed_archive("sparse files are not supported; pack without --sparse"));
                 }
                 _ => return self.build_entry(&header, size, extension).map(Some),
             }
@@ -134,22 +123,15 @@ impl<R: Read> TarReader<R> {
     /// Classifies the error of a failed read of content.
     pub(crate) fn classify_error(&self, error: io::Error) -> ReadStop {
         match error.kind() {
-            io::ErrorKind::UnexpectedEof => ReadStop::Refused(Refusal::Truncated {
-                after: display_name(&self.last),
-            }),
+            io::ErrorKind::UnexpectedEof => ReadStop::Refused(Refusal::Truncated { after: display_name(&self.last) }),
             // flate2 reports a corrupt stream this way.
-            io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => {
-                self.malformed_archive(error)
-            }
+            io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => self.malformed_archive(error),
             _ => ReadStop::Source(error),
         }
     }
 
     fn malformed_archive(&self, problem: impl ToString) -> ReadStop {
-        ReadStop::Refused(Refusal::Malformed {
-            after: display_name(&self.last),
-            problem: problem.to_string(),
-        })
+        ReadStop::Refused(Refusal::Malformed { after: display_name(&self.last), problem: problem.to_string() })
     }
 
     fn begin_content(&mut self, size: u64) {
@@ -182,12 +164,7 @@ impl<R: Read> TarReader<R> {
         }
         self.headers += 1;
         // The checksum treats the eight bytes of its own field as spaces.
-        let sum: u32 = block[..148]
-            .iter()
-            .chain(&block[156..])
-            .map(|&byte| u32::from(byte))
-            .sum::<u32>()
-            + 8 * 32;
+        let sum: u32 = block[..148].iter().chain(&block[156..]).map(|&byte| u32::from(byte)).sum::<u32>() + 8 * 32;
         match header.cksum() {
             Ok(stated) if stated == sum => Ok(Some(header)),
             _ => Err(self.malformed_archive("a header has a wrong checksum")),
@@ -218,28 +195,16 @@ impl<R: Read> TarReader<R> {
     }
 
     /// Parses POSIX pax records: `LENGTH KEY=VALUE `, where LENGTH includes all of it.
-    fn apply_pax_records(
-        &self,
-        mut records: &[u8],
-        extension: &mut ExtendedHeaders,
-    ) -> Result<(), ReadStop> {
+    fn apply_pax_records(&self, mut records: &[u8], extension: &mut ExtendedHeaders) -> Result<(), ReadStop> {
         while !records.is_empty() {
-            let record =
-                pax_record(records).ok_or_else(|| self.malformed_archive("invalid pax record"))?;
+            let record = pax_record(records).ok_or_else(|| self.malformed_archive("invalid pax record"))?;
             let (key, value) = (record.key, record.value);
             let number = || {
                 let whole = value.split(|&byte| byte == b'.').next().unwrap_or(value);
-                std::str::from_utf8(whole)
-                    .ok()?
-                    .parse::<i64>()
-                    .ok()
-                    .map(|number| number.max(0) as u64)
+                std::str::from_utf8(whole).ok()?.parse::<i64>().ok().map(|number| number.max(0) as u64)
             };
-            let required = || {
-                number().ok_or_else(|| {
-                    self.malformed_archive(format!("pax {} is not a number", display_name(key)))
-                })
-            };
+            let required =
+                || number().ok_or_else(|| self.malformed_archive(format!("pax {} is not a number", display_name(key))));
             match key {
                 b"path" => extension.name = Some(value.to_vec()),
                 b"linkpath" => extension.link = Some(value.to_vec()),
@@ -248,9 +213,7 @@ impl<R: Read> TarReader<R> {
                 b"gid" => extension.gid = Some(required()?),
                 b"mtime" => extension.mtime = number(),
                 key if key.starts_with(b"GNU.sparse.") => {
-                    return Err(self.malformed_archive(
-                        "sparse files are not supported; pack without --sparse",
-                    ));
+                    return Err(self.malformed_archive("sparse files are not supported; pack without --sparse"));
                 }
                 key => {
                     if let Some(name) = key.strip_prefix(b"SCHILY.xattr.") {
@@ -263,23 +226,14 @@ impl<R: Read> TarReader<R> {
         Ok(())
     }
 
-    fn build_entry(
-        &mut self,
-        header: &Header,
-        size: u64,
-        extension: ExtendedHeaders,
-    ) -> Result<Entry, ReadStop> {
-        let name = extension
-            .name
-            .unwrap_or_else(|| header.path_bytes().into_owned());
+    fn build_entry(&mut self, header: &Header, size: u64, extension: ExtendedHeaders) -> Result<Entry, ReadStop> {
+        let name = extension.name.unwrap_or_else(|| header.path_bytes().into_owned());
         self.last.clone_from(&name);
         let mut kind = Kind::from_typeflag(header.entry_type().as_byte());
         if kind == Kind::File && name.last() == Some(&b'/') {
             kind = Kind::Directory;
         }
-        let link = extension
-            .link
-            .or_else(|| header.link_name_bytes().map(|link| link.into_owned()));
+        let link = extension.link.or_else(|| header.link_name_bytes().map(|link| link.into_owned()));
         let device = |number: io::Result<Option<u32>>| number.ok().flatten().unwrap_or(0);
         // Blank means 0, as in GNU tar.
         let blank = |raw: &[u8]| raw.iter().all(|byte| matches!(byte, 0 | b' '));
@@ -291,25 +245,12 @@ impl<R: Read> TarReader<R> {
         let entry = Entry {
             kind,
             link: link.unwrap_or_default(),
-            mode: header
-                .mode()
-                .map_err(|error| self.malformed_archive(error))?
-                & 0o7777,
-            uid: extension
-                .uid
-                .map_or_else(|| field(&old.uid, header.uid()), Ok)?,
-            gid: extension
-                .gid
-                .map_or_else(|| field(&old.gid, header.gid()), Ok)?,
-            mtime: extension
-                .mtime
-                .unwrap_or_else(|| header.mtime().unwrap_or(0)),
+            mode: header.mode().map_err(|error| self.malformed_archive(error))? & 0o7777,
+            uid: extension.uid.map_or_else(|| field(&old.uid, header.uid()), Ok)?,
+            gid: extension.gid.map_or_else(|| field(&old.gid, header.gid()), Ok)?,
+            mtime: extension.mtime.unwrap_or_else(|| header.mtime().unwrap_or(0)),
             // Links and directories have no content, though some writers store the target's size.
-            size: if kind == Kind::File {
-                extension.size.unwrap_or(size)
-            } else {
-                0
-            },
+            size: if kind == Kind::File { extension.size.unwrap_or(size) } else { 0 },
             device: (device(header.device_major()), device(header.device_minor())),
             xattrs: extension.xattrs,
             name,
@@ -333,18 +274,12 @@ fn pax_record(records: &[u8]) -> Option<PaxRecord<'_>> {
     let length: usize = std::str::from_utf8(&records[..space]).ok()?.parse().ok()?;
     let body = records.get(space + 1..length)?.strip_suffix(b"\n")?;
     let equals = body.iter().position(|&byte| byte == b'=')?;
-    Some(PaxRecord {
-        key: &body[..equals],
-        value: &body[equals + 1..],
-        rest: &records[length..],
-    })
+    Some(PaxRecord { key: &body[..equals], value: &body[equals + 1..], rest: &records[length..] })
 }
 
 impl<R: Read> Read for TarReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let most = buffer
-            .len()
-            .min(usize::try_from(self.remaining).unwrap_or(usize::MAX));
+        let most = buffer.len().min(usize::try_from(self.remaining).unwrap_or(usize::MAX));
         if most == 0 {
             return Ok(0);
         }

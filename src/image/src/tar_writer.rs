@@ -35,12 +35,7 @@ impl<W: Write> TarWriter<W> {
     }
 
     /// Writes a file with exactly `entry.size` bytes of `content`; `UnexpectedEof` if there are fewer.
-    pub(crate) fn write_file(
-        &mut self,
-        entry: &Entry,
-        content: impl Read,
-        buffer: &mut [u8],
-    ) -> io::Result<()> {
+    pub(crate) fn write_file(&mut self, entry: &Entry, content: impl Read, buffer: &mut [u8]) -> io::Result<()> {
         self.write_header(entry)?;
         let mut content = content.take(entry.size);
         let mut copied = 0;
@@ -75,11 +70,7 @@ fn pax_records(entry: &Entry) -> Vec<u8> {
     if entry.link.len() > 100 {
         pax_record(&mut records, b"linkpath", &entry.link);
     }
-    for (key, value, most) in [
-        ("size", entry.size, MAX_SIZE),
-        ("uid", entry.uid, MAX_ID),
-        ("gid", entry.gid, MAX_ID),
-    ] {
+    for (key, value, most) in [("size", entry.size, MAX_SIZE), ("uid", entry.uid, MAX_ID), ("gid", entry.gid, MAX_ID)] {
         if value > most {
             pax_record(&mut records, key.as_bytes(), value.to_string().as_bytes());
         }

@@ -29,10 +29,7 @@ const BUFFER: usize = 256 << 10;
 /// Maximum size of a list of attribute names, and of a value (linux/limits.h).
 const XATTR_MAX: usize = 64 << 10;
 
-const READ: OFlags = OFlags::RDONLY
-    .union(OFlags::NOFOLLOW)
-    .union(OFlags::CLOEXEC)
-    .union(OFlags::NONBLOCK);
+const READ: OFlags = OFlags::RDONLY.union(OFlags::NOFOLLOW).union(OFlags::CLOEXEC).union(OFlags::NONBLOCK);
 const DIRECTORY: OFlags = READ.union(OFlags::DIRECTORY);
 
 /// Packer of a file tree.
@@ -74,17 +71,9 @@ impl<'a, W: Write> Packer<'a, W> {
         self.writer.finish()
     }
 
-    fn pack_directory(
-        &mut self,
-        directory: BorrowedFd<'_>,
-        path: &[u8],
-        depth: usize,
-    ) -> Result<(), Error> {
+    fn pack_directory(&mut self, directory: BorrowedFd<'_>, path: &[u8], depth: usize) -> Result<(), Error> {
         if depth > MAX_DEPTH {
-            return Err(self.tree_error(
-                path,
-                format!("it is more than {MAX_DEPTH} directories deep"),
-            ));
+            return Err(self.tree_error(path, format!("it is more than {MAX_DEPTH} directories deep")));
         }
         let mut children = Vec::new();
         for name in self.list_names(directory, path)? {
@@ -103,10 +92,7 @@ impl<'a, W: Write> Packer<'a, W> {
                 continue;
             }
             if name.starts_with(WHITEOUT) {
-                return Err(self.tree_error(
-                    &child,
-                    "names that begin with .wh. mean deletions; rename it",
-                ));
+                return Err(self.tree_error(&child, "names that begin with .wh. mean deletions; rename it"));
             }
             children.push((name, child, stat));
         }
@@ -150,8 +136,7 @@ impl<'a, W: Write> Packer<'a, W> {
                 (entry.kind, entry.link) = (Kind::Hardlink, first.clone());
                 return self.write(&entry);
             }
-            self.links
-                .insert((stat.st_dev, stat.st_ino), entry.name.clone());
+            self.links.insert((stat.st_dev, stat.st_ino), entry.name.clone());
         }
         match kind {
             FileType::Directory => {
@@ -164,10 +149,7 @@ impl<'a, W: Write> Packer<'a, W> {
                 self.write(&entry)?;
                 if attributes.opaque {
                     let opaque = Entry::new(join(&path, OPAQUE), Kind::File, 0o644);
-                    self.write(&Entry {
-                        mtime: self.mtime(0),
-                        ..opaque
-                    })?;
+                    self.write(&Entry { mtime: self.mtime(0), ..opaque })?;
                 }
                 self.pack_directory(directory.as_fd(), &path, depth + 1)
             }
@@ -182,15 +164,8 @@ impl<'a, W: Write> Packer<'a, W> {
                 self.write(&entry)
             }
             FileType::CharacterDevice | FileType::BlockDevice => {
-                entry.kind = if kind == FileType::BlockDevice {
-                    Kind::Block
-                } else {
-                    Kind::Character
-                };
-                entry.device = (
-                    rustix::fs::major(stat.st_rdev),
-                    rustix::fs::minor(stat.st_rdev),
-                );
+                entry.kind = if kind == FileType::BlockDevice { Kind::Block } else { Kind::Character };
+                entry.device = (rustix::fs::major(stat.st_rdev), rustix::fs::minor(stat.st_rdev));
                 self.write(&entry)
             }
             FileType::Fifo => {
@@ -202,49 +177,29 @@ impl<'a, W: Write> Packer<'a, W> {
         }
     }
 
-    fn pack_file(
-        &mut self,
-        parent: BorrowedFd<'_>,
-        name: &[u8],
-        mut entry: Entry,
-        stat: &Stat,
-    ) -> Result<(), Error> {
+    fn pack_file(&mut self, parent: BorrowedFd<'_>, name: &[u8], mut entry: Entry, stat: &Stat) -> Result<(), Error> {
         let file = File::from(self.open(parent, name, &entry.name, READ)?);
-        let now = rustix::fs::fstat(&file)
-            .map_err(|error| self.file_error("look at", &entry.name, error))?;
+        let now = rustix::fs::fstat(&file).map_err(|error| self.file_error("look at", &entry.name, error))?;
         if (now.st_dev, now.st_ino) != (stat.st_dev, stat.st_ino) {
             return Err(self.tree_error(&entry.name, "it was replaced while it was read"));
         }
         entry.size = now.st_size as u64;
-        entry.xattrs = self
-            .list_and_read_attributes(file.as_fd(), &entry.name)?
-            .kept;
+        entry.xattrs = self.list_and_read_attributes(file.as_fd(), &entry.name)?.kept;
         let mut buffer = std::mem::take(&mut self.buffer);
         let written = self.writer.write_file(&entry, &file, &mut buffer);
         self.buffer = buffer;
         written.map_err(|error| match error.kind() {
-            io::ErrorKind::UnexpectedEof => {
-                self.tree_error(&entry.name, "it became shorter while it was read")
-            }
+            io::ErrorKind::UnexpectedEof => self.tree_error(&entry.name, "it became shorter while it was read"),
             _ => Error::file("pack", self.full_path(&entry.name), error),
         })
     }
 
-    fn open(
-        &self,
-        parent: BorrowedFd<'_>,
-        name: &[u8],
-        path: &[u8],
-        flags: OFlags,
-    ) -> Result<OwnedFd, Error> {
-        rustix::fs::openat(parent, name, flags, Mode::empty())
-            .map_err(|error| self.file_error("open", path, error))
+    fn open(&self, parent: BorrowedFd<'_>, name: &[u8], path: &[u8], flags: OFlags) -> Result<OwnedFd, Error> {
+        rustix::fs::openat(parent, name, flags, Mode::empty()).map_err(|error| self.file_error("open", path, error))
     }
 
     fn write(&mut self, entry: &Entry) -> Result<(), Error> {
-        self.writer
-            .write_header(entry)
-            .map_err(|error| Error::file("pack", self.full_path(&entry.name), error))
+        self.writer.write_header(entry).map_err(|error| Error::file("pack", self.full_path(&entry.name), error))
     }
 
     /// Returns whether a file is an overlay's deletion mark: a character device with number 0:0.
@@ -265,11 +220,7 @@ impl<'a, W: Write> Packer<'a, W> {
         }
     }
 
-    fn list_and_read_attributes(
-        &mut self,
-        file: BorrowedFd<'_>,
-        path: &[u8],
-    ) -> Result<Attributes, Error> {
+    fn list_and_read_attributes(&mut self, file: BorrowedFd<'_>, path: &[u8]) -> Result<Attributes, Error> {
         let mut names = std::mem::take(&mut self.attribute_names);
         let result = match rustix::fs::flistxattr(file, &mut names[..]) {
             Ok(0) | Err(Errno::NOTSUP) => Ok(Attributes::default()),
@@ -280,18 +231,10 @@ impl<'a, W: Write> Packer<'a, W> {
         result
     }
 
-    fn read_attributes(
-        &self,
-        file: BorrowedFd<'_>,
-        path: &[u8],
-        names: &[u8],
-    ) -> Result<Attributes, Error> {
+    fn read_attributes(&self, file: BorrowedFd<'_>, path: &[u8], names: &[u8]) -> Result<Attributes, Error> {
         let mut found = Attributes::default();
         let mut value = vec![0; XATTR_MAX];
-        let mut names: Vec<&[u8]> = names
-            .split(|&byte| byte == 0)
-            .filter(|name| !name.is_empty())
-            .collect();
+        let mut names: Vec<&[u8]> = names.split(|&byte| byte == 0).filter(|name| !name.is_empty()).collect();
         names.sort_unstable();
         for name in names {
             let length = rustix::fs::fgetxattr(file, name, &mut value[..])
@@ -301,16 +244,8 @@ impl<'a, W: Write> Packer<'a, W> {
         Ok(found)
     }
 
-    fn add_attribute(
-        &self,
-        found: &mut Attributes,
-        name: &[u8],
-        value: &[u8],
-        path: &[u8],
-    ) -> Result<(), Error> {
-        let overlay = [&b"trusted.overlay."[..], b"user.overlay."]
-            .into_iter()
-            .find_map(|own| name.strip_prefix(own));
+    fn add_attribute(&self, found: &mut Attributes, name: &[u8], value: &[u8], path: &[u8]) -> Result<(), Error> {
+        let overlay = [&b"trusted.overlay."[..], b"user.overlay."].into_iter().find_map(|own| name.strip_prefix(own));
         match overlay {
             Some(b"opaque") if self.options.overlay_upper => found.opaque |= value == b"y",
             Some(b"redirect" | b"metacopy") if self.options.overlay_upper => {
@@ -341,10 +276,7 @@ impl<'a, W: Write> Packer<'a, W> {
     }
 
     fn tree_error(&self, path: &[u8], problem: impl Into<String>) -> Error {
-        Error::Tree {
-            path: self.full_path(path),
-            problem: problem.into(),
-        }
+        Error::Tree { path: self.full_path(path), problem: problem.into() }
     }
 }
 

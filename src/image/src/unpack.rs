@@ -30,11 +30,7 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        Self {
-            entries: 200_000,
-            bytes: 8 << 30,
-            path: 1024,
-        }
+        Self { entries: 200_000, bytes: 8 << 30, path: 1024 }
     }
 }
 
@@ -59,11 +55,7 @@ const STREAM: &str = "the archive";
 /// [`Error::Archive`] for `..`, absolute paths, devices, links that leave the tree, paths behind links, duplicate
 /// entries, unusable names, archives that exceed `limits`, and a truncated or corrupt stream; [`Error::DiskFull`] and
 /// [`Error::File`] otherwise.
-pub fn unpack(
-    archive: impl Read,
-    destination: &Path,
-    limits: &Limits,
-) -> Result<UnpackStats, Error> {
+pub fn unpack(archive: impl Read, destination: &Path, limits: &Limits) -> Result<UnpackStats, Error> {
     claim_destination(destination)?;
     let result = unpack_into(archive, destination, limits);
     if result.is_err() {
@@ -89,33 +81,20 @@ fn claim_destination(destination: &Path) -> Result<(), Error> {
     }
 }
 
-fn unpack_into(
-    archive: impl Read,
-    destination: &Path,
-    limits: &Limits,
-) -> Result<UnpackStats, Error> {
+fn unpack_into(archive: impl Read, destination: &Path, limits: &Limits) -> Result<UnpackStats, Error> {
     let mut input = BufReader::with_capacity(256 << 10, archive);
     let stopped = |stop| Error::from_stop(STREAM, Path::new(STREAM), stop);
-    let format =
-        gzip::detect_format(&mut input).map_err(|error| stopped(ReadStop::Source(error)))?;
+    let format = gzip::detect_format(&mut input).map_err(|error| stopped(ReadStop::Source(error)))?;
     let input: Box<dyn Read + '_> = match format {
         Format::Gzip => Box::new(MultiGzDecoder::new(input)),
         Format::Plain => Box::new(input),
         Format::Zstd => {
             let problem = "it is compressed with zstd".to_owned();
-            return Err(stopped(ReadStop::Refused(Refusal::Malformed {
-                after: String::new(),
-                problem,
-            })));
+            return Err(stopped(ReadStop::Refused(Refusal::Malformed { after: String::new(), problem })));
         }
     };
-    let reader = TarReader::new(MeteredReader {
-        input,
-        left: limits.bytes,
-        exceeded: false,
-    });
-    let beneath = ConfinedRoot::without_links(destination)
-        .map_err(|error| Error::file("open", destination, error))?;
+    let reader = TarReader::new(MeteredReader { input, left: limits.bytes, exceeded: false });
+    let beneath = ConfinedRoot::without_links(destination).map_err(|error| Error::file("open", destination, error))?;
     Unpacker {
         reader,
         beneath,
@@ -175,18 +154,12 @@ impl<R: Read> Unpacker<'_, R> {
             }));
         }
         if entry.name.starts_with(b"/") {
-            return Err(refusal_error(Refusal::AbsolutePath {
-                entry: display_name(&entry.name),
-            }));
+            return Err(refusal_error(Refusal::AbsolutePath { entry: display_name(&entry.name) }));
         }
         let path = names::normalize(&entry.name, self.limits.path).map_err(refusal_error)?;
         if path.is_empty() {
             // The root of the archive itself, "./".
-            return if entry.kind == Kind::Directory {
-                Ok(())
-            } else {
-                Err(refusal_error(root_refusal(entry)))
-            };
+            return if entry.kind == Kind::Directory { Ok(()) } else { Err(refusal_error(root_refusal(entry))) };
         }
         match entry.kind {
             Kind::Directory => self.unpack_directory(entry, &path),
@@ -206,8 +179,7 @@ impl<R: Read> Unpacker<'_, R> {
 
     fn unpack_file(&mut self, entry: &Entry, path: &[u8]) -> Result<(), Error> {
         let parent = self.make_parent(entry, path)?;
-        let file = beneath::create(&parent, split(path).1)
-            .map_err(|error| self.create_error(entry, path, error))?;
+        let file = beneath::create(&parent, split(path).1).map_err(|error| self.create_error(entry, path, error))?;
         let mut file = File::from(file);
         loop {
             let read = match self.reader.read(&mut self.buffer) {
@@ -221,16 +193,10 @@ impl<R: Read> Unpacker<'_, R> {
                 break;
             }
             let written = file.write_all(&self.buffer[..read]);
-            written.map_err(|error| {
-                Error::file("write", self.full_path(path), error).with_needed_bytes(entry.size)
-            })?;
+            written.map_err(|error| Error::file("write", self.full_path(path), error).with_needed_bytes(entry.size))?;
             self.done.bytes += read as u64;
         }
-        let mode = if entry.mode & 0o111 == 0 {
-            0o644
-        } else {
-            0o755
-        };
+        let mode = if entry.mode & 0o111 == 0 { 0o644 } else { 0o755 };
         rustix::fs::fchmod(&file, Mode::from_raw_mode(mode))
             .map_err(|error| Error::file("set the rights of", self.full_path(path), error))
     }
@@ -263,10 +229,7 @@ impl<R: Read> Unpacker<'_, R> {
                 target: display_name(&entry.link),
             })
         };
-        let from = self
-            .beneath
-            .directory(target_above)
-            .map_err(|_| nothing())?;
+        let from = self.beneath.directory(target_above).map_err(|_| nothing())?;
         // In a link to a symbolic link, a relative target would have another meaning.
         let there = stat_entry(&from, target_name).map_err(|_| nothing())?;
         if !there.is_some_and(|stat| is_kind(&stat, FileType::RegularFile)) {
@@ -279,9 +242,7 @@ impl<R: Read> Unpacker<'_, R> {
 
     fn make_parent(&mut self, entry: &Entry, path: &[u8]) -> Result<std::rc::Rc<OwnedFd>, Error> {
         let above = split(path).0;
-        self.beneath
-            .make_directory(above)
-            .map_err(|error| self.directory_error(entry, above, error))
+        self.beneath.make_directory(above).map_err(|error| self.directory_error(entry, above, error))
     }
 
     /// Returns the error of failing to open or create the directory `path` for `entry`.
@@ -291,14 +252,9 @@ impl<R: Read> Unpacker<'_, R> {
                 let link = self.first_link(path);
                 refusal_error(match link {
                     Some(link) if link != path || entry.kind != Kind::Directory => {
-                        Refusal::BehindLink {
-                            entry: display_name(&entry.name),
-                            link: display_name(&link),
-                        }
+                        Refusal::BehindLink { entry: display_name(&entry.name), link: display_name(&link) }
                     }
-                    _ => Refusal::Duplicate {
-                        entry: display_name(&entry.name),
-                    },
+                    _ => Refusal::Duplicate { entry: display_name(&entry.name) },
                 })
             }
             error => Error::file("create", self.full_path(path), error),
@@ -307,9 +263,7 @@ impl<R: Read> Unpacker<'_, R> {
 
     fn create_error(&self, entry: &Entry, path: &[u8], error: Errno) -> Error {
         match error {
-            Errno::EXIST => refusal_error(Refusal::Duplicate {
-                entry: display_name(&entry.name),
-            }),
+            Errno::EXIST => refusal_error(Refusal::Duplicate { entry: display_name(&entry.name) }),
             error => Error::file("create", self.full_path(path), error),
         }
     }
@@ -352,10 +306,7 @@ impl<R: Read> Unpacker<'_, R> {
 
     fn stop_error(&mut self, stop: ReadStop, entry: &[u8]) -> Error {
         if self.reader.source().exceeded {
-            return refusal_error(Refusal::TooLarge {
-                entry: display_name(entry),
-                limit: self.limits.bytes,
-            });
+            return refusal_error(Refusal::TooLarge { entry: display_name(entry), limit: self.limits.bytes });
         }
         Error::from_stop(STREAM, Path::new(STREAM), stop)
     }
@@ -367,24 +318,15 @@ impl<R: Read> Unpacker<'_, R> {
 }
 
 fn refusal_error(problem: Refusal) -> Error {
-    Error::Archive {
-        archive: STREAM.to_owned(),
-        problem,
-    }
+    Error::Archive { archive: STREAM.to_owned(), problem }
 }
 
 fn root_refusal(entry: &Entry) -> Refusal {
-    Refusal::BadName {
-        entry: display_name(&entry.name),
-        problem: "it is the root of the archive".to_owned(),
-    }
+    Refusal::BadName { entry: display_name(&entry.name), problem: "it is the root of the archive".to_owned() }
 }
 
 fn link_leaves(entry: &Entry) -> Refusal {
-    Refusal::LinkLeaves {
-        entry: display_name(&entry.name),
-        target: display_name(&entry.link),
-    }
+    Refusal::LinkLeaves { entry: display_name(&entry.name), target: display_name(&entry.link) }
 }
 
 /// Result of checking the text of a symbolic link's target.
@@ -400,23 +342,13 @@ fn classify_target(above: &[u8], target: &[u8]) -> LinkTarget {
     if target.starts_with(b"/") || target.is_empty() || target.contains(&0) {
         return LinkTarget::Leaves;
     }
-    let depth = above
-        .split(|&byte| byte == b'/')
-        .filter(|part| !part.is_empty())
-        .count();
-    let parts: Vec<&[u8]> = target
-        .split(|&byte| byte == b'/')
-        .filter(|part| !matches!(*part, b"" | b"."))
-        .collect();
+    let depth = above.split(|&byte| byte == b'/').filter(|part| !part.is_empty()).count();
+    let parts: Vec<&[u8]> = target.split(|&byte| byte == b'/').filter(|part| !matches!(*part, b"" | b".")).collect();
     let ups = parts.iter().take_while(|part| **part == b"..").count();
     if ups > depth {
         return LinkTarget::Leaves;
     }
-    if parts[ups..].contains(&&b".."[..]) {
-        LinkTarget::Unsure
-    } else {
-        LinkTarget::Within
-    }
+    if parts[ups..].contains(&&b".."[..]) { LinkTarget::Unsure } else { LinkTarget::Within }
 }
 
 /// Reader that fails when the stream exceeds its limit.
@@ -430,16 +362,11 @@ impl<R: Read> Read for MeteredReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         foreign::cancel::check()?;
         // One extra byte distinguishes "just fits" from "too long".
-        let most = usize::try_from(self.left.saturating_add(1))
-            .unwrap_or(usize::MAX)
-            .min(buffer.len());
+        let most = usize::try_from(self.left.saturating_add(1)).unwrap_or(usize::MAX).min(buffer.len());
         let read = self.input.read(&mut buffer[..most])?;
         if read as u64 > self.left {
             self.exceeded = true;
-            return Err(io::Error::new(
-                io::ErrorKind::InvalidData,
-                "it is too large",
-            ));
+            return Err(io::Error::new(io::ErrorKind::InvalidData, "it is too large"));
         }
         self.left -= read as u64;
         Ok(read)

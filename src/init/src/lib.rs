@@ -17,6 +17,4 @@
 pub mod socket;
 pub mod wire;
 
-pub use wire::{
-    EncodeError, InitReply, InitRequest, MAX_MESSAGE, Scope, Start, StartRequest, StartStage,
-};
+pub use wire::{EncodeError, InitReply, InitRequest, MAX_MESSAGE, Scope, Start, StartRequest, StartStage};

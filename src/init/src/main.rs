@@ -83,16 +83,8 @@ fn watch_children() -> Option<RawFd> {
 /// Handles events until the shim is gone.
 fn serve(shim: RawFd, children: RawFd) {
     let mut watched = [
-        libc::pollfd {
-            fd: shim,
-            events: libc::POLLIN,
-            revents: 0,
-        },
-        libc::pollfd {
-            fd: children,
-            events: libc::POLLIN,
-            revents: 0,
-        },
+        libc::pollfd { fd: shim, events: libc::POLLIN, revents: 0 },
+        libc::pollfd { fd: children, events: libc::POLLIN, revents: 0 },
     ];
     loop {
         // SAFETY: two initialised entries.
@@ -162,20 +154,8 @@ fn handle_request(shim: RawFd) -> bool {
 
 /// Forks and executes a program; the reply says which step failed, if any.
 fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
-    let failed = |errno, stage| {
-        send_reply(
-            shim,
-            InitReply::Failed {
-                id: request.id,
-                errno,
-                stage,
-            },
-            &[],
-        )
-    };
-    if streams.len() != 2
-        || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS
-    {
+    let failed = |errno, stage| send_reply(shim, InitReply::Failed { id: request.id, errno, stage }, &[]);
+    if streams.len() != 2 || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS {
         return failed(libc::E2BIG, StartStage::Request);
     }
     let mut report = [-1; 2];
@@ -199,11 +179,7 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     // SAFETY: `report` is ours; the read ends when exec closes the other end, or with the child's three bytes.
     let read = unsafe {
         libc::close(report[1]);
-        let read = if pid < 0 {
-            0
-        } else {
-            libc::read(report[0], bytes.as_mut_ptr().cast(), bytes.len())
-        };
+        let read = if pid < 0 { 0 } else { libc::read(report[0], bytes.as_mut_ptr().cast(), bytes.len()) };
         libc::close(report[0]);
         read
     };
@@ -213,23 +189,13 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     if read == 3 {
         // SAFETY: our child, which is about to exit: it must not be reported as a process that ran.
         unsafe { libc::waitpid(pid, ptr::null_mut(), 0) };
-        return failed(
-            i32::from(bytes[1]) | i32::from(bytes[2]) << 8,
-            StartStage::from_byte(bytes[0]),
-        );
+        return failed(i32::from(bytes[1]) | i32::from(bytes[2]) << 8, StartStage::from_byte(bytes[0]));
     }
     // The child is not reaped yet, so the pid is certainly its own.
     // SAFETY: no pointers.
     let pidfd = unsafe { libc::syscall(libc::SYS_pidfd_open, pid, 0) } as RawFd;
     let beside = [pidfd];
-    let told = send_reply(
-        shim,
-        InitReply::Started {
-            id: request.id,
-            pid,
-        },
-        if pidfd < 0 { &[] } else { &beside },
-    );
+    let told = send_reply(shim, InitReply::Started { id: request.id, pid }, if pidfd < 0 { &[] } else { &beside });
     // SAFETY: opened above.
     unsafe { libc::close(pidfd) };
     told
@@ -255,11 +221,7 @@ fn exec_program(request: &Start<'_>, streams: &[RawFd]) -> (StartStage, c_int) {
         let mut slot = 0;
         let mut next = || {
             let text = request.strings[at..].as_ptr();
-            at += request.strings[at..]
-                .iter()
-                .position(|byte| *byte == 0)
-                .unwrap_or(0)
-                + 1;
+            at += request.strings[at..].iter().position(|byte| *byte == 0).unwrap_or(0) + 1;
             text.cast::<c_char>()
         };
         let directory = next();

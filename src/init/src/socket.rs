@@ -13,10 +13,7 @@ struct ControlBuffer([u8; CONTROL]);
 
 /// Sends one message. Interrupted calls are repeated; a closed peer is an error, not a signal.
 pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
-    let mut vector = libc::iovec {
-        iov_base: bytes.as_ptr().cast_mut().cast(),
-        iov_len: bytes.len(),
-    };
+    let mut vector = libc::iovec { iov_base: bytes.as_ptr().cast_mut().cast(), iov_len: bytes.len() };
     let mut control = ControlBuffer([0; CONTROL]);
     // SAFETY: an all-zero msghdr is valid; every pointer put into it outlives the call.
     let mut message: libc::msghdr = unsafe { std::mem::zeroed() };
@@ -24,10 +21,7 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
     message.msg_iovlen = 1;
     if !fds.is_empty() {
         let payload = std::mem::size_of_val(fds);
-        assert!(
-            fds.len() <= MAX_FDS,
-            "at most {MAX_FDS} file descriptors fit beside a message"
-        );
+        assert!(fds.len() <= MAX_FDS, "at most {MAX_FDS} file descriptors fit beside a message");
         message.msg_control = control.0.as_mut_ptr().cast();
         // SAFETY: pure arithmetic.
         message.msg_controllen = unsafe { libc::CMSG_SPACE(payload as u32) } as _;
@@ -38,11 +32,7 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
             (*header).cmsg_level = libc::SOL_SOCKET;
             (*header).cmsg_type = libc::SCM_RIGHTS;
             (*header).cmsg_len = libc::CMSG_LEN(payload as u32) as _;
-            std::ptr::copy_nonoverlapping(
-                fds.as_ptr().cast::<u8>(),
-                libc::CMSG_DATA(header),
-                payload,
-            );
+            std::ptr::copy_nonoverlapping(fds.as_ptr().cast::<u8>(), libc::CMSG_DATA(header), payload);
         }
     }
     loop {
@@ -60,15 +50,8 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
 
 /// Receives one message; returns the number of bytes and of file descriptors (close-on-exec, now owned by the caller).
 /// Neither bytes nor descriptors mean that the peer has closed. A message longer than `bytes` is an error.
-pub fn receive(
-    socket: RawFd,
-    bytes: &mut [u8],
-    fds: &mut [RawFd; MAX_FDS],
-) -> io::Result<(usize, usize)> {
-    let mut vector = libc::iovec {
-        iov_base: bytes.as_mut_ptr().cast(),
-        iov_len: bytes.len(),
-    };
+pub fn receive(socket: RawFd, bytes: &mut [u8], fds: &mut [RawFd; MAX_FDS]) -> io::Result<(usize, usize)> {
+    let mut vector = libc::iovec { iov_base: bytes.as_mut_ptr().cast(), iov_len: bytes.len() };
     let mut control = ControlBuffer([0; CONTROL]);
     // SAFETY: an all-zero msghdr is valid; every pointer put into it outlives the calls.
     let mut message: libc::msghdr = unsafe { std::mem::zeroed() };
@@ -133,10 +116,7 @@ mod tests {
         send(left.as_raw_fd(), b"hello", &[far.as_raw_fd()]).unwrap();
         drop(far);
         let (mut bytes, mut fds) = ([0; 16], [-1; MAX_FDS]);
-        assert_eq!(
-            receive(right.as_raw_fd(), &mut bytes, &mut fds).unwrap(),
-            (5, 1)
-        );
+        assert_eq!(receive(right.as_raw_fd(), &mut bytes, &mut fds).unwrap(), (5, 1));
         // SAFETY: received just now and owned by nobody else.
         let received = unsafe { OwnedFd::from_raw_fd(fds[0]) };
         UnixStream::from(received).write_all(b"through").unwrap();

@@ -79,10 +79,7 @@ pub enum EncodeError {
 impl fmt::Display for EncodeError {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Empty => write!(
-                formatter,
-                "no program is named: give its absolute path as the first argument"
-            ),
+            Self::Empty => write!(formatter, "no program is named: give its absolute path as the first argument"),
             Self::ZeroByte(text) => write!(formatter, "{text:?} holds a zero byte: remove it"),
             Self::TooLong(length) => write!(
                 formatter,
@@ -159,19 +156,11 @@ impl StartRequest<'_> {
         if self.argv.first().is_none_or(|program| program.is_empty()) {
             return Err(EncodeError::Empty);
         }
-        let directory = if self.directory.is_empty() {
-            "/"
-        } else {
-            self.directory
-        };
+        let directory = if self.directory.is_empty() { "/" } else { self.directory };
         let mut out = vec![START];
         out.extend(self.id.to_le_bytes());
         for count in [self.argv.len(), self.environment.len()] {
-            out.extend(
-                u16::try_from(count)
-                    .map_err(|_| EncodeError::TooLong(count))?
-                    .to_le_bytes(),
-            );
+            out.extend(u16::try_from(count).map_err(|_| EncodeError::TooLong(count))?.to_le_bytes());
         }
         let strings = std::iter::once(directory)
             .chain(self.argv.iter().map(String::as_str))
@@ -183,11 +172,7 @@ impl StartRequest<'_> {
             out.extend(text.as_bytes());
             out.push(0);
         }
-        if out.len() > MAX_MESSAGE {
-            Err(EncodeError::TooLong(out.len()))
-        } else {
-            Ok(out)
-        }
+        if out.len() > MAX_MESSAGE { Err(EncodeError::TooLong(out.len())) } else { Ok(out) }
     }
 }
 
@@ -201,8 +186,8 @@ impl<'a> InitRequest<'a> {
                 let arguments = u16::from_le_bytes([fixed[4], fixed[5]]);
                 let variables = u16::from_le_bytes([fixed[6], fixed[7]]);
                 let ended = strings.iter().filter(|byte| **byte == 0).count();
-                let complete = strings.last() == Some(&0)
-                    && ended == 1 + usize::from(arguments) + usize::from(variables);
+                let complete =
+                    strings.last() == Some(&0) && ended == 1 + usize::from(arguments) + usize::from(variables);
                 (complete && arguments > 0).then_some(Self::Start(Start {
                     id: read_u32(fixed, 0)?,
                     arguments,
@@ -217,11 +202,7 @@ impl<'a> InitRequest<'a> {
                     2 => Scope::All,
                     _ => return None,
                 };
-                Some(Self::Signal {
-                    pid: read_u32(rest, 0)? as i32,
-                    signal: read_u32(rest, 4)? as i32,
-                    scope,
-                })
+                Some(Self::Signal { pid: read_u32(rest, 0)? as i32, signal: read_u32(rest, 4)? as i32, scope })
             }
             _ => None,
         }
@@ -265,19 +246,9 @@ impl InitReply {
         let (first, second, last) = (read_u32(rest, 0)?, read_u32(rest, 4)?, *rest.get(8)?);
         match kind {
             READY => Some(Self::Ready),
-            STARTED => Some(Self::Started {
-                id: first,
-                pid: second as i32,
-            }),
-            FAILED => Some(Self::Failed {
-                id: first,
-                errno: second as i32,
-                stage: StartStage::from_byte(last),
-            }),
-            EXITED => Some(Self::Exited {
-                pid: first as i32,
-                status: second as i32,
-            }),
+            STARTED => Some(Self::Started { id: first, pid: second as i32 }),
+            FAILED => Some(Self::Failed { id: first, errno: second as i32, stage: StartStage::from_byte(last) }),
+            EXITED => Some(Self::Exited { pid: first as i32, status: second as i32 }),
             _ => None,
         }
     }
@@ -298,60 +269,28 @@ mod tests {
     #[test]
     fn start_is_read_as_written() {
         let (argv, environment) = (strings(&["/bin/node", "", "x y"]), strings(&["A=1", "B="]));
-        let request = StartRequest {
-            id: 7,
-            directory: "",
-            argv: &argv,
-            environment: &environment,
-        };
+        let request = StartRequest { id: 7, directory: "", argv: &argv, environment: &environment };
         let bytes = request.encode().unwrap();
-        let Some(InitRequest::Start(start)) = InitRequest::decode(&bytes) else {
-            panic!("not a start")
-        };
+        let Some(InitRequest::Start(start)) = InitRequest::decode(&bytes) else { panic!("not a start") };
         assert_eq!((start.id, start.arguments, start.variables), (7, 3, 2));
         assert_eq!(start.strings, b"/\0/bin/node\0\0x y\0A=1\0B=\0");
     }
 
     #[test]
     fn what_cannot_be_sent_is_refused_with_a_reason() {
-        let encode = |argv: &[String]| {
-            StartRequest {
-                id: 0,
-                directory: "/",
-                argv,
-                environment: &[],
-            }
-            .encode()
-            .unwrap_err()
-        };
+        let encode =
+            |argv: &[String]| StartRequest { id: 0, directory: "/", argv, environment: &[] }.encode().unwrap_err();
         assert_eq!(encode(&[]), EncodeError::Empty);
-        assert!(matches!(
-            encode(&strings(&["/a\0b"])),
-            EncodeError::ZeroByte(_)
-        ));
-        assert!(matches!(
-            encode(&["x".repeat(MAX_MESSAGE)]),
-            EncodeError::TooLong(_)
-        ));
+        assert!(matches!(encode(&strings(&["/a\0b"])), EncodeError::ZeroByte(_)));
+        assert!(matches!(encode(&["x".repeat(MAX_MESSAGE)]), EncodeError::TooLong(_)));
     }
 
     #[test]
     fn truncated_and_foreign_datagrams_are_not_read() {
         let argv = strings(&["/bin/node"]);
-        let bytes = StartRequest {
-            id: 1,
-            directory: "/",
-            argv: &argv,
-            environment: &[],
-        }
-        .encode()
-        .unwrap();
+        let bytes = StartRequest { id: 1, directory: "/", argv: &argv, environment: &[] }.encode().unwrap();
         for length in 0..bytes.len() {
-            assert_eq!(
-                InitRequest::decode(&bytes[..length]),
-                None,
-                "{length} bytes"
-            );
+            assert_eq!(InitRequest::decode(&bytes[..length]), None, "{length} bytes");
         }
         assert_eq!(InitRequest::decode(&[99; 32]), None);
         assert_eq!(InitReply::decode(&[1, 2, 3]), None);
@@ -362,28 +301,14 @@ mod tests {
         for reply in [
             InitReply::Ready,
             InitReply::Started { id: 3, pid: 12 },
-            InitReply::Failed {
-                id: 4,
-                errno: 2,
-                stage: StartStage::Execute,
-            },
-            InitReply::Exited {
-                pid: 5,
-                status: 0x8b,
-            },
+            InitReply::Failed { id: 4, errno: 2, stage: StartStage::Execute },
+            InitReply::Exited { pid: 5, status: 0x8b },
         ] {
             assert_eq!(InitReply::decode(&reply.encode()), Some(reply));
         }
         for scope in [Scope::Process, Scope::Group, Scope::All] {
             let bytes = InitRequest::encode_signal(9, 15, scope);
-            assert_eq!(
-                InitRequest::decode(&bytes),
-                Some(InitRequest::Signal {
-                    pid: 9,
-                    signal: 15,
-                    scope
-                })
-            );
+            assert_eq!(InitRequest::decode(&bytes), Some(InitRequest::Signal { pid: 9, signal: 15, scope }));
         }
     }
 }

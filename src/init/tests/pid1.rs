@@ -24,21 +24,12 @@ impl Init {
         // SAFETY: just created, owned by nobody else.
         let [ours, theirs] = pair.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
         // A missing message must fail the test, not hang it.
-        let patience = libc::timeval {
-            tv_sec: 30,
-            tv_usec: 0,
-        };
+        let patience = libc::timeval { tv_sec: 30, tv_usec: 0 };
         let length = size_of::<libc::timeval>() as libc::socklen_t;
         // SAFETY: a live structure of the given length.
         let set = unsafe {
             let value = std::ptr::addr_of!(patience).cast();
-            libc::setsockopt(
-                ours.as_raw_fd(),
-                libc::SOL_SOCKET,
-                libc::SO_RCVTIMEO,
-                value,
-                length,
-            )
+            libc::setsockopt(ours.as_raw_fd(), libc::SOL_SOCKET, libc::SO_RCVTIMEO, value, length)
         };
         assert_eq!(set, 0);
         let process = Command::new("unshare")
@@ -46,10 +37,7 @@ impl Init {
             .stdin(Stdio::from(theirs))
             .spawn()
             .expect("unshare, of util-linux; run this test as root");
-        let init = Self {
-            socket: Some(ours),
-            process,
-        };
+        let init = Self { socket: Some(ours), process };
         assert_eq!(init.receive().0, InitReply::Ready);
         init
     }
@@ -63,10 +51,7 @@ impl Init {
         let (length, count) = socket::receive(self.fd(), &mut bytes, &mut fds).expect("an answer");
         // SAFETY: just received, owned by nobody else.
         let fd = (count > 0).then(|| unsafe { OwnedFd::from_raw_fd(fds[0]) });
-        (
-            InitReply::decode(&bytes[..length]).expect("one of ours"),
-            fd,
-        )
+        (InitReply::decode(&bytes[..length]).expect("one of ours"), fd)
     }
 
     /// Starts a shell script; its output can be read from the returned file.
@@ -77,24 +62,14 @@ impl Init {
     fn run(&self, id: u32, argv: &[&str], directory: &str) -> std::fs::File {
         let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
         let environment = ["GREETING=hello".to_owned()];
-        let request = StartRequest {
-            id,
-            directory,
-            argv: &argv,
-            environment: &environment,
-        };
+        let request = StartRequest { id, directory, argv: &argv, environment: &environment };
         let mut pipe = [-1; 2];
         // SAFETY: an array of two for two descriptors.
         let made = unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) };
         assert_eq!(made, 0);
         // SAFETY: just created, owned by nobody else.
         let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
-        socket::send(
-            self.fd(),
-            &request.encode().unwrap(),
-            &[write.as_raw_fd(), write.as_raw_fd()],
-        )
-        .unwrap();
+        socket::send(self.fd(), &request.encode().unwrap(), &[write.as_raw_fd(), write.as_raw_fd()]).unwrap();
         read.into()
     }
 
@@ -135,30 +110,12 @@ fn it_runs_programs_and_tells_how_they_end() {
 fn what_cannot_be_executed_is_told_apart_with_its_error() {
     let init = Init::start();
     init.run(1, &["/no/such/program"], "/");
-    assert_eq!(
-        init.receive().0,
-        InitReply::Failed {
-            id: 1,
-            errno: libc::ENOENT,
-            stage: StartStage::Execute
-        }
-    );
+    assert_eq!(init.receive().0, InitReply::Failed { id: 1, errno: libc::ENOENT, stage: StartStage::Execute });
     init.run(2, &["/bin/sh"], "/no/such/directory");
-    assert_eq!(
-        init.receive().0,
-        InitReply::Failed {
-            id: 2,
-            errno: libc::ENOENT,
-            stage: StartStage::Directory
-        }
-    );
+    assert_eq!(init.receive().0, InitReply::Failed { id: 2, errno: libc::ENOENT, stage: StartStage::Directory });
     socket::send(init.fd(), b"nonsense", &[]).unwrap();
     init.shell(3, "exit 0");
-    assert_eq!(
-        init.expect_exit(init.expect_started(3)),
-        0,
-        "nonsense is passed over"
-    );
+    assert_eq!(init.expect_exit(init.expect_started(3)), 0, "nonsense is passed over");
 }
 
 #[test]
@@ -173,22 +130,11 @@ fn programs_begin_with_ordinary_signals_and_a_session_of_their_own() {
     // The script's child must exist before the group is killed.
     let mut line = [0; 3];
     printed.read_exact(&mut line).unwrap();
-    socket::send(
-        init.fd(),
-        &InitRequest::encode_signal(pid, libc::SIGKILL, Scope::Group),
-        &[],
-    )
-    .unwrap();
+    socket::send(init.fd(), &InitRequest::encode_signal(pid, libc::SIGKILL, Scope::Group), &[]).unwrap();
     assert_eq!(init.expect_exit(pid) & 0x7f, libc::SIGKILL);
     let orphan = init.receive().0;
     assert!(
-        matches!(
-            orphan,
-            InitReply::Exited {
-                status: libc::SIGKILL,
-                ..
-            }
-        ),
+        matches!(orphan, InitReply::Exited { status: libc::SIGKILL, .. }),
         "its child, in the same group: {orphan:?}"
     );
 }
@@ -199,10 +145,7 @@ fn orphans_are_reaped_and_told() {
     init.shell(1, "(sleep 0.1; exit 7) & exit 0");
     let pid = init.expect_started(1);
     assert_eq!(init.expect_exit(pid), 0);
-    assert!(matches!(
-        init.receive().0,
-        InitReply::Exited { status: 0x700, .. }
-    ));
+    assert!(matches!(init.receive().0, InitReply::Exited { status: 0x700, .. }));
 }
 
 #[test]

@@ -17,9 +17,7 @@ static SHIFT: AtomicI64 = AtomicI64::new(0);
 /// Returns the current time in nanoseconds since the Unix epoch.
 pub fn now() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    let now = since.map_or(0, |since| {
-        i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
-    });
+    let now = since.map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX));
     now.saturating_add(SHIFT.load(Ordering::Relaxed))
 }
 
@@ -43,10 +41,7 @@ impl ClockSample {
     pub fn new(sent: i64, arrived: i64, left: i64, came: i64) -> Self {
         let there = arrived.saturating_sub(sent);
         let back = left.saturating_sub(came);
-        Self {
-            offset: there / 2 + back / 2,
-            delay: there.saturating_sub(back).max(0),
-        }
+        Self { offset: there / 2 + back / 2, delay: there.saturating_sub(back).max(0) }
     }
 }
 
@@ -75,10 +70,7 @@ impl ClockFilter {
 
     /// Returns the sample with the shortest round trip, or `None` before the first pong.
     pub fn best(&self) -> Option<ClockSample> {
-        self.samples
-            .iter()
-            .min_by_key(|sample| sample.delay)
-            .copied()
+        self.samples.iter().min_by_key(|sample| sample.delay).copied()
     }
 
     /// Returns the most recent round-trip time in nanoseconds.
@@ -98,22 +90,13 @@ mod tests {
         let mut clock = ClockFilter::default();
         // The peer is 250 ms ahead, with a delay of 3 ms each way.
         clock.add(ClockSample::new(0, 253 * MS, 254 * MS, 7 * MS));
-        assert_eq!(
-            clock.best(),
-            Some(ClockSample {
-                offset: 250 * MS,
-                delay: 6 * MS
-            })
-        );
+        assert_eq!(clock.best(), Some(ClockSample { offset: 250 * MS, delay: 6 * MS }));
         // A slow forward path spoils a sample, which is then not used.
         clock.add(ClockSample::new(100 * MS, 450 * MS, 450 * MS, 203 * MS));
         assert_eq!(clock.best().unwrap().offset, 250 * MS);
         assert_eq!(clock.last_delay(), Some(103 * MS));
         for _ in 0..SAMPLES {
-            clock.add(ClockSample {
-                offset: 1,
-                delay: 1000 * MS,
-            });
+            clock.add(ClockSample { offset: 1, delay: 1000 * MS });
         }
         assert_eq!(clock.best().unwrap().offset, 1, "old samples are forgotten");
     }

@@ -458,21 +458,13 @@ pub struct NodeEndpoints {
 
 impl From<NodeNames> for NodeEndpoints {
     fn from(names: NodeNames) -> Self {
-        Self {
-            outputs: names.publishes,
-            inputs: names.subscribes,
-            services: names.serves,
-        }
+        Self { outputs: names.publishes, inputs: names.subscribes, services: names.serves }
     }
 }
 
 impl From<NodeEndpoints> for NodeNames {
     fn from(has: NodeEndpoints) -> Self {
-        Self {
-            publishes: has.outputs,
-            subscribes: has.inputs,
-            serves: has.services,
-        }
+        Self { publishes: has.outputs, subscribes: has.inputs, serves: has.services }
     }
 }
 
@@ -526,10 +518,7 @@ pub struct ServiceChannel {
     /// Hash of the type.
     pub md5: String,
     /// Hashes of the request and response types where ROS exposes them (ROS 2), otherwise empty.
-    #[serde(
-        skip_serializing_if = "Vec::is_empty",
-        deserialize_with = "bounded::list::<_, _, 16>"
-    )]
+    #[serde(skip_serializing_if = "Vec::is_empty", deserialize_with = "bounded::list::<_, _, 16>")]
     pub halves: Vec<String>,
 }
 
@@ -574,22 +563,14 @@ mod tests {
         let hello: Hello = serde_json::from_str(hello).unwrap();
         assert_eq!((hello.run.as_str(), hello.machine.as_str()), ("r", "m"));
         assert_eq!((hello.next, hello.attempt), (5, 0));
-        let earlier = LinkLimits {
-            record: 256 << 20,
-            under_way: 256,
-            under_way_bytes: 320 << 20,
-            ahead: 65_536,
-        };
+        let earlier = LinkLimits { record: 256 << 20, under_way: 256, under_way_bytes: 320 << 20, ahead: 65_536 };
         assert_eq!(hello.limits, earlier, "what earlier releases take");
         assert_eq!(hello.resume.unwrap().ahead, [6]);
         assert_eq!((hello.node.name.as_str(), hello.sla.max), ("/n", Some(0.3)));
         assert!(!hello.node.named_by_argv);
         let welcome = r#"{"accepted":{"session":"s","resumed":true,"received":1,"ahead":[],"next":2,"servant":"v"}}"#;
         let welcome: Welcome = serde_json::from_str(welcome).unwrap();
-        let Welcome::Accepted {
-            next: 2, limits, ..
-        } = welcome
-        else {
+        let Welcome::Accepted { next: 2, limits, .. } = welcome else {
             panic!("{welcome:?}");
         };
         assert_eq!(limits, earlier);
@@ -643,23 +624,14 @@ mod tests {
     #[test]
     fn session_messages_are_distinguished_from_control_messages() {
         let asked = Control::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
-        assert_eq!(
-            asked,
-            Control::Between(SessionMessage::Keyframe { channel: 7 })
-        );
+        assert_eq!(asked, Control::Between(SessionMessage::Keyframe { channel: 7 }));
         // Whitespace does not matter.
         let asked = Control::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
-        assert_eq!(
-            asked,
-            Control::Between(SessionMessage::Keyframe { channel: 7 })
-        );
+        assert_eq!(asked, Control::Between(SessionMessage::Keyframe { channel: 7 }));
         let order = Control::read(br#"{"signal":{"signal":9}}"#).unwrap();
         assert_eq!(order, Control::Order(FromRobot::Signal { signal: 9 }));
         for unknown in [r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
-            assert!(
-                Control::<FromRobot>::read(unknown.as_bytes()).is_err(),
-                "{unknown}"
-            );
+            assert!(Control::<FromRobot>::read(unknown.as_bytes()).is_err(), "{unknown}");
         }
     }
 
@@ -675,13 +647,9 @@ mod tests {
             }),
             (Value::Array(whole), Value::Array(part)) if whole.len() == part.len() => {
                 let pairs = whole.iter().zip(part);
-                pairs
-                    .into_iter()
-                    .find_map(|(whole, part)| find_missing(whole, part))
+                pairs.into_iter().find_map(|(whole, part)| find_missing(whole, part))
             }
-            (Value::Number(whole), Value::Number(part)) => {
-                (whole.as_f64() != part.as_f64()).then(|| part.to_string())
-            }
+            (Value::Number(whole), Value::Number(part)) => (whole.as_f64() != part.as_f64()).then(|| part.to_string()),
             (whole, part) => (whole != part).then(|| part.to_string()),
         }
     }

@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use ros::bus::{
-    self, Digest, QosDurability, QosLiveliness, QosReliability, RosVersion, ServiceType,
-};
+use ros::bus::{self, Digest, QosDurability, QosLiveliness, QosReliability, RosVersion, ServiceType};
 
 use crate::control::{ServiceChannel, WireQos};
 
@@ -28,24 +26,12 @@ impl WireQos {
     pub fn to_bus(&self, depth: usize) -> bus::QosProfile {
         let time = |seconds: Option<f64>| Duration::try_from_secs_f64(seconds?).ok();
         bus::QosProfile {
-            reliability: if self.best_effort {
-                QosReliability::BestEffort
-            } else {
-                QosReliability::Reliable
-            },
-            durability: if self.transient_local {
-                QosDurability::TransientLocal
-            } else {
-                QosDurability::Volatile
-            },
+            reliability: if self.best_effort { QosReliability::BestEffort } else { QosReliability::Reliable },
+            durability: if self.transient_local { QosDurability::TransientLocal } else { QosDurability::Volatile },
             depth: self.depth.max(depth),
             deadline: time(self.deadline),
             lifespan: time(self.lifespan),
-            liveliness: if self.manual_liveliness {
-                QosLiveliness::ManualByTopic
-            } else {
-                QosLiveliness::Automatic
-            },
+            liveliness: if self.manual_liveliness { QosLiveliness::ManualByTopic } else { QosLiveliness::Automatic },
             lease: time(self.lease),
         }
     }
@@ -60,13 +46,7 @@ impl ServiceChannel {
         } else {
             Vec::new()
         };
-        Self {
-            channel,
-            name: name.to_owned(),
-            type_name: of.name.clone(),
-            md5: of.digest.to_string(),
-            halves,
-        }
+        Self { channel, name: name.to_owned(), type_name: of.name.clone(), md5: of.digest.to_string(), halves }
     }
 
     /// Returns the service type for the given ROS version.
@@ -98,21 +78,14 @@ mod tests {
         let read: WireQos = serde_json::from_str(&told).unwrap();
         assert_eq!(read.to_bus(1), qos);
         assert_eq!(read.to_bus(256).depth, 256);
-        let nonsense = WireQos {
-            lease: Some(-1.0),
-            deadline: Some(f64::NAN),
-            ..WireQos::default()
-        };
+        let nonsense = WireQos { lease: Some(-1.0), deadline: Some(f64::NAN), ..WireQos::default() };
         assert_eq!(nonsense.to_bus(1), bus::QosProfile::keep_last(1));
     }
 
     #[test]
     fn a_service_keeps_the_hashes_of_both_its_messages() {
-        let of = ServiceType {
-            request: "RIHS01_1".into(),
-            ..ServiceType::new("a/srv/B", "*")
-        }
-        .with_version(RosVersion::Two);
+        let of = ServiceType { request: "RIHS01_1".into(), ..ServiceType::new("a/srv/B", "*") }
+            .with_version(RosVersion::Two);
         let served = ServiceChannel::new(3, "/b", &of);
         assert_eq!(served.service_type(RosVersion::Two), of);
         let of = ServiceType::new("a/B", "d41d8cd98f00b204e9800998ecf8427e");

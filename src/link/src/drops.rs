@@ -49,9 +49,7 @@ impl Cause {
             Self::Busy => "they arrived faster than this end of the link accepts them",
             Self::Slow => "the subscriber is too slow",
             Self::Early => "the node had not connected to the topic yet",
-            Self::Full => {
-                "more latched messages and goals waited for the link than fit into its queue (64 MB)"
-            }
+            Self::Full => "more latched messages and goals waited for the link than fit into its queue (64 MB)",
             Self::Gone => "their publisher was gone before they could be sent",
             Self::Undecodable => "they were encoded relative to a message that was lost",
             Self::Other => "for a reason that this version does not know",
@@ -84,10 +82,7 @@ impl fmt::Display for TopicDropCount {
         let (topic, words) = (&self.topic, self.cause.description());
         match self.count {
             1 => write!(formatter, "1 message of {topic} was dropped: {words}"),
-            count => write!(
-                formatter,
-                "{count} messages of {topic} were dropped: {words}"
-            ),
+            count => write!(formatter, "{count} messages of {topic} were dropped: {words}"),
         }
     }
 }
@@ -146,11 +141,7 @@ impl<K: Ord> Tally<K> {
 impl Tally<String> {
     /// Returns the counts by topic.
     pub(crate) fn per_topic(&self) -> Vec<TopicDropCount> {
-        let all = self.iter().map(|(topic, cause, count)| TopicDropCount {
-            topic: topic.clone(),
-            cause,
-            count,
-        });
+        let all = self.iter().map(|(topic, cause, count)| TopicDropCount { topic: topic.clone(), cause, count });
         all.collect()
     }
 }
@@ -177,12 +168,7 @@ impl DropCounters {
     }
 
     /// Includes the value returned by `counter` until it reports that its value is final.
-    pub fn watch_with(
-        &self,
-        topic: &str,
-        cause: Cause,
-        counter: impl Fn() -> (u64, bool) + Send + Sync + 'static,
-    ) {
+    pub fn watch_with(&self, topic: &str, cause: Cause, counter: impl Fn() -> (u64, bool) + Send + Sync + 'static) {
         self.watched.lock().push(WatchedCounter {
             topic: topic.to_owned(),
             cause,
@@ -195,11 +181,7 @@ impl DropCounters {
     pub fn snapshot(&self) -> Vec<TopicDropCount> {
         self.watched.lock().retain_mut(|watched| {
             let (count, over) = (watched.counter)();
-            self.add(
-                &watched.topic,
-                watched.cause,
-                count.saturating_sub(watched.seen),
-            );
+            self.add(&watched.topic, watched.cause, count.saturating_sub(watched.seen));
             watched.seen = count.max(watched.seen);
             !over
         });
@@ -218,10 +200,7 @@ impl DropReporter {
     pub fn take_new(&mut self, all: &[TopicDropCount]) -> Vec<TopicDropCount> {
         let mut news = Vec::new();
         for drop in all {
-            let told = self
-                .told
-                .entry((drop.topic.clone(), drop.cause))
-                .or_default();
+            let told = self.told.entry((drop.topic.clone(), drop.cause)).or_default();
             if drop.count >= told.saturating_mul(10).max(1) {
                 *told = drop.count;
                 news.push(drop.clone());
@@ -245,11 +224,7 @@ mod tests {
         counter.add(lost(2));
         drops.watch("/scan", Cause::Busy, counter.clone());
         drops.add("/image", Cause::Replaced, 1);
-        let told: Vec<String> = reporter
-            .take_new(&drops.snapshot())
-            .iter()
-            .map(TopicDropCount::to_string)
-            .collect();
+        let told: Vec<String> = reporter.take_new(&drops.snapshot()).iter().map(TopicDropCount::to_string).collect();
         assert_eq!(
             told,
             [
@@ -258,18 +233,11 @@ mod tests {
             ]
         );
         drops.add("/image", Cause::Replaced, 8);
-        assert!(
-            reporter.take_new(&drops.snapshot()).is_empty(),
-            "9 are few more than 1"
-        );
+        assert!(reporter.take_new(&drops.snapshot()).is_empty(), "9 are few more than 1");
         counter.add(lost(23));
         drop(counter);
         drops.add("/image", Cause::Replaced, 1);
-        let told: Vec<u64> = reporter
-            .take_new(&drops.snapshot())
-            .iter()
-            .map(|drop| drop.count)
-            .collect();
+        let told: Vec<u64> = reporter.take_new(&drops.snapshot()).iter().map(|drop| drop.count).collect();
         assert_eq!(told, [10, 25]);
         // The owner of the counter is gone, but its count remains.
         assert_eq!(drops.snapshot()[1].count, 25);

@@ -68,10 +68,7 @@ mod tests {
         echoes.expect("/a", &one);
         assert!(echoes.is_echo("/a", Some(&one)));
         assert!(!echoes.is_echo("/a", Some(&two)));
-        assert!(
-            !echoes.is_echo("/a", Some(&one)),
-            "it is set by this end now"
-        );
+        assert!(!echoes.is_echo("/a", Some(&one)), "it is set by this end now");
         echoes.expect("/a", &one);
         assert!(!echoes.is_echo("/a", None), "it was removed here");
         // Values are reported in the order in which they were set.
@@ -82,10 +79,7 @@ mod tests {
         for value in [&one, &three, &three] {
             assert!(echoes.is_echo("/a", Some(value)), "{value:?}");
         }
-        assert!(
-            !echoes.is_echo("/a", Some(&two)),
-            "this end has set it back"
-        );
+        assert!(!echoes.is_echo("/a", Some(&two)), "this end has set it back");
         for number in 0..1000 {
             echoes.expect("/a", &ParamValue::Int(number));
         }

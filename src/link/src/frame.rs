@@ -104,10 +104,7 @@ impl ReceiveProgress {
     }
 
     fn get(bytes: &mut Bytes) -> Self {
-        Self {
-            number: bytes.get_u64_le(),
-            bytes: bytes.get_u64_le(),
-        }
+        Self { number: bytes.get_u64_le(), bytes: bytes.get_u64_le() }
     }
 }
 
@@ -121,12 +118,7 @@ impl Frame {
                 out.put_u8(WHOLE);
                 out.put_u64_le(*number);
             }
-            Frame::Begin {
-                stream,
-                number,
-                total,
-                ..
-            } => {
+            Frame::Begin { stream, number, total, .. } => {
                 out.put_u8(BEGIN);
                 out.put_u32_le(*stream);
                 out.put_u64_le(*number);
@@ -141,12 +133,7 @@ impl Frame {
                 out.put_i64_le(*sent);
                 received.put(&mut out);
             }
-            Frame::Pong {
-                sent,
-                arrived,
-                left,
-                received,
-            } => {
+            Frame::Pong { sent, arrived, left, received } => {
                 out.put_u8(PONG);
                 out.put_i64_le(*sent);
                 out.put_i64_le(*arrived);
@@ -201,24 +188,15 @@ impl Frame {
         bytes.advance(1);
         Ok(match kind {
             OPEN => Frame::Open(bytes),
-            WHOLE => Frame::Whole {
-                number: bytes.get_u64_le(),
-                record: bytes,
-            },
+            WHOLE => Frame::Whole { number: bytes.get_u64_le(), record: bytes },
             BEGIN => Frame::Begin {
                 stream: bytes.get_u32_le(),
                 number: bytes.get_u64_le(),
                 total: bytes.get_u32_le(),
                 bytes,
             },
-            MORE => Frame::More {
-                stream: bytes.get_u32_le(),
-                bytes,
-            },
-            PING => Frame::Ping {
-                sent: bytes.get_i64_le(),
-                received: ReceiveProgress::get(&mut bytes),
-            },
+            MORE => Frame::More { stream: bytes.get_u32_le(), bytes },
+            PING => Frame::Ping { sent: bytes.get_i64_le(), received: ReceiveProgress::get(&mut bytes) },
             PONG => Frame::Pong {
                 sent: bytes.get_i64_le(),
                 arrived: bytes.get_i64_le(),
@@ -226,10 +204,7 @@ impl Frame {
                 received: ReceiveProgress::get(&mut bytes),
             },
             ACK => Frame::Ack(ReceiveProgress::get(&mut bytes)),
-            _ => Frame::Damaged {
-                channel: bytes.get_u32_le(),
-                born: bytes.get_i64_le(),
-            },
+            _ => Frame::Damaged { channel: bytes.get_u32_le(), born: bytes.get_i64_le() },
         })
     }
 }
@@ -240,36 +215,17 @@ mod tests {
 
     #[test]
     fn frames_round_trip() {
-        let received = ReceiveProgress {
-            number: 7,
-            bytes: 1 << 40,
-        };
+        let received = ReceiveProgress { number: 7, bytes: 1 << 40 };
         let bytes = Bytes::from_static(b"abc");
         for frame in [
             Frame::Open(bytes.clone()),
-            Frame::Whole {
-                number: 1,
-                record: bytes.clone(),
-            },
-            Frame::Begin {
-                stream: 2,
-                number: 0,
-                total: 9,
-                bytes: bytes.clone(),
-            },
+            Frame::Whole { number: 1, record: bytes.clone() },
+            Frame::Begin { stream: 2, number: 0, total: 9, bytes: bytes.clone() },
             Frame::More { stream: 2, bytes },
             Frame::Ping { sent: -1, received },
-            Frame::Pong {
-                sent: 1,
-                arrived: 2,
-                left: i64::MAX,
-                received,
-            },
+            Frame::Pong { sent: 1, arrived: 2, left: i64::MAX, received },
             Frame::Ack(received),
-            Frame::Damaged {
-                channel: 3,
-                born: -4,
-            },
+            Frame::Damaged { channel: 3, born: -4 },
         ] {
             assert_eq!(Frame::decode(frame.encode()).unwrap(), frame);
         }
@@ -279,51 +235,23 @@ mod tests {
     #[test]
     fn the_bytes_of_frames_are_those_of_this_version() {
         assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
-        let received = ReceiveProgress {
-            number: 7,
-            bytes: 0x0102_0304_0506_0708,
-        };
+        let received = ReceiveProgress { number: 7, bytes: 0x0102_0304_0506_0708 };
         let bytes = Bytes::from_static(b"abc");
         let pinned = [
             (Frame::Open(bytes.clone()), "00 616263"),
+            (Frame::Whole { number: 1, record: bytes.clone() }, "01 0100000000000000 616263"),
             (
-                Frame::Whole {
-                    number: 1,
-                    record: bytes.clone(),
-                },
-                "01 0100000000000000 616263",
-            ),
-            (
-                Frame::Begin {
-                    stream: 2,
-                    number: 3,
-                    total: 9,
-                    bytes: bytes.clone(),
-                },
+                Frame::Begin { stream: 2, number: 3, total: 9, bytes: bytes.clone() },
                 "02 02000000 0300000000000000 09000000 616263",
             ),
             (Frame::More { stream: 2, bytes }, "03 02000000 616263"),
+            (Frame::Ping { sent: -1, received }, "04 ffffffffffffffff 0700000000000000 0807060504030201"),
             (
-                Frame::Ping { sent: -1, received },
-                "04 ffffffffffffffff 0700000000000000 0807060504030201",
-            ),
-            (
-                Frame::Pong {
-                    sent: 1,
-                    arrived: 2,
-                    left: 3,
-                    received,
-                },
+                Frame::Pong { sent: 1, arrived: 2, left: 3, received },
                 "05 0100000000000000 0200000000000000 0300000000000000 0700000000000000 0807060504030201",
             ),
             (Frame::Ack(received), "06 0700000000000000 0807060504030201"),
-            (
-                Frame::Damaged {
-                    channel: 3,
-                    born: 4,
-                },
-                "07 03000000 0400000000000000",
-            ),
+            (Frame::Damaged { channel: 3, born: 4 }, "07 03000000 0400000000000000"),
         ];
         for (frame, expected) in pinned {
             let encoded = frame.encode();

@@ -62,10 +62,7 @@ impl Incoming {
     }
 
     pub(crate) fn progress(&self) -> ReceiveProgress {
-        ReceiveProgress {
-            number: self.number,
-            bytes: self.bytes,
-        }
+        ReceiveProgress { number: self.number, bytes: self.bytes }
     }
 
     /// Returns the number of incomplete records and the sum of their lengths.
@@ -84,11 +81,7 @@ impl Incoming {
     }
 
     /// Receives a record in one piece. Returns `None` for a duplicate.
-    pub(crate) fn receive_whole(
-        &mut self,
-        number: u64,
-        record: Bytes,
-    ) -> Result<Option<Bytes>, Error> {
+    pub(crate) fn receive_whole(&mut self, number: u64, record: Bytes) -> Result<Option<Bytes>, Error> {
         self.bytes += record.len() as u64;
         Ok(self.note_number(number)?.then_some(record))
     }
@@ -111,11 +104,7 @@ impl Incoming {
         }
         let under_way = self.streams.len();
         if under_way >= limits.under_way {
-            return Err(limit_error(
-                "records under way",
-                under_way,
-                limits.under_way,
-            ));
+            return Err(limit_error("records under way", under_way, limits.under_way));
         }
         if bytes.len() > total || self.streams.contains_key(&stream) {
             return Err(Error::Protocol("a record that begins twice or is too long"));
@@ -125,22 +114,13 @@ impl Incoming {
             let limit = limits.under_way_bytes;
             return Err(limit_error("records under way", self.partial, limit));
         }
-        let partial = Partial {
-            number,
-            total,
-            bytes: BytesMut::new(),
-            permit: self.budget.permit(),
-        };
+        let partial = Partial { number, total, bytes: BytesMut::new(), permit: self.budget.permit() };
         self.streams.insert(stream, partial);
         self.receive_more(stream, bytes)
     }
 
     /// Receives the next piece; returns the record once it is complete.
-    pub(crate) fn receive_more(
-        &mut self,
-        stream: u32,
-        bytes: &[u8],
-    ) -> Result<Option<Bytes>, Error> {
+    pub(crate) fn receive_more(&mut self, stream: u32, bytes: &[u8]) -> Result<Option<Bytes>, Error> {
         let Some(partial) = self.streams.get_mut(&stream) else {
             return Err(Error::Protocol("more of a record that did not begin"));
         };
@@ -164,9 +144,7 @@ impl Incoming {
             return Ok(None);
         };
         self.partial -= whole.total;
-        Ok(self
-            .note_number(whole.number)?
-            .then(|| whole.bytes.freeze()))
+        Ok(self.note_number(whole.number)?.then(|| whole.bytes.freeze()))
     }
 
     /// Records a received number and returns whether it is new.
@@ -189,11 +167,7 @@ impl Incoming {
             return Ok(true);
         }
         if self.ahead.len() >= self.limits.ahead {
-            return Err(limit_error(
-                "numbers ahead",
-                self.ahead.len(),
-                self.limits.ahead,
-            ));
+            return Err(limit_error("numbers ahead", self.ahead.len(), self.limits.ahead));
         }
         self.ahead.insert(number);
         Ok(true)
@@ -201,11 +175,7 @@ impl Incoming {
 }
 
 pub(crate) fn limit_error(what: &'static str, bytes: usize, limit: usize) -> Error {
-    Error::TooMuch {
-        what,
-        bytes: bytes as u64,
-        limit: limit as u64,
-    }
+    Error::TooMuch { what, bytes: bytes as u64, limit: limit as u64 }
 }
 
 #[cfg(test)]
@@ -223,14 +193,9 @@ mod tests {
         }
         assert_eq!(budget.used_bytes(), 2 * READ_AHEAD);
         let more = vec![7; 2 * READ_AHEAD];
-        let refused = incoming
-            .receive_more(0, &more)
-            .and_then(|_| incoming.receive_more(1, &more));
+        let refused = incoming.receive_more(0, &more).and_then(|_| incoming.receive_more(1, &more));
         let refused = refused.expect_err("both cannot grow");
-        assert!(
-            refused.to_string().contains("the memory for servant x"),
-            "{refused}"
-        );
+        assert!(refused.to_string().contains("the memory for servant x"), "{refused}");
         incoming.reconnect(1);
         assert_eq!(budget.used_bytes(), 0);
     }
@@ -239,9 +204,7 @@ mod tests {
     fn a_complete_record_releases_its_budget() {
         let budget = Budget::new("servant x", 3 << 20);
         let mut incoming = Incoming::with_budget(&budget);
-        let begun = incoming
-            .receive_begin(1, 1, 1000, &[7; 400])
-            .expect("there is room");
+        let begun = incoming.receive_begin(1, 1, 1000, &[7; 400]).expect("there is room");
         assert!(begun.is_none() && budget.used_bytes() == 1000);
         let whole = incoming.receive_more(1, &[7; 600]).expect("there is room");
         assert_eq!(whole, Some(vec![7; 1000].into()));

@@ -41,9 +41,7 @@ pub use drops::SkipCounts;
 pub use echoes::Echoes;
 pub use limits::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 pub use outgoing::DeliveryMode;
-pub use session::{
-    CloudSession, DisconnectReason, RobotSession, Session, SessionHandler, SessionOptions,
-};
+pub use session::{CloudSession, DisconnectReason, RobotSession, Session, SessionHandler, SessionOptions};
 
 /// The WebSocket subprotocol of this version. Both ends list those they support, newest first.
 ///

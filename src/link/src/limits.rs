@@ -31,23 +31,13 @@ impl Default for LinkLimits {
     /// Returns the limits of this release, which all earlier releases of this protocol version use without announcing
     /// them.
     fn default() -> Self {
-        Self {
-            record: MAX_RECORD,
-            under_way: 256,
-            under_way_bytes: MAX_RECORD + (64 << 20),
-            ahead: 65_536,
-        }
+        Self { record: MAX_RECORD, under_way: 256, under_way_bytes: MAX_RECORD + (64 << 20), ahead: 65_536 }
     }
 }
 
 impl LinkLimits {
     /// Minimum values below which a peer could send nothing useful.
-    const LEAST: Self = Self {
-        record: MAX_CONTROL,
-        under_way: 8,
-        under_way_bytes: MAX_CONTROL,
-        ahead: 256,
-    };
+    const LEAST: Self = Self { record: MAX_CONTROL, under_way: 8, under_way_bytes: MAX_CONTROL, ahead: 256 };
 
     /// Raises limits announced by a peer to the minimum values.
     pub(crate) fn with_minimums(self) -> Self {
@@ -63,37 +53,19 @@ impl LinkLimits {
 
 /// Control records that are queued, in flight or unacknowledged. If the limit is exceeded, the session is closed. A
 /// single record may have any size.
-pub(crate) const CONTROL: RingBounds = RingBounds {
-    messages: 16_384,
-    bytes: 128 << 20,
-};
+pub(crate) const CONTROL: RingBounds = RingBounds { messages: 16_384, bytes: 128 << 20 };
 /// Limit for calls and goals, as [`CONTROL`]; goals beyond it are dropped and counted.
-pub(crate) const CALLS: RingBounds = RingBounds {
-    messages: 16_384,
-    bytes: 256 << 20,
-};
+pub(crate) const CALLS: RingBounds = RingBounds { messages: 16_384, bytes: 256 << 20 };
 /// Limit for responses, as [`CONTROL`].
 pub(crate) const ANSWERS: RingBounds = CALLS;
 /// Queued lines; the oldest are dropped first.
-pub(crate) const LINES: RingBounds = RingBounds {
-    messages: 4096,
-    bytes: 1 << 20,
-};
+pub(crate) const LINES: RingBounds = RingBounds { messages: 4096, bytes: 1 << 20 };
 /// Messages queued for one topic; the oldest are dropped first.
-pub(crate) const WAITING: RingBounds = RingBounds {
-    messages: 256,
-    bytes: 2 << 20,
-};
+pub(crate) const WAITING: RingBounds = RingBounds { messages: 256, bytes: 2 << 20 };
 /// Limit for a topic on which a big message is queued: only the newest is kept.
-pub(crate) const BIG_WAITING: RingBounds = RingBounds {
-    messages: 1,
-    ..WAITING
-};
+pub(crate) const BIG_WAITING: RingBounds = RingBounds { messages: 1, ..WAITING };
 /// Bytes of messages that must all be delivered (latched messages, messages of actions), over all topics, in addition
 /// to the last one; and of those kept until they are acknowledged.
 pub(crate) const EACH: usize = 64 << 20;
 /// Messages and lines kept for retransmission. Those beyond the limit are not sent again.
-pub(crate) const KEPT: RingBounds = RingBounds {
-    messages: 2048,
-    bytes: 4 << 20,
-};
+pub(crate) const KEPT: RingBounds = RingBounds { messages: 2048, bytes: 4 << 20 };

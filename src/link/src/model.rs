@@ -27,12 +27,7 @@ use crate::outgoing::{DeliveryMode, Outgoing};
 use crate::record::{Data, Record};
 
 /// The lowest limits that an end may announce.
-const LIMITS: LinkLimits = LinkLimits {
-    record: 1 << 20,
-    under_way: 8,
-    under_way_bytes: 1 << 20,
-    ahead: 256,
-};
+const LIMITS: LinkLimits = LinkLimits { record: 1 << 20, under_way: 8, under_way_bytes: 1 << 20, ahead: 256 };
 const CHANNELS: u32 = 12;
 
 /// One end: its state, what it has sent and received, and its frames in flight.
@@ -81,8 +76,7 @@ impl ModelEnd {
 
     fn push(&mut self, step: &ModelStep) {
         match *step {
-            ModelStep::Goal(channel, _) | ModelStep::Publish(channel, ..)
-                if self.gone.contains(&channel) => {}
+            ModelStep::Goal(channel, _) | ModelStep::Publish(channel, ..) if self.gone.contains(&channel) => {}
             ModelStep::Tell(size) => {
                 let record = self.next_control(b'T', 0, size);
                 self.out.push(&record, DeliveryMode::Each);
@@ -90,11 +84,7 @@ impl ModelEnd {
             ModelStep::Call(size) => {
                 self.called += 1;
                 let (id, request) = (self.called, vec![0; size].into());
-                let call = Record::Call {
-                    id,
-                    service: 1,
-                    request,
-                };
+                let call = Record::Call { id, service: 1, request };
                 self.out.push(&call, DeliveryMode::Each);
             }
             ModelStep::Goal(channel, size) => {
@@ -105,11 +95,7 @@ impl ModelEnd {
             }
             ModelStep::Publish(channel, size, each) => {
                 self.open(channel, size);
-                let quality = if each {
-                    DeliveryMode::Each
-                } else {
-                    DeliveryMode::Newest
-                };
+                let quality = if each { DeliveryMode::Each } else { DeliveryMode::Newest };
                 self.out.push(&data(channel, 0, size), quality);
             }
             ModelStep::Close(channel) if self.opened.remove(&channel) => {
@@ -139,12 +125,7 @@ impl ModelEnd {
     fn take(&mut self, frame: Frame) -> TestCaseResult {
         let record = match frame {
             Frame::Whole { number, record } => self.incoming.receive_whole(number, record),
-            Frame::Begin {
-                stream,
-                number,
-                total,
-                bytes,
-            } => self.incoming.receive_begin(stream, number, total, &bytes),
+            Frame::Begin { stream, number, total, bytes } => self.incoming.receive_begin(stream, number, total, &bytes),
             Frame::More { stream, bytes } => self.incoming.receive_more(stream, &bytes),
             Frame::Ack(received) => {
                 self.out.acknowledge(received.number);
@@ -174,19 +155,12 @@ impl ModelEnd {
         match text[0] {
             b'{' => {
                 let text = String::from_utf8_lossy(text);
-                let digits = text
-                    .split('[')
-                    .nth(1)
-                    .and_then(|text| text.split(' ').next());
+                let digits = text.split('[').nth(1).and_then(|text| text.split(' ').next());
                 self.read += digits.unwrap().parse::<u32>().unwrap();
             }
             b'L' => {
                 self.read += 1;
-                prop_assert_eq!(
-                    word(1),
-                    self.read,
-                    "a line before others that were not told of"
-                );
+                prop_assert_eq!(word(1), self.read, "a line before others that were not told of");
             }
             b'C' => prop_assert!(self.known.remove(&word(5)), "closed and not open"),
             kind => {
@@ -265,8 +239,7 @@ enum ModelStep {
 }
 
 fn step() -> impl Strategy<Value = ModelStep> {
-    let size =
-        || prop_oneof![4 => 0usize..2000, 1 => 30_000usize..120_000, 1 => Just(600_000usize)];
+    let size = || prop_oneof![4 => 0usize..2000, 1 => 30_000usize..120_000, 1 => Just(600_000usize)];
     let channel = || 1..CHANNELS;
     prop_oneof![
         4 => size().prop_map(ModelStep::Tell),
@@ -328,11 +301,7 @@ impl LinkModel {
 
     fn take(&mut self, at_robot: bool, step: &ModelStep) -> TestCaseResult {
         let [robot, cloud] = &mut self.0;
-        let (this, other) = if at_robot {
-            (robot, cloud)
-        } else {
-            (cloud, robot)
-        };
+        let (this, other) = if at_robot { (robot, cloud) } else { (cloud, robot) };
         match step {
             ModelStep::Leave(frames) => {
                 let left = std::iter::from_fn(|| this.out.next(0)).take(*frames);
@@ -362,11 +331,7 @@ impl LinkModel {
         self.connect(None);
         while !self.0.iter().all(|end| end.out.is_empty()) {
             for at_robot in [true, false] {
-                for step in [
-                    ModelStep::Leave(50),
-                    ModelStep::Acknowledge,
-                    ModelStep::Come(usize::MAX),
-                ] {
+                for step in [ModelStep::Leave(50), ModelStep::Acknowledge, ModelStep::Come(usize::MAX)] {
                     self.take(at_robot, &step)?;
                 }
             }

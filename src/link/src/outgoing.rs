@@ -156,11 +156,7 @@ impl Outgoing {
         }
         if out.len() > self.peer.record {
             let (bytes, limit) = (out.len(), self.peer.record);
-            tracing::warn!(
-                bytes,
-                limit,
-                "a record is longer than the other end of the link accepts, and was dropped"
-            );
+            tracing::warn!(bytes, limit, "a record is longer than the other end of the link accepts, and was dropped");
             if let Some(channel) = out.channel {
                 self.dropped.add(channel, Cause::Full, 1);
             }
@@ -234,11 +230,7 @@ impl Outgoing {
             return Some(self.start(line, now));
         }
         let is_turn_of_long = self.in_a_row >= SMALL_IN_A_ROW && !self.sending.is_empty();
-        let next = if is_turn_of_long {
-            None
-        } else {
-            self.next_record(now)
-        };
+        let next = if is_turn_of_long { None } else { self.next_record(now) };
         if let Some(out) = next {
             self.in_a_row = self.in_a_row.wrapping_add(1);
             return Some(self.start(out, now));
@@ -263,15 +255,9 @@ impl Outgoing {
 
     fn next_record(&mut self, now: i64) -> Option<OutgoingRecord> {
         let is_turn_of_data = self.in_a_row % TURN_OF_DATA == TURN_OF_DATA - 1;
-        let data = if is_turn_of_data {
-            self.next_data(now)
-        } else {
-            None
-        };
+        let data = if is_turn_of_data { self.next_data(now) } else { None };
         let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
-        let place = data
-            .is_none()
-            .then(|| self.lanes.first_ready(|out| gate.allows(out)));
+        let place = data.is_none().then(|| self.lanes.first_ready(|out| gate.allows(out)));
         let required = place.flatten().and_then(|lane| self.lanes.take(lane));
         data.or(required).or_else(|| self.next_data(now))
     }
@@ -306,19 +292,8 @@ impl Outgoing {
         self.count_sent(out.lane, bytes.len());
         let total = u32::try_from(length).unwrap_or(u32::MAX);
         let at = bytes.len();
-        self.sending.push_back(InFlightRecord {
-            stream,
-            number,
-            again,
-            at,
-            out,
-        });
-        Frame::Begin {
-            stream,
-            number,
-            total,
-            bytes,
-        }
+        self.sending.push_back(InFlightRecord { stream, number, again, at, out });
+        Frame::Begin { stream, number, total, bytes }
     }
 
     fn count_sent(&mut self, lane: RecordLane, bytes: usize) {
@@ -338,8 +313,7 @@ impl Outgoing {
             self.sending.push_back(sending);
         } else {
             self.end_turn(&sending.out);
-            self.retransmit
-                .add(sending.number, sending.again, sending.out);
+            self.retransmit.add(sending.number, sending.again, sending.out);
         }
         Some(Frame::More { stream, bytes })
     }

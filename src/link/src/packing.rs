@@ -8,10 +8,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use codec::{
-    Codec, CodecPolicy, JpegOptions, LossyCodec, Receiver, ReceiverFeedback, Schema, Sender,
-    VideoOptions,
-};
+use codec::{Codec, CodecPolicy, JpegOptions, LossyCodec, Receiver, ReceiverFeedback, Schema, Sender, VideoOptions};
 
 use crate::MAX_RECORD;
 
@@ -23,14 +20,7 @@ const MAX_TOPICS: usize = 1024;
 /// allowed.
 const SHARE_OF_T_MAX: u32 = 4;
 /// Codecs used for lossless encoding.
-const LOSSLESS: [Codec; 6] = [
-    Codec::Raw,
-    Codec::Zstd(3),
-    Codec::Image,
-    Codec::Grid,
-    Codec::Scan,
-    Codec::Cloud,
-];
+const LOSSLESS: [Codec; 6] = [Codec::Raw, Codec::Zstd(3), Codec::Image, Codec::Grid, Codec::Scan, Codec::Cloud];
 
 /// Codecs that lose detail of images.
 const LOSSY: [Codec; 2] = [Codec::Jpeg, Codec::Video];
@@ -39,9 +29,7 @@ const LOSSY: [Codec; 2] = [Codec::Jpeg, Codec::Video];
 /// `welcome` returns true.
 pub fn supported_codecs(welcome: impl Fn(Codec) -> bool) -> Vec<String> {
     // A decoder is built together with its encoder.
-    let lossy = LOSSY
-        .into_iter()
-        .filter(|codec| codec.is_available() && welcome(*codec));
+    let lossy = LOSSY.into_iter().filter(|codec| codec.is_available() && welcome(*codec));
     let all = LOSSLESS.into_iter().chain(lossy);
     all.map(|codec| codec.name().to_owned()).collect()
 }
@@ -77,14 +65,8 @@ impl EncodeJob {
     pub(crate) fn run(mut self) -> EncodedMessage {
         let begun = Instant::now();
         let mut frame = Vec::new();
-        self.sender
-            .encode(&self.message, || begun.elapsed(), &mut frame);
-        EncodedMessage {
-            channel: self.channel,
-            sender: self.sender,
-            frame: frame.into(),
-            took: begun.elapsed(),
-        }
+        self.sender.encode(&self.message, || begun.elapsed(), &mut frame);
+        EncodedMessage { channel: self.channel, sender: self.sender, frame: frame.into(), took: begun.elapsed() }
     }
 }
 
@@ -102,10 +84,7 @@ pub(crate) struct SessionCodecs {
 impl SessionCodecs {
     /// Creates the codecs for a link with this maximum response time.
     pub(crate) fn new(t_max: Option<Duration>) -> Self {
-        Self {
-            deadline: t_max.map(|t_max| t_max / SHARE_OF_T_MAX),
-            ..Self::default()
-        }
+        Self { deadline: t_max.map(|t_max| t_max / SHARE_OF_T_MAX), ..Self::default() }
     }
 
     /// Sets the quality of JPEG images, 1 to 100 (default: 80).
@@ -122,12 +101,7 @@ impl SessionCodecs {
 
     /// Adds an outgoing topic with messages of this schema.
     pub(crate) fn add(&mut self, channel: u32, schema: Schema) {
-        let lane = TopicEncoder {
-            schema,
-            sender: None,
-            answers: Vec::new(),
-            begin_anew: false,
-        };
+        let lane = TopicEncoder { schema, sender: None, answers: Vec::new(), begin_anew: false };
         self.lanes.insert(channel, lane);
     }
 
@@ -159,10 +133,7 @@ impl SessionCodecs {
             _ => CodecPolicy::Lossless,
         };
         let (schema, deadline) = (lane.schema, self.deadline);
-        let mut sender = lane
-            .sender
-            .take()
-            .unwrap_or_else(|| Sender::new(schema, policy).with_deadline(deadline));
+        let mut sender = lane.sender.take().unwrap_or_else(|| Sender::new(schema, policy).with_deadline(deadline));
         if std::mem::take(&mut lane.begin_anew) {
             sender.on_reconnect();
         }
@@ -173,16 +144,9 @@ impl SessionCodecs {
             sender.on_feedback(ReceiverFeedback::Keyframe);
         }
         if let Some(rate) = throughput {
-            sender.record_transfer(
-                1 << 20,
-                Duration::from_secs_f64(f64::from(1 << 20) / rate.max(1.0)),
-            );
+            sender.record_transfer(1 << 20, Duration::from_secs_f64(f64::from(1 << 20) / rate.max(1.0)));
         }
-        Some(EncodeJob {
-            channel,
-            sender,
-            message,
-        })
+        Some(EncodeJob { channel, sender, message })
     }
 
     /// Returns the encoder to its topic and the frame to the caller.
@@ -218,10 +182,7 @@ impl SessionCodecs {
         if self.receivers.len() >= MAX_TOPICS && !self.receivers.contains_key(&channel) {
             self.receivers.clear();
         }
-        let receiver = self
-            .receivers
-            .entry(channel)
-            .or_insert_with(|| Receiver::new(MAX_RECORD));
+        let receiver = self.receivers.entry(channel).or_insert_with(|| Receiver::new(MAX_RECORD));
         let mut message = Vec::new();
         let (decoded, answer) = receiver.decode(frame, &mut message);
         (decoded.map(|_| message.into()), answer)

@@ -126,26 +126,8 @@ impl Record {
                 None => return Ok(None),
             },
             Record::Data(data) => Record::Data(data),
-            Record::Call {
-                id,
-                service,
-                request,
-            } => Record::Call {
-                id,
-                service,
-                request,
-            },
-            Record::Answer {
-                id,
-                taken,
-                given,
-                response,
-            } => Record::Answer {
-                id,
-                taken,
-                given,
-                response,
-            },
+            Record::Call { id, service, request } => Record::Call { id, service, request },
+            Record::Answer { id, taken, given, response } => Record::Answer { id, taken, given, response },
         }))
     }
 
@@ -176,22 +158,13 @@ impl Record {
                 }
                 data.message.clone()
             }
-            Record::Call {
-                id,
-                service,
-                request,
-            } => {
+            Record::Call { id, service, request } => {
                 head.put_u8(CALL);
                 head.put_u32_le(*id);
                 head.put_u32_le(*service);
                 request.clone()
             }
-            Record::Answer {
-                id,
-                taken,
-                given,
-                response,
-            } => {
+            Record::Answer { id, taken, given, response } => {
                 head.put_u8(ANSWER);
                 head.put_u32_le(*id);
                 head.put_u8(u8::from(response.is_ok()));
@@ -247,11 +220,7 @@ impl Record {
                     message: bytes,
                 })
             }
-            CALL => Record::Call {
-                id: bytes.get_u32_le(),
-                service: bytes.get_u32_le(),
-                request: bytes,
-            },
+            CALL => Record::Call { id: bytes.get_u32_le(), service: bytes.get_u32_le(), request: bytes },
             _ => {
                 let id = bytes.get_u32_le();
                 let ok = bytes.get_u8() != 0;
@@ -259,11 +228,7 @@ impl Record {
                     id,
                     taken: bytes.get_i64_le(),
                     given: bytes.get_i64_le(),
-                    response: if ok {
-                        Ok(bytes)
-                    } else {
-                        Err(FailureReason::new(String::from_utf8_lossy(&bytes)))
-                    },
+                    response: if ok { Ok(bytes) } else { Err(FailureReason::new(String::from_utf8_lossy(&bytes))) },
                 }
             }
         })
@@ -295,48 +260,21 @@ mod tests {
         let answered = Data {
             encoded: false,
             latching: true,
-            answered: Some(InputTiming {
-                born: 1,
-                serialise: 2,
-                left: 3,
-                taken: 4,
-                given: 5,
-            }),
+            answered: Some(InputTiming { born: 1, serialise: 2, left: 3, taken: 4, given: 5 }),
             ..data.clone()
         };
-        let answer = |response| Record::Answer {
-            id: 6,
-            taken: 7,
-            given: 8,
-            response,
-        };
+        let answer = |response| Record::Answer { id: 6, taken: 7, given: 8, response };
         let pinned = [
             (Record::Control(Bytes::from_static(b"{}")), "007b7d"),
-            (
-                Record::Data(data),
-                "01 04030201 01 1817161514131211 feffffffffffffff 24232221 6d7367",
-            ),
+            (Record::Data(data), "01 04030201 01 1817161514131211 feffffffffffffff 24232221 6d7367"),
             (
                 Record::Data(answered),
                 "01 04030201 06 1817161514131211 feffffffffffffff 24232221 0100000000000000 02000000 0300000000000000 \
                  0400000000000000 0500000000000000 6d7367",
             ),
-            (
-                Record::Call {
-                    id: 9,
-                    service: 10,
-                    request: Bytes::from_static(b"ask"),
-                },
-                "02 09000000 0a000000 61736b",
-            ),
-            (
-                answer(Ok(Bytes::from_static(b"yes"))),
-                "03 06000000 01 0700000000000000 0800000000000000 796573",
-            ),
-            (
-                answer(Err(FailureReason::new("no"))),
-                "03 06000000 00 0700000000000000 0800000000000000 6e6f",
-            ),
+            (Record::Call { id: 9, service: 10, request: Bytes::from_static(b"ask") }, "02 09000000 0a000000 61736b"),
+            (answer(Ok(Bytes::from_static(b"yes"))), "03 06000000 01 0700000000000000 0800000000000000 796573"),
+            (answer(Err(FailureReason::new("no"))), "03 06000000 00 0700000000000000 0800000000000000 6e6f"),
         ];
         for (record, expected) in pinned {
             let (mut head, payload) = record.to_parts();
@@ -361,36 +299,16 @@ mod tests {
         let answered = Data {
             encoded: false,
             latching: true,
-            answered: Some(InputTiming {
-                born: 1,
-                serialise: 4,
-                left: 5,
-                taken: 2,
-                given: 3,
-            }),
+            answered: Some(InputTiming { born: 1, serialise: 4, left: 5, taken: 2, given: 3 }),
             ..data.clone()
         };
         for record in [
             Record::Control(Bytes::from_static(b"{}")),
             Record::Data(data),
             Record::Data(answered),
-            Record::Call {
-                id: 1,
-                service: 2,
-                request: Bytes::new(),
-            },
-            Record::Answer {
-                id: 1,
-                taken: 2,
-                given: 3,
-                response: Ok(Bytes::from_static(b"x")),
-            },
-            Record::Answer {
-                id: 1,
-                taken: 2,
-                given: 3,
-                response: Err(FailureReason::new("no")),
-            },
+            Record::Call { id: 1, service: 2, request: Bytes::new() },
+            Record::Answer { id: 1, taken: 2, given: 3, response: Ok(Bytes::from_static(b"x")) },
+            Record::Answer { id: 1, taken: 2, given: 3, response: Err(FailureReason::new("no")) },
         ] {
             let (mut head, payload) = record.to_parts();
             head.extend_from_slice(&payload);

@@ -104,12 +104,8 @@ impl DisconnectReason {
     /// Returns the WebSocket close code and reason to send to the peer, if the connection still works.
     pub fn close_frame(&self) -> Option<(u16, String)> {
         match self {
-            DisconnectReason::Protocol(Error::Refused { code, reason }) => {
-                Some((*code, reason.clone()))
-            }
-            DisconnectReason::Protocol(error @ Error::Exceeded(_)) => {
-                Some((1013, error.to_string()))
-            }
+            DisconnectReason::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
+            DisconnectReason::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
             DisconnectReason::Protocol(error) => Some((1002, error.to_string())),
             DisconnectReason::Full(_) => Some((1013, self.to_string())),
             _ => None,
@@ -196,9 +192,7 @@ impl State {
 impl<O: ControlMessage> Session<O> {
     /// Creates a session without a connection.
     pub fn new(options: SessionOptions) -> Self {
-        let age = options
-            .max_age
-            .map(|age| i64::try_from(age.as_nanos()).unwrap_or(i64::MAX));
+        let age = options.max_age.map(|age| i64::try_from(age.as_nanos()).unwrap_or(i64::MAX));
         let packing = SessionCodecs::new(options.max_age);
         Self {
             options,
@@ -276,10 +270,7 @@ impl<O: ControlMessage> Session<O> {
     pub fn skip_counts(&self) -> SkipCounts {
         let state = self.state.lock();
         let of = |cause| state.out.dropped.count_for(cause) + state.dropped.count_for(cause);
-        SkipCounts {
-            replaced: of(Cause::Replaced),
-            stale: of(Cause::Stale),
-        }
+        SkipCounts { replaced: of(Cause::Replaced), stale: of(Cause::Stale) }
     }
 
     /// Returns the numbers of messages that did not reach the peer.
@@ -330,11 +321,7 @@ impl<O: ControlMessage> Session<O> {
     /// Calls a service. The response arrives as a record with the returned id.
     pub fn call(&self, service: u32, request: Bytes) -> u32 {
         let id = self.next_call.fetch_add(1, Ordering::Relaxed);
-        let call = Record::Call {
-            id,
-            service,
-            request,
-        };
+        let call = Record::Call { id, service, request };
         self.push(&call, DeliveryMode::Each);
         id
     }
@@ -347,12 +334,7 @@ impl<O: ControlMessage> Session<O> {
                 "the response has {bytes} bytes, more than a link carries ({MAX_RESPONSE})"
             ))),
         });
-        let answer = Record::Answer {
-            id,
-            taken,
-            given: now(),
-            response,
-        };
+        let answer = Record::Answer { id, taken, given: now(), response };
         self.push(&answer, DeliveryMode::Each);
     }
 
@@ -403,11 +385,7 @@ impl<O: ControlMessage> Session<O> {
 
     /// Closes the session once everything queued was sent, or the peer has received nothing for two seconds.
     pub fn close(&self, code: u16, reason: &str) {
-        self.state.lock().ending = Some(RequestedClose {
-            code,
-            reason: reason.to_owned(),
-            at: Instant::now(),
-        });
+        self.state.lock().ending = Some(RequestedClose { code, reason: reason.to_owned(), at: Instant::now() });
         self.wake.notify_one();
     }
 
@@ -439,12 +417,8 @@ impl<O: ControlMessage> Session<O> {
         let mut state = self.state.lock();
         state.out.acknowledge(received.number);
         state.forget_closed();
-        let counters = Counters {
-            at: Instant::now(),
-            bytes: received.bytes,
-            sent: state.out.sent,
-            idle: state.out.is_idle(),
-        };
+        let counters =
+            Counters { at: Instant::now(), bytes: received.bytes, sent: state.out.sent, idle: state.out.is_idle() };
         if let Some(rate) = state.throughput.update(counters) {
             state.out.set_throughput(rate);
             let pays = state.packing.is_worthwhile(Some(rate));
@@ -459,13 +433,7 @@ fn control_record(told: &impl Serialize) -> Option<Record> {
     let (bytes, limit) = (json.len(), control::max_control_length(&json));
     let (weight, room) = (JsonWeight::estimate(&json).bytes, MAX_TOLD);
     if bytes > limit || weight > room {
-        tracing::warn!(
-            bytes,
-            limit,
-            weight,
-            room,
-            "a message is too long for the link and was not sent"
-        );
+        tracing::warn!(bytes, limit, weight, room, "a message is too long for the link and was not sent");
         return None;
     }
     Some(Record::Control(json.into()))
@@ -476,9 +444,7 @@ impl Session<FromRobot> {
     pub fn close_channel(&self, channel: u32) {
         let json = serde_json::to_vec(&FromRobot::Close { channel }).unwrap_or_default();
         let mut state = self.state.lock();
-        state
-            .out
-            .close_channel(channel, &Record::Control(json.into()));
+        state.out.close_channel(channel, &Record::Control(json.into()));
         drop(state);
         self.wake.notify_one();
     }

@@ -88,10 +88,7 @@ impl Skew {
             let Some(stamp) = stamps.read(&message, at) else {
                 continue;
             };
-            let changed = there
-                .get(stamp)
-                .or_else(|| shift_stamp(stamp, change))
-                .unwrap_or(stamp);
+            let changed = there.get(stamp).or_else(|| shift_stamp(stamp, change)).unwrap_or(stamp);
             if changed != stamp {
                 back.insert(changed, stamp);
                 stamps.write(&mut message, at, changed);
@@ -111,10 +108,7 @@ fn shift_stamp(stamp: Time, by: i64) -> Option<Time> {
     if total <= 0 {
         return None;
     }
-    Some(Time {
-        secs: u32::try_from(total / SECOND).ok()?,
-        nsecs: u32::try_from(total % SECOND).ok()?,
-    })
+    Some(Time { secs: u32::try_from(total / SECOND).ok()?, nsecs: u32::try_from(total % SECOND).ok()? })
 }
 
 /// The most recent conversions.

@@ -31,9 +31,7 @@ impl Serialize for JsonParam<'_> {
             ParamValue::String(text) => serializer.serialize_str(text),
             // Stubs omit such values and log that.
             ParamValue::Nil => serializer.serialize_str(""),
-            ParamValue::Binary(bytes) => {
-                serializer.collect_map([(BYTES, STANDARD.encode_to_string(bytes))])
-            }
+            ParamValue::Binary(bytes) => serializer.collect_map([(BYTES, STANDARD.encode_to_string(bytes))]),
             ParamValue::List(items) => serializer.collect_seq(items.iter().map(JsonParam)),
             ParamValue::Map(members) => {
                 serializer.collect_map(members.iter().map(|(name, value)| (name, JsonParam(value))))
@@ -62,9 +60,7 @@ fn parse_special(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
     match name.as_str() {
         _ if members.len() > 1 => None,
         DOUBLE => Some(ParamValue::Double(text.parse().unwrap_or(f64::NAN))),
-        BYTES => Some(ParamValue::Binary(
-            STANDARD.decode_to_vec(text).unwrap_or_default(),
-        )),
+        BYTES => Some(ParamValue::Binary(STANDARD.decode_to_vec(text).unwrap_or_default())),
         _ => None,
     }
 }
@@ -109,8 +105,7 @@ pub(crate) mod changes {
     pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<Vec<(String, Option<ParamValue>)>, D::Error> {
-        let mut changes =
-            bounded::list::<_, (String, Option<ParamValue>), MOST_CHANGES>(deserializer)?;
+        let mut changes = bounded::list::<_, (String, Option<ParamValue>), MOST_CHANGES>(deserializer)?;
         let values = changes.iter_mut().filter_map(|(_, value)| value.as_mut());
         values.for_each(decode_special_values);
         Ok(changes)
@@ -136,23 +131,11 @@ mod tests {
             ]
             .into(),
         );
-        let hello = Hello {
-            parameters: [("scan".to_owned(), map.clone())].into(),
-            ..Hello::default()
-        };
+        let hello = Hello { parameters: [("scan".to_owned(), map.clone())].into(), ..Hello::default() };
         let text = serde_json::to_string(&hello).unwrap();
-        assert_eq!(
-            serde_json::from_str::<Hello>(&text).unwrap(),
-            hello,
-            "{text}"
-        );
-        let changed =
-            FromRobot::Parameters(vec![("/scan".into(), Some(map)), ("/gone".into(), None)]);
+        assert_eq!(serde_json::from_str::<Hello>(&text).unwrap(), hello, "{text}");
+        let changed = FromRobot::Parameters(vec![("/scan".into(), Some(map)), ("/gone".into(), None)]);
         let text = serde_json::to_string(&changed).unwrap();
-        assert_eq!(
-            serde_json::from_str::<FromRobot>(&text).unwrap(),
-            changed,
-            "{text}"
-        );
+        assert_eq!(serde_json::from_str::<FromRobot>(&text).unwrap(), changed, "{text}");
     }
 }

@@ -10,9 +10,7 @@ use budget::Permit;
 use bytes::Bytes;
 use link::control::{FromCloud, FromRobot};
 use link::record::{Data, Record};
-use link::{
-    CloudSession, DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions,
-};
+use link::{CloudSession, DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream, duplex, split};
 use tokio::time::{interval, sleep, timeout};
 use ws::WebSocket;
@@ -89,10 +87,7 @@ impl SessionHandler<FromCloud> for RobotEnd {
 }
 
 /// Carries bytes one way, [`SLICE`] at a time.
-async fn carry_slowly(
-    mut from: tokio::io::ReadHalf<DuplexStream>,
-    mut to: tokio::io::WriteHalf<DuplexStream>,
-) {
+async fn carry_slowly(mut from: tokio::io::ReadHalf<DuplexStream>, mut to: tokio::io::WriteHalf<DuplexStream>) {
     let mut slice = [0; SLICE];
     let mut clock = interval(SLICE_TIME);
     while let Ok(read @ 1..) = from.read(&mut slice).await {
@@ -104,12 +99,7 @@ async fn carry_slowly(
 }
 
 /// Lets both ends exchange what they have for `time` over one connection.
-async fn connect(
-    robot: &RobotSession,
-    cloud: &Arc<CloudSession>,
-    heard: &RobotEnd,
-    time: Duration,
-) {
+async fn connect(robot: &RobotSession, cloud: &Arc<CloudSession>, heard: &RobotEnd, time: Duration) {
     let (robot_has, robot_ahead, robot_next) = robot.position();
     let (cloud_has, cloud_ahead, cloud_next) = cloud.position();
     robot.reconnect(cloud_has, &cloud_ahead, cloud_next);
@@ -158,10 +148,7 @@ async fn an_hour_of_a_camera_leaves_no_memory_behind() {
             loop {
                 clock.tick().await;
                 node.publish(message(ANSWERS, COMMAND), DeliveryMode::Newest);
-                node.send_control(&FromCloud::Line {
-                    error: false,
-                    text: "a line of a node".to_owned(),
-                });
+                node.send_control(&FromCloud::Line { error: false, text: "a line of a node".to_owned() });
             }
         }),
     ];
@@ -175,10 +162,7 @@ async fn an_hour_of_a_camera_leaves_no_memory_behind() {
     sources.iter().for_each(tokio::task::JoinHandle::abort);
     let most = |minutes: &[usize]| minutes.iter().copied().max().unwrap_or_default();
     let (earlier, later) = (most(&held[10..30]), most(&held[30..]));
-    assert!(
-        later <= earlier + FLUCTUATION,
-        "bytes held after each minute: {held:?}"
-    );
+    assert!(later <= earlier + FLUCTUATION, "bytes held after each minute: {held:?}");
     // Every call was answered, most commands and lines arrived.
     let heard = heard.0.load(Ordering::Relaxed);
     assert!(heard > 60 * 57 * 20, "{heard} records arrived at the robot");

@@ -66,10 +66,7 @@ struct RecordedTopic {
 impl BlackBox {
     /// Starts recording the servant's topics.
     pub fn start(seen: ObservedServant, options: BlackBoxSettings) -> Self {
-        let ring = Ring::new(RetentionBounds {
-            span: options.span,
-            bytes: options.bytes,
-        });
+        let ring = Ring::new(RetentionBounds { span: options.span, bytes: options.bytes });
         let inner = Arc::new(BlackBoxRecorder {
             format: match seen.bus.version() {
                 RosVersion::One => RecordingFormat::Ros1,
@@ -80,10 +77,7 @@ impl BlackBox {
             ring: Mutex::new(ring),
         });
         let observer = Arc::clone(&inner);
-        Self {
-            inner,
-            _followed: spawn_observer(seen, observer),
-        }
+        Self { inner, _followed: spawn_observer(seen, observer) }
     }
 
     /// Returns the format in which this box's messages are written.
@@ -94,8 +88,7 @@ impl BlackBox {
     /// Drops messages that have expired, even when no new ones arrive.
     pub fn evict(&self) {
         self.inner.ring.lock().evict(now());
-        self.inner
-            .forget_ended_topics(&mut self.inner.topics.lock());
+        self.inner.forget_ended_topics(&mut self.inner.topics.lock());
     }
 
     /// Writes the buffered messages to a file of this box's [`format`](Self::format). Blocks.
@@ -107,9 +100,7 @@ impl BlackBox {
             let mut topics = self.inner.topics.lock();
             let mut ring = self.inner.ring.lock();
             let (before, kept) = ring.snapshot(now());
-            let topics = topics
-                .iter_mut()
-                .map(|(number, topic)| (number, (topic.name.clone(), Arc::clone(&topic.of))));
+            let topics = topics.iter_mut().map(|(number, topic)| (number, (topic.name.clone(), Arc::clone(&topic.of))));
             let topics: HashMap<u32, _> = topics.collect();
             (topics, before, kept, ring.left_out)
         };
@@ -167,12 +158,7 @@ impl Observer for BlackBoxRecorder {
         }
         let size = of.definition.len() + of.name.len() + topic.len() + EACH;
         let counted = self.options.budget.take(size).ok()?;
-        topics.add(RecordedTopic {
-            name: topic.to_owned(),
-            of: Arc::new(of),
-            ended: false,
-            _counted: counted,
-        })
+        topics.add(RecordedTopic { name: topic.to_owned(), of: Arc::new(of), ended: false, _counted: counted })
     }
 
     fn on_message(&self, topic: u32, message: SerializedMessage) {
@@ -183,11 +169,7 @@ impl Observer for BlackBoxRecorder {
             ring.left_out += 1;
             return;
         };
-        let kept = StoredMessage {
-            topic,
-            time: now(),
-            bytes: permit.wrap_bytes(message.bytes),
-        };
+        let kept = StoredMessage { topic, time: now(), bytes: permit.wrap_bytes(message.bytes) };
         ring.push(kept, latched_by);
     }
 
@@ -211,10 +193,7 @@ mod tests {
     use crate::numbered::MOST;
 
     fn inner(budget: &Budget) -> BlackBoxRecorder {
-        let bounds = RetentionBounds {
-            span: Duration::from_secs(3600),
-            bytes: 1 << 20,
-        };
+        let bounds = RetentionBounds { span: Duration::from_secs(3600), bytes: 1 << 20 };
         BlackBoxRecorder {
             format: RecordingFormat::Ros1,
             options: BlackBoxSettings {
@@ -260,10 +239,7 @@ mod tests {
         inner.on_topic_ended("/kept");
         for number in 0..3 * MOST {
             let topic = format!("/topic{number}");
-            assert!(
-                inner.on_topic_started(&topic, of.clone()).is_some(),
-                "{topic}"
-            );
+            assert!(inner.on_topic_started(&topic, of.clone()).is_some(), "{topic}");
             inner.on_topic_ended(&topic);
         }
         let mut topics = inner.topics.lock();
@@ -273,12 +249,8 @@ mod tests {
         assert_eq!(inner.on_topic_started("/kept", of), Some(kept), "as before");
         // The number of simultaneous topics is bounded.
         for number in 0..MOST {
-            let _ =
-                inner.on_topic_started(&format!("/at/once{number}"), WireType::new("a/B", "", ""));
+            let _ = inner.on_topic_started(&format!("/at/once{number}"), WireType::new("a/B", "", ""));
         }
-        assert_eq!(
-            inner.on_topic_started("/more", WireType::new("a/B", "", "")),
-            None
-        );
+        assert_eq!(inner.on_topic_started("/more", WireType::new("a/B", "", "")), None);
     }
 }

@@ -59,11 +59,7 @@ impl Figures {
     pub fn start(seen: ObservedServant) -> Self {
         let counts = Arc::<TopicCounters>::default();
         let observer = Arc::clone(&counts);
-        Self {
-            counts,
-            since: Mutex::new(Instant::now()),
-            _followed: spawn_observer(seen, observer),
-        }
+        Self { counts, since: Mutex::new(Instant::now()), _followed: spawn_observer(seen, observer) }
     }
 
     /// Returns the statistics since they were last taken, sorted by topic, and the length of that period.
@@ -76,9 +72,7 @@ impl Figures {
 impl TopicCounters {
     fn take(&self) -> Vec<TopicFigures> {
         let mut all = self.all.lock();
-        let counted = all
-            .iter_mut()
-            .filter(|(_, count)| count.published || count.messages > 0);
+        let counted = all.iter_mut().filter(|(_, count)| count.published || count.messages > 0);
         let mut taken: Vec<TopicFigures> = counted.map(|(_, count)| count.take()).collect();
         all.retain(|_, count| count.published);
         taken.sort_by(|a, b| a.topic.cmp(&b.topic));
@@ -140,9 +134,7 @@ impl Observer for TopicCounters {
             && !message.latching
             && count.ages.len() < MOST_AGES
             && let Some(stamp) = read_header_stamp(&message.bytes)
-            && let Some(age) = i64::try_from(now())
-                .ok()
-                .and_then(|now| now.checked_sub(stamp))
+            && let Some(age) = i64::try_from(now()).ok().and_then(|now| now.checked_sub(stamp))
             && AGES.contains(&age)
         {
             count.ages.push(age);
@@ -184,9 +176,7 @@ mod tests {
 
     #[test]
     fn messages_that_begin_with_a_header_have_a_stamp() {
-        assert!(has_header(
-            "# A picture\n\nuint8 X=1\nHeader header # when\nuint32 height\n"
-        ));
+        assert!(has_header("# A picture\n\nuint8 X=1\nHeader header # when\nuint32 height\n"));
         assert!(has_header("std_msgs/Header header"));
         assert!(!has_header("string data\nHeader header"));
         assert!(!has_header(""));
@@ -215,10 +205,7 @@ mod tests {
         // Topics that come and go are bounded, too.
         for number in 0..2 * MOST {
             let topic = format!("/topic{number}");
-            assert!(
-                counts.on_topic_started(&topic, of.clone()).is_some(),
-                "{topic}"
-            );
+            assert!(counts.on_topic_started(&topic, of.clone()).is_some(), "{topic}");
             counts.on_topic_ended(&topic);
         }
         let taken = counts.take();

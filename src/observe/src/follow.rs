@@ -48,11 +48,7 @@ impl Drop for ObserverTask {
 /// Subscribes `observer` to what is published on a servant's bus.
 pub(crate) fn spawn_observer(seen: ObservedServant, observer: Arc<dyn Observer>) -> ObserverTask {
     let task = tokio::spawn(async move {
-        let ObservedServant {
-            bus,
-            registry,
-            held,
-        } = seen;
+        let ObservedServant { bus, registry, held } = seen;
         follow_graph(&bus, &registry, &observer).await;
         drop(held);
     });
@@ -118,11 +114,7 @@ async fn forward_messages(
         return;
     };
     // The subscription lasts until this guard is dropped.
-    let Subscription {
-        mut messages,
-        guard: _guard,
-        ..
-    } = subscription;
+    let Subscription { mut messages, guard: _guard, .. } = subscription;
     while let Some(message) = messages.recv().await {
         observer.on_message(topic, message);
     }
@@ -137,7 +129,5 @@ fn is_published(graph: &Graph, own: &str, topic: &str) -> bool {
 /// Returns the time in nanoseconds since 1970.
 pub(crate) fn now() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    now.map_or(0, |since| {
-        u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
-    })
+    now.map_or(0, |since| u64::try_from(since.as_nanos()).unwrap_or(u64::MAX))
 }

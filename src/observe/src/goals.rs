@@ -88,10 +88,7 @@ impl GoalMonitor {
             ended: watch::Sender::new(0),
         });
         let observer = Arc::clone(&heard);
-        Self {
-            heard,
-            _followed: spawn_observer(seen, observer),
-        }
+        Self { heard, _followed: spawn_observer(seen, observer) }
     }
 
     /// Returns the remembered goals, newest first.
@@ -157,14 +154,9 @@ impl Observer for GoalLog {
 
 impl GoalLog {
     fn ended_after(&self, number: u64) -> Vec<ObservedGoal> {
-        let number_of =
-            |goal: &ObservedGoal| goal.ended.as_ref().map_or(0, |(_, outcome)| outcome.number);
+        let number_of = |goal: &ObservedGoal| goal.ended.as_ref().map_or(0, |(_, outcome)| outcome.number);
         let all = self.all.lock();
-        let mut ended: Vec<ObservedGoal> = all
-            .iter()
-            .filter(|goal| number_of(goal) > number)
-            .cloned()
-            .collect();
+        let mut ended: Vec<ObservedGoal> = all.iter().filter(|goal| number_of(goal) > number).cloned().collect();
         drop(all);
         ended.sort_by_key(number_of);
         ended
@@ -173,31 +165,15 @@ impl GoalLog {
     fn record_goal(&self, action: String, bytes: &Bytes, client: &str) -> Option<()> {
         let (goal, _) = messages::read_goal(bytes)?;
         let id = truncate(&goal.id);
-        let sender = if client == self.own {
-            GoalSender::Inside
-        } else {
-            GoalSender::Node(client.to_owned())
-        };
+        let sender = if client == self.own { GoalSender::Inside } else { GoalSender::Node(client.to_owned()) };
         let mut all = self.all.lock();
         // The result may arrive first, because both come over separate connections.
-        let known = all
-            .iter_mut()
-            .rev()
-            .find(|goal| goal.id == id && goal.action == action);
+        let known = all.iter_mut().rev().find(|goal| goal.id == id && goal.action == action);
         match known {
             // The first observed sender counts; the id decides only if none was observed.
             Some(goal) if matches!(goal.sender, GoalSender::Node(_)) => {}
             Some(goal) => goal.sender = sender,
-            None => remember(
-                &mut all,
-                ObservedGoal {
-                    action,
-                    id,
-                    sender,
-                    began: now(),
-                    ended: None,
-                },
-            ),
+            None => remember(&mut all, ObservedGoal { action, id, sender, began: now(), ended: None }),
         }
         Some(())
     }
@@ -208,36 +184,17 @@ impl GoalLog {
         let mut all = self.all.lock();
         let time = now();
         let number = *self.ended.borrow() + 1;
-        let outcome = ObservedOutcome {
-            status: state.status,
-            text: truncate(&state.text),
-            number,
-        };
+        let outcome = ObservedOutcome { status: state.status, text: truncate(&state.text), number };
         let ended = Some((time, outcome));
-        let open = all
-            .iter_mut()
-            .rev()
-            .find(|goal| goal.id == id && goal.action == action);
+        let open = all.iter_mut().rev().find(|goal| goal.id == id && goal.action == action);
         match open {
             // A latched result arrives again with each connection.
             Some(goal) if goal.ended.is_some() => return None,
             Some(goal) => goal.ended = ended,
             None => {
-                let sender = if is_id_of_node(&state.goal.id, &self.own) {
-                    GoalSender::Inside
-                } else {
-                    GoalSender::Unheard
-                };
-                remember(
-                    &mut all,
-                    ObservedGoal {
-                        action: action.to_owned(),
-                        id,
-                        sender,
-                        began: time,
-                        ended,
-                    },
-                );
+                let sender =
+                    if is_id_of_node(&state.goal.id, &self.own) { GoalSender::Inside } else { GoalSender::Unheard };
+                remember(&mut all, ObservedGoal { action: action.to_owned(), id, sender, began: time, ended });
             }
         }
         self.ended.send_replace(number);
@@ -248,9 +205,7 @@ impl GoalLog {
 /// Returns true if the goal id has the form that actionlib clients of this node generate:
 /// NODE-NUMBER-SECONDS.NANOSECONDS.
 fn is_id_of_node(id: &str, node: &str) -> bool {
-    let rest = id
-        .strip_prefix(node)
-        .and_then(|rest| rest.strip_prefix('-'));
+    let rest = id.strip_prefix(node).and_then(|rest| rest.strip_prefix('-'));
     let parts = rest.and_then(|rest| {
         let (number, time) = rest.split_once('-')?;
         let (seconds, nanoseconds) = time.split_once('.')?;
@@ -280,10 +235,7 @@ mod tests {
     use super::*;
 
     fn id(name: &str) -> GoalId {
-        GoalId {
-            id: name.to_owned(),
-            ..GoalId::default()
-        }
+        GoalId { id: name.to_owned(), ..GoalId::default() }
     }
 
     fn goal(name: &str) -> Bytes {
@@ -291,11 +243,7 @@ mod tests {
     }
 
     fn result(name: &str, status: ActionlibStatus, text: &str) -> Bytes {
-        let state = GoalState {
-            goal: id(name),
-            status,
-            text: text.to_owned(),
-        };
+        let state = GoalState { goal: id(name), status, text: text.to_owned() };
         messages::write_state(Time::default(), &state, b"its own")
     }
 
@@ -314,21 +262,11 @@ mod tests {
         heard.record_goal("/dock".into(), &goal("a-1"), "/rover");
         heard.record_result("/dock", &result("a-1", ActionlibStatus::Succeeded, "there"));
         // The same result again, as if latched.
-        heard.record_result(
-            "/dock",
-            &result("a-1", ActionlibStatus::Aborted, "not there"),
-        );
+        heard.record_result("/dock", &result("a-1", ActionlibStatus::Aborted, "not there"));
         heard.record_goal("/dock".into(), &goal("a-2"), "/rover");
         let all = heard.all.lock();
         let (_, outcome) = all[0].ended.clone().expect("it has ended");
-        assert_eq!(
-            outcome,
-            ObservedOutcome {
-                status: ActionlibStatus::Succeeded,
-                text: "there".into(),
-                number: 1
-            }
-        );
+        assert_eq!(outcome, ObservedOutcome { status: ActionlibStatus::Succeeded, text: "there".into(), number: 1 });
         assert_eq!(all[0].sender, GoalSender::Node("/rover".into()));
         assert_eq!((all.len(), &all[1].ended), (2, &None));
         assert_eq!(*heard.ended.borrow(), 1);
@@ -342,14 +280,8 @@ mod tests {
         heard.record_result("/dock", &result("own", ActionlibStatus::Succeeded, ""));
         let all = heard.all.lock();
         let senders: Vec<_> = all.iter().map(|goal| goal.sender.clone()).collect();
-        assert_eq!(
-            senders,
-            [GoalSender::Node("/rover".into()), GoalSender::Unheard]
-        );
-        assert_eq!(
-            all[1].ended.as_ref().map(|(time, _)| *time),
-            Some(all[1].began)
-        );
+        assert_eq!(senders, [GoalSender::Node("/rover".into()), GoalSender::Unheard]);
+        assert_eq!(all[1].ended.as_ref().map(|(time, _)| *time), Some(all[1].began));
     }
 
     #[test]
@@ -399,10 +331,7 @@ mod tests {
         let heard = goal_log();
         let whole = goal("a-1");
         for end in 0..whole.len() - b"its own".len() {
-            assert_eq!(
-                heard.record_goal("/dock".into(), &whole.slice(..end), "/rover"),
-                None
-            );
+            assert_eq!(heard.record_goal("/dock".into(), &whole.slice(..end), "/rover"), None);
         }
         for number in 0..=MOST {
             let id = format!("a-{number}");
@@ -418,18 +347,9 @@ mod tests {
     #[test]
     fn topics_of_actions_are_told_by_their_types() {
         let dock = |kind| Some(("/dock".to_owned(), kind));
-        assert_eq!(
-            parse_action_topic("/dock/goal", "nav/DockActionGoal"),
-            dock(Kind::Goal)
-        );
-        assert_eq!(
-            parse_action_topic("/dock/result", "nav/DockActionResult"),
-            dock(Kind::Result)
-        );
+        assert_eq!(parse_action_topic("/dock/goal", "nav/DockActionGoal"), dock(Kind::Goal));
+        assert_eq!(parse_action_topic("/dock/result", "nav/DockActionResult"), dock(Kind::Result));
         assert_eq!(parse_action_topic("/dock/goal", "geometry_msgs/Pose"), None);
-        assert_eq!(
-            parse_action_topic("/dock/status", "actionlib_msgs/GoalStatusArray"),
-            None
-        );
+        assert_eq!(parse_action_topic("/dock/status", "actionlib_msgs/GoalStatusArray"), None);
     }
 }

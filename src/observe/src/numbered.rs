@@ -15,10 +15,7 @@ pub(crate) struct IdMap<T> {
 
 impl<T> Default for IdMap<T> {
     fn default() -> Self {
-        Self {
-            all: BTreeMap::new(),
-            next: 0,
-        }
+        Self { all: BTreeMap::new(), next: 0 }
     }
 }
 

@@ -127,13 +127,7 @@ impl LatchedMessages {
 impl Ring {
     /// Creates an empty ring.
     pub fn new(bounds: RetentionBounds) -> Self {
-        Self {
-            bounds,
-            topics: BTreeMap::new(),
-            bytes: 0,
-            latched: LatchedMessages::default(),
-            left_out: 0,
-        }
+        Self { bounds, topics: BTreeMap::new(), bytes: 0, latched: LatchedMessages::default(), left_out: 0 }
     }
 
     /// Adds a message. `latched_by` is its publisher if that latches.
@@ -211,18 +205,11 @@ mod tests {
     const SECOND: u64 = 1_000_000_000;
 
     fn stored_message(topic: u32, second: u64, size: usize) -> StoredMessage {
-        StoredMessage {
-            topic,
-            time: second * SECOND,
-            bytes: vec![0; size].into(),
-        }
+        StoredMessage { topic, time: second * SECOND, bytes: vec![0; size].into() }
     }
 
     fn ring(seconds: u64, bytes: usize) -> Ring {
-        Ring::new(RetentionBounds {
-            span: Duration::from_secs(seconds),
-            bytes,
-        })
+        Ring::new(RetentionBounds { span: Duration::from_secs(seconds), bytes })
     }
 
     fn times(ring: &mut Ring, now: u64) -> Vec<u64> {
@@ -294,9 +281,7 @@ mod tests {
         let publisher = |number: usize| Some(PeerId::new("/a", number as u128));
         // Limited by bytes: the newest remain.
         let mut small = ring(10, 10 * (100 + EACH + 2));
-        (0..50).for_each(|number| {
-            small.push(stored_message(0, number as u64, 100), publisher(number))
-        });
+        (0..50).for_each(|number| small.push(stored_message(0, number as u64, 100), publisher(number)));
         // Much later, only the latched messages remain.
         assert_eq!(times(&mut small, 1000), (40..50).collect::<Vec<_>>());
         assert_eq!(small.latched.bytes, 10 * (100 + EACH + 2));
@@ -305,8 +290,7 @@ mod tests {
         assert_eq!(small.latched.bytes, 10 * (100 + EACH + 2));
         // Limited by their number.
         let mut large = ring(10, usize::MAX / 2);
-        (0..LATCHED + 5)
-            .for_each(|number| large.push(stored_message(0, number as u64, 0), publisher(number)));
+        (0..LATCHED + 5).for_each(|number| large.push(stored_message(0, number as u64, 0), publisher(number)));
         assert_eq!(large.latched.all.len(), LATCHED);
         assert_eq!(times(&mut large, 100_000).first(), Some(&5));
         assert!(large.has_topic(0));

@@ -23,10 +23,7 @@ impl Claims {
     pub fn from_value(value: Value) -> Result<Claims, serde_json::Error> {
         let all: Map<String, Value> = serde_json::from_value(value)?;
         let subject = all.get("sub").cloned().unwrap_or_default();
-        Ok(Claims {
-            subject: serde_json::from_value(subject)?,
-            all,
-        })
+        Ok(Claims { subject: serde_json::from_value(subject)?, all })
     }
 
     /// Returns the subject identifier (`sub`).
@@ -102,19 +99,9 @@ mod tests {
 
     #[test]
     fn an_address_that_is_not_verified_is_no_group() {
-        for (verified, count) in [
-            (json!(true), 1),
-            (json!(false), 0),
-            (json!("true"), 0),
-            (json!(null), 0),
-        ] {
-            let all =
-                claims(json!({"sub": "1", "email": "a@lab.example", "email_verified": verified}));
-            assert_eq!(
-                all.find_groups("email").expect("there").len(),
-                count,
-                "{verified}"
-            );
+        for (verified, count) in [(json!(true), 1), (json!(false), 0), (json!("true"), 0), (json!(null), 0)] {
+            let all = claims(json!({"sub": "1", "email": "a@lab.example", "email_verified": verified}));
+            assert_eq!(all.find_groups("email").expect("there").len(), count, "{verified}");
         }
     }
 

@@ -24,9 +24,7 @@ pub enum Error {
     #[error("too many sign-ins at once")]
     Busy,
     /// The state is unknown.
-    #[error(
-        "this sign-in was not started here, is already finished, or took longer than 10 minutes"
-    )]
+    #[error("this sign-in was not started here, is already finished, or took longer than 10 minutes")]
     UnknownState,
     /// The sign-in was started in another browser.
     #[error("this sign-in was started in another browser")]
@@ -64,25 +62,17 @@ pub enum Error {
 impl Error {
     /// Creates the error for a sign-in that the provider refused.
     pub fn from_denial(reason: &str) -> Error {
-        Error::Denied {
-            reason: sanitize(reason),
-        }
+        Error::Denied { reason: sanitize(reason) }
     }
 
     /// Returns true if an operator has to look into it.
     pub fn is_provider_fault(&self) -> bool {
-        matches!(
-            self,
-            Error::Unreachable { .. } | Error::Client { .. } | Error::Token { .. }
-        )
+        matches!(self, Error::Unreachable { .. } | Error::Client { .. } | Error::Token { .. })
     }
 
     /// Returns true if the error may be the result of guessing.
     pub fn is_guess(&self) -> bool {
-        matches!(
-            self,
-            Error::UnknownState | Error::OtherBrowser | Error::Code { .. }
-        )
+        matches!(self, Error::UnknownState | Error::OtherBrowser | Error::Code { .. })
     }
 
     /// Returns what the person should do next.

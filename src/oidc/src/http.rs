@@ -14,8 +14,7 @@ use openidconnect::{AsyncHttpClient, HttpRequest, HttpResponse};
 use crate::claims::Claims;
 use crate::{BYTES, TIME, is_confidential};
 
-const ADVICE: &str =
-    "add the authority of the provider's certificate to authorities in [oidc] of the configuration";
+const ADVICE: &str = "add the authority of the provider's certificate to authorities in [oidc] of the configuration";
 
 /// Reason why a request failed.
 #[derive(Debug, thiserror::Error)]
@@ -57,10 +56,7 @@ pub struct Http {
 
 impl Http {
     pub fn new(authorities: Option<PathBuf>, secure: bool) -> Http {
-        Http {
-            client: outbound::OutboundClient::new(authorities, ADVICE).with_limits(TIME, BYTES),
-            secure,
-        }
+        Http { client: outbound::OutboundClient::new(authorities, ADVICE).with_limits(TIME, BYTES), secure }
     }
 
     /// Returns true if a URL named by the provider is as secure as its issuer.
@@ -79,13 +75,9 @@ impl Http {
     }
 
     /// Fetches the claims of the access token's owner (section 5.3.1).
-    pub async fn fetch_userinfo(
-        &self,
-        url: &Url,
-        access_token: &str,
-    ) -> Result<Claims, UserinfoError> {
-        let shown = HeaderValue::from_str(&format!("Bearer {access_token}"))
-            .map_err(|_| UserinfoError::UnsendableToken)?;
+    pub async fn fetch_userinfo(&self, url: &Url, access_token: &str) -> Result<Claims, UserinfoError> {
+        let shown =
+            HeaderValue::from_str(&format!("Bearer {access_token}")).map_err(|_| UserinfoError::UnsendableToken)?;
         let request = Request::get(url.as_str())
             .header(AUTHORIZATION, shown)
             .header(ACCEPT, "application/json")
@@ -100,8 +92,7 @@ impl Http {
 
 impl<'c> AsyncHttpClient<'c> for Http {
     type Error = ProviderRequestError;
-    type Future =
-        Pin<Box<dyn Future<Output = Result<HttpResponse, ProviderRequestError>> + Send + 'c>>;
+    type Future = Pin<Box<dyn Future<Output = Result<HttpResponse, ProviderRequestError>> + Send + 'c>>;
 
     fn call(&'c self, request: HttpRequest) -> Self::Future {
         Box::pin(self.send(request))

@@ -26,9 +26,8 @@ use std::time::{Duration, Instant};
 use openidconnect::core::CoreAuthenticationFlow;
 use openidconnect::url::Url;
 use openidconnect::{
-    AuthType, AuthorizationCode, ClientId, ClientSecret, CsrfToken, IssuerUrl, Nonce,
-    OAuth2TokenResponse, PkceCodeChallenge, PkceCodeVerifier, RedirectUrl, RequestTokenError,
-    Scope, TokenResponse,
+    AuthType, AuthorizationCode, ClientId, ClientSecret, CsrfToken, IssuerUrl, Nonce, OAuth2TokenResponse,
+    PkceCodeChallenge, PkceCodeVerifier, RedirectUrl, RequestTokenError, Scope, TokenResponse,
 };
 use parking_lot::Mutex;
 use tokio::sync::{Semaphore, SemaphorePermit};
@@ -133,8 +132,7 @@ impl Provider {
         let http = Http::new(settings.authorities.clone(), issuer.scheme() == "https");
         Ok(Provider {
             issuer: IssuerUrl::new(settings.issuer.clone()).map_err(wrong(&settings.issuer))?,
-            redirect: RedirectUrl::new(settings.redirect.clone())
-                .map_err(wrong(&settings.redirect))?,
+            redirect: RedirectUrl::new(settings.redirect.clone()).map_err(wrong(&settings.redirect))?,
             http,
             metadata: MetadataCache::default(),
             pending: Mutex::default(),
@@ -153,10 +151,7 @@ impl Provider {
     }
 
     fn unreachable(&self, reason: String) -> Error {
-        Error::Unreachable {
-            issuer: self.settings.issuer.clone(),
-            reason: error::sanitize(&reason),
-        }
+        Error::Unreachable { issuer: self.settings.issuer.clone(), reason: error::sanitize(&reason) }
     }
 
     fn client(&self, known: &DiscoveredProvider) -> OidcClient {
@@ -166,14 +161,8 @@ impl Provider {
             ClientId::new(self.settings.client_id.clone()),
             secret,
         );
-        let how = if known.supports_basic_auth() {
-            AuthType::BasicAuth
-        } else {
-            AuthType::RequestBody
-        };
-        client
-            .set_redirect_uri(self.redirect.clone())
-            .set_auth_type(how)
+        let how = if known.supports_basic_auth() { AuthType::BasicAuth } else { AuthType::RequestBody };
+        client.set_redirect_uri(self.redirect.clone()).set_auth_type(how)
     }
 
     /// Starts a sign-in. `browser` identifies the browser if it was here before; `earlier` is returned as
@@ -208,19 +197,10 @@ impl Provider {
             Some(browser) => browser.to_owned(),
             None => CsrfToken::new_random_len(SECRET).into_secret(),
         };
-        let waiting = PendingSignIn {
-            browser: browser.clone(),
-            from,
-            nonce,
-            verifier,
-            earlier,
-        };
+        let waiting = PendingSignIn { browser: browser.clone(), from, nonce, verifier, earlier };
         let mut pending = self.pending.lock();
         pending.insert(state.into_secret(), waiting, Instant::now());
-        Ok(SignInRedirect {
-            url: url.into(),
-            browser,
-        })
+        Ok(SignInRedirect { url: url.into(), browser })
     }
 
     /// Takes the sign-in that was started with this state in this browser. Works once.
@@ -233,10 +213,7 @@ impl Provider {
         match issuer {
             Some(other) if other != self.settings.issuer => Err(Error::Token {
                 issuer: self.settings.issuer.clone(),
-                reason: format!(
-                    "the answer comes from another issuer, {}",
-                    error::sanitize(other)
-                ),
+                reason: format!("the answer comes from another issuer, {}", error::sanitize(other)),
             }),
             _ => Ok(()),
         }
@@ -245,9 +222,7 @@ impl Provider {
     /// Exchanges the authorization code for the person who signed in.
     pub async fn finish(&self, started: ReturnedSignIn, code: String) -> Result<Person, Error> {
         if code.is_empty() || code.len() > LONGEST_CODE {
-            return Err(Error::Code {
-                reason: "it is empty, or too long".into(),
-            });
+            return Err(Error::Code { reason: "it is empty, or too long".into() });
         }
         let _turn = self.acquire_permit()?;
         let known = self.metadata.get(&self.issuer, &self.http).await;
@@ -274,15 +249,11 @@ impl Provider {
             verified => verified,
         };
         let claims = claims.map_err(|refused| self.token_error(refused.to_string()))?;
-        self.resolve_person(&known, claims, response.access_token().secret())
-            .await
+        self.resolve_person(&known, claims, response.access_token().secret()).await
     }
 
     fn token_error(&self, reason: String) -> Error {
-        Error::Token {
-            issuer: self.settings.issuer.clone(),
-            reason: error::sanitize(&reason),
-        }
+        Error::Token { issuer: self.settings.issuer.clone(), reason: error::sanitize(&reason) }
     }
 
     async fn exchange(
@@ -296,29 +267,21 @@ impl Provider {
             .exchange_code(AuthorizationCode::new(code))
             .map_err(|_| self.unreachable("it names no token endpoint".into()))?;
         let asked = request.set_pkce_verifier(verifier);
-        asked
-            .request_async(&self.http)
-            .await
-            .map_err(|error| match error {
-                RequestTokenError::ServerResponse(refusal) => {
-                    // The error concerns the client, not the code (RFC 6749, section 5.2): nobody can sign in.
-                    let reason = error::sanitize(&refusal.to_string());
-                    match refusal.error().as_ref() {
-                        "invalid_grant" => Error::Code { reason },
-                        _ => Error::Client {
-                            issuer: self.settings.issuer.clone(),
-                            reason,
-                        },
-                    }
+        asked.request_async(&self.http).await.map_err(|error| match error {
+            RequestTokenError::ServerResponse(refusal) => {
+                // The error concerns the client, not the code (RFC 6749, section 5.2): nobody can sign in.
+                let reason = error::sanitize(&refusal.to_string());
+                match refusal.error().as_ref() {
+                    "invalid_grant" => Error::Code { reason },
+                    _ => Error::Client { issuer: self.settings.issuer.clone(), reason },
                 }
-                RequestTokenError::Request(error) => self.unreachable(error.to_string()),
-                // The response may contain a secret.
-                RequestTokenError::Parse(..) => self.token_error(
-                    "the answer of the token endpoint has no ID token with iss, sub, aud, exp and iat"
-                        .into(),
-                ),
-                other => self.token_error(error::with_causes(&other)),
-            })
+            }
+            RequestTokenError::Request(error) => self.unreachable(error.to_string()),
+            // The response may contain a secret.
+            RequestTokenError::Parse(..) => self
+                .token_error("the answer of the token endpoint has no ID token with iss, sub, aud, exp and iat".into()),
+            other => self.token_error(error::with_causes(&other)),
+        })
     }
 
     /// Builds the person from verified claims. Missing groups are fetched from the userinfo endpoint (section 5.3).
@@ -346,14 +309,8 @@ impl Provider {
             let of_userinfo = || more.as_ref().and_then(|more| more.find_groups(claim));
             claims.find_groups(claim).or_else(of_userinfo)
         };
-        let named = claims
-            .find_text(name)
-            .or_else(|| more.as_ref().and_then(|more| more.find_text(name)));
-        Ok(Person {
-            name: named.unwrap_or_else(|| subject.clone()),
-            groups: told(groups).unwrap_or_default(),
-            subject,
-        })
+        let named = claims.find_text(name).or_else(|| more.as_ref().and_then(|more| more.find_text(name)));
+        Ok(Person { name: named.unwrap_or_else(|| subject.clone()), groups: told(groups).unwrap_or_default(), subject })
     }
 }
 

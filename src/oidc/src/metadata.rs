@@ -63,19 +63,11 @@ pub struct MetadataCache(Mutex<State>);
 
 impl MetadataCache {
     /// Returns the cached metadata, or fetches it.
-    pub async fn get(
-        &self,
-        issuer: &IssuerUrl,
-        http: &Http,
-    ) -> Result<Arc<DiscoveredProvider>, MetadataError> {
+    pub async fn get(&self, issuer: &IssuerUrl, http: &Http) -> Result<Arc<DiscoveredProvider>, MetadataError> {
         // Concurrent callers wait for the same response.
         let asked = Instant::now();
         let mut state = self.0.lock().await;
-        if let Some(known) = state
-            .known
-            .as_ref()
-            .filter(|known| known.at.elapsed() < AGE)
-        {
+        if let Some(known) = state.known.as_ref().filter(|known| known.at.elapsed() < AGE) {
             return Ok(Arc::clone(known));
         }
         if let Some((at, error)) = &state.failed
@@ -116,10 +108,8 @@ impl MetadataCache {
         state.keys = Some(Instant::now());
         let asked = CoreJsonWebKeySet::fetch_async(before.metadata.jwks_uri(), http).await;
         let keys = asked.map_err(MetadataError::new)?;
-        let known = Arc::new(DiscoveredProvider {
-            metadata: before.metadata.clone().set_jwks(keys),
-            at: Instant::now(),
-        });
+        let known =
+            Arc::new(DiscoveredProvider { metadata: before.metadata.clone().set_jwks(keys), at: Instant::now() });
         state.known = Some(Arc::clone(&known));
         Ok(Some(known))
     }

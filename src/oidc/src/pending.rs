@@ -64,12 +64,7 @@ impl PendingSignIns {
     }
 
     /// Removes and returns the sign-in with this state. It is used up even if the caller is refused.
-    pub fn take(
-        &mut self,
-        state: &str,
-        browser: Option<&str>,
-        now: Instant,
-    ) -> Result<ReturnedSignIn, Error> {
+    pub fn take(&mut self, state: &str, browser: Option<&str>, now: Instant) -> Result<ReturnedSignIn, Error> {
         let (begun, waiting) = self.all.remove(state).ok_or(Error::UnknownState)?;
         if !is_fresh(begun, now) {
             return Err(Error::UnknownState);
@@ -77,11 +72,7 @@ impl PendingSignIns {
         if browser != Some(&*waiting.browser) {
             return Err(Error::OtherBrowser);
         }
-        Ok(ReturnedSignIn {
-            nonce: waiting.nonce,
-            verifier: waiting.verifier,
-            earlier: waiting.earlier,
-        })
+        Ok(ReturnedSignIn { nonce: waiting.nonce, verifier: waiting.verifier, earlier: waiting.earlier })
     }
 }
 
@@ -112,32 +103,14 @@ mod tests {
         let mine = Some("browser");
         pending.take("a", mine, now).map(|_| ()).expect("begun");
         let wrong = |taken: Result<ReturnedSignIn, Error>| taken.map(|_| ()).expect_err("refused");
-        assert!(matches!(
-            wrong(pending.take("a", mine, now)),
-            Error::UnknownState
-        ));
-        assert!(matches!(
-            wrong(pending.take("x", mine, now)),
-            Error::UnknownState
-        ));
-        assert!(matches!(
-            wrong(pending.take("b", Some("other"), now)),
-            Error::OtherBrowser
-        ));
+        assert!(matches!(wrong(pending.take("a", mine, now)), Error::UnknownState));
+        assert!(matches!(wrong(pending.take("x", mine, now)), Error::UnknownState));
+        assert!(matches!(wrong(pending.take("b", Some("other"), now)), Error::OtherBrowser));
         // The first caller has used it up.
-        assert!(matches!(
-            wrong(pending.take("b", mine, now)),
-            Error::UnknownState
-        ));
-        assert!(matches!(
-            wrong(pending.take("c", None, now)),
-            Error::OtherBrowser
-        ));
+        assert!(matches!(wrong(pending.take("b", mine, now)), Error::UnknownState));
+        assert!(matches!(wrong(pending.take("c", None, now)), Error::OtherBrowser));
         let late = now + TIME;
-        assert!(matches!(
-            wrong(pending.take("d", mine, late)),
-            Error::UnknownState
-        ));
+        assert!(matches!(wrong(pending.take("d", mine, late)), Error::UnknownState));
     }
 
     #[test]

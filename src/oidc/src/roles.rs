@@ -44,11 +44,7 @@ impl Roles {
             let new: Vec<Glob> = new.cloned().collect();
             services.extend(new);
         }
-        Some(GrantedRole {
-            role,
-            services,
-            groups: mine.iter().map(|group| group.name.clone()).collect(),
-        })
+        Some(GrantedRole { role, services, groups: mine.iter().map(|group| group.name.clone()).collect() })
     }
 }
 
@@ -60,10 +56,7 @@ mod tests {
         RoleGroup {
             name: name.into(),
             role,
-            services: services
-                .iter()
-                .map(|one| one.parse().expect("a pattern"))
-                .collect(),
+            services: services.iter().map(|one| one.parse().expect("a pattern")).collect(),
         }
     }
 
@@ -84,14 +77,8 @@ mod tests {
         assert_eq!(of(&["all"]), Some((Role::Viewer, "*".into(), "all".into())));
         // A viewer's services do not become a deployer's.
         let both = of(&["b", "all", "a", "unknown"]);
-        assert_eq!(
-            both,
-            Some((Role::Deployer, "a_* shared b_*".into(), "all a b".into()))
-        );
-        assert_eq!(
-            of(&["a", "ops"]),
-            Some((Role::Operator, String::new(), "a ops".into()))
-        );
+        assert_eq!(both, Some((Role::Deployer, "a_* shared b_*".into(), "all a b".into())));
+        assert_eq!(of(&["a", "ops"]), Some((Role::Operator, String::new(), "a ops".into())));
         assert_eq!(of(&["unknown", "ALL", ""]), None);
         assert_eq!(of(&[]), None);
     }

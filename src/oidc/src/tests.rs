@@ -63,25 +63,17 @@ fn addresses_that_others_read_are_none() {
         "https://id.lab.example/#lab",
         "",
     ] {
-        let refused = Provider::new(settings(issuer))
-            .map(|_| ())
-            .expect_err(issuer);
+        let refused = Provider::new(settings(issuer)).map(|_| ()).expect_err(issuer);
         assert!(refused.to_string().contains("https://"), "{refused}");
     }
-    for issuer in [
-        "https://id.lab.example/realms/lab",
-        "http://localhost:1",
-        "http://[::1]:1/x/",
-    ] {
+    for issuer in ["https://id.lab.example/realms/lab", "http://localhost:1", "http://[::1]:1/x/"] {
         provider(issuer);
     }
     let elsewhere = Settings {
         redirect: "http://robots.lab.example/api/v1/oidc/callback".into(),
         ..settings("https://id.lab.example")
     };
-    Provider::new(elsewhere)
-        .map(|_| ())
-        .expect_err("plain text");
+    Provider::new(elsewhere).map(|_| ()).expect_err("plain text");
 }
 
 #[tokio::test]
@@ -89,9 +81,7 @@ async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
     let issuer = serve_answers(vec![METADATA, KEYS]).await;
     let provider = provider(&issuer);
     let first = provider.begin(None, HERE, None).await.expect("begun");
-    let second = provider
-        .begin(Some(&first.browser), HERE, Some("earlier".into()))
-        .await;
+    let second = provider.begin(Some(&first.browser), HERE, Some("earlier".into())).await;
     let second = second.expect("begun: what the provider says of itself is kept");
     assert_eq!(first.browser, second.browser, "two windows of one browser");
     let asked = |begun: &SignInRedirect, name: &str| {
@@ -100,11 +90,7 @@ async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
         let found = pairs.find(|(key, _)| key == name);
         found.expect(name).1.into_owned()
     };
-    assert!(
-        first.url.starts_with(&format!("{issuer}/auth?")),
-        "{}",
-        first.url
-    );
+    assert!(first.url.starts_with(&format!("{issuer}/auth?")), "{}", first.url);
     assert_eq!(asked(&first, "response_type"), "code");
     assert_eq!(asked(&first, "code_challenge_method"), "S256");
     assert_eq!(asked(&first, "scope"), "openid profile");
@@ -114,9 +100,7 @@ async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
         assert!(one.len() >= 43 && one != other, "{name}: {one} {other}");
     }
     let state = asked(&second, "state");
-    let taken = provider
-        .resume(&state, Some(&second.browser))
-        .expect("begun");
+    let taken = provider.resume(&state, Some(&second.browser)).expect("begun");
     assert_eq!(taken.earlier.as_deref(), Some("earlier"));
 }
 
@@ -133,9 +117,7 @@ async fn a_provider_that_says_it_is_another_is_not_asked() {
 #[tokio::test]
 async fn a_provider_at_https_names_no_plain_text() {
     let http = Http::new(None, true);
-    let request = openidconnect::http::Request::get("http://127.0.0.1:1/keys")
-        .body(Vec::new())
-        .expect("a request");
+    let request = openidconnect::http::Request::get("http://127.0.0.1:1/keys").body(Vec::new()).expect("a request");
     let refused = openidconnect::AsyncHttpClient::call(&http, request).await;
     let refused = refused.expect_err("plain text").to_string();
     assert!(refused.contains("not https"), "{refused}");
@@ -149,11 +131,7 @@ async fn a_provider_at_https_names_no_plain_text() {
 #[tokio::test]
 async fn concurrent_sign_ins_beyond_the_limit_are_refused() {
     let provider = provider("https://id.lab.example");
-    let all = provider
-        .turns
-        .acquire_many(AT_ONCE as u32)
-        .await
-        .expect("open");
+    let all = provider.turns.acquire_many(AT_ONCE as u32).await.expect("open");
     let refused = provider.begin(None, HERE, None).await.expect_err("busy");
     assert!(matches!(refused, Error::Busy), "{refused}");
     drop(all);
@@ -177,19 +155,12 @@ async fn a_code_that_is_none_is_not_sent() {
 fn an_answer_of_another_provider_is_refused() {
     let provider = provider("https://id.lab.example");
     provider.check_issuer(None).expect("older ones do not say");
-    provider
-        .check_issuer(Some("https://id.lab.example"))
-        .expect("its own");
-    provider
-        .check_issuer(Some("https://id.lab.example/"))
-        .expect_err("another");
+    provider.check_issuer(Some("https://id.lab.example")).expect("its own");
+    provider.check_issuer(Some("https://id.lab.example/")).expect_err("another");
 }
 
 #[test]
 fn what_others_say_is_cut_to_a_line() {
     let denied = Error::from_denial(&format!("a\nb\u{1b}{}", "x".repeat(1000))).to_string();
-    assert!(
-        !denied.contains(char::is_control) && denied.len() < 400,
-        "{denied}"
-    );
+    assert!(!denied.contains(char::is_control) && denied.len() < 400, "{denied}");
 }

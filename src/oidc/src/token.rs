@@ -5,14 +5,13 @@ use std::collections::BTreeMap;
 use chrono::{DateTime, TimeDelta, Utc};
 use openidconnect::core::{
     CoreAuthDisplay, CoreAuthPrompt, CoreErrorResponseType, CoreGenderClaim, CoreJsonWebKey,
-    CoreJweContentEncryptionAlgorithm, CoreJwsSigningAlgorithm, CoreRevocableToken,
-    CoreRevocationErrorResponse, CoreTokenIntrospectionResponse, CoreTokenType,
+    CoreJweContentEncryptionAlgorithm, CoreJwsSigningAlgorithm, CoreRevocableToken, CoreRevocationErrorResponse,
+    CoreTokenIntrospectionResponse, CoreTokenType,
 };
 use openidconnect::{
-    AccessToken, AccessTokenHash, AdditionalClaims, ClaimsVerificationError, ClientId,
-    EmptyExtraTokenFields, EndpointMaybeSet, EndpointNotSet, EndpointSet, IdTokenFields,
-    IdTokenVerifier, IssuerUrl, Nonce, SignatureVerificationError, StandardErrorResponse,
-    StandardTokenResponse,
+    AccessToken, AccessTokenHash, AdditionalClaims, ClaimsVerificationError, ClientId, EmptyExtraTokenFields,
+    EndpointMaybeSet, EndpointNotSet, EndpointSet, IdTokenFields, IdTokenVerifier, IssuerUrl, Nonce,
+    SignatureVerificationError, StandardErrorResponse, StandardTokenResponse,
 };
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -43,12 +42,8 @@ pub struct ExtraClaims(BTreeMap<String, Value>);
 
 impl AdditionalClaims for ExtraClaims {}
 
-type IdToken = openidconnect::IdToken<
-    ExtraClaims,
-    CoreGenderClaim,
-    CoreJweContentEncryptionAlgorithm,
-    CoreJwsSigningAlgorithm,
->;
+type IdToken =
+    openidconnect::IdToken<ExtraClaims, CoreGenderClaim, CoreJweContentEncryptionAlgorithm, CoreJwsSigningAlgorithm>;
 
 /// Response of the token endpoint.
 pub type Response = StandardTokenResponse<
@@ -106,9 +101,7 @@ pub enum IdTokenError {
 impl IdTokenError {
     /// Returns true if it is signed by a key that is missing from the fetched key set.
     pub fn is_unknown_key(&self) -> bool {
-        let unknown = ClaimsVerificationError::SignatureVerification(
-            SignatureVerificationError::NoMatchingKey,
-        );
+        let unknown = ClaimsVerificationError::SignatureVerification(SignatureVerificationError::NoMatchingKey);
         matches!(self, IdTokenError::Claims(error) if *error == unknown)
     }
 }
@@ -125,24 +118,16 @@ pub struct IdTokenChecks<'a> {
 
 impl IdTokenChecks<'_> {
     /// Verifies the token and returns its claims.
-    pub fn verify(
-        &self,
-        token: &IdToken,
-        known: &DiscoveredProvider,
-    ) -> Result<Claims, IdTokenError> {
+    pub fn verify(&self, token: &IdToken, known: &DiscoveredProvider) -> Result<Claims, IdTokenError> {
         let keys = known.metadata.jwks().clone();
         let client = ClientId::new(self.client_id.to_owned());
         let verifier = IdTokenVerifier::new_public_client(client, self.issuer.clone(), keys)
             .set_allowed_algs(ALGORITHMS)
             .set_time_fn(|| Utc::now() - SKEW)
-            .set_issue_time_verifier_fn(|issued| {
-                check_issue_time(issued).map_err(|error| error.to_string())
-            })
+            .set_issue_time_verifier_fn(|issued| check_issue_time(issued).map_err(|error| error.to_string()))
             // With several audiences, azp decides.
             .set_other_audience_verifier_fn(|_| true);
-        let claims = token
-            .claims(&verifier, self.nonce)
-            .map_err(IdTokenError::Claims)?;
+        let claims = token.claims(&verifier, self.nonce).map_err(IdTokenError::Claims)?;
         match claims.authorized_party() {
             Some(party) if party.as_str() != self.client_id => {
                 return Err(IdTokenError::Party(party.as_str().to_owned()));
@@ -151,12 +136,11 @@ impl IdTokenChecks<'_> {
             _ => {}
         }
         if let Some(expected) = claims.access_token_hash() {
-            let signature =
-                |error| IdTokenError::Claims(ClaimsVerificationError::SignatureVerification(error));
+            let signature = |error| IdTokenError::Claims(ClaimsVerificationError::SignatureVerification(error));
             let algorithm = token.signing_alg().map_err(signature)?;
             let key = token.signing_key(&verifier).map_err(signature)?;
-            let found = AccessTokenHash::from_token(self.access, algorithm, key)
-                .map_err(|_| IdTokenError::AccessToken)?;
+            let found =
+                AccessTokenHash::from_token(self.access, algorithm, key).map_err(|_| IdTokenError::AccessToken)?;
             if found != *expected {
                 return Err(IdTokenError::AccessToken);
             }
@@ -171,9 +155,5 @@ impl IdTokenChecks<'_> {
 struct FutureIssueTime(DateTime<Utc>);
 
 fn check_issue_time(issued: DateTime<Utc>) -> Result<(), FutureIssueTime> {
-    if issued <= Utc::now() + SKEW {
-        Ok(())
-    } else {
-        Err(FutureIssueTime(issued))
-    }
+    if issued <= Utc::now() + SKEW { Ok(()) } else { Err(FutureIssueTime(issued)) }
 }

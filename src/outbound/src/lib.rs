@@ -27,9 +27,7 @@ pub enum Error {
     #[error("{0} is no address of a server; write https://HOST/PATH")]
     NoAddress(String),
     /// The URL would send plain text to another machine.
-    #[error(
-        "{0} would be asked in plain text, which is done on this machine alone; write https://"
-    )]
+    #[error("{0} would be asked in plain text, which is done on this machine alone; write https://")]
     PlainText(String),
     /// The connection could not be established.
     #[error("{server} cannot be reached: {source}")]
@@ -77,28 +75,14 @@ impl OutboundClient {
     /// Creates a client that trusts the authorities of a PEM file (default: the system's). `advice` tells the
     /// operator what to do if there are none.
     pub fn new(authorities: Option<PathBuf>, advice: &'static str) -> OutboundClient {
-        let trust = Trust {
-            authorities,
-            fingerprint: None,
-            known: None,
-            accept: String::new(),
-            advice,
-            identity: None,
-        };
-        OutboundClient {
-            trust,
-            time: TIME,
-            bytes: BYTES,
-        }
+        let trust =
+            Trust { authorities, fingerprint: None, known: None, accept: String::new(), advice, identity: None };
+        OutboundClient { trust, time: TIME, bytes: BYTES }
     }
 
     /// Sets the timeout of each request and the size limit of each response body in bytes.
     pub fn with_limits(self, time: Duration, bytes: usize) -> OutboundClient {
-        OutboundClient {
-            time,
-            bytes,
-            ..self
-        }
+        OutboundClient { time, bytes, ..self }
     }
 
     /// Sends a request to the server of its URL and reads the whole response.
@@ -107,33 +91,17 @@ impl OutboundClient {
         let server = address.authority();
         match tokio::time::timeout(self.time, self.exchange(&address, request)).await {
             Ok(answer) => answer,
-            Err(_) => Err(Error::Late {
-                server,
-                time: self.time,
-            }),
+            Err(_) => Err(Error::Late { server, time: self.time }),
         }
     }
 
-    async fn exchange(
-        &self,
-        address: &ServerAddress,
-        request: Request<Full<Bytes>>,
-    ) -> Result<Response<Bytes>, Error> {
-        let unreachable = |source| Error::Unreachable {
-            server: address.authority(),
-            source,
-        };
-        let stream = TcpStream::connect((address.host.as_str(), address.port))
-            .await
-            .map_err(unreachable)?;
+    async fn exchange(&self, address: &ServerAddress, request: Request<Full<Bytes>>) -> Result<Response<Bytes>, Error> {
+        let unreachable = |source| Error::Unreachable { server: address.authority(), source };
+        let stream = TcpStream::connect((address.host.as_str(), address.port)).await.map_err(unreachable)?;
         if !address.secure {
             return self.send_over(stream, address, request).await;
         }
-        let connected = self
-            .trust
-            .connect(stream, &address.host, &address.authority())
-            .await
-            .map_err(unreachable)?;
+        let connected = self.trust.connect(stream, &address.host, &address.authority()).await.map_err(unreachable)?;
         self.send_over(connected.stream, address, request).await
     }
 
@@ -143,14 +111,8 @@ impl OutboundClient {
         address: &ServerAddress,
         mut request: Request<Full<Bytes>>,
     ) -> Result<Response<Bytes>, Error> {
-        let no_answer = |source| Error::NoAnswer {
-            server: address.authority(),
-            source,
-        };
-        let unreadable = |reason: String| Error::Unreadable {
-            server: address.authority(),
-            reason,
-        };
+        let no_answer = |source| Error::NoAnswer { server: address.authority(), source };
+        let unreadable = |reason: String| Error::Unreadable { server: address.authority(), reason };
         let named = HeaderValue::from_str(&address.named).map_err(|_| address.invalid_address())?;
         request.headers_mut().insert(HOST, named);
         let close = HeaderValue::from_static("close");
@@ -158,16 +120,11 @@ impl OutboundClient {
         // Origin form of the request target (RFC 9112, section 3.2.1).
         let path = request.uri().path_and_query().cloned();
         *request.uri_mut() = path.map_or(Uri::from_static("/"), Uri::from);
-        let (mut sender, connection) = http1::handshake(TokioIo::new(stream))
-            .await
-            .map_err(no_answer)?;
+        let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(no_answer)?;
         let answer = async {
             let answer = sender.send_request(request).await.map_err(no_answer)?;
             let (parts, body) = answer.into_parts();
-            let body = Limited::new(body, self.bytes)
-                .collect()
-                .await
-                .map_err(|error| unreadable(error.to_string()))?;
+            let body = Limited::new(body, self.bytes).collect().await.map_err(|error| unreadable(error.to_string()))?;
             Ok(Response::from_parts(parts, body.to_bytes()))
         };
         // The connection ends after its only response, or when the request is dropped.
@@ -194,10 +151,7 @@ impl ServerAddress {
         let none = || Error::NoAddress(uri.to_string());
         let authority = uri.authority().ok_or_else(none)?;
         let host = authority.host();
-        let host = host
-            .strip_prefix('[')
-            .and_then(|host| host.strip_suffix(']'))
-            .unwrap_or(host);
+        let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
         let secure = match uri.scheme_str() {
             Some("https") => true,
             Some("http") if is_loopback_host(host) => false,
@@ -210,9 +164,7 @@ impl ServerAddress {
         }
         Ok(ServerAddress {
             host: host.to_owned(),
-            port: authority
-                .port_u16()
-                .unwrap_or(if secure { 443 } else { 80 }),
+            port: authority.port_u16().unwrap_or(if secure { 443 } else { 80 }),
             named: authority.as_str().to_owned(),
             secure,
         })
@@ -233,10 +185,7 @@ impl ServerAddress {
 
 /// Returns true if the host is this machine, so that nobody on the network can intercept.
 pub fn is_loopback_host(host: &str) -> bool {
-    host.eq_ignore_ascii_case("localhost")
-        || host
-            .parse::<IpAddr>()
-            .is_ok_and(|address| address.is_loopback())
+    host.eq_ignore_ascii_case("localhost") || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
 }
 
 #[cfg(test)]
@@ -251,9 +200,7 @@ mod tests {
     }
 
     fn get(address: &str) -> Request<Full<Bytes>> {
-        Request::get(address)
-            .body(Full::default())
-            .expect("a request")
+        Request::get(address).body(Full::default()).expect("a request")
     }
 
     /// Starts a server that answers its first connection with `answer` and returns the request it received.
@@ -275,8 +222,7 @@ mod tests {
 
     #[tokio::test]
     async fn an_answer_is_read_whole() {
-        let (address, asked) =
-            server(b"HTTP/1.1 200 OK\r\ncontent-length: 5\r\n\r\nhello".to_vec()).await;
+        let (address, asked) = server(b"HTTP/1.1 200 OK\r\ncontent-length: 5\r\n\r\nhello".to_vec()).await;
         let answer = client().send(get(&format!("{address}/a?b=c"))).await;
         assert_eq!(answer.expect("an answer").body().as_ref(), b"hello");
         let asked = asked.await.expect("asked");
@@ -287,11 +233,8 @@ mod tests {
 
     #[tokio::test]
     async fn a_redirect_is_an_answer_like_another() {
-        let (address, _) = server(
-            b"HTTP/1.1 302 Found\r\nlocation: http://192.0.2.1/\r\ncontent-length: 0\r\n\r\n"
-                .to_vec(),
-        )
-        .await;
+        let (address, _) =
+            server(b"HTTP/1.1 302 Found\r\nlocation: http://192.0.2.1/\r\ncontent-length: 0\r\n\r\n".to_vec()).await;
         let answer = client().send(get(&address)).await.expect("an answer");
         assert_eq!(answer.status(), 302);
     }
@@ -301,18 +244,13 @@ mod tests {
         let mut long = b"HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n".to_vec();
         long.extend(vec![b'x'; 2000]);
         let (address, _) = server(long).await;
-        let refused = client()
-            .with_limits(TIME, 1000)
-            .send(get(&address))
-            .await
-            .expect_err("too long");
+        let refused = client().with_limits(TIME, 1000).send(get(&address)).await.expect_err("too long");
         assert!(matches!(refused, Error::Unreadable { .. }), "{refused}");
     }
 
     #[tokio::test]
     async fn an_answer_that_ends_too_soon_is_none() {
-        let (address, _) =
-            server(b"HTTP/1.1 200 OK\r\ncontent-length: 50\r\n\r\nhello".to_vec()).await;
+        let (address, _) = server(b"HTTP/1.1 200 OK\r\ncontent-length: 50\r\n\r\nhello".to_vec()).await;
         let refused = client().send(get(&address)).await.expect_err("cut");
         assert!(matches!(refused, Error::Unreadable { .. }), "{refused}");
     }
@@ -329,10 +267,7 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = format!("http://{}", listener.local_addr().expect("bound"));
         let refused = client().send(get(&address)).await.expect_err("silent");
-        assert!(
-            matches!(refused, Error::Late { .. }) && refused.to_string().contains("15 s"),
-            "{refused}"
-        );
+        assert!(matches!(refused, Error::Late { .. }) && refused.to_string().contains("15 s"), "{refused}");
     }
 
     #[tokio::test]
@@ -340,28 +275,17 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
         drop(listener);
-        let refused = client()
-            .send(get(&format!("http://{address}/")))
-            .await
-            .expect_err("nobody")
-            .to_string();
+        let refused = client().send(get(&format!("http://{address}/"))).await.expect_err("nobody").to_string();
         assert!(refused.contains(&address.to_string()), "{refused}");
     }
 
     #[tokio::test]
     async fn addresses_that_are_none_are_refused() {
-        for address in [
-            "http://192.0.2.1/",
-            "http://lab.example/",
-            "ftp://localhost/",
-            "/path",
-            "https://user:word@localhost/",
-        ] {
+        for address in
+            ["http://192.0.2.1/", "http://lab.example/", "ftp://localhost/", "/path", "https://user:word@localhost/"]
+        {
             let refused = client().send(get(address)).await.expect_err(address);
-            assert!(
-                matches!(refused, Error::NoAddress(_) | Error::PlainText(_)),
-                "{refused}"
-            );
+            assert!(matches!(refused, Error::NoAddress(_) | Error::PlainText(_)), "{refused}");
             assert!(refused.to_string().contains("https://"), "{refused}");
         }
     }

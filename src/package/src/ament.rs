@@ -15,10 +15,7 @@ const MAX_COMPONENTS: usize = 1000;
 
 /// Returns the names of the packages in the indexes of install spaces (absolute paths in the layers). `layers` are
 /// extracted trees, lowest first. Blocking.
-pub fn packages<L: AsRef<Path>, P: AsRef<str>>(
-    layers: &[L],
-    prefixes: &[P],
-) -> Result<BTreeSet<String>, Error> {
+pub fn packages<L: AsRef<Path>, P: AsRef<str>>(layers: &[L], prefixes: &[P]) -> Result<BTreeSet<String>, Error> {
     let stack = merged::open_layers(layers)?;
     let mut found = BTreeSet::new();
     for prefix in prefixes {
@@ -27,10 +24,7 @@ pub fn packages<L: AsRef<Path>, P: AsRef<str>>(
     Ok(found)
 }
 
-pub(crate) fn packages_in(
-    stack: &[LayerDirectory],
-    prefix: &str,
-) -> Result<BTreeSet<String>, Error> {
+pub(crate) fn packages_in(stack: &[LayerDirectory], prefix: &str) -> Result<BTreeSet<String>, Error> {
     let index = MergedDirectory::open_path(stack, &format!("{prefix}/{INDEX}/packages"))?;
     let names = index.names()?.into_keys();
     let names = names.filter_map(|name| String::from_utf8(name).ok());
@@ -54,8 +48,7 @@ pub(crate) fn components(
     };
     let text = String::from_utf8_lossy(&file.bytes);
     let lines = text.lines().filter_map(|line| line.split_once(';'));
-    let good =
-        lines.filter(|(class, library)| names::is_class(class) && names::is_library(library));
+    let good = lines.filter(|(class, library)| names::is_class(class) && names::is_library(library));
     let owned = good.map(|(class, library)| (class.to_owned(), library.to_owned()));
     Ok(owned.take(MAX_COMPONENTS).collect())
 }

@@ -29,10 +29,7 @@ pub(crate) fn parse_commands(text: &str) -> Vec<Command> {
         let Some(arguments) = reader.arguments() else {
             return found;
         };
-        found.push(Command {
-            name: name.to_ascii_lowercase(),
-            arguments,
-        });
+        found.push(Command { name: name.to_ascii_lowercase(), arguments });
     }
 }
 
@@ -101,11 +98,7 @@ impl<'a> CmakeParser<'a> {
                 }
                 parenthesis @ ('(' | ')') => {
                     self.next();
-                    depth = if parenthesis == '(' {
-                        depth + 1
-                    } else {
-                        depth - 1
-                    };
+                    depth = if parenthesis == '(' { depth + 1 } else { depth - 1 };
                     found.push(parenthesis.to_string());
                 }
                 '"' => {

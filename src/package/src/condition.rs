@@ -32,11 +32,7 @@ impl Variables {
     /// Evaluates a condition. Fails if it cannot be parsed.
     pub fn evaluate(&self, condition: &str) -> Result<bool, ConditionError> {
         let tokens = tokenize(condition)?;
-        let mut parser = Parser {
-            tokens: &tokens,
-            variables: self,
-            depth: 0,
-        };
+        let mut parser = Parser { tokens: &tokens, variables: self, depth: 0 };
         let holds = parser.or_expression()?;
         match parser.tokens {
             [] => Ok(holds),
@@ -47,12 +43,7 @@ impl Variables {
 
 impl<K: Into<String>, V: Into<String>> FromIterator<(K, V)> for Variables {
     fn from_iter<I: IntoIterator<Item = (K, V)>>(pairs: I) -> Self {
-        Self(
-            pairs
-                .into_iter()
-                .map(|(name, value)| (name.into(), value.into()))
-                .collect(),
-        )
+        Self(pairs.into_iter().map(|(name, value)| (name.into(), value.into())).collect())
     }
 }
 
@@ -111,17 +102,13 @@ fn tokenize(text: &str) -> Result<Vec<Token>, ConditionError> {
     let mut tokens = Vec::new();
     let mut rest = text.trim_start();
     while let Some(first) = rest.chars().next() {
-        let operator = OPERATORS
-            .into_iter()
-            .find(|operator| rest.starts_with(operator));
+        let operator = OPERATORS.into_iter().find(|operator| rest.starts_with(operator));
         let (token, length) = match (operator, first) {
             (Some(operator), _) => (Token::Operator(operator), operator.len()),
             (_, '(') => (Token::Open, 1),
             (_, ')') => (Token::Close, 1),
             (_, quote @ ('"' | '\'')) => {
-                let end = rest[1..]
-                    .find(quote)
-                    .ok_or(ConditionError::OpenQuote(quote))?;
+                let end = rest[1..].find(quote).ok_or(ConditionError::OpenQuote(quote))?;
                 (Token::Quoted(rest[1..=end].to_owned()), end + 2)
             }
             (_, '$') => {
@@ -230,9 +217,7 @@ mod tests {
     use super::*;
 
     fn holds(condition: &str) -> bool {
-        Variables::for_distribution(1, "noetic")
-            .evaluate(condition)
-            .unwrap()
+        Variables::for_distribution(1, "noetic").evaluate(condition).unwrap()
     }
 
     #[test]
@@ -241,9 +226,7 @@ mod tests {
         assert!(!holds("$ROS_VERSION==2"));
         assert!(holds("$ROS_PYTHON_VERSION >= 3"));
         assert!(holds("$ROS_DISTRO != melodic and $ROS_DISTRO > 'kinetic'"));
-        assert!(holds(
-            "$ROS_VERSION == 2 or ($ROS_DISTRO == \"noetic\" and $UNSET == '')"
-        ));
+        assert!(holds("$ROS_VERSION == 2 or ($ROS_DISTRO == \"noetic\" and $UNSET == '')"));
         // "and" binds more tightly.
         assert!(holds("1 == 1 or 1 == 2 and 1 == 2"));
         assert!(!holds("(1 == 1 or 1 == 2) and 1 == 2"));
@@ -263,10 +246,7 @@ mod tests {
             ("== 1", "value is missing"),
             (&"(".repeat(1000), "brackets"),
         ] {
-            let problem = Variables::default()
-                .evaluate(condition)
-                .unwrap_err()
-                .to_string();
+            let problem = Variables::default().evaluate(condition).unwrap_err().to_string();
             assert!(problem.contains(reason), "{condition}: {problem}");
         }
     }

@@ -30,14 +30,8 @@ struct InterfaceFormat {
 }
 
 const FORMS: [InterfaceFormat; 2] = [
-    InterfaceFormat {
-        extension: ".idl",
-        read: InterfaceFile::read_idl,
-    },
-    InterfaceFormat {
-        extension: ".json",
-        read: InterfaceFile::read_description,
-    },
+    InterfaceFormat { extension: ".idl", read: InterfaceFile::read_idl },
+    InterfaceFormat { extension: ".json", read: InterfaceFile::read_description },
 ];
 
 /// Reads all definitions below the share directories of a stack of layers.
@@ -46,16 +40,9 @@ const FORMS: [InterfaceFormat; 2] = [
 /// `opt/ros/noetic/share`; of a package in several of them only the definitions in the first are used, as in ROS
 /// itself; of several definitions of one type the one in `msg`, `srv` or `action`. Text that is not UTF-8 (in comments)
 /// is replaced. IDL and type descriptions are converted to the language of `.msg` if the package has no such file.
-pub fn read<L: AsRef<Path>, S: AsRef<str>>(
-    layers: &[L],
-    shares: &[S],
-) -> Result<Definitions, Error> {
+pub fn read<L: AsRef<Path>, S: AsRef<str>>(layers: &[L], shares: &[S]) -> Result<Definitions, Error> {
     let stack = merged::open_layers(layers)?;
-    let mut reader = DefinitionReader {
-        definitions: Definitions::new(),
-        packages: BTreeSet::new(),
-        total: 0,
-    };
+    let mut reader = DefinitionReader { definitions: Definitions::new(), packages: BTreeSet::new(), total: 0 };
     for share in shares {
         reader.read_share(&MergedDirectory::open_path(&stack, share.as_ref())?)?;
     }
@@ -95,8 +82,7 @@ impl DefinitionReader {
             let files = merged.names()?;
             for (level, name, of_type) in files_with_extension(&files, extension) {
                 if let Some(text) = self.read_file(level, name)? {
-                    self.definitions
-                        .insert(format!("{package}/{kind}/{of_type}"), text);
+                    self.definitions.insert(format!("{package}/{kind}/{of_type}"), text);
                 }
             }
             for form in FORMS {
@@ -174,11 +160,7 @@ impl DefinitionReader {
         let (path, bytes) = (level.path().join(name), file.bytes);
         self.total += bytes.len();
         if self.total > MAX_TOTAL || self.definitions.len() >= MAX_FILES {
-            return Err(Error::TooMany {
-                path,
-                what: "message definitions before it",
-                limit: self.definitions.len(),
-            });
+            return Err(Error::TooMany { path, what: "message definitions before it", limit: self.definitions.len() });
         }
         Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
     }
@@ -223,19 +205,13 @@ mod tests {
         }
 
         fn read(&self, layers: &[&str]) -> Result<Definitions, Error> {
-            let layers: Vec<PathBuf> = layers
-                .iter()
-                .map(|layer| self.0.path().join(layer))
-                .collect();
+            let layers: Vec<PathBuf> = layers.iter().map(|layer| self.0.path().join(layer)).collect();
             read(&layers, &["opt/x/share", "usr/share"])
         }
     }
 
     fn list(definitions: &Definitions) -> Vec<(&str, &str)> {
-        definitions
-            .iter()
-            .map(|(key, text)| (key.as_str(), text.as_str()))
-            .collect()
+        definitions.iter().map(|(key, text)| (key.as_str(), text.as_str())).collect()
     }
 
     #[test]
@@ -244,10 +220,7 @@ mod tests {
         layers
             .write("base/usr/share/std_msgs/msg/String.msg", "string data")
             .write("base/usr/share/std_srvs/srv/Empty.srv", "---")
-            .write(
-                "base/usr/share/demo/action/Go.action",
-                b"# caf\xe9\n---\n---\n",
-            )
+            .write("base/usr/share/demo/action/Go.action", b"# caf\xe9\n---\n---\n")
             .write("base/usr/share/std_msgs/msg/readme.txt", "x")
             .write("base/usr/share/std_msgs/msg/no-type.msg", "x")
             .write("base/usr/share/.hidden/msg/X.msg", "x")
@@ -282,8 +255,7 @@ mod tests {
         assert_eq!(names, ["p/msg/Both", "p/msg/Count", "p/msg/Point"]);
         assert_eq!(found["p/msg/Both"], "int8 of_text");
         assert_eq!(found["p/msg/Count"], "int32 n 7\n");
-        let registry =
-            ros::schema::Registry::with_definitions(ros::bus::RosVersion::Two, &found).unwrap();
+        let registry = ros::schema::Registry::with_definitions(ros::bus::RosVersion::Two, &found).unwrap();
         assert_eq!(registry.message("p/msg/Point").unwrap().fields().len(), 2);
     }
 
@@ -335,22 +307,9 @@ mod tests {
         whiteout("upper/usr/share/p/msg/C.msg");
         whiteout("upper/usr/share/gone");
         let fresh = layers.path("upper/usr/share/fresh");
-        rustix::fs::setxattr(
-            &fresh,
-            "user.overlay.opaque",
-            b"y",
-            rustix::fs::XattrFlags::empty(),
-        )
-        .unwrap();
+        rustix::fs::setxattr(&fresh, "user.overlay.opaque", b"y", rustix::fs::XattrFlags::empty()).unwrap();
         let found = layers.read(&["lower", "upper"]).unwrap();
-        assert_eq!(
-            list(&found),
-            [
-                ("fresh/msg/New", "new"),
-                ("p/msg/A", "lower A"),
-                ("p/msg/B", "upper B")
-            ]
-        );
+        assert_eq!(list(&found), [("fresh/msg/New", "new"), ("p/msg/A", "lower A"), ("p/msg/B", "upper B")]);
     }
 
     #[test]
@@ -371,20 +330,11 @@ mod tests {
         outside.write("msg/Secret.msg", "secret");
         let layers = Layers::new();
         layers.write("base/usr/share/p/msg/A.msg", "a");
-        symlink(
-            outside.0.path().join("msg/Secret.msg"),
-            layers.path("base/usr/share/p/msg/S.msg"),
-        )
-        .unwrap();
-        symlink(
-            outside.0.path().join("msg"),
-            layers.path("base/usr/share/p/srv"),
-        )
-        .unwrap();
+        symlink(outside.0.path().join("msg/Secret.msg"), layers.path("base/usr/share/p/msg/S.msg")).unwrap();
+        symlink(outside.0.path().join("msg"), layers.path("base/usr/share/p/srv")).unwrap();
         symlink(outside.0.path(), layers.path("base/usr/share/q")).unwrap();
         symlink(outside.0.path(), layers.path("base/opt/x/share")).unwrap();
-        let here =
-            std::fs::File::open(layers.path("base/usr/share/p/msg/x").parent().unwrap()).unwrap();
+        let here = std::fs::File::open(layers.path("base/usr/share/p/msg/x").parent().unwrap()).unwrap();
         rustix::fs::mkfifoat(&here, "Fifo.msg", Mode::RWXU).unwrap();
         std::fs::create_dir(layers.path("base/usr/share/p/msg/Directory.msg")).unwrap();
         assert_eq!(list(&layers.read(&["base"]).unwrap()), [("p/msg/A", "a")]);
@@ -403,14 +353,8 @@ mod tests {
         let layers = Layers::new();
         layers.write("base/usr/share/p/msg/Big.msg", "#".repeat(300 << 10));
         let text = layers.read(&["base"]).unwrap_err().to_string();
-        assert!(
-            text.contains("p/msg/Big.msg is larger than the limit of 262144 bytes"),
-            "{text}"
-        );
+        assert!(text.contains("p/msg/Big.msg is larger than the limit of 262144 bytes"), "{text}");
         let text = layers.read(&["missing"]).unwrap_err().to_string();
-        assert!(
-            text.starts_with("cannot open ") && text.contains("missing"),
-            "{text}"
-        );
+        assert!(text.starts_with("cannot open ") && text.contains("missing"), "{text}");
     }
 }

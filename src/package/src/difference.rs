@@ -64,17 +64,11 @@ struct ChangeList(Vec<Change>);
 
 impl ChangeList {
     fn add_compatible(&mut self, text: String) {
-        self.0.push(Change {
-            compatible: true,
-            text,
-        });
+        self.0.push(Change { compatible: true, text });
     }
 
     fn add_breaking(&mut self, text: String) {
-        self.0.push(Change {
-            compatible: false,
-            text,
-        });
+        self.0.push(Change { compatible: false, text });
     }
 
     /// Matches two lists by key, records removed and added items, and passes the others to `both`.
@@ -102,10 +96,7 @@ impl ChangeList {
         if old.0 != new.0 {
             self.add_breaking(format!("{what} was a {} and is a {}", old.0, new.0));
         } else if old.1 != new.1 && !old.1.is_empty() && !new.1.is_empty() {
-            self.add_breaking(format!(
-                "{what} has a different definition of {} (md5 {} was {})",
-                new.0, new.1, old.1
-            ));
+            self.add_breaking(format!("{what} has a different definition of {} (md5 {} was {})", new.0, new.1, old.1));
         }
     }
 
@@ -134,11 +125,7 @@ impl ChangeList {
             Direction::Input => before.common_request(after) == before,
         };
         let text = format!("the quality of service of {what} is {after} and was {before}");
-        if suits {
-            self.add_compatible(text)
-        } else {
-            self.add_breaking(text)
-        }
+        if suits { self.add_compatible(text) } else { self.add_breaking(text) }
     }
 
     fn compare_services(&mut self, old: &[Service], new: &[Service]) {
@@ -151,30 +138,16 @@ impl ChangeList {
     fn compare_actions(&mut self, old_all: &Interface, new_all: &Interface) {
         let key = |action: &Action| format!("action {}", action.name);
         let definition = |all: &Interface, action: &Action| {
-            let text = all
-                .definitions
-                .get(&names::definition_key(&action.type_name, "action"));
+            let text = all.definitions.get(&names::definition_key(&action.type_name, "action"));
             text.map(|text| normalize(text))
         };
-        self.compare_by_key(
-            &old_all.actions,
-            &new_all.actions,
-            key,
-            |changes, what, old, new| {
-                changes.compare_type(what, (&old.type_name, ""), (&new.type_name, ""));
-                let (before, after) = (definition(old_all, old), definition(new_all, new));
-                if old.type_name == new.type_name
-                    && before.is_some()
-                    && after.is_some()
-                    && before != after
-                {
-                    changes.add_breaking(format!(
-                        "{what} has a different definition of {}",
-                        new.type_name
-                    ));
-                }
-            },
-        );
+        self.compare_by_key(&old_all.actions, &new_all.actions, key, |changes, what, old, new| {
+            changes.compare_type(what, (&old.type_name, ""), (&new.type_name, ""));
+            let (before, after) = (definition(old_all, old), definition(new_all, new));
+            if old.type_name == new.type_name && before.is_some() && after.is_some() && before != after {
+                changes.add_breaking(format!("{what} has a different definition of {}", new.type_name));
+            }
+        });
     }
 
     fn compare_parameters(&mut self, old: &[Parameter], new: &[Parameter]) {
@@ -187,10 +160,7 @@ impl ChangeList {
                 }
             }
         });
-        self.0.extend(notes.0.into_iter().map(|change| Change {
-            compatible: true,
-            ..change
-        }));
+        self.0.extend(notes.0.into_iter().map(|change| Change { compatible: true, ..change }));
     }
 }
 
@@ -204,9 +174,7 @@ fn topic_key(topic: &Topic) -> String {
 
 /// Returns a definition without comments and insignificant white space.
 fn normalize(text: &str) -> Vec<String> {
-    let lines = text
-        .lines()
-        .map(|line| line.split('#').next().unwrap_or_default());
+    let lines = text.lines().map(|line| line.split('#').next().unwrap_or_default());
     let folded = lines.map(|line| line.split_whitespace().collect::<Vec<_>>().join(" "));
     folded.filter(|line| !line.is_empty()).collect()
 }
@@ -227,37 +195,18 @@ mod tests {
             lazy: false,
             qos: None,
         };
-        let parameter = |name: &str, value: i64| Parameter {
-            name: name.into(),
-            value: Some(value.into()),
-            ..Parameter::default()
-        };
+        let parameter =
+            |name: &str, value: i64| Parameter { name: name.into(), value: Some(value.into()), ..Parameter::default() };
         Interface {
             late: Vec::new(),
-            topics: vec![
-                topic("/in", Direction::Input, false),
-                topic("/out", Direction::Output, true),
-            ],
-            services: vec![Service {
-                name: "/s".into(),
-                type_name: "a/S".into(),
-                md5: "bb".into(),
-                node: "/n".into(),
-            }],
-            actions: vec![Action {
-                name: "/act".into(),
-                type_name: "a/Go".into(),
-                node: "/n".into(),
-            }],
+            topics: vec![topic("/in", Direction::Input, false), topic("/out", Direction::Output, true)],
+            services: vec![Service { name: "/s".into(), type_name: "a/S".into(), md5: "bb".into(), node: "/n".into() }],
+            actions: vec![Action { name: "/act".into(), type_name: "a/Go".into(), node: "/n".into() }],
             parameters: vec![parameter("/p", 1)],
             needs: Vec::new(),
             lifecycle: Vec::new(),
             requests: None,
-            definitions: [(
-                "a/action/Go".to_owned(),
-                "int32 x # goal\n---\n---\n".to_owned(),
-            )]
-            .into(),
+            definitions: [("a/action/Go".to_owned(), "int32 x # goal\n---\n---\n".to_owned())].into(),
         }
     }
 
@@ -270,8 +219,7 @@ mod tests {
         let mut new = old();
         new.topics.reverse();
         new.topics[0].nodes = vec!["/renamed".into()];
-        new.definitions
-            .insert("a/action/Go".into(), "int32   x\n\n---\n---".into());
+        new.definitions.insert("a/action/Go".into(), "int32   x\n\n---\n---".into());
         let difference = Difference::compare(&old(), &new);
         assert_eq!(difference, Difference::default());
         assert!(difference.compatible());
@@ -287,11 +235,7 @@ mod tests {
         assert!(difference.compatible());
         assert_eq!(
             texts(&difference),
-            [
-                "  input topic /in is new",
-                "  parameter /p is 1 and was 2",
-                "  service /s is new"
-            ]
+            ["  input topic /in is new", "  parameter /p is 1 and was 2", "  service /s is new"]
         );
     }
 
@@ -302,19 +246,10 @@ mod tests {
             interface.topics[at].qos = Some(qos);
             interface
         };
-        let (weak, strong) = (
-            Qos {
-                reliability: Reliability::BestEffort,
-                ..Qos::default()
-            },
-            Qos::default(),
-        );
-        for (at, from, to, compatible) in [
-            (1, strong, weak, false),
-            (1, weak, strong, true),
-            (0, weak, strong, false),
-            (0, strong, weak, true),
-        ] {
+        let (weak, strong) = (Qos { reliability: Reliability::BestEffort, ..Qos::default() }, Qos::default());
+        for (at, from, to, compatible) in
+            [(1, strong, weak, false), (1, weak, strong, true), (0, weak, strong, false), (0, strong, weak, true)]
+        {
             let difference = Difference::compare(&with(at, from), &with(at, to));
             assert_eq!(difference.changes.len(), 1, "{difference}");
             assert_eq!(difference.compatible(), compatible, "{difference}");
@@ -329,11 +264,7 @@ mod tests {
     #[test]
     fn actions_of_ros_2_are_compared_by_their_definitions() {
         let go = |text: &str| Interface {
-            actions: vec![Action {
-                name: "/go".into(),
-                type_name: "a/action/Go".into(),
-                node: "/n".into(),
-            }],
+            actions: vec![Action { name: "/go".into(), type_name: "a/action/Go".into(), node: "/n".into() }],
             definitions: [("a/action/Go".to_owned(), text.to_owned())].into(),
             ..Interface::default()
         };
@@ -347,8 +278,7 @@ mod tests {
         new.topics[0].type_name = "std_msgs/Int32".into();
         new.topics[1].direction = Direction::Input;
         new.services[0].md5 = "cc".into();
-        new.definitions
-            .insert("a/action/Go".into(), "int64 x\n---\n---\n".into());
+        new.definitions.insert("a/action/Go".into(), "int64 x\n---\n---\n".into());
         new.parameters.clear();
         let difference = Difference::compare(&old(), &new);
         assert!(!difference.compatible());
@@ -363,10 +293,7 @@ mod tests {
         assert_eq!(texts(&difference), expected);
         let mut unlatched = old();
         unlatched.topics[1].latched = false;
-        assert_eq!(
-            texts(&Difference::compare(&old(), &unlatched)),
-            ["! output topic /out is no longer latched"]
-        );
+        assert_eq!(texts(&Difference::compare(&old(), &unlatched)), ["! output topic /out is no longer latched"]);
         assert!(Difference::compare(&unlatched, &old()).compatible());
     }
 }

@@ -157,9 +157,7 @@ pub enum Error {
         problem: String,
     },
     /// A supplement contradicts what was found in the running package.
-    #[error(
-        "in the interface file {what} is {stated}, but {found} was found; correct or remove it there"
-    )]
+    #[error("in the interface file {what} is {stated}, but {found} was found; correct or remove it there")]
     Contradiction {
         /// Object, such as "input topic /image".
         what: String,
@@ -187,17 +185,13 @@ pub enum Error {
         type_name: String,
     },
     /// A request pair is to be matched by the goal of an action.
-    #[error(
-        "{input} is given with \"by goal\"; action goals are recognised automatically, so remove it"
-    )]
+    #[error("{input} is given with \"by goal\"; action goals are recognised automatically, so remove it")]
     GoalIsNoTopic {
         /// Topic.
         input: String,
     },
     /// Two request pairs name the same topic.
-    #[error(
-        "{topic} is named twice; name all outputs that answer an input in one request, and each output in one"
-    )]
+    #[error("{topic} is named twice; name all outputs that answer an input in one request, and each output in one")]
     NamedTwice {
         /// Topic.
         topic: String,
@@ -223,22 +217,10 @@ fn describe_topics(direction: &str, topics: &[String]) -> String {
 impl From<foreign::Error> for Error {
     fn from(error: foreign::Error) -> Self {
         match error {
-            foreign::Error::File {
-                action,
-                path,
-                source,
-            } => Self::File {
-                action,
-                path,
-                source,
-            },
+            foreign::Error::File { action, path, source } => Self::File { action, path, source },
             foreign::Error::TooLarge { path, limit } => Self::TooLarge { path, limit },
             foreign::Error::Outside { path, root } => Self::Outside { path, root },
-            foreign::Error::TooDeep { path, limit } => Self::TooMany {
-                path,
-                what: "directories in each other",
-                limit,
-            },
+            foreign::Error::TooDeep { path, limit } => Self::TooMany { path, what: "directories in each other", limit },
             foreign::Error::NotAFile { path } => Self::File {
                 action: "read",
                 path,
@@ -252,11 +234,9 @@ impl From<foreign::Error> for Error {
                     "a file system is mounted there; detach it with umount --lazy",
                 ),
             },
-            foreign::Error::Cancelled(cancelled) => Self::File {
-                action: "read",
-                path: PathBuf::new(),
-                source: cancelled.into(),
-            },
+            foreign::Error::Cancelled(cancelled) => {
+                Self::File { action: "read", path: PathBuf::new(), source: cancelled.into() }
+            }
         }
     }
 }

@@ -87,23 +87,11 @@ fn intersect(earlier: RosSupport, later: RosSupport) -> Result<RosSupport, Error
         (RosSupport::Either, later) => Ok(later),
         (earlier, RosSupport::Either) => Ok(earlier),
         (
-            RosSupport::Only {
-                version: first,
-                package: first_package,
-                because: first_because,
-            },
-            RosSupport::Only {
-                version: second,
-                package: second_package,
-                because: second_because,
-            },
+            RosSupport::Only { version: first, package: first_package, because: first_because },
+            RosSupport::Only { version: second, package: second_package, because: second_because },
         ) => {
             if first == second {
-                Ok(RosSupport::Only {
-                    version: first,
-                    package: first_package,
-                    because: first_because,
-                })
+                Ok(RosSupport::Only { version: first, package: first_package, because: first_because })
             } else {
                 Err(Error::TwoFlavours {
                     first: format!("{first_package} {first_because}"),
@@ -116,11 +104,7 @@ fn intersect(earlier: RosSupport, later: RosSupport) -> Result<RosSupport, Error
     }
 }
 
-fn detect_package(
-    located: &Located,
-    path: &Path,
-    distributions: &[Distribution],
-) -> Result<RosSupport, Error> {
+fn detect_package(located: &Located, path: &Path, distributions: &[Distribution]) -> Result<RosSupport, Error> {
     let file = located.base().join(path).join("package.xml");
     let text = read::read_text(&located.root, &file, MAX_BYTES)?;
     let mut fitting: Vec<(RosVersion, Manifest)> = Vec::new();
@@ -136,11 +120,9 @@ fn detect_package(
     }
     match &fitting[..] {
         [] => Err(unsupported_error(&file, last)),
-        [(version, manifest)] => Ok(RosSupport::Only {
-            version: *version,
-            because: reason(manifest),
-            package: manifest.name.clone(),
-        }),
+        [(version, manifest)] => {
+            Ok(RosSupport::Only { version: *version, because: reason(manifest), package: manifest.name.clone() })
+        }
         _ => Ok(RosSupport::Either),
     }
 }
@@ -156,10 +138,7 @@ fn reason(manifest: &Manifest) -> String {
 /// Returns the error for a package that no distribution can build.
 fn unsupported_error(file: &Path, manifest: Option<Manifest>) -> Error {
     let Some(manifest) = manifest else {
-        return Error::BuildType {
-            path: file.to_owned(),
-            build_type: "unknown".to_owned(),
-        };
+        return Error::BuildType { path: file.to_owned(), build_type: "unknown".to_owned() };
     };
     match manifest.ament_tool() {
         Some(tool) if manifest.build_type == "catkin" => Error::NoBuildType {
@@ -171,10 +150,7 @@ fn unsupported_error(file: &Path, manifest: Option<Manifest>) -> Error {
             },
             tool,
         },
-        _ => Error::BuildType {
-            path: file.to_owned(),
-            build_type: manifest.build_type,
-        },
+        _ => Error::BuildType { path: file.to_owned(), build_type: manifest.build_type },
     }
 }
 
@@ -201,9 +177,7 @@ impl Manifest {
             return Some("rosidl".to_owned());
         }
         let tools = self.needs(&[Kind::Buildtool]);
-        let tool = tools
-            .into_iter()
-            .find(|tool| tool.starts_with("ament_") || tool.starts_with("rosidl_"));
+        let tool = tools.into_iter().find(|tool| tool.starts_with("ament_") || tool.starts_with("rosidl_"));
         tool.map(str::to_owned)
     }
 }

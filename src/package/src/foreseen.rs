@@ -28,18 +28,8 @@ pub struct SourceScan {
 }
 
 /// Directories of a ROS 1 package whose files are installed only if its build files state so.
-const LEFT_OUT: [&str; 10] = [
-    "build",
-    "devel",
-    "install",
-    "test",
-    "tests",
-    "doc",
-    "docs",
-    "include",
-    "__pycache__",
-    "cmake",
-];
+const LEFT_OUT: [&str; 10] =
+    ["build", "devel", "install", "test", "tests", "doc", "docs", "include", "__pycache__", "cmake"];
 
 /// File name suffixes of ROS 2 launch files, wherever they are installed.
 const LAUNCH_OF_TWO: [&str; 4] = ["launch.py", "launch.xml", "launch.yaml", "launch.yml"];
@@ -65,13 +55,7 @@ impl SourceScan {
         self.programs > 1 && (launch_files > 1 || launch_files == 0 && !self.may_launch_more)
     }
 
-    fn add_launch_files(
-        &mut self,
-        root: &Path,
-        package: &Package,
-        version: RosVersion,
-        installed: &[String],
-    ) {
+    fn add_launch_files(&mut self, root: &Path, package: &Package, version: RosVersion, installed: &[String]) {
         // The package may be behind a link that stays inside, as in the search of the workspace.
         let Ok(directory) = root.join(&package.path).canonicalize() else {
             self.may_launch_more = true;
@@ -88,9 +72,7 @@ impl SourceScan {
                     RosVersion::One => name.ends_with(".launch") && is_shared(path),
                     RosVersion::Two => {
                         LAUNCH_OF_TWO.iter().any(|end| name.ends_with(end))
-                            && installed
-                                .iter()
-                                .any(|directory| path.starts_with(directory))
+                            && installed.iter().any(|directory| path.starts_with(directory))
                     }
                 };
             if is_installed {

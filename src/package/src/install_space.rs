@@ -64,9 +64,7 @@ pub(crate) fn find_install_space(root: &Path, space: &Path) -> Result<Option<Loc
         return Ok(None);
     };
     if layout == Layout::Catkin && is_devel(root, space)? {
-        return Err(Error::DevelSpace {
-            path: space.to_owned(),
-        });
+        return Err(Error::DevelSpace { path: space.to_owned() });
     }
     let prefixes = match layout {
         Layout::Catkin | Layout::Merged => vec![space.to_owned()],
@@ -82,16 +80,9 @@ pub(crate) fn find_install_space(root: &Path, space: &Path) -> Result<Option<Loc
     }
     if packages.is_empty() {
         let looked_for = "the install space has no share/*/package.xml".to_owned();
-        return Err(Error::NoPackage {
-            path: space.to_owned(),
-            looked_for,
-        });
+        return Err(Error::NoPackage { path: space.to_owned(), looked_for });
     }
-    Ok(Some(LocatedSpace {
-        root: space.to_owned(),
-        layout,
-        packages,
-    }))
+    Ok(Some(LocatedSpace { root: space.to_owned(), layout, packages }))
 }
 
 fn detect_layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
@@ -106,9 +97,7 @@ fn detect_layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
     if !is_file("local_setup.sh") && !is_file(".colcon_install_layout") {
         return Ok(None);
     }
-    let isolated = subdirectories(root, space)?
-        .iter()
-        .any(|prefix| prefix.join(INDEX).is_dir());
+    let isolated = subdirectories(root, space)?.iter().any(|prefix| prefix.join(INDEX).is_dir());
     Ok(isolated.then_some(Layout::Isolated))
 }
 
@@ -132,10 +121,7 @@ fn share_packages(root: &Path, prefix: &Path) -> Result<Vec<PathBuf>, Error> {
 fn check_no_symlink_install(space: &Path, package: &Path) -> Result<(), Error> {
     let hook = package.join("hook/pythonpath_develop.sh");
     if hook.is_file() {
-        return Err(Error::SymlinkInstall {
-            path: space.to_owned(),
-            hook,
-        });
+        return Err(Error::SymlinkInstall { path: space.to_owned(), hook });
     }
     Ok(())
 }
@@ -162,9 +148,7 @@ fn parse_plain_path(after: &str) -> Option<PathBuf> {
     let name = named.trim().trim_matches(['"', '\'']);
     let is_plain = name.starts_with('/')
         && name.len() > 1
-        && name
-            .chars()
-            .all(|c| c.is_alphanumeric() || "/_-.+@ ".contains(c))
+        && name.chars().all(|c| c.is_alphanumeric() || "/_-.+@ ".contains(c))
         && name.split('/').all(|part| part != "..");
     is_plain.then(|| PathBuf::from(name.trim_end_matches('/')))
 }

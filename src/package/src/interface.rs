@@ -37,10 +37,7 @@ pub struct Interface {
     pub lifecycle: Vec<String>,
     /// Request pairs, as decided by the push; absent in interfaces recorded by earlier versions
     /// ([`Interface::decided_requests`]).
-    #[serde(
-        skip_serializing_if = "Option::is_none",
-        deserialize_with = "read_requests"
-    )]
+    #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "read_requests")]
     pub requests: Option<Vec<Request>>,
     /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`: those used above and all that
     /// they refer to.

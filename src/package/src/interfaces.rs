@@ -60,8 +60,7 @@ pub fn check(workspace: &Workspace, known: &Definitions) -> Result<(), Error> {
         }
     }
     for source in sources.iter().filter(|source| source.is_built) {
-        resolve(&registry, &source.key)
-            .map_err(|error| definition_error(workspace, source, &error))?;
+        resolve(&registry, &source.key).map_err(|error| definition_error(workspace, source, &error))?;
     }
     Ok(())
 }
@@ -99,18 +98,11 @@ fn definition_error(workspace: &Workspace, source: &InterfaceSource, error: &Sch
         }
         other => other.to_string(),
     };
-    Error::Definition {
-        path: workspace.root.join(&source.path),
-        problem,
-    }
+    Error::Definition { path: workspace.root.join(&source.path), problem }
 }
 
 /// Reads the interface files of a package, if its build generates code for any.
-fn read_package(
-    root: &Path,
-    package: &Package,
-    sources: &mut Vec<InterfaceSource>,
-) -> Result<(), Error> {
+fn read_package(root: &Path, package: &Package, sources: &mut Vec<InterfaceSource>) -> Result<(), Error> {
     let directory = root.join(&package.path);
     let build_file = directory.join("CMakeLists.txt");
     if !build_file.is_file() {
@@ -128,11 +120,7 @@ fn read_package(
         };
         let mut names = files.names()?;
         if names.len() > MAX_FILES {
-            return Err(Error::TooMany {
-                path: files.path().to_owned(),
-                what: "files",
-                limit: MAX_FILES,
-            });
+            return Err(Error::TooMany { path: files.path().to_owned(), what: "files", limit: MAX_FILES });
         }
         names.sort();
         for name in names {

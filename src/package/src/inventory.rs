@@ -76,12 +76,7 @@ impl Inventory {
 
 /// Returns the install spaces: those named by the environment and the nodes, then `/usr`, then others below `/opt`.
 fn find_prefixes(stack: &[LayerDirectory], of: SearchHints<'_>) -> Result<Vec<String>, Error> {
-    let variable = |name| {
-        of.environment
-            .get(name)
-            .map_or("", String::as_str)
-            .split(':')
-    };
+    let variable = |name| of.environment.get(name).map_or("", String::as_str).split(':');
     let spaces = variable("AMENT_PREFIX_PATH").chain(variable("CMAKE_PREFIX_PATH"));
     let mut named: Vec<String> = spaces.map(str::to_owned).collect();
     let shares = variable("ROS_PACKAGE_PATH").filter_map(|share| share.strip_suffix("/share"));
@@ -133,10 +128,7 @@ fn list_directories(stack: &[LayerDirectory], parent: &str) -> Result<Vec<String
     Ok(found)
 }
 
-fn find_packages(
-    stack: &[LayerDirectory],
-    prefixes: &[String],
-) -> Result<BTreeMap<String, InstalledPackage>, Error> {
+fn find_packages(stack: &[LayerDirectory], prefixes: &[String]) -> Result<BTreeMap<String, InstalledPackage>, Error> {
     let mut packages: BTreeMap<String, InstalledPackage> = BTreeMap::new();
     for prefix in prefixes {
         let share = MergedDirectory::open_path(stack, &format!("{prefix}/share"))?;
@@ -156,18 +148,13 @@ fn find_packages(
             if !is_package && !indexed.contains(&name) {
                 continue;
             }
-            let components = if indexed.contains(&name) {
-                ament::components(stack, prefix, &name)?
-            } else {
-                Vec::new()
-            };
+            let components =
+                if indexed.contains(&name) { ament::components(stack, prefix, &name)? } else { Vec::new() };
             let components = components.into_iter();
             let installed = InstalledPackage {
                 share: format!("{prefix}/share/{name}"),
                 launch_files: launch::find_launch_files(&own)?,
-                components: components
-                    .map(|(class, library)| (class, format!("{prefix}/{library}")))
-                    .collect(),
+                components: components.map(|(class, library)| (class, format!("{prefix}/{library}"))).collect(),
                 ..InstalledPackage::default()
             };
             packages.insert(name, installed);
@@ -211,9 +198,8 @@ fn find_executables(lib: &MergedDirectory) -> Result<BTreeSet<String>, Error> {
 fn find_programs(stack: &[LayerDirectory], of: SearchHints<'_>) -> BTreeMap<String, String> {
     let package = of.package;
     let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
-    let of_package = |argument: &&String| {
-        argument.starts_with('/') && below.iter().any(|below| argument.contains(below))
-    };
+    let of_package =
+        |argument: &&String| argument.starts_with('/') && below.iter().any(|below| argument.contains(below));
     // Nodes also get files of the package as arguments. A file that cannot be found or inspected is assumed to be an
     // executable, since it was when it was started.
     let runs = |path: &&String| !matches!(is_program(stack, Path::new(path)), Ok(Some(false)));

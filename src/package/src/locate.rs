@@ -47,18 +47,13 @@ impl Located {
 
 /// Searches a directory; see [`crate::workspace::inspect`] for the rules.
 pub(crate) fn locate(root: &Path) -> Result<Located, Error> {
-    let real = root
-        .canonicalize()
-        .map_err(|error| read::file_error("open", root, error))?;
+    let real = root.canonicalize().map_err(|error| read::file_error("open", root, error))?;
     if !real.is_dir() {
         let error = std::io::Error::from(std::io::ErrorKind::NotADirectory);
         return Err(read::file_error("open", root, error));
     }
     if real.join("package.xml").is_file() {
-        return Ok(Located {
-            root: real,
-            what: LocatedKind::Sources(vec![PathBuf::new()]),
-        });
+        return Ok(Located { root: real, what: LocatedKind::Sources(vec![PathBuf::new()]) });
     }
     let has_sources = real.join("src").is_dir();
     for candidate in [real.clone(), real.join("install")] {
@@ -66,70 +61,36 @@ pub(crate) fn locate(root: &Path) -> Result<Located, Error> {
             continue;
         }
         if let Some(space) = install_space::find_install_space(&real, &candidate)? {
-            return Ok(Located {
-                root: real,
-                what: LocatedKind::Space(space),
-            });
+            return Ok(Located { root: real, what: LocatedKind::Space(space) });
         }
     }
-    let start = if has_sources {
-        PathBuf::from("src")
-    } else {
-        PathBuf::new()
-    };
-    let mut search = PackageSearch {
-        root: &real,
-        seen: BTreeSet::new(),
-        packages: Vec::new(),
-        ignored: 0,
-    };
+    let start = if has_sources { PathBuf::from("src") } else { PathBuf::new() };
+    let mut search = PackageSearch { root: &real, seen: BTreeSet::new(), packages: Vec::new(), ignored: 0 };
     search.search_directory(&start, 0)?;
-    let PackageSearch {
-        packages, ignored, ..
-    } = search;
+    let PackageSearch { packages, ignored, .. } = search;
     if packages.is_empty() {
-        return Err(Error::NoPackage {
-            path: root.to_owned(),
-            looked_for: describe_search(has_sources, ignored),
-        });
+        return Err(Error::NoPackage { path: root.to_owned(), looked_for: describe_search(has_sources, ignored) });
     }
-    Ok(Located {
-        root: real,
-        what: LocatedKind::Sources(packages),
-    })
+    Ok(Located { root: real, what: LocatedKind::Sources(packages) })
 }
 
 fn describe_search(has_sources: bool, ignored: usize) -> String {
-    let place = if has_sources {
-        "below its src"
-    } else {
-        "anywhere below it"
-    };
-    let mut text = format!(
-        "no package.xml in it or {place}, no {MARKER} with a setup.sh, and no {}",
-        install_space::INDEX
-    );
+    let place = if has_sources { "below its src" } else { "anywhere below it" };
+    let mut text =
+        format!("no package.xml in it or {place}, no {MARKER} with a setup.sh, and no {}", install_space::INDEX);
     if ignored > 0 {
-        text.push_str(&format!(
-            " ({ignored} directories were skipped because of a file such as {})",
-            IGNORE[0]
-        ));
+        text.push_str(&format!(" ({ignored} directories were skipped because of a file such as {})", IGNORE[0]));
     }
     text
 }
 
 /// Resolves a path; fails if the result is not below `root`.
 fn resolve_inside(root: &Path, path: &Path) -> Result<PathBuf, Error> {
-    let real = path
-        .canonicalize()
-        .map_err(|error| read::file_error("open", path, error))?;
+    let real = path.canonicalize().map_err(|error| read::file_error("open", path, error))?;
     if real.starts_with(root) {
         return Ok(real);
     }
-    Err(Error::Outside {
-        path: path.to_owned(),
-        root: root.to_owned(),
-    })
+    Err(Error::Outside { path: path.to_owned(), root: root.to_owned() })
 }
 
 /// Returns the subdirectories of a directory, sorted by name, including links that stay in `root`.
@@ -141,9 +102,8 @@ pub(crate) fn subdirectories(root: &Path, directory: &Path) -> Result<Vec<PathBu
         let kind = entry.file_type().map_err(failed)?;
         let hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
         // A link that is dangling or leads outside is not a package's directory.
-        let within = kind.is_dir()
-            || kind.is_symlink()
-                && resolve_inside(root, &entry.path()).is_ok_and(|real| real.is_dir());
+        let within =
+            kind.is_dir() || kind.is_symlink() && resolve_inside(root, &entry.path()).is_ok_and(|real| real.is_dir());
         if within && !hidden {
             found.push(entry.path());
         }
@@ -157,11 +117,7 @@ pub(crate) fn check_package_count(packages: usize, path: &Path) -> Result<(), Er
     if packages <= MAX_PACKAGES {
         return Ok(());
     }
-    Err(Error::TooMany {
-        path: path.to_owned(),
-        what: "packages",
-        limit: MAX_PACKAGES,
-    })
+    Err(Error::TooMany { path: path.to_owned(), what: "packages", limit: MAX_PACKAGES })
 }
 
 /// Search for source packages.
@@ -181,11 +137,7 @@ impl PackageSearch<'_> {
             return Ok(());
         }
         if self.seen.len() > MAX_DIRECTORIES {
-            return Err(Error::TooMany {
-                path: self.root.to_owned(),
-                what: "directories",
-                limit: MAX_DIRECTORIES,
-            });
+            return Err(Error::TooMany { path: self.root.to_owned(), what: "directories", limit: MAX_DIRECTORIES });
         }
         if IGNORE.iter().any(|name| directory.join(name).exists()) {
             self.ignored += 1;

@@ -96,11 +96,7 @@ impl Manifest {
     /// Parses the text of a file; `path` is used in messages.
     pub fn parse(text: &str, path: &Path, variables: &Variables) -> Result<Self, Error> {
         let document = Document::parse(text).map_err(|error| xml_error(path, &error))?;
-        let reader = ManifestReader {
-            document: &document,
-            path,
-            variables,
-        };
+        let reader = ManifestReader { document: &document, path, variables };
         reader.parse_manifest()
     }
 
@@ -111,10 +107,7 @@ impl Manifest {
 
     /// Returns the names of the dependencies of any of `kinds`.
     pub fn needs(&self, kinds: &[Kind]) -> BTreeSet<&str> {
-        let wanted = self
-            .dependencies
-            .iter()
-            .filter(|dependency| kinds.contains(&dependency.kind));
+        let wanted = self.dependencies.iter().filter(|dependency| kinds.contains(&dependency.kind));
         wanted.map(|dependency| dependency.name.as_str()).collect()
     }
 }
@@ -123,9 +116,7 @@ fn xml_error(path: &Path, error: &roxmltree::Error) -> Error {
     let position = error.pos();
     let text = error.to_string();
     // The position is already part of the error.
-    let problem = text
-        .strip_suffix(&format!(" at {position}"))
-        .unwrap_or(&text);
+    let problem = text.strip_suffix(&format!(" at {position}")).unwrap_or(&text);
     Error::Manifest {
         path: path.to_owned(),
         line: position.row,
@@ -144,29 +135,15 @@ impl<'a> ManifestReader<'a> {
     fn parse_manifest(&self) -> Result<Manifest, Error> {
         let root = self.document.root_element();
         if !root.has_tag_name("package") {
-            let problem = format!(
-                "the root element is <{}>, not <package>",
-                root.tag_name().name()
-            );
+            let problem = format!("the root element is <{}>, not <package>", root.tag_name().name());
             return Err(self.manifest_error(root, problem));
         }
         let format = self.format(root)?;
         let name = self.name(root)?;
-        let version = self
-            .children(root, "version")?
-            .first()
-            .map(|node| self.text(*node))
-            .unwrap_or_default();
-        let description = self
-            .children(root, "description")?
-            .first()
-            .map(|node| folded_text(*node))
-            .unwrap_or_default();
-        let licenses = self
-            .children(root, "license")?
-            .into_iter()
-            .map(|node| self.text(node))
-            .collect();
+        let version = self.children(root, "version")?.first().map(|node| self.text(*node)).unwrap_or_default();
+        let description =
+            self.children(root, "description")?.first().map(|node| folded_text(*node)).unwrap_or_default();
+        let licenses = self.children(root, "license")?.into_iter().map(|node| self.text(node)).collect();
         let dependencies = self.dependencies(root, format)?;
         let (build_type, metapackage) = self.export(root)?;
         let groups = self.groups(root, "member_of_group", format)?;
@@ -190,10 +167,9 @@ impl<'a> ManifestReader<'a> {
             None | Some("1") => Ok(1),
             Some("2") => Ok(2),
             Some("3") => Ok(3),
-            Some(other) => Err(self.manifest_error(
-                root,
-                format!("unknown format {other:?}; supported are 1, 2 and 3"),
-            )),
+            Some(other) => {
+                Err(self.manifest_error(root, format!("unknown format {other:?}; supported are 1, 2 and 3")))
+            }
         }
     }
 
@@ -208,8 +184,7 @@ impl<'a> ManifestReader<'a> {
         };
         let name = self.text(node);
         if !names::is_package(&name) {
-            let problem =
-                format!("{name:?} is not a package name: a letter, then letters, digits, _ and -");
+            let problem = format!("{name:?} is not a package name: a letter, then letters, digits, _ and -");
             return Err(self.manifest_error(node, problem));
         }
         Ok(name)
@@ -226,27 +201,16 @@ impl<'a> ManifestReader<'a> {
             }
             let name = self.text(node);
             if !names::is_dependency(&name) {
-                let problem = format!(
-                    "{name:?} in <{}> is not a valid dependency name",
-                    node.tag_name().name()
-                );
+                let problem = format!("{name:?} in <{}> is not a valid dependency name", node.tag_name().name());
                 return Err(self.manifest_error(node, problem));
             }
-            dependencies.extend(kinds.iter().map(|&kind| Dependency {
-                name: name.clone(),
-                kind,
-            }));
+            dependencies.extend(kinds.iter().map(|&kind| Dependency { name: name.clone(), kind }));
         }
         Ok(dependencies)
     }
 
     /// Returns the names of groups in elements of this name.
-    fn groups(
-        &self,
-        root: Node<'a, 'a>,
-        element: &str,
-        format: u8,
-    ) -> Result<BTreeSet<String>, Error> {
+    fn groups(&self, root: Node<'a, 'a>, element: &str, format: u8) -> Result<BTreeSet<String>, Error> {
         let nodes = match format {
             3.. => self.children(root, element)?,
             _ => Vec::new(),
@@ -256,10 +220,7 @@ impl<'a> ManifestReader<'a> {
             if names::is_dependency(&name) {
                 Ok(name)
             } else {
-                Err(self.manifest_error(
-                    node,
-                    format!("{name:?} in <{element}> is not a valid group name"),
-                ))
+                Err(self.manifest_error(node, format!("{name:?} in <{element}> is not a valid group name")))
             }
         });
         named.collect()
@@ -291,9 +252,7 @@ impl<'a> ManifestReader<'a> {
         let Some(condition) = node.attribute("condition") else {
             return Ok(true);
         };
-        let wrong = |problem| {
-            self.manifest_error(node, format!("invalid condition {condition:?}: {problem}"))
-        };
+        let wrong = |problem| self.manifest_error(node, format!("invalid condition {condition:?}: {problem}"));
         self.variables.evaluate(condition).map_err(wrong)
     }
 
@@ -303,21 +262,13 @@ impl<'a> ManifestReader<'a> {
 
     fn manifest_error(&self, node: Node<'a, 'a>, problem: String) -> Error {
         let position = self.document.text_pos_at(node.range().start);
-        Error::Manifest {
-            path: self.path.to_owned(),
-            line: position.row,
-            column: position.col,
-            problem,
-        }
+        Error::Manifest { path: self.path.to_owned(), line: position.row, column: position.col, problem }
     }
 }
 
 /// Returns all text in an element, with white space collapsed.
 fn folded_text(node: Node<'_, '_>) -> String {
-    let texts = node
-        .descendants()
-        .filter(Node::is_text)
-        .filter_map(|text| text.text());
+    let texts = node.descendants().filter(Node::is_text).filter_map(|text| text.text());
     let text: String = texts.collect();
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
@@ -327,11 +278,7 @@ mod tests {
     use super::*;
 
     fn parse(text: &str) -> Result<Manifest, Error> {
-        Manifest::parse(
-            text,
-            Path::new("src/x/package.xml"),
-            &Variables::for_distribution(1, "noetic"),
-        )
+        Manifest::parse(text, Path::new("src/x/package.xml"), &Variables::for_distribution(1, "noetic"))
     }
 
     fn refusal(text: &str) -> String {
@@ -358,10 +305,7 @@ mod tests {
                </package>"#,
         )
         .unwrap();
-        assert_eq!(
-            (manifest.format, &manifest.name[..], &manifest.version[..]),
-            (1, "people_detect", "1.2.3")
-        );
+        assert_eq!((manifest.format, &manifest.name[..], &manifest.version[..]), (1, "people_detect", "1.2.3"));
         assert_eq!(manifest.description, "Finds people in pictures");
         assert_eq!(manifest.licenses, ["BSD", "MIT"]);
         assert_eq!(needs(&manifest, Kind::Buildtool), ["catkin"]);
@@ -369,10 +313,7 @@ mod tests {
         assert_eq!(needs(&manifest, Kind::BuildExport), ["rospy"]);
         assert_eq!(needs(&manifest, Kind::Exec), ["rospy"]);
         assert_eq!(needs(&manifest, Kind::Test), ["gtest"]);
-        assert_eq!(
-            (&manifest.build_type[..], manifest.metapackage),
-            ("catkin", false)
-        );
+        assert_eq!((&manifest.build_type[..], manifest.metapackage), ("catkin", false));
     }
 
     #[test]
@@ -448,14 +389,8 @@ mod tests {
         assert!(one.groups.is_empty());
         let two = read(2, "jazzy");
         assert_eq!(two.build_type, "ament_cmake");
-        assert_eq!(
-            needs(&two, Kind::Buildtool),
-            ["ament_cmake", "rosidl_default_generators"]
-        );
-        assert_eq!(
-            needs(&two, Kind::Exec),
-            ["new_one", "rosidl_default_runtime", "std_msgs"]
-        );
+        assert_eq!(needs(&two, Kind::Buildtool), ["ament_cmake", "rosidl_default_generators"]);
+        assert_eq!(needs(&two, Kind::Exec), ["new_one", "rosidl_default_runtime", "std_msgs"]);
         assert_eq!(two.groups, BTreeSet::from([INTERFACES.to_owned()]));
         assert!(!needs(&read(2, "humble"), Kind::Exec).contains(&"new_one"));
     }
@@ -469,30 +404,19 @@ mod tests {
             )
         };
         let manifest = parse(&text(3)).unwrap();
-        assert_eq!(
-            manifest.group_dependencies,
-            BTreeSet::from(["g".to_owned()])
-        );
+        assert_eq!(manifest.group_dependencies, BTreeSet::from(["g".to_owned()]));
         assert_eq!(manifest.groups, BTreeSet::from(["h".to_owned()]));
         let manifest = parse(&text(2)).unwrap();
         assert!(manifest.group_dependencies.is_empty() && manifest.groups.is_empty());
-        let message = refusal(
-            "<package format='3'><name>x</name><member_of_group>../g</member_of_group></package>",
-        );
+        let message = refusal("<package format='3'><name>x</name><member_of_group>../g</member_of_group></package>");
         assert!(message.contains("not a valid group name"), "{message}");
     }
 
     #[test]
     fn malformed_xml_is_told_with_its_place() {
         let text = refusal("<package>\n  <name>x</nam>\n</package>");
-        assert!(
-            text.starts_with("src/x/package.xml, line 2, column "),
-            "{text}"
-        );
-        assert!(
-            text.contains("malformed XML") && !text.contains(" at 2:"),
-            "{text}"
-        );
+        assert!(text.starts_with("src/x/package.xml, line 2, column "), "{text}");
+        assert!(text.contains("malformed XML") && !text.contains(" at 2:"), "{text}");
         assert!(refusal("").contains("malformed XML"));
         let entities = r#"<!DOCTYPE p [<!ENTITY a "aaaa">]><package><name>&a;</name></package>"#;
         assert!(refusal(entities).contains("malformed XML"));
@@ -503,31 +427,13 @@ mod tests {
         for (text, reason) in [
             ("<launch/>", "<launch>, not <package>"),
             ("<package/>", "<name> element is missing"),
-            (
-                "<package>\n<name>a</name>\n<name>b</name></package>",
-                "line 3, column 1: a second <name>",
-            ),
-            (
-                "<package><name>1x</name></package>",
-                "\"1x\" is not a package name",
-            ),
-            (
-                "<package><name></name></package>",
-                "\"\" is not a package name",
-            ),
+            ("<package>\n<name>a</name>\n<name>b</name></package>", "line 3, column 1: a second <name>"),
+            ("<package><name>1x</name></package>", "\"1x\" is not a package name"),
+            ("<package><name></name></package>", "\"\" is not a package name"),
             ("<package><name>../x</name></package>", "not a package name"),
-            (
-                "<package format='4'><name>x</name></package>",
-                "unknown format \"4\"",
-            ),
-            (
-                "<package><name>x</name><build_depend>-o x</build_depend></package>",
-                "\"-o x\" in <build_depend>",
-            ),
-            (
-                "<package format='2'><name>x</name><depend></depend></package>",
-                "\"\" in <depend>",
-            ),
+            ("<package format='4'><name>x</name></package>", "unknown format \"4\""),
+            ("<package><name>x</name><build_depend>-o x</build_depend></package>", "\"-o x\" in <build_depend>"),
+            ("<package format='2'><name>x</name><depend></depend></package>", "\"\" in <depend>"),
             (
                 "<package format='3'><name>x</name><depend condition='$A'>y</depend></package>",
                 "invalid condition \"$A\"",
@@ -543,13 +449,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("package.xml");
         let read = || {
-            Manifest::load(
-                directory.path(),
-                &path,
-                &Variables::for_distribution(1, "noetic"),
-            )
-            .unwrap_err()
-            .to_string()
+            Manifest::load(directory.path(), &path, &Variables::for_distribution(1, "noetic")).unwrap_err().to_string()
         };
         assert!(read().starts_with("cannot open ") && read().contains("package.xml"));
         std::fs::write(&path, " ".repeat(2 << 20)).unwrap();

@@ -19,9 +19,7 @@ pub(crate) const MAX_FILES: usize = 20_000;
 /// Opens extracted trees, given lowest first; returns them uppermost first.
 pub(crate) fn open_layers<L: AsRef<Path>>(layers: &[L]) -> Result<Vec<LayerDirectory>, Error> {
     let layers = layers.iter().rev();
-    layers
-        .map(|layer| Ok(LayerDirectory(Tree::open(layer.as_ref())?)))
-        .collect()
+    layers.map(|layer| Ok(LayerDirectory(Tree::open(layer.as_ref())?))).collect()
 }
 
 /// A directory in one layer.
@@ -40,8 +38,7 @@ impl LayerDirectory {
     pub(crate) fn is_executable(&self, name: &[u8]) -> bool {
         let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
         rustix::fs::statat(self.0.as_fd(), name, flags).is_ok_and(|stat| {
-            FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile
-                && stat.st_mode & 0o111 != 0
+            FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile && stat.st_mode & 0o111 != 0
         })
     }
 
@@ -91,12 +88,8 @@ impl MergedDirectory {
     }
 
     fn open_root(stack: &[LayerDirectory]) -> Result<Self, Error> {
-        let levels = stack
-            .iter()
-            .map(|level| Ok(LayerDirectory(level.0.try_clone()?)));
-        Ok(Self {
-            levels: levels.collect::<Result<_, Error>>()?,
-        })
+        let levels = stack.iter().map(|level| Ok(LayerDirectory(level.0.try_clone()?)));
+        Ok(Self { levels: levels.collect::<Result<_, Error>>()? })
     }
 
     /// Returns whether the directory exists.
@@ -136,11 +129,7 @@ impl MergedDirectory {
                 }
             }
             if names.len() > MAX_FILES {
-                return Err(Error::TooMany {
-                    path: level.path().to_owned(),
-                    what: "files",
-                    limit: MAX_FILES,
-                });
+                return Err(Error::TooMany { path: level.path().to_owned(), what: "files", limit: MAX_FILES });
             }
         }
         Ok(names)
@@ -149,11 +138,8 @@ impl MergedDirectory {
 
 /// Returns whether a directory hides those of its name in the layers below.
 fn is_opaque(directory: &Tree) -> bool {
-    ["trusted.overlay.opaque", "user.overlay.opaque"]
-        .iter()
-        .any(|name| {
-            let mut value = [0; 4];
-            rustix::fs::fgetxattr(directory.as_fd(), *name, &mut value[..])
-                .is_ok_and(|length| &value[..length] == b"y")
-        })
+    ["trusted.overlay.opaque", "user.overlay.opaque"].iter().any(|name| {
+        let mut value = [0; 4];
+        rustix::fs::fgetxattr(directory.as_fd(), *name, &mut value[..]).is_ok_and(|length| &value[..length] == b"y")
+    })
 }

@@ -5,9 +5,7 @@
 pub fn is_package(name: &str) -> bool {
     name.len() <= 128
         && name.starts_with(|c: char| c.is_ascii_alphabetic())
-        && name
-            .chars()
-            .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
 }
 
 /// Returns whether a text is the name of a dependency: a package or a rosdep key, such as `libstdc++6` or
@@ -15,9 +13,7 @@ pub fn is_package(name: &str) -> bool {
 pub fn is_dependency(name: &str) -> bool {
     name.len() <= 128
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
-        && name
-            .chars()
-            .all(|c| c.is_ascii_alphanumeric() || "_-.+".contains(c))
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || "_-.+".contains(c))
 }
 
 /// Returns whether a text is the second part of a type: a letter, then letters, digits and `_`.
@@ -32,9 +28,7 @@ pub fn is_type(name: &str) -> bool {
 pub fn is_executable(name: &str) -> bool {
     (1..=255).contains(&name.len())
         && !name.starts_with(['.', '-'])
-        && name
-            .chars()
-            .all(|c| !c.is_control() && !"'\"`$\\/".contains(c))
+        && name.chars().all(|c| !c.is_control() && !"'\"`$\\/".contains(c))
 }
 
 /// Returns whether a text is a qualified C++ class, such as `image_tools::ShowImage`.
@@ -51,9 +45,7 @@ pub fn is_library(path: &str) -> bool {
 pub fn is_full_type(name: &str) -> bool {
     let parts: Vec<&str> = name.splitn(4, '/').collect();
     match parts[..] {
-        [package, of_it] | [package, "msg" | "srv" | "action", of_it] => {
-            is_package(package) && is_type(of_it)
-        }
+        [package, of_it] | [package, "msg" | "srv" | "action", of_it] => is_package(package) && is_type(of_it),
         _ => false,
     }
 }
@@ -84,16 +76,9 @@ mod tests {
 
     #[test]
     fn what_names_packages_types_and_topics() {
-        assert!(
-            is_package("image_proc")
-                && !is_package("1x")
-                && !is_package("a b")
-                && !is_package("../x")
-        );
+        assert!(is_package("image_proc") && !is_package("1x") && !is_package("a b") && !is_package("../x"));
         assert!(is_dependency("libstdc++6") && !is_dependency("-oDir=/") && !is_dependency("a;b"));
-        assert!(
-            is_full_type("sensor_msgs/Image") && !is_full_type("Image") && !is_full_type("a/b/C")
-        );
+        assert!(is_full_type("sensor_msgs/Image") && !is_full_type("Image") && !is_full_type("a/b/C"));
         assert!(
             is_full_type("sensor_msgs/msg/Image")
                 && is_full_type("a/srv/B")
@@ -104,17 +89,8 @@ mod tests {
         assert_eq!(definition_key("a/B", "srv"), "a/srv/B");
         assert_eq!(definition_key("a/msg/B", "srv"), "a/msg/B");
         assert!(is_class("image_tools::ShowImage") && !is_class("a::") && !is_class("a b"));
-        assert!(
-            is_library("lib/libx.so") && !is_library("/lib/libx.so") && !is_library("lib/../x")
-        );
-        assert!(
-            is_graph_name("/camera/image_raw") && is_graph_name("/_x") && !is_graph_name("image")
-        );
-        assert!(
-            !is_graph_name("/")
-                && !is_graph_name("/a//b")
-                && !is_graph_name("/a/")
-                && !is_graph_name("/a b")
-        );
+        assert!(is_library("lib/libx.so") && !is_library("/lib/libx.so") && !is_library("lib/../x"));
+        assert!(is_graph_name("/camera/image_raw") && is_graph_name("/_x") && !is_graph_name("image"));
+        assert!(!is_graph_name("/") && !is_graph_name("/a//b") && !is_graph_name("/a/") && !is_graph_name("/a b"));
     }
 }

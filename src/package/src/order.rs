@@ -7,30 +7,19 @@ use crate::manifest::Kind;
 use crate::workspace::Package;
 
 /// Dependencies that must be built before a package.
-const BEFORE: [Kind; 4] = [
-    Kind::Buildtool,
-    Kind::BuildtoolExport,
-    Kind::Build,
-    Kind::BuildExport,
-];
+const BEFORE: [Kind; 4] = [Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport];
 
 /// Sorts packages after their build dependencies, otherwise by name.
 pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error> {
-    let mut waiting: BTreeMap<String, Package> = packages
-        .into_iter()
-        .map(|package| (package.manifest.name.clone(), package))
-        .collect();
+    let mut waiting: BTreeMap<String, Package> =
+        packages.into_iter().map(|package| (package.manifest.name.clone(), package)).collect();
     let mut ordered = Vec::with_capacity(waiting.len());
     while !waiting.is_empty() {
-        let ready = waiting
-            .values()
-            .find(|package| build_prerequisites(package, &waiting).is_empty());
+        let ready = waiting.values().find(|package| build_prerequisites(package, &waiting).is_empty());
         match ready.map(|package| package.manifest.name.clone()) {
             Some(name) => ordered.extend(waiting.remove(&name)),
             None => {
-                return Err(Error::Circle {
-                    circle: find_cycle(&waiting),
-                });
+                return Err(Error::Circle { circle: find_cycle(&waiting) });
             }
         }
     }
@@ -38,10 +27,7 @@ pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error>
 }
 
 /// Returns the names of remaining packages that must be built before this one.
-fn build_prerequisites<'a>(
-    package: &'a Package,
-    waiting: &'a BTreeMap<String, Package>,
-) -> BTreeSet<&'a str> {
+fn build_prerequisites<'a>(package: &'a Package, waiting: &'a BTreeMap<String, Package>) -> BTreeSet<&'a str> {
     let own = &package.manifest;
     let mut names = own.needs(&BEFORE);
     names.retain(|name| waiting.contains_key(*name));
@@ -64,11 +50,9 @@ fn find_cycle(waiting: &BTreeMap<String, Package>) -> Vec<String> {
             circle.push(name);
             return circle;
         }
-        let next = waiting.get(&name).and_then(|package| {
-            build_prerequisites(package, waiting)
-                .first()
-                .map(|next| (*next).to_owned())
-        });
+        let next = waiting
+            .get(&name)
+            .and_then(|package| build_prerequisites(package, waiting).first().map(|next| (*next).to_owned()));
         path.push(name);
         match next {
             Some(next) => name = next,

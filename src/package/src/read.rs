@@ -15,23 +15,11 @@ pub(crate) fn read_text(root: &Path, path: &Path, limit: u64) -> Result<String, 
 fn decode_utf8(bytes: Vec<u8>, path: &Path) -> Result<String, Error> {
     String::from_utf8(bytes).map_err(|error| {
         let problem = format!("it is not UTF-8: {}", error.utf8_error());
-        file_error(
-            "read",
-            path,
-            std::io::Error::new(std::io::ErrorKind::InvalidData, problem),
-        )
+        file_error("read", path, std::io::Error::new(std::io::ErrorKind::InvalidData, problem))
     })
 }
 
 /// Creates the error of a failed file operation.
-pub(crate) fn file_error(
-    action: &'static str,
-    path: &Path,
-    error: impl Into<std::io::Error>,
-) -> Error {
-    Error::File {
-        action,
-        path: path.to_owned(),
-        source: error.into(),
-    }
+pub(crate) fn file_error(action: &'static str, path: &Path, error: impl Into<std::io::Error>) -> Error {
+    Error::File { action, path: path.to_owned(), source: error.into() }
 }

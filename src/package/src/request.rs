@@ -37,18 +37,12 @@ impl fmt::Display for Request {
         let answer = outputs.first().map_or("", String::as_str);
         let why = match self.reason {
             Reason::Stated => {
-                return write!(
-                    out,
-                    "answers on {answer} count for {input}, as set by --request"
-                );
+                return write!(out, "answers on {answer} count for {input}, as set by --request");
             }
             Reason::Watched => "it carried the stamp of the test input",
             Reason::Alone => "its node has no other topics",
             Reason::Guessed => "a guess by types and names, because no answer was seen",
         };
-        write!(
-            out,
-            "answers on {answer} count for {input} ({why}); change it with --request INPUT=OUTPUT"
-        )
+        write!(out, "answers on {answer} count for {input} ({why}); change it with --request INPUT=OUTPUT")
     }
 }

@@ -46,34 +46,17 @@ impl Interface {
 ///
 /// Pairs in `watched` take precedence; the rest is decided by rules. An output answers a single input, since its
 /// messages are matched with that only.
-pub fn decide_requests(
-    ros: RosVersion,
-    interface: &Interface,
-    watched: &BTreeSet<ObservedAnswer>,
-) -> Vec<Request> {
+pub fn decide_requests(ros: RosVersion, interface: &Interface, watched: &BTreeSet<ObservedAnswer>) -> Vec<Request> {
     let ends = TopicEnds::from_interface(ros, interface);
-    let nodes: BTreeSet<&str> = interface
-        .topics
-        .iter()
-        .flat_map(|topic| topic.nodes.iter().map(String::as_str))
-        .collect();
+    let nodes: BTreeSet<&str> =
+        interface.topics.iter().flat_map(|topic| topic.nodes.iter().map(String::as_str)).collect();
     // A supplement may leave the nodes of its topics unspecified.
-    let nodes = if nodes.is_empty() {
-        BTreeSet::from([""])
-    } else {
-        nodes
-    };
+    let nodes = if nodes.is_empty() { BTreeSet::from([""]) } else { nodes };
     let of_node = |node: &str| -> Vec<Request> {
-        let (inputs, outputs) = (
-            ends.topics_of_node(node, Direction::Input),
-            ends.topics_of_node(node, Direction::Output),
-        );
+        let (inputs, outputs) =
+            (ends.topics_of_node(node, Direction::Input), ends.topics_of_node(node, Direction::Output));
         let found = rules::pair_topics(&inputs, &outputs, watched).into_iter();
-        let request = |(pair, reason)| Request {
-            node: node.to_owned(),
-            pair,
-            reason,
-        };
+        let request = |(pair, reason)| Request { node: node.to_owned(), pair, reason };
         found.map(request).collect()
     };
     nodes.into_iter().flat_map(of_node).collect()
@@ -93,41 +76,27 @@ pub fn apply_stated(
     let mut requests = Vec::new();
     for pair in stated {
         let input = ends.find(Direction::Input, &pair.input)?;
-        let outputs = pair
-            .outputs
-            .iter()
-            .map(|name| ends.find(Direction::Output, name));
+        let outputs = pair.outputs.iter().map(|name| ends.find(Direction::Output, name));
         let outputs = outputs.collect::<Result<Vec<_>, _>>()?;
         let all = || std::iter::once(&input).chain(&outputs);
         let unstamped = all().find(|end| end.is_known && !end.is_stamped);
         let is_known = all().all(|end| end.is_known);
         let by = match (pair.by, unstamped) {
             (Some(Correlation::Goal), _) => {
-                return Err(Error::GoalIsNoTopic {
-                    input: pair.input.clone(),
-                });
+                return Err(Error::GoalIsNoTopic { input: pair.input.clone() });
             }
             (Some(Correlation::Stamp), Some(end)) => {
-                return Err(Error::NoStamp {
-                    topic: end.name.clone(),
-                    type_name: end.type_name.clone(),
-                });
+                return Err(Error::NoStamp { topic: end.name.clone(), type_name: end.type_name.clone() });
             }
             (Some(by), _) => Some(by),
             (None, None) => is_known.then_some(Correlation::Stamp),
             (None, Some(_)) => Some(Correlation::Arrival),
         };
-        let named = |name: &String, request: &Request| {
-            request.pair.input == *name || request.pair.outputs.contains(name)
-        };
+        let named =
+            |name: &String, request: &Request| request.pair.input == *name || request.pair.outputs.contains(name);
         let names = std::iter::once(&pair.input).chain(&pair.outputs);
-        if let Some(twice) = names
-            .into_iter()
-            .find(|name| requests.iter().any(|request| named(name, request)))
-        {
-            return Err(Error::NamedTwice {
-                topic: twice.clone(),
-            });
+        if let Some(twice) = names.into_iter().find(|name| requests.iter().any(|request| named(name, request))) {
+            return Err(Error::NamedTwice { topic: twice.clone() });
         }
         requests.push(Request {
             node: ends.find_node(&input.name, &outputs),
@@ -136,10 +105,7 @@ pub fn apply_stated(
         });
     }
     let is_stated = |node: &String| requests.iter().any(|request| request.node == *node);
-    let others: Vec<Request> = decided
-        .into_iter()
-        .filter(|other| !is_stated(&other.node))
-        .collect();
+    let others: Vec<Request> = decided.into_iter().filter(|other| !is_stated(&other.node)).collect();
     requests.extend(others);
     Ok(requests)
 }
@@ -167,47 +133,30 @@ impl<'a> TopicEnds<'a> {
             };
             (topic, end)
         };
-        Self {
-            topics: interface.topics.iter().map(end).collect(),
-        }
+        Self { topics: interface.topics.iter().map(end).collect() }
     }
 
-    fn topics_in_direction(
-        &self,
-        direction: Direction,
-    ) -> impl Iterator<Item = &(&'a Topic, TopicEnd)> {
-        self.topics
-            .iter()
-            .filter(move |(topic, _)| topic.direction == direction)
+    fn topics_in_direction(&self, direction: Direction) -> impl Iterator<Item = &(&'a Topic, TopicEnd)> {
+        self.topics.iter().filter(move |(topic, _)| topic.direction == direction)
     }
 
     /// Returns the topics of a node; topics without known nodes belong to every node.
     fn topics_of_node(&self, node: &str, direction: Direction) -> Vec<TopicEnd> {
-        let is_of =
-            |topic: &Topic| topic.nodes.is_empty() || topic.nodes.iter().any(|name| name == node);
-        let ends = self
-            .topics_in_direction(direction)
-            .filter(|(topic, _)| is_of(topic));
+        let is_of = |topic: &Topic| topic.nodes.is_empty() || topic.nodes.iter().any(|name| name == node);
+        let ends = self.topics_in_direction(direction).filter(|(topic, _)| is_of(topic));
         ends.map(|(_, end)| end.clone()).collect()
     }
 
     fn find(&self, direction: Direction, name: &str) -> Result<TopicEnd, Error> {
-        let found = self
-            .topics_in_direction(direction)
-            .find(|(topic, _)| topic.name == name);
-        found
-            .map(|(_, end)| end.clone())
-            .ok_or_else(|| Error::NoSuchTopic {
-                topic: name.to_owned(),
-                direction: match direction {
-                    Direction::Input => "input",
-                    Direction::Output => "output",
-                },
-                topics: self
-                    .topics_in_direction(direction)
-                    .map(|(topic, _)| topic.name.clone())
-                    .collect(),
-            })
+        let found = self.topics_in_direction(direction).find(|(topic, _)| topic.name == name);
+        found.map(|(_, end)| end.clone()).ok_or_else(|| Error::NoSuchTopic {
+            topic: name.to_owned(),
+            direction: match direction {
+                Direction::Input => "input",
+                Direction::Output => "output",
+            },
+            topics: self.topics_in_direction(direction).map(|(topic, _)| topic.name.clone()).collect(),
+        })
     }
 
     /// Returns the node with both the input and the answer; if there is none, that of the input.
@@ -215,8 +164,8 @@ impl<'a> TopicEnds<'a> {
         let mut nodes: BTreeMap<&str, usize> = BTreeMap::new();
         for (topic, end) in &self.topics {
             let is_input = topic.direction == Direction::Input && end.name == input;
-            let is_answer = topic.direction == Direction::Output
-                && outputs.first().is_some_and(|first| first.name == end.name);
+            let is_answer =
+                topic.direction == Direction::Output && outputs.first().is_some_and(|first| first.name == end.name);
             for node in topic.nodes.iter().filter(|_| is_input || is_answer) {
                 // The input's node has a higher weight than the output's; a node with both has the highest.
                 *nodes.entry(node).or_default() += if is_input { 2 } else { 1 };

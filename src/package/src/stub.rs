@@ -88,14 +88,7 @@ pub struct ProgramRequest {
 
 /// Files that the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a
 /// robot's token would get its permissions, and its content would be read as a setting.
-const OURS: [&str; 6] = [
-    "token",
-    "ca.pem",
-    "install.sh",
-    "stub.toml",
-    "interface.toml",
-    "revision.toml",
-];
+const OURS: [&str; 6] = ["token", "ca.pem", "install.sh", "stub.toml", "interface.toml", "revision.toml"];
 
 /// Files of a stub, by path in the install space.
 pub type Files = BTreeMap<String, Content>;
@@ -104,9 +97,7 @@ pub type Files = BTreeMap<String, Content>;
 pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Error> {
     let package = about.package;
     if !contents.share.contains_key("package.xml") {
-        return Err(Error::NoManifest {
-            package: package.to_owned(),
-        });
+        return Err(Error::NoManifest { package: package.to_owned() });
     }
     let mut files = match about.ros {
         RosVersion::One => {
@@ -116,10 +107,7 @@ pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Er
         RosVersion::Two => ament::index_files(about, &contents),
     };
     let names = launcher_names(about, &contents);
-    files.insert(
-        "install.sh".to_owned(),
-        text_file(&fill_template(INSTALL, about)),
-    );
+    files.insert("install.sh".to_owned(), text_file(&fill_template(INSTALL, about)));
     files.insert("README.md".to_owned(), text_file(&readme(about, &names)));
     for name in &names {
         let launcher = launcher(about, name, "/../..");
@@ -127,9 +115,7 @@ pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Er
     }
     for (path, content) in contents.share {
         // Also below such a name, which is then a directory.
-        if OURS.contains(&path.split('/').next().unwrap_or_default())
-            || !is_shipped(about, &path, &content)
-        {
+        if OURS.contains(&path.split('/').next().unwrap_or_default()) || !is_shipped(about, &path, &content) {
             continue;
         }
         let content = to_stub_content(about, &path, content);
@@ -157,9 +143,7 @@ fn is_shipped(about: &StubInfo<'_>, path: &str, content: &Content) -> bool {
     }
     match content {
         Content::File { executable, .. } => needed::is_needed(path, *executable),
-        Content::Link(target) => {
-            needed::is_needed(path, false) && !target.chars().any(char::is_control)
-        }
+        Content::Link(target) => needed::is_needed(path, false) && !target.chars().any(char::is_control),
     }
 }
 
@@ -196,11 +180,7 @@ impl RosTerms {
 
 /// Converts a shared file for the stub: executables are replaced by launchers.
 fn to_stub_content(about: &StubInfo<'_>, path: &str, content: Content) -> Content {
-    let Content::File {
-        bytes,
-        executable: true,
-    } = &content
-    else {
+    let Content::File { bytes, executable: true } = &content else {
         return content;
     };
     let name = path.rsplit('/').next().unwrap_or(path);
@@ -214,20 +194,13 @@ fn to_stub_content(about: &StubInfo<'_>, path: &str, content: Content) -> Conten
 }
 
 fn launcher(about: &StubInfo<'_>, node: &str, up: &str) -> Content {
-    let template = if about.outsourced.contains(node) {
-        RUN
-    } else {
-        ORIGINAL
-    };
+    let template = if about.outsourced.contains(node) { RUN } else { ORIGINAL };
     let text = template
         .replace("@PACKAGE@", about.package)
         .replace("@UP@", up)
         // Last, since the name may contain anything.
         .replace("@NODE@", &shell_quote(node));
-    Content::File {
-        bytes: text.into_bytes(),
-        executable: true,
-    }
+    Content::File { bytes: text.into_bytes(), executable: true }
 }
 
 /// Quotes a word for a shell.
@@ -236,10 +209,7 @@ fn shell_quote(word: &str) -> String {
 }
 
 fn text_file(text: &str) -> Content {
-    Content::File {
-        bytes: text.as_bytes().to_vec(),
-        executable: false,
-    }
+    Content::File { bytes: text.as_bytes().to_vec(), executable: false }
 }
 
 fn fill_template(template: &str, about: &StubInfo<'_>) -> String {
@@ -262,20 +232,14 @@ fn readme(about: &StubInfo<'_>, names: &BTreeSet<String>) -> String {
     let original = names.difference(about.outsourced).map(String::as_str);
     let example = about.outsourced.first().or(names.first());
     fill_template(README, about)
-        .replace(
-            "@OUTSOURCED@",
-            &list(about.outsourced.iter().map(String::as_str).collect()),
-        )
+        .replace("@OUTSOURCED@", &list(about.outsourced.iter().map(String::as_str).collect()))
         .replace("@ORIGINAL@", &list(original.collect()))
         .replace("@EXAMPLE@", example.map_or("NODE", String::as_str))
 }
 
 /// Returns the path of `pkg/msg/Type` in the install space, if it is of this package.
 fn definition_path(package: &str, key: &str) -> Option<String> {
-    let (kind, name) = key
-        .strip_prefix(package)?
-        .strip_prefix('/')?
-        .split_once('/')?;
+    let (kind, name) = key.strip_prefix(package)?.strip_prefix('/')?.split_once('/')?;
     let known = matches!(kind, "msg" | "srv" | "action") && crate::names::is_type(name);
     known.then(|| format!("share/{package}/{kind}/{name}.{kind}"))
 }

@@ -46,27 +46,21 @@ impl Interface {
     /// Sorts by name, so that equal interfaces have equal texts.
     pub fn sort(&mut self) {
         let direction = |topic: &Topic| matches!(topic.direction, Direction::Output);
-        self.topics
-            .sort_by(|a, b| (&a.name, direction(a)).cmp(&(&b.name, direction(b))));
+        self.topics.sort_by(|a, b| (&a.name, direction(a)).cmp(&(&b.name, direction(b))));
         self.services.sort_by(|a, b| a.name.cmp(&b.name));
         self.actions.sort_by(|a, b| a.name.cmp(&b.name));
         self.parameters.sort_by(|a, b| a.name.cmp(&b.name));
     }
 
     fn add_topic(&mut self, stated: &Topic) -> Result<(), Error> {
-        let same =
-            |topic: &&mut Topic| topic.name == stated.name && topic.direction == stated.direction;
+        let same = |topic: &&mut Topic| topic.name == stated.name && topic.direction == stated.direction;
         let Some(found) = self.topics.iter_mut().find(same) else {
             self.topics.push(stated.clone());
             return Ok(());
         };
         let what = || format!("topic {}", stated.name);
         fill_in(what, &stated.type_name, &mut found.type_name)?;
-        fill_in(
-            || format!("the md5 of topic {}", stated.name),
-            &stated.md5,
-            &mut found.md5,
-        )?;
+        fill_in(|| format!("the md5 of topic {}", stated.name), &stated.md5, &mut found.md5)?;
         found.latched |= stated.latched;
         found.lazy |= stated.lazy;
         found.qos = found.qos.or(stated.qos);
@@ -75,48 +69,24 @@ impl Interface {
     }
 
     fn add_service(&mut self, stated: &Service) -> Result<(), Error> {
-        let Some(found) = self
-            .services
-            .iter_mut()
-            .find(|service| service.name == stated.name)
-        else {
+        let Some(found) = self.services.iter_mut().find(|service| service.name == stated.name) else {
             self.services.push(stated.clone());
             return Ok(());
         };
-        fill_in(
-            || format!("service {}", stated.name),
-            &stated.type_name,
-            &mut found.type_name,
-        )?;
-        fill_in(
-            || format!("the md5 of service {}", stated.name),
-            &stated.md5,
-            &mut found.md5,
-        )
+        fill_in(|| format!("service {}", stated.name), &stated.type_name, &mut found.type_name)?;
+        fill_in(|| format!("the md5 of service {}", stated.name), &stated.md5, &mut found.md5)
     }
 
     fn add_action(&mut self, stated: &Action) -> Result<(), Error> {
-        let Some(found) = self
-            .actions
-            .iter_mut()
-            .find(|action| action.name == stated.name)
-        else {
+        let Some(found) = self.actions.iter_mut().find(|action| action.name == stated.name) else {
             self.actions.push(stated.clone());
             return Ok(());
         };
-        fill_in(
-            || format!("action {}", stated.name),
-            &stated.type_name,
-            &mut found.type_name,
-        )
+        fill_in(|| format!("action {}", stated.name), &stated.type_name, &mut found.type_name)
     }
 
     fn add_parameter(&mut self, stated: &Parameter) {
-        match self
-            .parameters
-            .iter_mut()
-            .find(|parameter| parameter.name == stated.name)
-        {
+        match self.parameters.iter_mut().find(|parameter| parameter.name == stated.name) {
             Some(found) => {
                 found.value = found.value.take().or_else(|| stated.value.clone());
                 merge_names(&mut found.read_by, &stated.read_by);
@@ -135,19 +105,11 @@ fn fill_in(what: impl Fn() -> String, stated: &str, found: &mut String) -> Resul
     if found.is_empty() || (found == "*" && !stated.is_empty()) {
         stated.clone_into(found);
     }
-    if stated.is_empty() || stated == found {
-        Ok(())
-    } else {
-        Err(contradiction_error(what(), stated, found))
-    }
+    if stated.is_empty() || stated == found { Ok(()) } else { Err(contradiction_error(what(), stated, found)) }
 }
 
 fn contradiction_error(what: String, stated: impl Display, found: impl Display) -> Error {
-    Error::Contradiction {
-        what,
-        stated: stated.to_string(),
-        found: found.to_string(),
-    }
+    Error::Contradiction { what, stated: stated.to_string(), found: found.to_string() }
 }
 
 fn merge_names(found: &mut Vec<String>, stated: &[String]) {
@@ -203,26 +165,12 @@ mod tests {
             ..Parameter::default()
         });
         let mut stated = stated_interface();
-        stated.topics.push(Topic {
-            direction: Direction::Output,
-            ..stated.topics[0].clone()
-        });
+        stated.topics.push(Topic { direction: Direction::Output, ..stated.topics[0].clone() });
         found.supplement(&stated).unwrap();
         assert_eq!(found.topics.len(), 2);
         assert!(found.topics[0].lazy && found.topics[0].md5.starts_with("0600"));
-        assert_eq!(
-            (
-                found.services.len(),
-                found.actions.len(),
-                found.definitions.len()
-            ),
-            (1, 1, 1)
-        );
-        assert_eq!(
-            found.parameters[0].value,
-            Some(0.9.into()),
-            "what was found stands"
-        );
+        assert_eq!((found.services.len(), found.actions.len(), found.definitions.len()), (1, 1, 1));
+        assert_eq!(found.parameters[0].value, Some(0.9.into()), "what was found stands");
         let once = found.clone();
         found.supplement(&stated).unwrap();
         assert_eq!(found, once);
@@ -240,23 +188,10 @@ mod tests {
             text
         };
         let text = change(|stated| stated.topics[0].type_name = "std_msgs/String".into());
-        assert!(
-            text.contains("topic /image is std_msgs/String, but sensor_msgs/Image was found"),
-            "{text}"
-        );
-        assert!(
-            change(|stated| stated.services[0].type_name = "a/B".into())
-                .contains("service /reset is a/B")
-        );
-        assert!(
-            change(|stated| stated.actions[0].type_name = "a/B".into())
-                .contains("action /go is a/B")
-        );
-        let text = change(|stated| {
-            _ = stated
-                .definitions
-                .insert("demo/action/Go".into(), "int64 x".into())
-        });
+        assert!(text.contains("topic /image is std_msgs/String, but sensor_msgs/Image was found"), "{text}");
+        assert!(change(|stated| stated.services[0].type_name = "a/B".into()).contains("service /reset is a/B"));
+        assert!(change(|stated| stated.actions[0].type_name = "a/B".into()).contains("action /go is a/B"));
+        let text = change(|stated| _ = stated.definitions.insert("demo/action/Go".into(), "int64 x".into()));
         assert!(text.contains("the definition of demo/action/Go"), "{text}");
     }
 }

@@ -92,10 +92,9 @@ pub fn inspect(root: &Path, variables: &Variables) -> Result<PushedDirectory, Er
     }
     let packages = packages.into_values().collect();
     Ok(match located.what {
-        LocatedKind::Sources(_) => PushedDirectory::Source(Workspace {
-            root: located.root,
-            packages: order::build_order(packages)?,
-        }),
+        LocatedKind::Sources(_) => {
+            PushedDirectory::Source(Workspace { root: located.root, packages: order::build_order(packages)? })
+        }
         LocatedKind::Space(space) => PushedDirectory::Installed(InstallSpace {
             prefix: install_space::read_prefix(&located.root, &space.root)?,
             layout: space.layout,
@@ -107,10 +106,7 @@ pub fn inspect(root: &Path, variables: &Variables) -> Result<PushedDirectory, Er
 
 /// Returns the dependencies of packages that are not among them, sorted by name.
 pub fn external_dependencies(packages: &[Package]) -> Vec<ExternalDependency> {
-    let own: BTreeSet<&str> = packages
-        .iter()
-        .map(|package| package.manifest.name.as_str())
-        .collect();
+    let own: BTreeSet<&str> = packages.iter().map(|package| package.manifest.name.as_str()).collect();
     let mut found: BTreeMap<&str, ExternalDependency> = BTreeMap::new();
     for package in packages {
         for dependency in &package.manifest.dependencies {
@@ -131,26 +127,16 @@ pub fn external_dependencies(packages: &[Package]) -> Vec<ExternalDependency> {
 }
 
 /// Reads the package in `base/path`, whose links may point anywhere in `root`.
-fn read_package(
-    root: &Path,
-    base: &Path,
-    path: &Path,
-    variables: &Variables,
-) -> Result<Package, Error> {
+fn read_package(root: &Path, base: &Path, path: &Path, variables: &Variables) -> Result<Package, Error> {
     let file = base.join(path).join("package.xml");
-    Ok(Package {
-        manifest: Manifest::load(root, &file, variables)?,
-        path: path.to_owned(),
-    })
+    Ok(Package { manifest: Manifest::load(root, &file, variables)?, path: path.to_owned() })
 }
 
 fn insert_unique(packages: &mut BTreeMap<String, Package>, package: Package) -> Result<(), Error> {
     match packages.get(&package.manifest.name) {
-        Some(first) => Err(Error::SameName {
-            name: package.manifest.name,
-            first: first.path.clone(),
-            second: package.path,
-        }),
+        Some(first) => {
+            Err(Error::SameName { name: package.manifest.name, first: first.path.clone(), second: package.path })
+        }
         None => {
             packages.insert(package.manifest.name.clone(), package);
             Ok(())

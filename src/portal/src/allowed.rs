@@ -48,25 +48,19 @@ pub async fn authorise(
             let name = &caller.who.principal.name;
             caller.check_access(action, &AccessObject::service("", Some(name)))
         }
-        AccessTarget::Service(parameter) => {
-            check_service(&app, caller, action, named(parameter).unwrap_or_default())
-        }
+        AccessTarget::Service(parameter) => check_service(&app, caller, action, named(parameter).unwrap_or_default()),
         AccessTarget::Stub(parameter) => {
             let file = named(parameter).unwrap_or_default();
             let service = stubs::parse_file_name(file).map_or(file, |(service, _)| service);
             check_service(&app, caller, action, service)
         }
-        AccessTarget::Servant(parameter) => {
-            check_servant(&app, caller, action, named(parameter).unwrap_or_default())
-        }
+        AccessTarget::Servant(parameter) => check_servant(&app, caller, action, named(parameter).unwrap_or_default()),
         AccessTarget::Recording(parameter) => {
             check_recording(&app, caller, action, named(parameter).unwrap_or_default())
         }
-        AccessTarget::Robot(parameter) => check_robot(
-            &caller.who.principal,
-            action,
-            named(parameter).unwrap_or_default(),
-        ),
+        AccessTarget::Robot(parameter) => {
+            check_robot(&caller.who.principal, action, named(parameter).unwrap_or_default())
+        }
     };
     let method = request.method().clone();
     let did = format!("{method} {}", request.uri().path());
@@ -94,56 +88,27 @@ pub async fn authorise(
     // Failures can be repeated without end; they must not push what was done out of the log.
     let failed = status.is_client_error() && is_recorded(action, &method);
     if status == StatusCode::FORBIDDEN || failed {
-        app.audit.record_throttled(
-            caller,
-            action,
-            &did,
-            &about.get_or(&object),
-            status.as_u16(),
-        );
+        app.audit.record_throttled(caller, action, &did, &about.get_or(&object), status.as_u16());
     } else if is_recorded(action, &method) {
-        app.audit.record(
-            caller,
-            action,
-            &did,
-            &about.get_or(&object),
-            status.as_u16(),
-        );
+        app.audit.record(caller, action, &did, &about.get_or(&object), status.as_u16());
     }
     response
 }
 
-fn check_service(
-    app: &App,
-    caller: &Caller,
-    action: AccessAction,
-    service: &str,
-) -> Result<(), Error> {
+fn check_service(app: &App, caller: &Caller, action: AccessAction, service: &str) -> Result<(), Error> {
     caller.check_service_access(app, action, service, None)?;
     check_service_known(app, caller, service)
 }
 
 fn check_servant(app: &App, caller: &Caller, action: AccessAction, id: &str) -> Result<(), Error> {
     let handle = app.choreographer.servant(id);
-    let may = handle
-        .map(|handle| caller.is_allowed_for_robot(app, action, handle.service(), &handle.robot));
-    conceal_missing(
-        caller,
-        action,
-        may.map_err(Error::from),
-        format_args!("servant {id}"),
-    )
+    let may = handle.map(|handle| caller.is_allowed_for_robot(app, action, handle.service(), &handle.robot));
+    conceal_missing(caller, action, may.map_err(Error::from), format_args!("servant {id}"))
 }
 
-fn check_recording(
-    app: &App,
-    caller: &Caller,
-    action: AccessAction,
-    number: &str,
-) -> Result<(), Error> {
+fn check_recording(app: &App, caller: &Caller, action: AccessAction, number: &str) -> Result<(), Error> {
     let known = recordings::find_recording(app, number);
-    let may =
-        known.map(|known| caller.is_allowed_for_robot(app, action, &known.service, &known.robot));
+    let may = known.map(|known| caller.is_allowed_for_robot(app, action, &known.service, &known.robot));
     conceal_missing(caller, action, may, format_args!("recording {number}"))
 }
 

@@ -43,9 +43,7 @@ pub async fn status(State(app): State<Arc<App>>) -> JsonResult<Status> {
 /// The daemon's clock.
 pub async fn clock() -> Json<api::Clock> {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    Json(api::Clock {
-        now: since.map_or(0.0, |since| since.as_secs_f64() * 1000.0),
-    })
+    Json(api::Clock { now: since.map_or(0.0, |since| since.as_secs_f64() * 1000.0) })
 }
 
 /// Runs all checks of the machine anew.
@@ -74,10 +72,7 @@ pub async fn services(
 }
 
 /// One service.
-pub async fn service(
-    State(app): State<Arc<App>>,
-    Path(name): Path<String>,
-) -> JsonResult<ServiceDetail> {
+pub async fn service(State(app): State<Arc<App>>, Path(name): Path<String>) -> JsonResult<ServiceDetail> {
     Ok(Json(views::service(&app, &name)?))
 }
 
@@ -86,9 +81,7 @@ pub async fn interface(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
 ) -> JsonResult<package::interface::Interface> {
-    Ok(Json(
-        app.catalogue.current_revision(&name)?.interface.clone(),
-    ))
+    Ok(Json(app.catalogue.current_revision(&name)?.interface.clone()))
 }
 
 /// Query: which revision.
@@ -114,10 +107,7 @@ pub async fn record(
 }
 
 /// Removes a service, its servants and its images.
-pub async fn remove_service(
-    State(app): State<Arc<App>>,
-    Path(name): Path<String>,
-) -> JsonResult<Stopped> {
+pub async fn remove_service(State(app): State<Arc<App>>, Path(name): Path<String>) -> JsonResult<Stopped> {
     app.catalogue.current_revision(&name)?;
     let removed = {
         let app = Arc::clone(&app);
@@ -153,10 +143,7 @@ pub async fn rollback(
 }
 
 /// The rollout of a service's next revision.
-pub async fn rollout(
-    State(app): State<Arc<App>>,
-    Path(name): Path<String>,
-) -> JsonResult<api::Rollout> {
+pub async fn rollout(State(app): State<Arc<App>>, Path(name): Path<String>) -> JsonResult<api::Rollout> {
     Ok(Json(app.choreographer.rollout(&name)?))
 }
 
@@ -175,11 +162,7 @@ pub async fn order_rollout(
     about.set_value(&format!("service {name}"), &order);
     let choreographer = &app.choreographer;
     Ok(Json(match order {
-        RolloutOrder::Start { revision, terms } => {
-            choreographer
-                .begin_rollout(&name, None, revision, terms)
-                .await?
-        }
+        RolloutOrder::Start { revision, terms } => choreographer.begin_rollout(&name, None, revision, terms).await?,
         RolloutOrder::Promote => choreographer.promote_rollout(&name).await?,
         RolloutOrder::Abort => choreographer.abort_rollout(&name).await?,
     }))
@@ -238,9 +221,7 @@ pub async fn trial(
             .map(Material::Bag)
             .map_err(|error| Error::BadRequest(error.to_string())),
     });
-    let material = material
-        .await
-        .map_err(|_| Error::Internal("reading the input of a trial"))??;
+    let material = material.await.map_err(|_| Error::Internal("reading the input of a trial"))??;
     let trial = app.choreographer.trial(&name, material).await;
     // The messages of a recording share the body's memory.
     drop(permit);
@@ -248,33 +229,22 @@ pub async fn trial(
 }
 
 /// Lists all servants.
-pub async fn servants(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-) -> Json<Vec<api::Servant>> {
+pub async fn servants(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>) -> Json<Vec<api::Servant>> {
     let mut handles = app.choreographer.servants();
     handles.retain(|handle| caller.can_see_servant(&app, handle));
-    let described = handles
-        .iter()
-        .map(|handle| app.choreographer.describe(handle));
+    let described = handles.iter().map(|handle| app.choreographer.describe(handle));
     Json(futures_util::future::join_all(described).await)
 }
 
 /// Lists services and robots whose servants failed repeatedly and are not restarted yet.
-pub async fn back_offs(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-) -> Json<Vec<api::BackOff>> {
+pub async fn back_offs(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>) -> Json<Vec<api::BackOff>> {
     let mut back_offs = app.choreographer.back_offs();
     back_offs.retain(|of| caller.can_act_for_robot(&of.robot) && caller.can_see(&app, &of.service));
     Json(back_offs)
 }
 
 /// One servant.
-pub async fn servant(
-    State(app): State<Arc<App>>,
-    Path(id): Path<String>,
-) -> JsonResult<api::Servant> {
+pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> JsonResult<api::Servant> {
     let handle = app.choreographer.servant(&id)?;
     Ok(Json(app.choreographer.describe(&handle).await))
 }
@@ -291,17 +261,11 @@ pub async fn set_limits(
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
     about.set_value(&format!("servant {id}"), &change);
-    change
-        .check()
-        .map_err(|error| Error::BadRequest(error.to_string()))?;
+    change.check().map_err(|error| Error::BadRequest(error.to_string()))?;
     let moves_cores = change.cpu_weight.is_some() || change.cpus.is_some();
     if moves_cores && !caller.who.principal.is_unscoped() {
-        let asked = app
-            .choreographer
-            .servant(&id)?
-            .requested_limits_after(change);
-        choreographer::limits::check_weight(&asked)
-            .map_err(|error| Error::BadRequest(error.to_string()))?;
+        let asked = app.choreographer.servant(&id)?.requested_limits_after(change);
+        choreographer::limits::check_weight(&asked).map_err(|error| Error::BadRequest(error.to_string()))?;
     }
     app.choreographer.set_limits(&id, change).await?;
     let handle = app.choreographer.servant(&id)?;
@@ -314,23 +278,13 @@ pub async fn explain(
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
 ) -> JsonResult<api::explain::Explanation> {
-    Ok(Json(
-        crate::explain::explain_robot(&app, &caller, &name).await?,
-    ))
+    Ok(Json(crate::explain::explain_robot(&app, &caller, &name).await?))
 }
 
 /// Stops one servant.
-pub async fn stop_servant(
-    State(app): State<Arc<App>>,
-    Path(id): Path<String>,
-) -> JsonResult<Stopped> {
+pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> JsonResult<Stopped> {
     app.choreographer.servant(&id)?;
-    Ok(Json(Stopped {
-        stopped: app
-            .choreographer
-            .stop("it was stopped", |handle| handle.id == id)
-            .await,
-    }))
+    Ok(Json(Stopped { stopped: app.choreographer.stop("it was stopped", |handle| handle.id == id).await }))
 }
 
 /// Query: whose servants.
@@ -358,14 +312,8 @@ pub async fn stop_servants(
     if let Some(service) = &of.service {
         app.catalogue.current_revision(service)?;
     }
-    let chosen = |handle: &choreographer::Handle| {
-        of.service
-            .as_ref()
-            .is_none_or(|service| handle.service() == service)
-    };
-    Ok(Json(Stopped {
-        stopped: app.choreographer.stop("it was stopped", chosen).await,
-    }))
+    let chosen = |handle: &choreographer::Handle| of.service.as_ref().is_none_or(|service| handle.service() == service);
+    Ok(Json(Stopped { stopped: app.choreographer.stop("it was stopped", chosen).await }))
 }
 
 /// Query of a log.
@@ -404,10 +352,7 @@ pub async fn logs(
         return Ok(json_lines(printed.take_until(ending)));
     }
     let past = container.logs(count, None).await;
-    let budget = app
-        .choreographer
-        .memory()
-        .client(&caller.peer.budget_name(None));
+    let budget = app.choreographer.memory().client(&caller.peer.budget_name(None));
     let held = budget.take(past.iter().map(|line| line.line.len() + LOG_LINE).sum())?;
     let past = futures_util::stream::iter(past).map(move |line| {
         let _held = (&place, &held);

@@ -123,9 +123,7 @@ impl App {
                 std::net::IpAddr::V4(_) => std::net::Ipv4Addr::LOCALHOST.into(),
                 std::net::IpAddr::V6(_) => std::net::Ipv6Addr::LOCALHOST.into(),
             };
-            let host = nix::unistd::gethostname()
-                .ok()
-                .and_then(|name| name.into_string().ok());
+            let host = nix::unistd::gethostname().ok().and_then(|name| name.into_string().ok());
             return match host {
                 Some(host) => format!("{scheme}://{host}:{}/{service}", address.port()),
                 None => {

@@ -49,11 +49,7 @@ struct RecentActions {
 
 impl RecentActions {
     fn throttle_for(&mut self, status: u16) -> &mut NoticeThrottle {
-        if status < 400 {
-            &mut self.succeeded
-        } else {
-            &mut self.failed
-        }
+        if status < 400 { &mut self.succeeded } else { &mut self.failed }
     }
 }
 
@@ -79,42 +75,18 @@ fn truncate(text: &str) -> String {
 impl Audit {
     /// Creates the log in the database `state`.
     pub fn new(state: Arc<State>) -> Audit {
-        Audit {
-            state,
-            recent: Mutex::default(),
-            last: watch::Sender::new(0),
-        }
+        Audit { state, recent: Mutex::default(), last: watch::Sender::new(0) }
     }
 
     /// Records an action; it is on disk when this returns.
-    pub fn record(
-        &self,
-        caller: &Caller,
-        action: AccessAction,
-        did: &str,
-        object: &str,
-        status: u16,
-    ) {
-        let what = AuditEntry {
-            action,
-            did,
-            object,
-            status,
-            more: 0,
-        };
+    pub fn record(&self, caller: &Caller, action: AccessAction, did: &str, object: &str, status: u16) {
+        let what = AuditEntry { action, did, object, status, more: 0 };
         self.write(caller, &what, State::add_audit_record);
     }
 
     /// Records an action that may be repeated or tried often: once a minute, with the number of repetitions, and
     /// without waiting for the disk.
-    pub fn record_throttled(
-        &self,
-        caller: &Caller,
-        action: AccessAction,
-        did: &str,
-        object: &str,
-        status: u16,
-    ) {
+    pub fn record_throttled(&self, caller: &Caller, action: AccessAction, did: &str, object: &str, status: u16) {
         let (who, address) = (&caller.who.principal.name, caller.peer.ip());
         let (did, object) = (&truncate(did), &truncate(object));
         let alike = format!("{address} {did} {object} {status}");
@@ -124,13 +96,7 @@ impl Audit {
             own.throttle_for(status).admit(&alike, store::now())
         };
         if let Some(more) = more {
-            let what = AuditEntry {
-                action,
-                did,
-                object,
-                status,
-                more,
-            };
+            let what = AuditEntry { action, did, object, status, more };
             self.write(caller, &what, State::add_audit_record_without_sync);
         }
     }
@@ -199,11 +165,7 @@ mod tests {
             (AccessAction::See, Method::GET, false),
             (AccessAction::Enter, Method::POST, false),
         ] {
-            assert_eq!(
-                is_recorded(action, &method),
-                recorded,
-                "{action:?} {method}"
-            );
+            assert_eq!(is_recorded(action, &method), recorded, "{action:?} {method}");
         }
     }
 }

@@ -67,9 +67,7 @@ pub async fn read_auth_message<S: AsyncRead + Unpin, T>(
             }
         }
     };
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0.0, |since| since.as_secs_f64());
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
     let who = recognise(&parse_auth_message(&payload)?, now)?;
     Ok((who, buffer.freeze()))
 }
@@ -79,8 +77,7 @@ fn parse_auth_message(payload: &[u8]) -> Result<AuthMessage, FirstMessageError> 
     struct Operation {
         op: String,
     }
-    let operation: Operation =
-        serde_json::from_slice(payload).map_err(|_| FirstMessageError::NotAnOperation)?;
+    let operation: Operation = serde_json::from_slice(payload).map_err(|_| FirstMessageError::NotAnOperation)?;
     if operation.op != "auth" {
         return Err(FirstMessageError::AnotherOperation(operation.op));
     }
@@ -123,11 +120,7 @@ mod tests {
             frame.extend_from_slice(&(text.len() as u16).to_be_bytes());
         }
         frame.extend_from_slice(&mask);
-        frame.extend(
-            text.bytes()
-                .zip(mask.iter().cycle())
-                .map(|(byte, mask)| byte ^ mask),
-        );
+        frame.extend(text.bytes().zip(mask.iter().cycle()).map(|(byte, mask)| byte ^ mask));
         frame
     }
 
@@ -145,9 +138,7 @@ mod tests {
     #[tokio::test]
     async fn a_token_is_taken_and_what_follows_is_left() {
         let padding = "x".repeat(200);
-        let mut sent = frame(&format!(
-            r#"{{"op":"auth","mac":"open sesame","rand":"{padding}"}}"#
-        ));
+        let mut sent = frame(&format!(r#"{{"op":"auth","mac":"open sesame","rand":"{padding}"}}"#));
         sent.extend_from_slice(b"next frame");
         let (token, rest) = first(&sent).await.expect("a known token");
         assert_eq!(token, crate::tokens::hash("open sesame"));
@@ -157,24 +148,12 @@ mod tests {
     #[tokio::test]
     async fn anything_else_is_refused_with_words() {
         let cases: [(Vec<u8>, &str); 6] = [
-            (
-                frame(r#"{"op":"auth","mac":"guess"}"#),
-                "neither contains a known token",
-            ),
-            (
-                frame(r#"{"op":"subscribe","topic":"/x"}"#),
-                "subscribe before auth",
-            ),
+            (frame(r#"{"op":"auth","mac":"guess"}"#), "neither contains a known token"),
+            (frame(r#"{"op":"subscribe","topic":"/x"}"#), "subscribe before auth"),
             (frame("hello"), "must be an auth operation"),
             (vec![0x82, 0x80, 0, 0, 0, 0], "one text frame"),
-            (
-                [&[0x81, 0xff, 0, 0, 0, 0, 0, 1, 0, 0], &[0; 4][..]].concat(),
-                "at most",
-            ),
-            (
-                frame(r#"{"op":"auth","mac":"open sesame"}"#)[..10].to_vec(),
-                "ended before",
-            ),
+            ([&[0x81, 0xff, 0, 0, 0, 0, 0, 1, 0, 0], &[0; 4][..]].concat(), "at most"),
+            (frame(r#"{"op":"auth","mac":"open sesame"}"#)[..10].to_vec(), "ended before"),
         ];
         for (sent, words) in cases {
             let refused = first(&sent).await.expect_err(words).to_string();

@@ -28,19 +28,13 @@ pub struct BufferedBody {
 }
 
 /// Reads a body of at most `max` bytes, which must be complete within `unfinished`.
-pub async fn read(
-    body: Body,
-    max: usize,
-    budget: &Budget,
-    unfinished: Duration,
-) -> Result<BufferedBody, Error> {
+pub async fn read(body: Body, max: usize, budget: &Budget, unfinished: Duration) -> Result<BufferedBody, Error> {
     let reading = async {
         let mut permit = budget.permit();
         let mut bytes = Vec::new();
         let mut parts = body.into_data_stream();
         while let Some(part) = parts.next().await {
-            let part = part
-                .map_err(|error| Error::BadRequest(format!("the body cannot be read: {error}")))?;
+            let part = part.map_err(|error| Error::BadRequest(format!("the body cannot be read: {error}")))?;
             let length = bytes.len() + part.len();
             if length > max {
                 let limit = api::Size(max as u64);
@@ -51,19 +45,13 @@ pub async fn read(
                 let room = (2 * bytes.capacity()).max(length).min(max);
                 if room > UNCOUNTED {
                     // The budget need not be a multiple of the step.
-                    permit.grow_to(
-                        room.next_multiple_of(STEP)
-                            .min(budget.max_permit().max(room)),
-                    )?;
+                    permit.grow_to(room.next_multiple_of(STEP).min(budget.max_permit().max(room)))?;
                 }
                 bytes.reserve_exact(room - bytes.len());
             }
             bytes.extend_from_slice(&part);
         }
-        Ok(BufferedBody {
-            bytes: bytes.into(),
-            permit,
-        })
+        Ok(BufferedBody { bytes: bytes.into(), permit })
     };
     match tokio::time::timeout(unfinished, reading).await {
         Ok(held) => held,
@@ -72,12 +60,7 @@ pub async fn read(
 }
 
 /// Reads a body within its sender's memory budget.
-pub async fn read_body(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-    max: usize,
-) -> Result<BufferedBody, Error> {
+pub async fn read_body(app: &App, caller: &Caller, body: Body, max: usize) -> Result<BufferedBody, Error> {
     let memory = app.choreographer.memory();
     let budget = memory.client(&caller.peer.budget_name(None));
     read(body, max, &budget, memory.unfinished).await

@@ -66,12 +66,8 @@ pub async fn calibration(
             Ok::<_, Error>(calibration.await?)
         };
         let event = match outcome.await {
-            Ok(calibration) => CalibrationEvent::Done {
-                calibration: Box::new(calibration),
-            },
-            Err(error) => CalibrationEvent::Error {
-                problem: error.problem(),
-            },
+            Ok(calibration) => CalibrationEvent::Done { calibration: Box::new(calibration) },
+            Err(error) => CalibrationEvent::Error { problem: error.problem() },
         };
         let _ = events.send(event).await;
     };
@@ -103,15 +99,9 @@ async fn read_material(
             .map(|recorded| (None, Material::Bag(recorded)))
             .map_err(|error| Error::BadRequest(error.to_string())),
     });
-    let (pictures, material) = reading
-        .await
-        .map_err(|_| Error::Internal("reading the input of a calibration"))??;
+    let (pictures, material) = reading.await.map_err(|_| Error::Internal("reading the input of a calibration"))??;
     if let Some((used, count)) = pictures.filter(|(used, count)| used < count) {
-        send_step(
-            events,
-            format!("using the first {used} of {count} pictures: more do not fit into memory"),
-        )
-        .await;
+        send_step(events, format!("using the first {used} of {count} pictures: more do not fit into memory")).await;
     }
     Ok(CalibrationRequests {
         material,
@@ -137,25 +127,18 @@ async fn capture_live(
     };
     send_step(
         events,
-        format!(
-            "recording what robot {robot} sends to {service}, for at most {} s",
-            bounds.time.as_secs_f64()
-        ),
+        format!("recording what robot {robot} sends to {service}, for at most {} s", bounds.time.as_secs_f64()),
     )
     .await;
-    let budget = app
-        .choreographer
-        .memory()
-        .client(&caller.peer.budget_name(None));
+    let budget = app.choreographer.memory().client(&caller.peer.budget_name(None));
     let captured = app.choreographer.capture(service, robot, bounds, &budget);
     Ok(captured.await?)
 }
 
 fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
     let options = match query_value(query_of, "options") {
-        Some(text) => serde_json::from_str(&text).map_err(|error| {
-            Error::BadRequest(format!("the calibration's options cannot be read: {error}"))
-        })?,
+        Some(text) => serde_json::from_str(&text)
+            .map_err(|error| Error::BadRequest(format!("the calibration's options cannot be read: {error}")))?,
         None => CalibrationOptions::default(),
     };
     check(&options)?;
@@ -166,9 +149,9 @@ fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
 fn check(options: &CalibrationOptions) -> Result<(), Error> {
     let refused = |words: String| Err(Error::BadRequest(words));
     let positive = |name: &str, value: Option<f64>, least: f64, most: f64| match value {
-        Some(value) if !(least..=most).contains(&value) => refused(format!(
-            "{name} = {value} is not between {least} and {most}"
-        )),
+        Some(value) if !(least..=most).contains(&value) => {
+            refused(format!("{name} = {value} is not between {least} and {most}"))
+        }
         _ => Ok(()),
     };
     for cpus in &options.cpus {
@@ -193,9 +176,7 @@ fn check(options: &CalibrationOptions) -> Result<(), Error> {
     }
     match (options.source, &options.robot) {
         (Source::Live, None) => refused("live needs robot, whose requests are recorded".to_owned()),
-        (Source::Bag | Source::Frames, Some(_)) => {
-            refused("robot can be given with live only".to_owned())
-        }
+        (Source::Bag | Source::Frames, Some(_)) => refused("robot can be given with live only".to_owned()),
         _ => Ok(()),
     }
 }
@@ -207,34 +188,20 @@ mod tests {
     #[test]
     fn options_that_cannot_be_measured_are_refused() {
         let read = |options: &str| {
-            let query = form_urlencoded::Serializer::new(String::new())
-                .append_pair("options", options)
-                .finish();
+            let query = form_urlencoded::Serializer::new(String::new()).append_pair("options", options).finish();
             read_options(Some(&query)).map_err(|error| error.problem().detail)
         };
-        assert_eq!(
-            read_options(None).expect("none"),
-            CalibrationOptions::default()
-        );
+        assert_eq!(read_options(None).expect("none"), CalibrationOptions::default());
         let live = read(r#"{"source":"live","robot":"r1","seconds":5}"#).expect("valid");
         assert_eq!((live.source, live.seconds), (Source::Live, Some(5.0)));
         for (options, words) in [
-            (
-                r#"{"cpus":[0.5,0]}"#,
-                "cpus = 0 is not between 0.01 and 4096",
-            ),
+            (r#"{"cpus":[0.5,0]}"#, "cpus = 0 is not between 0.01 and 4096"),
             (r#"{"rate":-1}"#, "rate = -1"),
-            (
-                r#"{"seconds":1e9}"#,
-                "seconds = 1000000000 is not between 0.1 and 600",
-            ),
+            (r#"{"seconds":1e9}"#, "seconds = 1000000000 is not between 0.1 and 600"),
             (r#"{"network":-3}"#, "network = -3"),
             (r#"{"keep":0}"#, "keep = 0 is not between"),
             (r#"{"memory":1024}"#, "memory = 1024 is not between"),
-            (
-                r#"{"requests":3}"#,
-                "requests = 3 is not between 10 and 10000",
-            ),
+            (r#"{"requests":3}"#, "requests = 3 is not between 10 and 10000"),
             (r#"{"rate":5,"fast":true}"#, "exclude each other"),
             (r#"{"own":true,"cpus":[1]}"#, "exclude each other"),
             (r#"{"source":"live"}"#, "live needs robot"),

@@ -52,9 +52,7 @@ impl ConnectionPeer {
     /// proxy's), the robot's name.
     pub fn budget_name(&self, robot: Option<&str>) -> String {
         match (self, robot) {
-            (ConnectionPeer::Tcp(address), _) if !address.ip().is_loopback() => {
-                address.ip().to_string()
-            }
+            (ConnectionPeer::Tcp(address), _) if !address.ip().is_loopback() => address.ip().to_string(),
             (_, Some(robot)) => robot.to_owned(),
             (ConnectionPeer::Tcp(address), None) => address.ip().to_string(),
             (ConnectionPeer::Unix(user), None) => format!("user {}", user.uid),
@@ -134,26 +132,12 @@ impl Caller {
         tracing::error_span!(parent: None, "connection", id, %peer, principal)
     }
 
-    pub(crate) fn new(
-        connection: &PortalConnection,
-        principal: Principal,
-        shown: Credential,
-    ) -> Caller {
-        let who = CallerIdentity {
-            principal: Arc::new(principal),
-            shown,
-            token: None,
-            owner: None,
-        };
+    pub(crate) fn new(connection: &PortalConnection, principal: Principal, shown: Credential) -> Caller {
+        let who = CallerIdentity { principal: Arc::new(principal), shown, token: None, owner: None };
         Caller::from_identity(connection, who)
     }
 
     pub(super) fn from_identity(connection: &PortalConnection, who: CallerIdentity) -> Caller {
-        Caller {
-            peer: connection.peer,
-            secure: connection.secure,
-            forwarded: connection.forwarded,
-            who,
-        }
+        Caller { peer: connection.peer, secure: connection.secure, forwarded: connection.forwarded, who }
     }
 }

@@ -46,12 +46,7 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
                     stranger: Some(Arc::new(stranger)),
                     ..PortalConnection::without_tls(ConnectionPeer::Tcp(address))
                 };
-                connections.spawn(serve_tcp_connection(
-                    Arc::clone(&app),
-                    router.clone(),
-                    stream,
-                    connection,
-                ));
+                connections.spawn(serve_tcp_connection(Arc::clone(&app), router.clone(), stream, connection));
             }
             Err(error) => {
                 tracing::warn!("no connection can be accepted: {error}");
@@ -123,10 +118,7 @@ fn peer_user(stream: &UnixStream, group: Option<u32>) -> std::io::Result<User> {
         None => false,
         Some(group) => peer.gid() == group || peer_groups::peer_groups(stream)?.contains(&group),
     };
-    Ok(User {
-        uid: peer.uid(),
-        is_member,
-    })
+    Ok(User { uid: peer.uid(), is_member })
 }
 
 async fn drain(app: &App, connections: TaskTracker) {
@@ -135,12 +127,7 @@ async fn drain(app: &App, connections: TaskTracker) {
 }
 
 /// Serves a TCP connection, through TLS if the portal uses it, until it ends or is dropped in favour of newer ones.
-async fn serve_tcp_connection(
-    app: Arc<App>,
-    router: Router,
-    stream: TcpStream,
-    connection: PortalConnection,
-) {
+async fn serve_tcp_connection(app: Arc<App>, router: Router, stream: TcpStream, connection: PortalConnection) {
     let peer = connection.peer;
     let place = connection.clone();
     let served = async {
@@ -157,13 +144,7 @@ async fn serve_tcp_connection(
     }
 }
 
-async fn serve_tls(
-    app: &Arc<App>,
-    tls: &Tls,
-    router: Router,
-    stream: TcpStream,
-    connection: PortalConnection,
-) {
+async fn serve_tls(app: &Arc<App>, tls: &Tls, router: Router, stream: TcpStream, connection: PortalConnection) {
     let peer = connection.peer;
     let accepted = tokio::select! {
         accepted = tokio::time::timeout(app.options.handshake, tls.accept(stream)) => accepted,
@@ -171,11 +152,8 @@ async fn serve_tls(
     };
     match accepted {
         Ok(Ok(AcceptedConnection::Tls(stream))) => {
-            let connection = PortalConnection {
-                secure: true,
-                certificates: tls::peer_certificates(&stream),
-                ..connection
-            };
+            let connection =
+                PortalConnection { secure: true, certificates: tls::peer_certificates(&stream), ..connection };
             let ended = wait_until_unpaired(app, &connection);
             tokio::select! {
                 // A connection upgraded to a WebSocket continues in its session, which is notified as well.
@@ -184,13 +162,7 @@ async fn serve_tls(
             }
         }
         Ok(Ok(AcceptedConnection::Plain(stream))) => {
-            serve(
-                Arc::clone(app),
-                tls::plain_text_router(),
-                stream,
-                connection,
-            )
-            .await;
+            serve(Arc::clone(app), tls::plain_text_router(), stream, connection).await;
         }
         Ok(Ok(AcceptedConnection::Challenge)) => {
             tracing::debug!("answered an ACME challenge of {peer}");
@@ -201,13 +173,7 @@ async fn serve_tls(
                 let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
                 let did = format!("presented a certificate that was refused: {refused}");
                 let status = axum::http::StatusCode::UNAUTHORIZED.as_u16();
-                app.audit.record_throttled(
-                    &nobody,
-                    AccessAction::Enter,
-                    &did,
-                    "the server",
-                    status,
-                );
+                app.audit.record_throttled(&nobody, AccessAction::Enter, &did, "the server", status);
             }
         }
         Err(_) => tracing::debug!("TLS handshake with {peer} failed: it did not finish in time"),
@@ -215,13 +181,8 @@ async fn serve_tls(
 }
 
 /// Waits until the robot is unpaired whose certificate the connection presented.
-fn wait_until_unpaired(
-    app: &Arc<App>,
-    connection: &PortalConnection,
-) -> impl Future<Output = ()> + use<> {
-    let who = app
-        .principals
-        .with_recogniser(|known| guard::recognise_certificate(app, connection, known));
+fn wait_until_unpaired(app: &Arc<App>, connection: &PortalConnection) -> impl Future<Output = ()> + use<> {
+    let who = app.principals.with_recogniser(|known| guard::recognise_certificate(app, connection, known));
     let app = Arc::clone(app);
     async move {
         match who {

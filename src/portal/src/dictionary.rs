@@ -48,11 +48,7 @@ pub async fn write(
     for row in &new.rows {
         check_row(row).map_err(|reason| Error::BadRequest(format!("entry for {row}: {reason}")))?;
     }
-    let there = if new.replace {
-        0
-    } else {
-        app.state.dictionary(&name)?.len()
-    };
+    let there = if new.replace { 0 } else { app.state.dictionary(&name)?.len() };
     if there + new.rows.len() > MOST_ROWS {
         return Err(Error::BadRequest(format!(
             "{there} entries and {} more exceed the limit of {MOST_ROWS} for a service; remove some with: cloudroidctl \
@@ -62,15 +58,9 @@ pub async fn write(
     }
     app.state.write_dictionary(&name, revision.number, &new)?;
     let rows = app.state.dictionary(&name)?;
-    let message = format!(
-        "{} entries of the SLA table of {name} were written; it now has {}",
-        new.rows.len(),
-        rows.len()
-    );
-    let about = NewEvent {
-        service: Some(&name),
-        ..NewEvent::default()
-    };
+    let message =
+        format!("{} entries of the SLA table of {name} were written; it now has {}", new.rows.len(), rows.len());
+    let about = NewEvent { service: Some(&name), ..NewEvent::default() };
     Journal::new(Arc::clone(&app.state)).info("dictionary-written", &message, &about);
     Ok(Json(rows))
 }
@@ -97,10 +87,7 @@ pub async fn remove(
         });
     }
     let message = format!("entry {id} of the SLA table of {name} was removed");
-    let about = NewEvent {
-        service: Some(&name),
-        ..NewEvent::default()
-    };
+    let about = NewEvent { service: Some(&name), ..NewEvent::default() };
     Journal::new(Arc::clone(&app.state)).info("dictionary-written", &message, &about);
     Ok(Json(rows))
 }
@@ -111,11 +98,7 @@ pub struct StatedQuery;
 impl IntoParams for StatedQuery {
     fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
         let parameters = KEYS.iter().map(|key| {
-            let kind = if key.is_number {
-                Type::Number
-            } else {
-                Type::String
-            };
+            let kind = if key.is_number { Type::Number } else { Type::String };
             ParameterBuilder::new()
                 .name(key.name)
                 .parameter_in(ParameterIn::Query)

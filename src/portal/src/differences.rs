@@ -43,12 +43,7 @@ pub async fn differences(
     let from = between.from.or_else(|| Some(before()?.number));
     let unknown = |revision: String| -> Error {
         let exists = revisions.iter().map(|line| line.number.to_string());
-        catalogue::Error::UnknownRevision {
-            service: name.clone(),
-            revision,
-            exists: exists.collect(),
-        }
-        .into()
+        catalogue::Error::UnknownRevision { service: name.clone(), revision, exists: exists.collect() }.into()
     };
     let record = |number: u64| {
         let found = app.state.revision(&name, number)?;
@@ -58,29 +53,16 @@ pub async fn differences(
     app.catalogue.current_revision(&name)?;
     let to = record(to)?;
     let from = record(from.ok_or_else(|| unknown(format!("before {}", to.number)))?)?;
-    let before = revision_parts(
-        &from,
-        &app.catalogue.revision_contents(&from).await?.inventory,
-    );
+    let before = revision_parts(&from, &app.catalogue.revision_contents(&from).await?.inventory);
     let after = revision_parts(&to, &app.catalogue.revision_contents(&to).await?.inventory);
-    Ok(Json(Differences {
-        service: name,
-        from: from.number,
-        to: to.number,
-        differences: compare(before, after),
-    }))
+    Ok(Json(Differences { service: name, from: from.number, to: to.number, differences: compare(before, after) }))
 }
 
 /// Parts of a revision: each with a text and, where the text does not show every change, a number that differs.
 type RevisionParts = BTreeMap<(Part, String), (String, u64)>;
 
 fn compare(before: RevisionParts, mut after: RevisionParts) -> Vec<Difference> {
-    let difference = |(part, name): (Part, String), before, after| Difference {
-        part,
-        name,
-        before,
-        after,
-    };
+    let difference = |(part, name): (Part, String), before, after| Difference { part, name, before, after };
     let mut found = Vec::new();
     for (key, was) in before {
         match after.remove(&key) {
@@ -117,19 +99,13 @@ fn revision_parts(of: &RevisionRecord, inventory: &Inventory) -> RevisionParts {
             add(Part::Node, &name(&field), value, 0);
         }
         for (variable, value) in &node.environment {
-            add(
-                Part::Environment,
-                &name(variable),
-                "set".to_owned(),
-                hash(value),
-            );
+            add(Part::Environment, &name(variable), "set".to_owned(), hash(value));
         }
     }
     for (container, components) in &of.plan.components {
         for (index, component) in components.iter().enumerate() {
             let name = component.full_name();
-            let name =
-                name.unwrap_or_else(|| format!("{} (number {})", component.plugin, index + 1));
+            let name = name.unwrap_or_else(|| format!("{} (number {})", component.plugin, index + 1));
             let loaded = serde_json::to_string(component).unwrap_or_default();
             add(Part::Node, &format!("{container} loads {name}"), loaded, 0);
         }
@@ -172,11 +148,7 @@ fn add_interface(of: &Interface, add: &mut impl FnMut(Part, &str, String, u64)) 
         };
         let marks = [(topic.latched, ", latched"), (topic.lazy, ", lazy")];
         let marks = marks.iter().filter(|(set, _)| *set).map(|(_, mark)| *mark);
-        let words = format!(
-            "{}, {direction}{}",
-            topic.type_name,
-            marks.collect::<String>()
-        );
+        let words = format!("{}, {direction}{}", topic.type_name, marks.collect::<String>());
         add(Part::Topic, &topic.name, words, 0);
     }
     for service in &of.services {
@@ -191,12 +163,7 @@ fn add_interface(of: &Interface, add: &mut impl FnMut(Part, &str, String, u64)) 
     }
     for (name, definition) in &of.definitions {
         let lines = definition.lines().count();
-        add(
-            Part::Definition,
-            name,
-            format!("{lines} lines"),
-            hash(definition),
-        );
+        add(Part::Definition, name, format!("{lines} lines"), hash(definition));
     }
 }
 
@@ -228,9 +195,7 @@ fn meaningful_fields(of: &Value) -> Vec<(String, String)> {
         _ => false,
     };
     let all = of.as_object().into_iter().flatten();
-    all.filter(|(_, value)| !says_nothing(value))
-        .map(|(name, value)| (name.clone(), value_text(value)))
-        .collect()
+    all.filter(|(_, value)| !says_nothing(value)).map(|(name, value)| (name.clone(), value_text(value))).collect()
 }
 
 #[cfg(test)]
@@ -248,8 +213,7 @@ mod tests {
             source: "/p".into(),
             flavour: ros::flavour::Flavour::default(),
             plan: store::Plan {
-                nodes: serde_json::from_str(r#"[{"name": "/n", "argv": ["/n", "-v"]}]"#)
-                    .expect("a node"),
+                nodes: serde_json::from_str(r#"[{"name": "/n", "argv": ["/n", "-v"]}]"#).expect("a node"),
                 environment: [("TOKEN".to_owned(), "secret".to_owned())].into(),
                 ..store::Plan::default()
             },
@@ -265,10 +229,7 @@ mod tests {
         after.plan.limits.cpus = Some(1.5);
         after.plan.nodes[0].respawn = true;
         after.plan.nodes[0].argv.pop();
-        after
-            .plan
-            .environment
-            .insert("TOKEN".into(), "other".into());
+        after.plan.environment.insert("TOKEN".into(), "other".into());
         let nothing = Inventory::default();
         let told = |from: &RevisionRecord, to: &RevisionRecord| -> Vec<String> {
             let found = compare(revision_parts(from, &nothing), revision_parts(to, &nothing));
@@ -282,12 +243,7 @@ mod tests {
         assert!(told(&before, &before).is_empty());
         assert_eq!(
             told(&before, &after),
-            [
-                "Node /n: /n -v > /n",
-                "Node /n respawn: - > true",
-                "Limit cpus: - > 1.5",
-                "Environment TOKEN: set > set",
-            ]
+            ["Node /n: /n -v > /n", "Node /n respawn: - > true", "Limit cpus: - > 1.5", "Environment TOKEN: set > set",]
         );
         assert_eq!(told(&after, &before)[2], "Limit cpus: 1.5 > -");
     }

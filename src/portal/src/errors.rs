@@ -150,9 +150,7 @@ pub enum Error {
         most: usize,
     },
     /// Too many connections look into the servant.
-    #[error(
-        "too many connections look into servant {servant}: the limit is {most}, and {each} for each user"
-    )]
+    #[error("too many connections look into servant {servant}: the limit is {most}, and {each} for each user")]
     TooManyLook {
         /// Id of the servant.
         servant: String,
@@ -253,9 +251,7 @@ impl Error {
 
 impl From<access::AccessDenied> for Error {
     fn from(refusal: access::AccessDenied) -> Error {
-        Error::Forbidden {
-            what: refusal.to_string(),
-        }
+        Error::Forbidden { what: refusal.to_string() }
     }
 }
 
@@ -265,10 +261,8 @@ impl Error {
     pub fn is_final(&self) -> bool {
         use choreographer::Error as C;
         let error = self.choreographer_error();
-        matches!(
-            error,
-            Some(C::Terms(_) | C::Full(AdmissionError::TooBig { .. }))
-        ) || matches!(error, Some(C::NotResized { reason, .. }) if !matches!(&**reason, ResizeError::Full(_)))
+        matches!(error, Some(C::Terms(_) | C::Full(AdmissionError::TooBig { .. })))
+            || matches!(error, Some(C::NotResized { reason, .. }) if !matches!(&**reason, ResizeError::Full(_)))
     }
 
     /// Returns true if the robot is refused because of its requirements; the message then tells what it could state.
@@ -286,16 +280,8 @@ const RETRY_AFTER: u64 = 10;
 /// Status, kind and title of a problem.
 type Kind = (StatusCode, &'static str, &'static str);
 
-const INTERNAL: Kind = (
-    StatusCode::INTERNAL_SERVER_ERROR,
-    "internal",
-    "internal error",
-);
-const ENDING: Kind = (
-    StatusCode::SERVICE_UNAVAILABLE,
-    "ending",
-    "daemon shutting down",
-);
+const INTERNAL: Kind = (StatusCode::INTERNAL_SERVER_ERROR, "internal", "internal error");
+const ENDING: Kind = (StatusCode::SERVICE_UNAVAILABLE, "ending", "daemon shutting down");
 
 impl Error {
     /// Returns the problem details for the client.
@@ -336,20 +322,12 @@ impl Error {
         if let Some(log) = self.log() {
             problem.log = log.to_vec();
         }
-        let again = [
-            StatusCode::SERVICE_UNAVAILABLE,
-            StatusCode::TOO_MANY_REQUESTS,
-        ];
+        let again = [StatusCode::SERVICE_UNAVAILABLE, StatusCode::TOO_MANY_REQUESTS];
         let after = match (self, self.choreographer_error()) {
-            (
-                Error::Unrecognised(
-                    AuthenticationError::Slowed(left) | AuthenticationError::SlowedSignIn(left),
-                ),
-                _,
-            ) => left.div_ceil(1000),
-            (_, Some(choreographer::Error::BackOff { again, .. })) => {
-                choreographer::seconds(*again)
+            (Error::Unrecognised(AuthenticationError::Slowed(left) | AuthenticationError::SlowedSignIn(left)), _) => {
+                left.div_ceil(1000)
             }
+            (_, Some(choreographer::Error::BackOff { again, .. })) => choreographer::seconds(*again),
             (Error::RecordedLately { again, .. }, _) => *again,
             _ => RETRY_AFTER,
         };
@@ -360,9 +338,7 @@ impl Error {
     /// Returns the choreographer's error that this error wraps, if any.
     fn choreographer_error(&self) -> Option<&choreographer::Error> {
         match self {
-            Error::Choreographer(error) | Error::Push(push::Error::Choreographer(error)) => {
-                Some(error)
-            }
+            Error::Choreographer(error) | Error::Push(push::Error::Choreographer(error)) => Some(error),
             _ => None,
         }
     }
@@ -395,11 +371,7 @@ impl Error {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
             Error::UnknownRow { .. } => (S::NOT_FOUND, "unknown-row", "unknown entry"),
             Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "not found"),
-            Error::OtherMethod { .. } => (
-                S::METHOD_NOT_ALLOWED,
-                "other-method",
-                "method not supported",
-            ),
+            Error::OtherMethod { .. } => (S::METHOD_NOT_ALLOWED, "other-method", "method not supported"),
             Error::BodyTooLarge { .. } | Error::TrialTooLarge { .. } => {
                 (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
             }
@@ -407,56 +379,34 @@ impl Error {
             Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body incomplete"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
             Error::Unstatable(_) => (S::BAD_REQUEST, "unstatable", "invalid terms"),
-            Error::WebSocketVersion => (
-                S::UPGRADE_REQUIRED,
-                "websocket-version",
-                "WebSocket version not supported",
-            ),
+            Error::WebSocketVersion => (S::UPGRADE_REQUIRED, "websocket-version", "WebSocket version not supported"),
             Error::Unrecognised(AuthenticationError::Slowed(_)) => {
                 (S::TOO_MANY_REQUESTS, "guessing", "too many unknown tokens")
             }
             Error::Unrecognised(AuthenticationError::SlowedSignIn(_)) => {
                 (S::TOO_MANY_REQUESTS, "guessing", "too many wrong passwords")
             }
-            Error::Unrecognised(AuthenticationError::SessionOver) => {
-                (S::UNAUTHORIZED, "unauthorised", "session ended")
-            }
+            Error::Unrecognised(AuthenticationError::SessionOver) => (S::UNAUTHORIZED, "unauthorised", "session ended"),
             Error::WrongPassword => (S::UNAUTHORIZED, "wrong-password", "sign-in failed"),
-            Error::TooManyStreams { .. } => {
-                (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams")
-            }
-            Error::TooManyLook { .. } => (
-                S::TOO_MANY_REQUESTS,
-                "too-many-look",
-                "too many connections inside",
-            ),
+            Error::TooManyStreams { .. } => (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams"),
+            Error::TooManyLook { .. } => (S::TOO_MANY_REQUESTS, "too-many-look", "too many connections inside"),
             Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not ready"),
             Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "no ring-buffer recording"),
             Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
             Error::NotRecorded { .. } => (S::INSUFFICIENT_STORAGE, "not-recorded", "not recorded"),
-            Error::RecordedLately { .. } => {
-                (S::TOO_MANY_REQUESTS, "recorded-lately", "already recorded")
-            }
+            Error::RecordedLately { .. } => (S::TOO_MANY_REQUESTS, "recorded-lately", "already recorded"),
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
                 (S::SERVICE_UNAVAILABLE, "busy", "too many sign-ins")
             }
             Error::NoProvider => (S::NOT_FOUND, "no-provider", "no identity provider"),
             Error::NoRole { .. } => (S::FORBIDDEN, "no-role", "not allowed"),
             Error::Provider(error) => kind_of_provider(error),
-            Error::Unauthorised(_) | Error::Unrecognised(_) => {
-                (S::UNAUTHORIZED, "unauthorised", "token needed")
-            }
+            Error::Unauthorised(_) | Error::Unrecognised(_) => (S::UNAUTHORIZED, "unauthorised", "token needed"),
             Error::Uncertified(_) => (S::UNAUTHORIZED, "unpaired", "robot not paired"),
             Error::Uncoded(_) => (S::UNAUTHORIZED, "pairing-code", "no pairing"),
-            Error::Uncertifiable(authority::Error::Unmade { .. } | authority::Error::Io { .. }) => {
-                INTERNAL
-            }
-            Error::Uncertifiable(authority::Error::TooLong(_)) => {
-                (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
-            }
-            Error::Uncertifiable(_) => {
-                (S::BAD_REQUEST, "no-request", "invalid certificate request")
-            }
+            Error::Uncertifiable(authority::Error::Unmade { .. } | authority::Error::Io { .. }) => INTERNAL,
+            Error::Uncertifiable(authority::Error::TooLong(_)) => (S::PAYLOAD_TOO_LARGE, "too-large", "body too large"),
+            Error::Uncertifiable(_) => (S::BAD_REQUEST, "no-request", "invalid certificate request"),
             Error::UnknownPairing { .. } => (S::NOT_FOUND, "unknown-pairing", "unknown robot"),
             Error::UnknownAccount { .. } => (S::NOT_FOUND, "unknown-account", "unknown account"),
             Error::AccountExists(_) => (S::CONFLICT, "account-exists", "name taken"),
@@ -512,9 +462,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
     use choreographer::Error as C;
     match error {
         C::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
-        C::Full(AdmissionError::TooBig { .. }) => {
-            (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit")
-        }
+        C::Full(AdmissionError::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
         C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no capacity"),
         C::Terms(untenable) => kind_of_terms(untenable),
         C::NotResized { reason, .. } => match &**reason {
@@ -532,9 +480,7 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
         C::OutOfMemory { .. } => (S::UNPROCESSABLE_ENTITY, "out-of-memory", "out of memory"),
-        C::Calibration(_)
-        | C::Shadow(_)
-        | C::Reach(reach::Error::Trial(_) | reach::Error::Linked(_)) => {
+        C::Calibration(_) | C::Shadow(_) | C::Reach(reach::Error::Trial(_) | reach::Error::Linked(_)) => {
             (S::BAD_REQUEST, "bad-request", "bad request")
         }
         C::Reach(_) => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
@@ -546,9 +492,7 @@ fn kind_of_terms(untenable: &TermsError) -> Kind {
     use StatusCode as S;
     match untenable {
         TermsError::UnknownClass { .. } => (S::BAD_REQUEST, "unknown-class", "unknown class"),
-        TermsError::Capped { .. } | TermsError::Beyond { .. } => {
-            (S::FORBIDDEN, "capped", "more than allowed")
-        }
+        TermsError::Capped { .. } | TermsError::Beyond { .. } => (S::FORBIDDEN, "capped", "more than allowed"),
         TermsError::Unmet { .. } => (S::UNPROCESSABLE_ENTITY, "unmet", "SLA cannot be met"),
     }
 }
@@ -569,9 +513,7 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
         C::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
         C::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
         C::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
-        C::UnknownArchitecture { .. } => {
-            (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
-        }
+        C::UnknownArchitecture { .. } => (S::NOT_FOUND, "unknown-architecture", "unknown architecture"),
         C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
         C::Name(_) => (S::BAD_REQUEST, "bad-name", "invalid name"),
         C::Inventory(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
@@ -586,10 +528,7 @@ impl IntoResponse for Error {
             // RFC 6455, section 4.4.
             let headers = response.headers_mut();
             headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-            headers.insert(
-                header::SEC_WEBSOCKET_VERSION,
-                HeaderValue::from_static("13"),
-            );
+            headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
         }
         response
     }
@@ -605,14 +544,10 @@ pub fn respond(problem: &Problem) -> Response {
     body.push(b'\n');
     let mut response = (status, [(header::CONTENT_TYPE, PROBLEM_JSON)], body).into_response();
     if let Some(seconds) = problem.retry_after {
-        response
-            .headers_mut()
-            .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     if status == StatusCode::UNAUTHORIZED {
-        response
-            .headers_mut()
-            .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+        response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
     }
     // Where clients read another format, the registry's, the problem is translated.
     response.extensions_mut().insert(problem.clone());
@@ -629,15 +564,9 @@ mod tests {
 
     #[test]
     fn an_unknown_service_lists_those_that_exist() {
-        let error = catalogue::Error::UnknownService {
-            name: "nope".into(),
-            exists: vec!["opencv_apps".into()],
-        };
+        let error = catalogue::Error::UnknownService { name: "nope".into(), exists: vec!["opencv_apps".into()] };
         let problem = Error::from(error).problem();
-        assert_eq!(
-            (problem.status, problem.kind.as_str()),
-            (404, "urn:cloudroid:unknown-service")
-        );
+        assert_eq!((problem.status, problem.kind.as_str()), (404, "urn:cloudroid:unknown-service"));
         assert!(problem.detail.contains("nope"), "{problem:?}");
         assert_eq!(problem.exists, ["opencv_apps"]);
         assert!(problem.next.is_some());
@@ -654,11 +583,7 @@ mod tests {
     #[test]
     fn what_can_never_fit_is_not_to_be_tried_again() {
         let amount = choreographer::Amount::new(64.0, 1);
-        let problem = refusal(AdmissionError::TooBig {
-            wanted: amount,
-            capacity: amount,
-        })
-        .problem();
+        let problem = refusal(AdmissionError::TooBig { wanted: amount, capacity: amount }).problem();
         assert_eq!((problem.status, problem.retry_after), (422, None));
         assert!(problem.detail.contains("64 cores"), "{problem:?}");
     }
@@ -668,10 +593,7 @@ mod tests {
         let reserved = catalogue::Error::from(NameError::Reserved("api".into()));
         let problem = Error::from(reserved).problem();
         assert_eq!(problem.status, 409);
-        assert!(
-            problem.detail.contains("reserved") && problem.detail.contains("api"),
-            "{problem:?}"
-        );
+        assert!(problem.detail.contains("reserved") && problem.detail.contains("api"), "{problem:?}");
     }
 
     #[test]
@@ -682,10 +604,7 @@ mod tests {
             (Error::BodyTooLarge { limit }, "send less"),
             (Error::TrialTooLarge { limit }, "[memory]"),
             (Error::Unfinished { after }, "raise unfinished"),
-            (
-                Error::Choreographer(choreographer::Error::Ending),
-                "has restarted",
-            ),
+            (Error::Choreographer(choreographer::Error::Ending), "has restarted"),
         ] {
             let problem = error.problem();
             let next = problem.next.as_deref().unwrap_or_default();
@@ -709,15 +628,8 @@ mod tests {
 
     #[test]
     fn the_last_line_that_says_something_is_told() {
-        let log = [
-            "loading".to_owned(),
-            "no map file".to_owned(),
-            " ".to_owned(),
-        ];
-        assert_eq!(
-            with_last_log_line("it ended", &log),
-            "it ended; its log ends with: no map file"
-        );
+        let log = ["loading".to_owned(), "no map file".to_owned(), " ".to_owned()];
+        assert_eq!(with_last_log_line("it ended", &log), "it ended; its log ends with: no map file");
         assert_eq!(with_last_log_line("it ended", &[]), "it ended");
     }
 }

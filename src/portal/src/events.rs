@@ -40,18 +40,11 @@ pub struct EventQuery {
 
 impl EventQuery {
     /// Returns the newest `limit` events after number `since` that the caller may see, oldest first.
-    fn read(
-        &self,
-        app: &App,
-        caller: &Caller,
-        since: i64,
-        limit: u32,
-    ) -> Result<Vec<api::Event>, Error> {
+    fn read(&self, app: &App, caller: &Caller, since: i64, limit: u32) -> Result<Vec<api::Event>, Error> {
         let services = visible_services(app, caller)?;
-        let told = services.as_deref().map(|services| EventVisibility {
-            services,
-            own_robot: caller.who.principal.scope.robot.as_deref(),
-        });
+        let told = services
+            .as_deref()
+            .map(|services| EventVisibility { services, own_robot: caller.who.principal.scope.robot.as_deref() });
         let filter = EventFilter {
             kind: self.kind.as_deref(),
             service: self.service.as_deref(),
@@ -75,11 +68,7 @@ pub fn visible_services(app: &App, caller: &Caller) -> Result<Option<Vec<String>
 
 /// Returns true if a caller that does not see everything may see the event: a robot sees its own events, everybody
 /// those of services that they see; the machine's own events require access to the machine.
-pub fn is_visible(
-    caller: &Caller,
-    event: &api::Event,
-    sees: &mut impl FnMut(&str) -> bool,
-) -> bool {
+pub fn is_visible(caller: &Caller, event: &api::Event, sees: &mut impl FnMut(&str) -> bool) -> bool {
     let own = caller.who.principal.scope.robot.as_deref();
     event.service.as_deref().is_some_and(sees)
         && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
@@ -114,9 +103,7 @@ impl Follower {
             let newest = *self.grown.borrow_and_update();
             let Follower { app, caller, .. } = self;
             let events = self.which.read(app, caller, self.last, u32::MAX);
-            let events = events
-                .inspect_err(|error| tracing::error!("the journal cannot be followed: {error}"))
-                .ok()?;
+            let events = events.inspect_err(|error| tracing::error!("the journal cannot be followed: {error}")).ok()?;
             let last = events.last().map_or(newest, |event| event.id.max(newest));
             self.last = self.last.max(last);
             if !events.is_empty() {
@@ -141,19 +128,11 @@ pub async fn follow(
     let there = which.read(&app, &caller, which.since, limit)?;
     let ending = caller.wait_for_end(&app, "");
     let last = there.last().map_or(newest, |event| event.id.max(newest));
-    let follower = Follower {
-        last: last.max(which.since),
-        app,
-        caller,
-        which,
-        grown,
-    };
+    let follower = Follower { last: last.max(which.since), app, caller, which, grown };
     let more = futures_util::stream::unfold((follower, place), |(mut follower, place)| async {
         let events = follower.next().await?;
         Some((events, (follower, place)))
     });
     let all = futures_util::stream::once(async { there }).chain(more);
-    Ok(json_lines(
-        all.flat_map(futures_util::stream::iter).take_until(ending),
-    ))
+    Ok(json_lines(all.flat_map(futures_util::stream::iter).take_until(ending)))
 }

@@ -35,16 +35,10 @@ pub async fn explain_robot(app: &App, caller: &Caller, name: &str) -> Result<Exp
         let mut exists: Vec<String> = all.iter().map(|handle| handle.robot.clone()).collect();
         exists.sort();
         exists.dedup();
-        return Err(Error::UnknownRobot {
-            name: name.to_owned(),
-            exists,
-        });
+        return Err(Error::UnknownRobot { name: name.to_owned(), exists });
     }
-    let servants = futures_util::future::join_all(
-        mine.iter()
-            .map(|handle| sample_servant(choreographer, handle)),
-    )
-    .await;
+    let servants =
+        futures_util::future::join_all(mine.iter().map(|handle| sample_servant(choreographer, handle))).await;
     Ok(Explanation {
         robot: name.to_owned(),
         causes: causes::find_causes(
@@ -62,10 +56,7 @@ fn recent_events(app: &App, caller: &Caller, robot: &str) -> Result<Vec<Event>, 
     let services = visible_services(app, caller)?;
     let of_it = EventFilter {
         robot: Some(robot),
-        told: services.as_deref().map(|services| EventVisibility {
-            services,
-            own_robot: Some(robot),
-        }),
+        told: services.as_deref().map(|services| EventVisibility { services, own_robot: Some(robot) }),
         ..EventFilter::default()
     };
     Ok(app.state.filtered_events(of_it, 0, EVENTS)?)
@@ -92,11 +83,7 @@ async fn sample_servant(choreographer: &Choreographer, handle: &Handle) -> Serve
 /// Returns the links to a servant, if it has any yet.
 pub fn links(handle: &Handle) -> Vec<Link> {
     let status = handle.reach().map(|reach| reach.links());
-    status
-        .unwrap_or_default()
-        .into_iter()
-        .map(to_link)
-        .collect()
+    status.unwrap_or_default().into_iter().map(to_link).collect()
 }
 
 fn to_link(status: LinkStatus) -> Link {
@@ -111,20 +98,12 @@ fn to_link(status: LinkStatus) -> Link {
     let requests = &status.requests;
     let late: Vec<&RequestTiming> = requests.iter().filter(is_late).collect();
     let dropped = status.drops.iter().chain(&status.dropped);
-    let here = status
-        .drops
-        .iter()
-        .map(|drop| format!("in the cloud {drop}"));
+    let here = status.drops.iter().map(|drop| format!("in the cloud {drop}"));
     let there = status.dropped.iter();
-    let drops = here
-        .chain(there.map(|drop| format!("on the robot {drop}")))
-        .collect();
+    let drops = here.chain(there.map(|drop| format!("on the robot {drop}"))).collect();
     let refused = status.refused.iter().map(|one| {
         let IncompatibleEndpoint { topic, node, why } = one;
-        format!(
-            "no messages on {topic} pass between {node} and {}: {why}",
-            status.node
-        )
+        format!("no messages on {topic} pass between {node} and {}: {why}", status.node)
     });
     let refused = refused.collect();
     Link {
@@ -142,10 +121,7 @@ fn to_link(status: LinkStatus) -> Link {
         age: status.sla.age.map(millis),
         desired_age: status.sla.desired_age.map(millis),
         fallback_after: status.sla.fallback_after.map(millis),
-        satisfaction: requests
-            .last()
-            .filter(|_| !unpromised)
-            .map(|request| request.satisfaction),
+        satisfaction: requests.last().filter(|_| !unpromised).map(|request| request.satisfaction),
         requests: requests.len(),
         late: late.len(),
         local: requests.iter().filter(|request| request.local).count(),
@@ -164,12 +140,8 @@ fn to_link(status: LinkStatus) -> Link {
 
 /// Returns how the time of the answered requests is divided into phases.
 fn phase_times<'a>(requests: impl IntoIterator<Item = &'a RequestTiming>) -> Vec<Part> {
-    let answered: Vec<&RequestTiming> = requests
-        .into_iter()
-        .filter(|request| request.total.is_some())
-        .collect();
-    let times =
-        |of: fn(&RequestTiming) -> f64| answered.iter().map(|request| of(request)).collect();
+    let answered: Vec<&RequestTiming> = requests.into_iter().filter(|request| request.total.is_some()).collect();
+    let times = |of: fn(&RequestTiming) -> f64| answered.iter().map(|request| of(request)).collect();
     let parts = [
         Part::from_samples("serialise", times(|request| request.serialise)),
         Part::from_samples("up", times(|request| request.up)),
@@ -190,12 +162,8 @@ fn robot_back_offs(choreographer: &Choreographer, robot: &str) -> Vec<api::BackO
 
 /// Returns rollouts of the robot's services whose canaries are due but not promoted.
 fn waiting_rollouts(choreographer: &Choreographer, servants: &[Served]) -> Vec<api::Rollout> {
-    let services = servants
-        .iter()
-        .map(|served| served.servant.service.as_str());
+    let services = servants.iter().map(|served| served.servant.service.as_str());
     let services: BTreeSet<&str> = services.collect();
-    let rollouts = services
-        .into_iter()
-        .filter_map(|service| choreographer.rollout(service).ok());
+    let rollouts = services.into_iter().filter_map(|service| choreographer.rollout(service).ok());
     rollouts.filter(|rollout| rollout.waits.is_some()).collect()
 }

@@ -35,11 +35,7 @@ pub async fn goals(
     Path(id): Path<String>,
 ) -> JsonResult<Vec<Goal>> {
     let handle = app.choreographer.servant(&id)?;
-    let whose = InsideTarget {
-        service: handle.service(),
-        robot: &handle.robot,
-        object: format_args!("servant {id}"),
-    };
+    let whose = InsideTarget { service: handle.service(), robot: &handle.robot, object: format_args!("servant {id}") };
     let grants = inside::inside_grants(&app, &caller, whose)?;
     let goals = app.observers.goals(&id);
     let mut all = goals.map(|goals| goals.recent()).unwrap_or_default();
@@ -81,13 +77,8 @@ fn to_api_goal(handle: &Handle, goal: observe::ObservedGoal) -> Goal {
         by: by.unwrap_or_else(|| UNHEARD.to_owned()),
         began: millis(goal.began),
         ended: ended.map(|(time, _)| millis(*time)),
-        state: ended.map_or(GoalState::Underway, |(_, outcome)| {
-            to_goal_state(outcome.status)
-        }),
-        text: goal
-            .ended
-            .map(|(_, outcome)| outcome.text)
-            .unwrap_or_default(),
+        state: ended.map_or(GoalState::Underway, |(_, outcome)| to_goal_state(outcome.status)),
+        text: goal.ended.map(|(_, outcome)| outcome.text).unwrap_or_default(),
     }
 }
 
@@ -139,11 +130,7 @@ pub fn report_ended_goals(app: &Arc<App>, handle: &Handle, goals: &Arc<GoalMonit
 
 /// Returns the last few of the goals that ended since number `before`, and the number of the others. `count` is the
 /// number of ended goals, at least.
-fn take_latest(
-    mut all: Vec<observe::ObservedGoal>,
-    before: &mut u64,
-    count: u64,
-) -> (u64, Vec<observe::ObservedGoal>) {
+fn take_latest(mut all: Vec<observe::ObservedGoal>, before: &mut u64, count: u64) -> (u64, Vec<observe::ObservedGoal>) {
     let last = all.last().and_then(|goal| goal.ended.as_ref());
     let count = last.map_or(count, |(_, outcome)| outcome.number.max(count));
     let few = all.split_off(all.len().saturating_sub(FEW));
@@ -164,24 +151,14 @@ fn journal_goal(app: &App, handle: &Handle, goal: observe::ObservedGoal, more: u
         0 => String::new(),
         took => format!(" after {:.1} s", took as f64 / 1e3),
     };
-    let words = if goal.text.is_empty() {
-        String::new()
-    } else {
-        format!(" ({})", goal.text)
-    };
+    let words = if goal.text.is_empty() { String::new() } else { format!(" ({})", goal.text) };
     let more = match more {
         0 => String::new(),
         more => format!("; {more} more have ended since the last report"),
     };
     let message = format!("{}: {whose} {}{took}{words}{more}", goal.action, goal.state);
-    let about = NewEvent {
-        service: Some(handle.service()),
-        servant: Some(&handle.id),
-        robot: Some(&handle.robot),
-    };
-    app.choreographer
-        .journal()
-        .info(GOAL_ENDED, &message, &about);
+    let about = NewEvent { service: Some(handle.service()), servant: Some(&handle.id), robot: Some(&handle.robot) };
+    app.choreographer.journal().info(GOAL_ENDED, &message, &about);
 }
 
 #[cfg(test)]
@@ -192,11 +169,7 @@ mod tests {
     use super::*;
 
     fn goal(number: u64) -> observe::ObservedGoal {
-        let outcome = ObservedOutcome {
-            status: ActionlibStatus::Succeeded,
-            text: String::new(),
-            number,
-        };
+        let outcome = ObservedOutcome { status: ActionlibStatus::Succeeded, text: String::new(), number };
         observe::ObservedGoal {
             action: "/dock".to_owned(),
             id: number.to_string(),
@@ -230,13 +203,7 @@ mod tests {
         };
         assert!(can_see_goals(&grants(&["call:/dock"]), "/dock"));
         assert!(can_see_goals(&grants(&["subscribe:/dock/*"]), "/dock"));
-        assert!(!can_see_goals(
-            &grants(&["subscribe:/dock/result"]),
-            "/dock"
-        ));
-        assert!(!can_see_goals(
-            &grants(&["subscribe:/map", "call:/other"]),
-            "/dock"
-        ));
+        assert!(!can_see_goals(&grants(&["subscribe:/dock/result"]), "/dock"));
+        assert!(!can_see_goals(&grants(&["subscribe:/map", "call:/other"]), "/dock"));
     }
 }

@@ -58,11 +58,7 @@ pub async fn guard(
     let Some(connection) = request.extensions().get::<PortalConnection>() else {
         return Error::Internal("identifying the caller").into_response();
     };
-    let connection = match app
-        .options
-        .proxies
-        .resolve_client(connection, request.headers())
-    {
+    let connection = match app.options.proxies.resolve_client(connection, request.headers()) {
         Ok(seen) => seen,
         Err(error) => {
             // The client cannot be determined, so the request is attributed to the proxy.
@@ -70,8 +66,7 @@ pub async fn guard(
             let did = format!("{} {}", request.method(), request.uri().path());
             let status = error.problem().status;
             let object = "a client with a malformed proxy header";
-            app.audit
-                .record_throttled(&nobody, AccessAction::Enter, &did, object, status);
+            app.audit.record_throttled(&nobody, AccessAction::Enter, &did, object, status);
             return error.into_response();
         }
     };
@@ -109,15 +104,13 @@ pub async fn guard(
                 let (method, path) = (request.method(), request.uri().path());
                 let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
                 let (did, status) = (format!("{method} {path}"), error.problem().status);
-                app.audit
-                    .record_throttled(&nobody, AccessAction::Enter, &did, what, status);
+                app.audit.record_throttled(&nobody, AccessAction::Enter, &did, what, status);
             }
             if let Error::Uncertified(why) = &error {
                 let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
                 let did = format!("{} {}", request.method(), request.uri().path());
                 let (object, status) = (why.to_string(), error.problem().status);
-                app.audit
-                    .record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
+                app.audit.record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             }
             error.into_response()
         }
@@ -132,8 +125,7 @@ pub fn recognise_certificate(
 ) -> Option<Result<CallerIdentity, CertificateRefusal>> {
     let own = connection.certificates.first()?;
     let authority = &app.robots.as_ref()?.authority;
-    let shown = authority::read_robot_certificate(own)
-        .map_err(|error| CertificateRefusal::Nameless(error.to_string()));
+    let shown = authority::read_robot_certificate(own).map_err(|error| CertificateRefusal::Nameless(error.to_string()));
     Some(shown.and_then(|shown| known.recognise_certificate(authority, &shown, store::now())))
 }
 
@@ -192,11 +184,7 @@ impl AdmissionRules<'_> {
         let open = is_open(access, method, uri, headers);
         // During a sign-in, a session is ignored: another site may have planted it.
         let signs_in = *method == Method::POST && access == Access::SignIn;
-        let shown = if signs_in {
-            None
-        } else {
-            cookies::session_cookie(connection, headers)?
-        };
+        let shown = if signs_in { None } else { cookies::session_cookie(connection, headers)? };
         let session = shown.map(|secret| {
             let who = self.known.recognise_session(&secret, store::now())?;
             cookies::check(connection, method, headers, &secret)?;
@@ -223,11 +211,7 @@ fn admit_user(connection: &PortalConnection, user: User) -> Result<Caller, Error
             0 => "root".to_owned(),
             uid => format!("user {uid}"),
         };
-        return Ok(Caller::new(
-            connection,
-            Principal::admin(&name),
-            Credential::User,
-        ));
+        return Ok(Caller::new(connection, Principal::admin(&name), Credential::User));
     }
     Err(Error::Foreign {
         what: format!("user {uid} may not use the daemon's socket"),
@@ -280,9 +264,7 @@ fn find_token(uri: &Uri, headers: &HeaderMap) -> Option<String> {
         let token = protocols(headers).find_map(|protocol| protocol.strip_prefix(BEARER))?;
         Some(token.to_owned())
     };
-    authorization(uri, headers)
-        .or_else(protocol)
-        .or_else(|| query_value(uri.query(), "token"))
+    authorization(uri, headers).or_else(protocol).or_else(|| query_value(uri.query(), "token"))
 }
 
 #[cfg(test)]

@@ -34,14 +34,8 @@ struct HistoryStep {
     kept: u32,
 }
 
-const FINE: HistoryStep = HistoryStep {
-    seconds: 10,
-    kept: 360,
-};
-const COARSE: HistoryStep = HistoryStep {
-    seconds: 60,
-    kept: 1_440,
-};
+const FINE: HistoryStep = HistoryStep { seconds: 10, kept: 360 };
+const COARSE: HistoryStep = HistoryStep { seconds: 60, kept: 1_440 };
 
 impl HistoryStep {
     fn millis(self) -> Millis {
@@ -122,21 +116,14 @@ pub async fn servants(
     Query(whose): Query<ServantHistoryQuery>,
     Extension(caller): Extension<Caller>,
 ) -> JsonResult<Vec<ServantHistory>> {
-    let asked = RequestedPeriod::parse(TimeQuery {
-        from: whose.from,
-        to: whose.to,
-        step: whose.step,
-    })?;
+    let asked = RequestedPeriod::parse(TimeQuery { from: whose.from, to: whose.to, step: whose.step })?;
     let services = visible_services(&app, &caller)?;
     let filter = SeriesFilter {
         // The machine's history has an endpoint of its own.
         servant: whose.servant.as_deref(),
         service: whose.service.as_deref(),
         robot: whose.robot.as_deref(),
-        told: services.as_deref().map(|services| EventVisibility {
-            services,
-            own_robot: caller.own_robot(),
-        }),
+        told: services.as_deref().map(|services| EventVisibility { services, own_robot: caller.own_robot() }),
     };
     let mut found = app.state.recorded_series(filter, asked.from, SERVANTS)?;
     found.retain(|one| one.servant != recorder::THE_MACHINE);
@@ -165,12 +152,7 @@ fn visible_services(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, E
     Ok(Some(services))
 }
 
-fn history(
-    app: &App,
-    one: RecordedSeries,
-    asked: &RequestedPeriod,
-    most: usize,
-) -> Result<ServantHistory, Error> {
+fn history(app: &App, one: RecordedSeries, asked: &RequestedPeriod, most: usize) -> Result<ServantHistory, Error> {
     let when = (asked.from, asked.to);
     let samples = app.state.samples(one.id, asked.step.seconds, when, most)?;
     // Before this one began, the robot had another servant.
@@ -188,24 +170,15 @@ fn history(
 }
 
 /// Returns the history of the machine.
-pub async fn machine(
-    State(app): State<Arc<App>>,
-    Query(when): Query<TimeQuery>,
-) -> JsonResult<MachineHistory> {
+pub async fn machine(State(app): State<Arc<App>>, Query(when): Query<TimeQuery>) -> JsonResult<MachineHistory> {
     let asked = RequestedPeriod::parse(when)?;
-    let filter = SeriesFilter {
-        servant: Some(recorder::THE_MACHINE),
-        ..SeriesFilter::default()
-    };
+    let filter = SeriesFilter { servant: Some(recorder::THE_MACHINE), ..SeriesFilter::default() };
     let mut samples = Vec::new();
     for one in app.state.recorded_series(filter, asked.from, 1)? {
         let when = (asked.from, asked.to);
         samples = app.state.samples(one.id, asked.step.seconds, when, MOST)?;
     }
-    Ok(Json(MachineHistory {
-        step: asked.step.seconds,
-        figures: figures::machine_figures(&samples),
-    }))
+    Ok(Json(MachineHistory { step: asked.step.seconds, figures: figures::machine_figures(&samples) }))
 }
 
 #[cfg(test)]

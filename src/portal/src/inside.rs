@@ -41,21 +41,10 @@ pub(crate) struct InsideTarget<'a> {
 
 /// Determines what the caller, who may see the service, may do inside a robot's servants. A robot has access where it
 /// may act as that robot, and nowhere else.
-pub(crate) fn inside_role(
-    app: &App,
-    caller: &Caller,
-    whose: InsideTarget<'_>,
-) -> Result<InsideRole, Error> {
+pub(crate) fn inside_role(app: &App, caller: &Caller, whose: InsideTarget<'_>) -> Result<InsideRole, Error> {
     let principal = &caller.who.principal;
-    let InsideTarget {
-        service,
-        robot,
-        object,
-    } = whose;
-    if caller
-        .check_service_access(app, AccessAction::Operate, service, None)
-        .is_ok()
-    {
+    let InsideTarget { service, robot, object } = whose;
+    if caller.check_service_access(app, AccessAction::Operate, service, None).is_ok() {
         return Ok(InsideRole::Acts);
     }
     if !principal.has_role(Role::Robot) {
@@ -65,10 +54,7 @@ pub(crate) fn inside_role(
     // The generated name of a nameless robot's servant is not revealed to others.
     let own = match principal.scope.robot.as_deref() {
         Some(own) => own == robot,
-        None => {
-            principal.has_role(Role::Viewer)
-                && (robot.starts_with('~') || is_robot_name_free(app, caller, robot)?)
-        }
+        None => principal.has_role(Role::Viewer) && (robot.starts_with('~') || is_robot_name_free(app, caller, robot)?),
     };
     match (connects, principal.has_role(Role::Viewer)) {
         (Ok(()), _) if own => Ok(InsideRole::Acts),
@@ -78,15 +64,9 @@ pub(crate) fn inside_role(
 }
 
 /// Returns the caller's current grants inside the target.
-pub(crate) fn inside_grants(
-    app: &App,
-    caller: &Caller,
-    whose: InsideTarget<'_>,
-) -> Result<Arc<Grants>, Error> {
+pub(crate) fn inside_grants(app: &App, caller: &Caller, whose: InsideTarget<'_>) -> Result<Arc<Grants>, Error> {
     let part = inside_role(app, caller, whose)?;
-    let standing = app
-        .principals
-        .inside_access(&caller.who, whose.service, part);
+    let standing = app.principals.inside_access(&caller.who, whose.service, part);
     match standing {
         ConnectionAccess::Granted(grants) => Ok(grants),
         ConnectionAccess::Ended(reason) => Err(Error::Forbidden { what: reason }),
@@ -122,18 +102,10 @@ impl InsideAccess {
     /// Checks whether the caller may look into the servant with this id.
     pub fn authorise(app: &Arc<App>, id: &str, caller: Caller) -> Result<Self, Error> {
         let handle = app.choreographer.servant(id)?;
-        let whose = InsideTarget {
-            service: handle.service(),
-            robot: &handle.robot,
-            object: format_args!("servant {id}"),
-        };
+        let whose =
+            InsideTarget { service: handle.service(), robot: &handle.robot, object: format_args!("servant {id}") };
         let part = inside_role(app, &caller, whose)?;
-        Ok(Self {
-            app: Arc::clone(app),
-            handle,
-            caller,
-            part,
-        })
+        Ok(Self { app: Arc::clone(app), handle, caller, part })
     }
 
     /// Upgrades to a WebSocket with this subprotocol, on which `serve` runs for as long as the caller has access.
@@ -148,14 +120,9 @@ impl InsideAccess {
         let Some(reach) = self.handle.reach() else {
             return Err(Error::NotThereYet(id.clone()));
         };
-        let place = self
-            .app
-            .inside
-            .acquire(id, &self.caller.who.principal.name)?;
+        let place = self.app.inside.acquire(id, &self.caller.who.principal.name)?;
         let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
-            return Err(Error::BadRequest(
-                "this connection cannot become a WebSocket".to_owned(),
-            ));
+            return Err(Error::BadRequest("this connection cannot become a WebSocket".to_owned()));
         };
         audit_recorder(&self.app, &self.caller, &self.handle)("looks inside");
         let sessions = self.app.sessions.clone();
@@ -177,17 +144,11 @@ impl InsideAccess {
         reach: Arc<dyn Reach>,
         serve: impl FnOnce(InsideSession, reach::UpgradedStream, Bytes) -> Served,
     ) {
-        let Self {
-            app,
-            handle,
-            caller,
-            part,
-        } = self;
+        let Self { app, handle, caller, part } = self;
         let (io, read_ahead) = robots::into_raw_stream(upgraded);
         let memory = app.choreographer.memory();
         let service = handle.service().to_owned();
-        let (standing, granted) =
-            watch::channel(app.principals.inside_access(&caller.who, &service, part));
+        let (standing, granted) = watch::channel(app.principals.inside_access(&caller.who, &service, part));
         let refused = audit_recorder(&app, &caller, &handle);
         let used = audit_recorder(&app, &caller, &handle);
         let looker = InsideSession {
@@ -195,9 +156,7 @@ impl InsideAccess {
             reach,
             budget: memory.client(&caller.peer.budget_name(None)),
             granted: ClientGrants::from_standing(granted)
-                .with_refusal_observer(move |operation| {
-                    refused(&format!("was refused {operation}"))
-                })
+                .with_refusal_observer(move |operation| refused(&format!("was refused {operation}")))
                 .with_use_observer(move |operation| used(&format!("inside: {operation}"))),
             caller: caller.clone(),
         };
@@ -234,25 +193,15 @@ pub async fn open_inside(
 }
 
 /// Returns a function that records what the caller does inside; repeated actions once a minute.
-fn audit_recorder(
-    app: &Arc<App>,
-    caller: &Caller,
-    handle: &Handle,
-) -> impl Fn(&str) + Send + Sync + use<> {
+fn audit_recorder(app: &Arc<App>, caller: &Caller, handle: &Handle) -> impl Fn(&str) + Send + Sync + use<> {
     let (app, caller) = (Arc::clone(app), caller.clone());
-    let object = format!(
-        "servant {} of robot {} at service {}",
-        handle.id,
-        handle.robot,
-        handle.service()
-    );
+    let object = format!("servant {} of robot {} at service {}", handle.id, handle.robot, handle.service());
     move |did| {
         let (action, status) = match did {
             "looks inside" => (AccessAction::See, StatusCode::SWITCHING_PROTOCOLS),
             did if did.starts_with("was refused") => (AccessAction::Operate, StatusCode::FORBIDDEN),
             _ => (AccessAction::Operate, StatusCode::OK),
         };
-        app.audit
-            .record_throttled(&caller, action, did, &object, status.as_u16());
+        app.audit.record_throttled(&caller, action, did, &object, status.as_u16());
     }
 }

@@ -17,15 +17,9 @@ use crate::errors::Error;
 pub type JsonResult<T> = Result<Json<T>, Error>;
 
 /// Reads a value of at most 64 KiB of JSON; `what` names it in an error.
-pub async fn read_json<T: DeserializeOwned>(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-    what: &str,
-) -> Result<T, Error> {
+pub async fn read_json<T: DeserializeOwned>(app: &App, caller: &Caller, body: Body, what: &str) -> Result<T, Error> {
     let body = read_body(app, caller, body, LARGEST_WORDS).await?.bytes;
-    serde_json::from_slice(&body)
-        .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
+    serde_json::from_slice(&body).map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
 }
 
 /// Builds a response that streams values as JSON lines.

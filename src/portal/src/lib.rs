@@ -102,8 +102,6 @@ pub fn router(app: Arc<App>) -> Router {
             (Arc::clone(&app), routes::find_access as FindAccess),
             guard::guard,
         ))
-        .layer(axum::middleware::from_fn(
-            registry_clients::translate_problems,
-        ))
+        .layer(axum::middleware::from_fn(registry_clients::translate_problems))
         .with_state(app)
 }

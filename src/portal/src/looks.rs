@@ -28,8 +28,7 @@ impl ServantSampler {
         let looks = handles.iter().map(|handle| describe_servant(app, handle));
         let mut servants = futures_util::future::join_all(looks).await;
         let now = Instant::now();
-        self.measured
-            .retain(|id, _| servants.iter().any(|one| one.servant.id == *id));
+        self.measured.retain(|id, _| servants.iter().any(|one| one.servant.id == *id));
         for servant in &mut servants {
             measure(servant, &mut self.measured, now);
         }
@@ -72,8 +71,7 @@ fn measure(served: &mut Served, measured: &mut HashMap<String, CpuMeasurement>, 
     let last = measured.entry(served.servant.id.clone()).or_insert(new);
     let passed = now.duration_since(last.at);
     if passed >= MEASURED {
-        let share =
-            |now: u64, then: u64| now.saturating_sub(then) as f64 / passed.as_micros() as f64;
+        let share = |now: u64, then: u64| now.saturating_sub(then) as f64 / passed.as_micros() as f64;
         *last = CpuMeasurement {
             cores: share(new.cpu_usec, last.cpu_usec),
             throttled: share(new.throttled_usec, last.throttled_usec).min(1.0),
@@ -101,11 +99,7 @@ pub mod tests {
     use super::*;
 
     pub fn served_servant(cpu_usec: u64, throttled_usec: u64) -> Served {
-        let usage = api::Usage {
-            cpu_usec,
-            throttled_usec,
-            ..api::Usage::default()
-        };
+        let usage = api::Usage { cpu_usec, throttled_usec, ..api::Usage::default() };
         let servant = serde_json::json!({
             "id": "s1", "service": "adder", "revision": 1, "robot": "r1", "phase": "ready", "created": 0,
             "connections": 1, "limits": {}, "usage": usage,
@@ -123,11 +117,7 @@ pub mod tests {
         let (mut measured, start) = (HashMap::new(), Instant::now());
         let mut at = |after: u64, cpu, throttled| {
             let mut servant = served_servant(cpu, throttled);
-            measure(
-                &mut servant,
-                &mut measured,
-                start + Duration::from_millis(after),
-            );
+            measure(&mut servant, &mut measured, start + Duration::from_millis(after));
             (servant.cores, servant.throttled)
         };
         assert_eq!(at(0, 1_000_000, 0), (0.0, 0.0));

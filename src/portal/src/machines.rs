@@ -50,11 +50,7 @@ pub async fn begin(
             ));
         }
         pair_and_warn(&app, || app.principals.pair_own(&new))?;
-        return Ok(Json(PairingMade {
-            robot: new.robot,
-            line: None,
-            expires: None,
-        }));
+        return Ok(Json(PairingMade { robot: new.robot, line: None, expires: None }));
     }
     let server = server_address(&app, &caller, &headers, new.address.as_deref())?;
     let (code, expires) = app.principals.begin_pairing(&new)?;
@@ -66,24 +62,13 @@ pub async fn begin(
         key: key.split(' ').nth(1).unwrap_or_default().to_owned(),
         code,
     };
-    Ok(Json(PairingMade {
-        robot: new.robot,
-        line: Some(line.to_string()),
-        expires: Some(expires),
-    }))
+    Ok(Json(PairingMade { robot: new.robot, line: Some(line.to_string()), expires: Some(expires) }))
 }
 
 /// Returns the host and port at which the robot reaches the daemon: the given address, or the one that the caller
 /// used.
-fn server_address(
-    app: &App,
-    caller: &Caller,
-    headers: &HeaderMap,
-    named: Option<&str>,
-) -> Result<String, Error> {
-    let host = headers
-        .get(header::HOST)
-        .and_then(|host| host.to_str().ok());
+fn server_address(app: &App, caller: &Caller, headers: &HeaderMap, named: Option<&str>) -> Result<String, Error> {
+    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok());
     let asked = match (named, caller.peer, caller.forwarded) {
         (Some(named), _, _) => named.to_owned(),
         (None, ConnectionPeer::Tcp(_), false) => host.unwrap_or_default().to_owned(),
@@ -101,9 +86,7 @@ fn server_address(
         // Clients omit the default port of the scheme (RFC 9110, section 4.2.2).
         Ok(format!("{asked}:443"))
     } else {
-        Err(Error::BadRequest(format!(
-            "{asked:?} is not an address of this daemon; give one with --address HOST:PORT"
-        )))
+        Err(Error::BadRequest(format!("{asked:?} is not an address of this daemon; give one with --address HOST:PORT")))
     }
 }
 
@@ -118,9 +101,7 @@ fn pair_and_warn<T>(app: &App, pairs: impl FnOnce() -> Result<T, Error>) -> Resu
     let first = app.principals.has_no_credentials();
     let done = pairs()?;
     if first {
-        tracing::warn!(
-            "the first robot was paired: from now on every request over TCP needs a token or a certificate"
-        );
+        tracing::warn!("the first robot was paired: from now on every request over TCP needs a token or a certificate");
     }
     Ok(done)
 }
@@ -162,20 +143,13 @@ pub async fn pair(
     match pair_by_code(&app, robots, &caller, &shown) {
         Ok(issued) => {
             let robot = Caller::as_robot(&caller, &shown.robot);
-            app.audit.record(
-                &robot,
-                AccessAction::Pair,
-                "was paired by a code",
-                &object,
-                200,
-            );
+            app.audit.record(&robot, AccessAction::Pair, "was paired by a code", &object, 200);
             Ok(Json(to_robot_certificate(shown.robot, issued)))
         }
         Err(error) => {
             let status = error.problem().status;
             let did = format!("presented a pairing code: {error}");
-            app.audit
-                .record_throttled(&caller, AccessAction::Pair, &did, &object, status);
+            app.audit.record_throttled(&caller, AccessAction::Pair, &did, &object, status);
             Err(error)
         }
     }
@@ -190,20 +164,12 @@ fn pair_by_code(
     let principals = &app.principals;
     // The code is checked first: requests of strangers are not parsed.
     let code = principals.check_code(&shown.robot, &shown.code, caller.peer.ip(), store::now())?;
-    let request =
-        CertificateRequest::parse(&shown.request, &shown.robot).map_err(Error::Uncertifiable)?;
-    pair_and_warn(app, || {
-        principals.pair(&code, &request, &robots.authority, robots.lifetime)
-    })
+    let request = CertificateRequest::parse(&shown.request, &shown.robot).map_err(Error::Uncertifiable)?;
+    pair_and_warn(app, || principals.pair(&code, &request, &robots.authority, robots.lifetime))
 }
 
 fn to_robot_certificate(robot: String, issued: IssuedRobotCertificate) -> RobotCertificate {
-    RobotCertificate {
-        robot,
-        certificate: issued.certificate,
-        issued: issued.issued,
-        expires: issued.expires,
-    }
+    RobotCertificate { robot, certificate: issued.certificate, issued: issued.issued, expires: issued.expires }
 }
 
 /// Renews the certificate of a paired robot.
@@ -213,12 +179,7 @@ pub async fn renew(
     body: Body,
 ) -> JsonResult<RobotCertificate> {
     let robots = require_robot_authority(&app, &caller)?;
-    let Credential::Certificate {
-        pairing,
-        key: Some(key),
-        ..
-    } = &caller.who.shown
-    else {
+    let Credential::Certificate { pairing, key: Some(key), .. } = &caller.who.shown else {
         return Err(Error::BadRequest(
             "only the robot itself can renew its certificate, and only one signed by this daemon; certificates of the \
                 lab's own authority are renewed there"
@@ -228,34 +189,25 @@ pub async fn renew(
     let asked: Renew = read_json(&app, &caller, body, "renewal").await?;
     let robot = caller.who.principal.name.clone();
     let object = format!("robot {robot}");
-    let renewed = CertificateRequest::parse(&asked.request, &robot)
-        .map_err(Error::Uncertifiable)
-        .and_then(|request| {
-            if request.key_hash() != key {
-                return Err(Error::BadRequest(format!(
-                    "the request has a different key than {robot} was paired with; to change the key, pair it again: \
+    let renewed = CertificateRequest::parse(&asked.request, &robot).map_err(Error::Uncertifiable).and_then(|request| {
+        if request.key_hash() != key {
+            return Err(Error::BadRequest(format!(
+                "the request has a different key than {robot} was paired with; to change the key, pair it again: \
                         cloudroidctl pair {robot}"
-                )));
-            }
-            let principals = &app.principals;
-            principals.renew((*pairing, &robot), &request, &robots.authority, robots.lifetime)
-        });
+            )));
+        }
+        let principals = &app.principals;
+        principals.renew((*pairing, &robot), &request, &robots.authority, robots.lifetime)
+    });
     match renewed {
         Ok(issued) => {
-            app.audit.record_throttled(
-                &caller,
-                AccessAction::Pair,
-                "renewed its certificate",
-                &object,
-                200,
-            );
+            app.audit.record_throttled(&caller, AccessAction::Pair, "renewed its certificate", &object, 200);
             Ok(Json(to_robot_certificate(robot, issued)))
         }
         Err(error) => {
             let status = error.problem().status;
             let did = "asked for another certificate";
-            app.audit
-                .record_throttled(&caller, AccessAction::Pair, did, &object, status);
+            app.audit.record_throttled(&caller, AccessAction::Pair, did, &object, status);
             Err(error)
         }
     }
@@ -284,11 +236,8 @@ impl Caller {
     /// Returns the caller with the identity of the robot, for the audit log.
     fn as_robot(caller: &Caller, robot: &str) -> Caller {
         let mut named = caller.clone();
-        named.who.principal = Arc::new(Principal {
-            name: robot.to_owned(),
-            roles: vec![access::Role::Robot],
-            ..Principal::nobody()
-        });
+        named.who.principal =
+            Arc::new(Principal { name: robot.to_owned(), roles: vec![access::Role::Robot], ..Principal::nobody() });
         named
     }
 }

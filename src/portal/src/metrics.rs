@@ -16,29 +16,17 @@ use crate::app::App;
 use crate::errors::Error;
 use choreographer::{Choreographer, Handle};
 use exposition::{
-    OPEN_METRICS, PROMETHEUS, accepts_open_metrics, format_labels, to_open_metrics, write_family,
-    write_gauge,
+    OPEN_METRICS, PROMETHEUS, accepts_open_metrics, format_labels, to_open_metrics, write_family, write_gauge,
 };
 
-const PHASES: [Phase; 6] = [
-    Phase::Requested,
-    Phase::Admitted,
-    Phase::Created,
-    Phase::Starting,
-    Phase::Ready,
-    Phase::Draining,
-];
+const PHASES: [Phase; 6] =
+    [Phase::Requested, Phase::Admitted, Phase::Created, Phase::Starting, Phase::Ready, Phase::Draining];
 
 /// Responds with all metrics, as OpenMetrics if that is requested.
 pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<Response, Error> {
     let mut out = String::new();
     let services = app.state.service_names()?;
-    write_gauge(
-        &mut out,
-        "cloudroid_services",
-        "Published services.",
-        [(String::new(), services.len() as f64)],
-    );
+    write_gauge(&mut out, "cloudroid_services", "Published services.", [(String::new(), services.len() as f64)]);
     write_servant_metrics(&mut out, &app.choreographer);
     write_group_metrics(&mut out, &app.choreographer, &services);
     let (pushes, failed) = app.pusher.counts();
@@ -58,10 +46,7 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
         "cloudroid_refused_tokens_total",
         "counter",
         "Tokens that let nobody in: unknown ones, and those not looked at because too many came from their address.",
-        [
-            (format_labels(&[("why", "unknown")]), unknown as f64),
-            (format_labels(&[("why", "slowed")]), slowed as f64),
-        ],
+        [(format_labels(&[("why", "unknown")]), unknown as f64), (format_labels(&[("why", "slowed")]), slowed as f64)],
     );
     let (wrong, slowed) = app.principals.password_counts();
     write_family(
@@ -69,10 +54,7 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
         "cloudroid_refused_passwords_total",
         "counter",
         "Passwords that let nobody in: wrong ones, and those not looked at because too many came for their account.",
-        [
-            (format_labels(&[("why", "wrong")]), wrong as f64),
-            (format_labels(&[("why", "slowed")]), slowed as f64),
-        ],
+        [(format_labels(&[("why", "wrong")]), wrong as f64), (format_labels(&[("why", "slowed")]), slowed as f64)],
     );
     write_gauge(
         &mut out,
@@ -102,10 +84,7 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
         "cloudroid_memory_bytes",
         "Bytes held for clients and servants, and how many may be.",
         [
-            (
-                format_labels(&[("what", "held")]),
-                memory.used_bytes() as f64,
-            ),
+            (format_labels(&[("what", "held")]), memory.used_bytes() as f64),
             (format_labels(&[("what", "limit")]), memory.limit() as f64),
         ],
     );
@@ -114,21 +93,13 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
         "cloudroid_memory_refused_total",
         "counter",
         "How often a client or servant was refused memory.",
-        [(
-            String::new(),
-            app.choreographer.memory().refusal_count() as f64,
-        )],
+        [(String::new(), app.choreographer.memory().refusal_count() as f64)],
     );
     let exists = |name: &str| services.iter().any(|service| service == name);
-    app.choreographer
-        .request_times()
-        .write_prometheus(&mut out, exists);
+    app.choreographer.request_times().write_prometheus(&mut out, exists);
     write_usage_metrics(&mut out, &app.choreographer.servants()).await;
-    let (kind, text) = if accepts_open_metrics(&headers) {
-        (OPEN_METRICS, to_open_metrics(&out))
-    } else {
-        (PROMETHEUS, out)
-    };
+    let (kind, text) =
+        if accepts_open_metrics(&headers) { (OPEN_METRICS, to_open_metrics(&out)) } else { (PROMETHEUS, out) };
     Ok(([(header::CONTENT_TYPE, kind)], text).into_response())
 }
 
@@ -160,34 +131,14 @@ fn write_group_metrics(out: &mut String, choreographer: &Choreographer, services
         "Requests to servants that robots share, by what became of them; wasted: work of replicas that nobody needed.",
         requests,
     );
-    write_gauge(
-        out,
-        "cloudroid_shared_waiting",
-        "Requests that wait for a servant that robots share.",
-        waiting,
-    );
-    write_gauge(
-        out,
-        "cloudroid_shared_servants",
-        "Servants that robots share and that answer.",
-        ready,
-    );
+    write_gauge(out, "cloudroid_shared_waiting", "Requests that wait for a servant that robots share.", waiting);
+    write_gauge(out, "cloudroid_shared_servants", "Servants that robots share and that answer.", ready);
 }
 
 fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
     let handles = choreographer.servants();
-    let count = |phase| {
-        handles
-            .iter()
-            .filter(|handle| handle.life().phase == phase)
-            .count()
-    };
-    let by_phase = PHASES.map(|phase| {
-        (
-            format_labels(&[("phase", &phase.to_string())]),
-            count(phase) as f64,
-        )
-    });
+    let count = |phase| handles.iter().filter(|handle| handle.life().phase == phase).count();
+    let by_phase = PHASES.map(|phase| (format_labels(&[("phase", &phase.to_string())]), count(phase) as f64));
     write_gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
     write_gauge(
         out,
@@ -199,58 +150,24 @@ fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
     for handle in &handles {
         *connections.entry(handle.service().to_owned()).or_default() += handle.connections();
     }
-    let connections = connections
-        .into_iter()
-        .map(|(service, count)| (format_labels(&[("service", &service)]), count as f64));
-    write_gauge(
-        out,
-        "cloudroid_connections",
-        "Connections of robots.",
-        connections,
-    );
-    let bridges: Vec<_> = handles
-        .iter()
-        .filter_map(|handle| Some((servant_labels(handle), handle.reach()?)))
-        .collect();
+    let connections =
+        connections.into_iter().map(|(service, count)| (format_labels(&[("service", &service)]), count as f64));
+    write_gauge(out, "cloudroid_connections", "Connections of robots.", connections);
+    let bridges: Vec<_> = handles.iter().filter_map(|handle| Some((servant_labels(handle), handle.reach()?))).collect();
     let messages = bridges.iter().flat_map(|(of, reach)| {
         let metrics = reach.metrics();
         [
-            (
-                format!("{of},direction=\"in\""),
-                metrics.frames_in.get() as f64,
-            ),
-            (
-                format!("{of},direction=\"out\""),
-                metrics.frames_out.get() as f64,
-            ),
+            (format!("{of},direction=\"in\""), metrics.frames_in.get() as f64),
+            (format!("{of},direction=\"out\""), metrics.frames_out.get() as f64),
         ]
     });
-    write_family(
-        out,
-        "cloudroid_messages_total",
-        "counter",
-        "WebSocket messages of robots.",
-        messages,
-    );
-    let dropped = bridges
-        .iter()
-        .map(|(of, reach)| (of.clone(), reach.dropped_count() as f64));
-    write_family(
-        out,
-        "cloudroid_dropped_total",
-        "counter",
-        "Messages dropped because someone was slow.",
-        dropped,
-    );
+    write_family(out, "cloudroid_messages_total", "counter", "WebSocket messages of robots.", messages);
+    let dropped = bridges.iter().map(|(of, reach)| (of.clone(), reach.dropped_count() as f64));
+    write_family(out, "cloudroid_dropped_total", "counter", "Messages dropped because someone was slow.", dropped);
     // All rows of a counter must be adjacent.
-    let told: Vec<_> = bridges
-        .iter()
-        .map(|(of, reach)| (of, reach.metrics().all()))
-        .collect();
+    let told: Vec<_> = bridges.iter().map(|(of, reach)| (of, reach.metrics().all())).collect();
     for (at, (name, help, _)) in Metrics::default().all().into_iter().enumerate() {
-        let rows = told
-            .iter()
-            .map(|(of, all)| ((*of).clone(), all[at].2 as f64));
+        let rows = told.iter().map(|(of, all)| ((*of).clone(), all[at].2 as f64));
         write_family(out, name, "counter", help, rows);
     }
 }
@@ -258,27 +175,11 @@ fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
 fn write_capacity_metrics(out: &mut String, choreographer: &Choreographer) {
     let (capacity, taken, waiting) = choreographer.admission().snapshot();
     let rows = [
-        (
-            "cloudroid_capacity_cpus",
-            "Cores that may be promised.",
-            capacity.cpus(),
-        ),
-        (
-            "cloudroid_capacity_memory_bytes",
-            "Memory that may be promised.",
-            capacity.memory as f64,
-        ),
+        ("cloudroid_capacity_cpus", "Cores that may be promised.", capacity.cpus()),
+        ("cloudroid_capacity_memory_bytes", "Memory that may be promised.", capacity.memory as f64),
         ("cloudroid_promised_cpus", "Cores promised.", taken.cpus()),
-        (
-            "cloudroid_promised_memory_bytes",
-            "Memory promised.",
-            taken.memory as f64,
-        ),
-        (
-            "cloudroid_waiting",
-            "Robots that wait for capacity.",
-            waiting as f64,
-        ),
+        ("cloudroid_promised_memory_bytes", "Memory promised.", taken.memory as f64),
+        ("cloudroid_waiting", "Robots that wait for capacity.", waiting as f64),
     ];
     for (name, help, value) in rows {
         write_gauge(out, name, help, [(String::new(), value)]);
@@ -306,30 +207,11 @@ async fn write_usage_metrics(out: &mut String, handles: &[Arc<Handle>]) {
             rows.push((servant_labels(handle), usage));
         }
     }
-    let of = |value: fn(&api::Usage) -> f64| {
-        rows.iter()
-            .map(move |(labels, usage)| (labels.clone(), value(usage)))
-    };
-    write_gauge(
-        out,
-        "cloudroid_servant_memory_bytes",
-        "Memory of a servant.",
-        of(|usage| usage.memory as f64),
-    );
-    write_gauge(
-        out,
-        "cloudroid_servant_pids",
-        "Processes and threads of a servant.",
-        of(|usage| usage.pids as f64),
-    );
+    let of = |value: fn(&api::Usage) -> f64| rows.iter().map(move |(labels, usage)| (labels.clone(), value(usage)));
+    write_gauge(out, "cloudroid_servant_memory_bytes", "Memory of a servant.", of(|usage| usage.memory as f64));
+    write_gauge(out, "cloudroid_servant_pids", "Processes and threads of a servant.", of(|usage| usage.pids as f64));
     let cpu = of(|usage| usage.cpu_usec as f64 / 1e6);
-    write_family(
-        out,
-        "cloudroid_servant_cpu_seconds_total",
-        "counter",
-        "Processor time of a servant.",
-        cpu,
-    );
+    write_family(out, "cloudroid_servant_cpu_seconds_total", "counter", "Processor time of a servant.", cpu);
     let throttled = of(|usage| usage.throttled_usec as f64 / 1e6);
     write_family(
         out,
@@ -340,25 +222,14 @@ async fn write_usage_metrics(out: &mut String, handles: &[Arc<Handle>]) {
     );
     write_pressure_metrics(out, &rows);
     let kills = of(|usage| usage.oom_kills as f64);
-    write_family(
-        out,
-        "cloudroid_servant_oom_kills_total",
-        "counter",
-        "Processes killed for want of memory.",
-        kills,
-    );
+    write_family(out, "cloudroid_servant_oom_kills_total", "counter", "Processes killed for want of memory.", kills);
 }
 
 /// Writes the pressure metrics, which cgroup v1 does not have.
 fn write_pressure_metrics(out: &mut String, rows: &[(String, api::Usage)]) {
     let waits = rows.iter().flat_map(|(labels, usage)| {
-        let each = usage.pressure.map(|pressure| {
-            [
-                ("cpu", pressure.cpu),
-                ("memory", pressure.memory),
-                ("io", pressure.io),
-            ]
-        });
+        let each =
+            usage.pressure.map(|pressure| [("cpu", pressure.cpu), ("memory", pressure.memory), ("io", pressure.io)]);
         each.into_iter()
             .flatten()
             .map(move |(what, percent)| (format!("{labels},resource=\"{what}\""), percent / 100.0))
@@ -372,9 +243,5 @@ fn write_pressure_metrics(out: &mut String, rows: &[(String, api::Usage)]) {
 }
 
 fn servant_labels(handle: &Handle) -> String {
-    format_labels(&[
-        ("servant", &handle.id),
-        ("service", handle.service()),
-        ("robot", &handle.robot),
-    ])
+    format_labels(&[("servant", &handle.id), ("service", handle.service()), ("robot", &handle.robot)])
 }

@@ -65,10 +65,8 @@ fn update_observers(app: &Arc<App>) {
         let id = handle.id.clone();
         // A servant that is slow to join delays no other.
         let joining = tokio::spawn(start_observing(Arc::clone(app), handle, reach));
-        let observed = ServantObservers {
-            _joining: Some(AbortOnDropHandle::new(joining)),
-            ..ServantObservers::default()
-        };
+        let observed =
+            ServantObservers { _joining: Some(AbortOnDropHandle::new(joining)), ..ServantObservers::default() };
         all.insert(id, observed);
     }
 }
@@ -76,11 +74,7 @@ fn update_observers(app: &Arc<App>) {
 /// Starts observing a servant once its ROS is available.
 async fn start_observing(app: Arc<App>, handle: Arc<Handle>, reach: Arc<dyn Reach>) {
     let joins = || start_observers(&app, &handle, &*reach);
-    let Some((kept, goals)) = app
-        .ending
-        .run_until_cancelled(retry_until_ready(joins))
-        .await
-    else {
+    let Some((kept, goals)) = app.ending.run_until_cancelled(retry_until_ready(joins)).await else {
         return;
     };
     let mut all = app.observers.all.lock();
@@ -94,9 +88,7 @@ async fn start_observing(app: Arc<App>, handle: Arc<Handle>, reach: Arc<dyn Reac
 }
 
 /// Repeats `joins` until it succeeds.
-async fn retry_until_ready<T, Joins: Future<Output = Option<T>>>(
-    mut joins: impl FnMut() -> Joins,
-) -> T {
+async fn retry_until_ready<T, Joins: Future<Output = Option<T>>>(mut joins: impl FnMut() -> Joins) -> T {
     loop {
         if let Ok(Some(joined)) = tokio::time::timeout(JOINS, joins()).await {
             return joined;
@@ -109,11 +101,7 @@ async fn retry_until_ready<T, Joins: Future<Output = Option<T>>>(
 type StartedObservers = (Option<Arc<BlackBox>>, Option<Arc<GoalMonitor>>);
 
 /// Returns `None` if the servant is about to end.
-async fn start_observers(
-    app: &App,
-    handle: &Handle,
-    reach: &dyn Reach,
-) -> Option<StartedObservers> {
+async fn start_observers(app: &App, handle: &Handle, reach: &dyn Reach) -> Option<StartedObservers> {
     let mut kept = None;
     if !app.options.black_box.span.is_zero() {
         let options = app.options.black_box.clone();
@@ -123,10 +111,7 @@ async fn start_observers(
             budget: app.choreographer.memory().servant(&handle.id),
             wanted: Arc::new(move |topic| options.matches_topic(topic)),
         };
-        kept = Some(Arc::new(BlackBox::start(
-            observed_servant(reach).await?,
-            options,
-        )));
+        kept = Some(Arc::new(BlackBox::start(observed_servant(reach).await?, options)));
     }
     let mut goals = None;
     if !handle.revision.interface.actions.is_empty() {
@@ -160,10 +145,7 @@ fn record_late_answer(app: &Arc<App>, answered: &AnsweredRequest) {
     if !app.observers.is_due(&handle) {
         return;
     }
-    let why = format!(
-        "a request took {:.0} ms, but its robot accepts at most {accepts:.0} ms",
-        answered.total
-    );
+    let why = format!("a request took {:.0} ms, but its robot accepts at most {accepts:.0} ms", answered.total);
     let app = Arc::clone(app);
     app.sessions.clone().spawn(async move {
         if let Err(error) = recordings::write_recording(&app, &handle, &why).await {

@@ -25,33 +25,20 @@ pub async fn version() -> Response {
 }
 
 /// `/v2/_catalog`.
-pub async fn catalog(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-) -> Result<Response, Error> {
+pub async fn catalog(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>) -> Result<Response, Error> {
     let mut names = app.state.service_names()?;
     names.retain(|name| caller.can_see(&app, name));
     Ok(Json(json!({ "repositories": names })).into_response())
 }
 
 /// `/v2/NAME/tags/list`.
-pub async fn tags(
-    State(app): State<Arc<App>>,
-    Path(name): Path<String>,
-) -> Result<Response, Error> {
+pub async fn tags(State(app): State<Arc<App>>, Path(name): Path<String>) -> Result<Response, Error> {
     let revisions = app.state.revisions(&name)?;
     if revisions.is_empty() {
-        return Ok(not_found(
-            "NAME_UNKNOWN",
-            &format!("there is no repository {name}"),
-        ));
+        return Ok(not_found("NAME_UNKNOWN", &format!("there is no repository {name}")));
     }
-    let tags: Vec<String> = revisions
-        .iter()
-        .rev()
-        .map(|revision| revision.number.to_string())
-        .chain(["latest".to_owned()])
-        .collect();
+    let tags: Vec<String> =
+        revisions.iter().rev().map(|revision| revision.number.to_string()).chain(["latest".to_owned()]).collect();
     Ok(Json(json!({ "name": name, "tags": tags })).into_response())
 }
 
@@ -66,31 +53,20 @@ pub async fn manifest(
         "latest" => current.map(|revision| revision.image.clone()),
         _ => revisions
             .into_iter()
-            .find(|revision| {
-                revision.number.to_string() == reference || revision.image == reference
-            })
+            .find(|revision| revision.number.to_string() == reference || revision.image == reference)
             .map(|revision| revision.image),
     };
     let Some(image) = image else {
-        return Ok(not_found(
-            "MANIFEST_UNKNOWN",
-            &format!("there is no image {name}:{reference}"),
-        ));
+        return Ok(not_found("MANIFEST_UNKNOWN", &format!("there is no image {name}:{reference}")));
     };
     let store = Arc::clone(app.catalogue.images());
     let found = privilege::spawn_blocking(move || store.manifest(&image))
         .await
         .map_err(|_| Error::Internal("reading a manifest"))??;
     let Some(manifest) = found else {
-        return Ok(not_found(
-            "MANIFEST_UNKNOWN",
-            &format!("the image {name}:{reference} is gone"),
-        ));
+        return Ok(not_found("MANIFEST_UNKNOWN", &format!("the image {name}:{reference} is gone")));
     };
-    let headers = [
-        (header::CONTENT_TYPE, manifest.media_type),
-        (CONTENT_DIGEST, manifest.digest.to_string()),
-    ];
+    let headers = [(header::CONTENT_TYPE, manifest.media_type), (CONTENT_DIGEST, manifest.digest.to_string())];
     Ok((headers, manifest.bytes).into_response())
 }
 
@@ -101,22 +77,14 @@ pub async fn blob(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let Ok(parsed) = digest.parse::<image::Digest>() else {
-        return Ok(error_response(
-            StatusCode::BAD_REQUEST,
-            "DIGEST_INVALID",
-            &format!("{digest} is not a digest"),
-        ));
+        return Ok(error_response(StatusCode::BAD_REQUEST, "DIGEST_INVALID", &format!("{digest} is not a digest")));
     };
     // Blobs are shared by all services. A caller that does not see every service gets only those of this one.
     let images: Option<Vec<image::Digest>> = if caller.who.principal.sees_all() {
         None
     } else {
         let revisions = app.state.revisions(&name)?.into_iter();
-        Some(
-            revisions
-                .filter_map(|revision| revision.image.parse().ok())
-                .collect(),
-        )
+        Some(revisions.filter_map(|revision| revision.image.parse().ok()).collect())
     };
     let store = Arc::clone(app.catalogue.images());
     let found = privilege::spawn_blocking(move || {
@@ -133,10 +101,7 @@ pub async fn blob(
     .await
     .map_err(|_| Error::Internal("reading a blob"))??;
     let Some(blob) = found else {
-        return Ok(not_found(
-            "BLOB_UNKNOWN",
-            &format!("there is no blob {digest}"),
-        ));
+        return Ok(not_found("BLOB_UNKNOWN", &format!("there is no blob {digest}")));
     };
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(blob.file), CHUNK);
     let headers = [
@@ -161,10 +126,7 @@ pub fn other_method(method: &Method, uri: &Uri) -> Response {
     error_response(
         StatusCode::METHOD_NOT_ALLOWED,
         "UNSUPPORTED",
-        &format!(
-            "{method} is not supported at {}; images are read-only here",
-            uri.path()
-        ),
+        &format!("{method} is not supported at {}; images are read-only here", uri.path()),
     )
 }
 

@@ -13,15 +13,9 @@ use utoipa::openapi::content::Content;
 use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::path::{HttpMethod, OperationBuilder, ParameterBuilder, ParameterIn, Paths};
 use utoipa::openapi::request_body::RequestBodyBuilder;
-use utoipa::openapi::schema::{
-    Array, Components, KnownFormat, ObjectBuilder, Schema, SchemaFormat, Type,
-};
-use utoipa::openapi::security::{
-    ApiKey, ApiKeyValue, Http, HttpAuthScheme, SecurityRequirement, SecurityScheme,
-};
-use utoipa::openapi::{
-    InfoBuilder, OpenApi, OpenApiBuilder, Ref, RefOr, Required, ResponseBuilder, Server,
-};
+use utoipa::openapi::schema::{Array, Components, KnownFormat, ObjectBuilder, Schema, SchemaFormat, Type};
+use utoipa::openapi::security::{ApiKey, ApiKeyValue, Http, HttpAuthScheme, SecurityRequirement, SecurityScheme};
+use utoipa::openapi::{InfoBuilder, OpenApi, OpenApiBuilder, Ref, RefOr, Required, ResponseBuilder, Server};
 use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 use crate::errors::Error;
@@ -52,10 +46,7 @@ const REFUSED: &[(u16, &str)] = &[
     (426, "The WebSocket version is not supported."),
     (429, "Too many requests; see Retry-After."),
     (500, "The daemon failed."),
-    (
-        502,
-        "Another component failed, such as the servant or the identity provider.",
-    ),
+    (502, "Another component failed, such as the servant or the identity provider."),
     (503, "Temporarily unavailable; see Retry-After."),
     (507, "The disk is full."),
 ];
@@ -100,9 +91,7 @@ pub struct Operation {
 pub fn operation(id: &str, summary: &str) -> Operation {
     Operation {
         id: id.to_owned(),
-        built: OperationBuilder::new()
-            .operation_id(Some(id))
-            .summary(Some(summary)),
+        built: OperationBuilder::new().operation_id(Some(id)).summary(Some(summary)),
         reads_body: false,
         schemas: Vec::new(),
     }
@@ -118,12 +107,7 @@ impl Operation {
     /// Declares a response with a JSON list.
     pub fn lists<T: ToSchema>(mut self) -> Self {
         let schema = Array::new(self.register_schema::<T>());
-        self.answer(
-            "200",
-            "The requested file.",
-            JSON,
-            Schema::Array(schema).into(),
-        )
+        self.answer("200", "The requested file.", JSON, Schema::Array(schema).into())
     }
 
     /// Declares a response with JSON lines.
@@ -146,9 +130,8 @@ impl Operation {
 
     /// Declares a response with a file of this media type.
     pub fn answers_file(self, media: &str) -> Self {
-        let file = ObjectBuilder::new()
-            .schema_type(Type::String)
-            .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
+        let file =
+            ObjectBuilder::new().schema_type(Type::String).format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
         self.answer("200", "The requested file.", media, file.into())
     }
 
@@ -175,9 +158,7 @@ impl Operation {
 
     /// Declares a response with an HTML page.
     pub fn answers_page(mut self) -> Self {
-        let response = ResponseBuilder::new()
-            .description("The requested file.")
-            .content(HTML, page());
+        let response = ResponseBuilder::new().description("The requested file.").content(HTML, page());
         self.built = self.built.response("200", response);
         self
     }
@@ -199,10 +180,7 @@ impl Operation {
                 .name(name)
                 .parameter_in(ParameterIn::Query)
                 .description(Some(description))
-                .extensions(Some(Extensions::from_iter([(
-                    "content",
-                    json!({ JSON: content }),
-                )]))),
+                .extensions(Some(Extensions::from_iter([("content", json!({ JSON: content }))]))),
         );
         self
     }
@@ -215,32 +193,21 @@ impl Operation {
 
     /// Declares a body that is a file of this media type.
     pub fn takes_file(self, media: &str, description: &str, required: Required) -> Self {
-        let file = ObjectBuilder::new()
-            .schema_type(Type::String)
-            .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
+        let file =
+            ObjectBuilder::new().schema_type(Type::String).format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
         let body = RequestBodyBuilder::new().description(Some(description));
         self.body(media, file.into(), body, required)
     }
 
-    fn body(
-        mut self,
-        media: &str,
-        schema: AnySchema,
-        body: RequestBodyBuilder,
-        required: Required,
-    ) -> Self {
-        let body = body
-            .content(media, Content::new(Some(schema)))
-            .required(Some(required));
+    fn body(mut self, media: &str, schema: AnySchema, body: RequestBodyBuilder, required: Required) -> Self {
+        let body = body.content(media, Content::new(Some(schema))).required(Some(required));
         self.built = self.built.request_body(Some(body.build()));
         self.reads_body = true;
         self
     }
 
     fn answer(mut self, status: &str, what: &str, media: &str, schema: AnySchema) -> Self {
-        let response = ResponseBuilder::new()
-            .description(what)
-            .content(media, Content::new(Some(schema)));
+        let response = ResponseBuilder::new().description(what).content(media, Content::new(Some(schema)));
         self.built = self.built.response(status, response);
         self
     }
@@ -271,14 +238,8 @@ fn name_of_refusal(status: u16) -> String {
 /// Describes a refusal: a problem document or, where a browser was redirected, an HTML page if it asks for one.
 fn refusal(words: &str, is_page: bool) -> utoipa::openapi::Response {
     let problem = Content::new(Some(Ref::from_schema_name(Problem::name())));
-    let response = ResponseBuilder::new()
-        .description(words)
-        .content(PROBLEM_JSON, problem);
-    if is_page {
-        response.content(HTML, page()).build()
-    } else {
-        response.build()
-    }
+    let response = ResponseBuilder::new().description(words).content(PROBLEM_JSON, problem);
+    if is_page { response.content(HTML, page()).build() } else { response.build() }
 }
 
 /// Describes an HTML page.
@@ -294,28 +255,20 @@ fn document(routes: &[Route]) -> OpenApi {
     let (problem, mut schemas) = (Problem::schema(), Vec::new());
     Problem::schemas(&mut schemas);
     components.schemas.extend(schemas);
-    components
-        .schemas
-        .insert(Problem::name().into_owned(), problem);
+    components.schemas.insert(Problem::name().into_owned(), problem);
     for (status, words) in REFUSED {
         let all = refusal(words, false);
-        components
-            .responses
-            .insert(name_of_refusal(*status), all.into());
+        components.responses.insert(name_of_refusal(*status), all.into());
     }
     for route in routes {
-        let (Some(operation), Some(path), Some(method)) = (
-            route.operation,
-            route.path.strip_prefix(BASE),
-            method(route.method),
-        ) else {
+        let (Some(operation), Some(path), Some(method)) =
+            (route.operation, route.path.strip_prefix(BASE), method(route.method))
+        else {
             continue;
         };
         let operation = operation();
         let statuses = refusals(path, &operation);
-        let Operation {
-            mut built, schemas, ..
-        } = operation;
+        let Operation { mut built, schemas, .. } = operation;
         for (status, words) in REFUSED {
             if !statuses.contains(status) {
                 continue;
@@ -344,12 +297,7 @@ fn document(routes: &[Route]) -> OpenApi {
     components.add_security_scheme("query", SecurityScheme::ApiKey(token));
     let none: [&str; 0] = [];
     OpenApiBuilder::new()
-        .info(
-            InfoBuilder::new()
-                .title("Cloudroid")
-                .version("1")
-                .description(Some(ABOUT)),
-        )
+        .info(InfoBuilder::new().title("Cloudroid").version("1").description(Some(ABOUT)))
         .servers(Some([Server::new(BASE)]))
         .security(Some([
             SecurityRequirement::new("bearer", none),
@@ -375,20 +323,18 @@ fn method(name: &str) -> Option<HttpMethod> {
 /// Returns the path parameters: in `/services/{name}`, the service.
 fn path_parameters(path: &str) -> impl Iterator<Item = ParameterBuilder> {
     let collections = path.split('/');
-    collections
-        .zip(path.split('/').skip(1))
-        .filter_map(|(collection, segment)| {
-            let name = segment.strip_prefix('{')?.strip_suffix('}')?;
-            let text = ObjectBuilder::new().schema_type(Type::String);
-            Some(
-                ParameterBuilder::new()
-                    .name(name)
-                    .parameter_in(ParameterIn::Path)
-                    .required(Required::True)
-                    .description(Some(format!("The {}.", collection.trim_end_matches('s'))))
-                    .schema(Some(text)),
-            )
-        })
+    collections.zip(path.split('/').skip(1)).filter_map(|(collection, segment)| {
+        let name = segment.strip_prefix('{')?.strip_suffix('}')?;
+        let text = ObjectBuilder::new().schema_type(Type::String);
+        Some(
+            ParameterBuilder::new()
+                .name(name)
+                .parameter_in(ParameterIn::Path)
+                .required(Required::True)
+                .description(Some(format!("The {}.", collection.trim_end_matches('s'))))
+                .schema(Some(text)),
+        )
+    })
 }
 
 /// Responds with the OpenAPI document.
@@ -397,9 +343,7 @@ pub async fn serve() -> Result<Response, Error> {
         let text = document(ROUTES).to_json().ok()?;
         Some(Bytes::from(text))
     });
-    let document = DOCUMENT
-        .as_ref()
-        .ok_or(Error::Internal("describing the portal"))?;
+    let document = DOCUMENT.as_ref().ok_or(Error::Internal("describing the portal"))?;
     Ok(([(header::CONTENT_TYPE, JSON)], document.clone()).into_response())
 }
 

@@ -27,10 +27,7 @@ const ENCODINGS: [(&str, &str); 2] = [("br", ".br"), ("gzip", ".gz")];
 /// `/`.
 pub fn index(method: &Method, headers: &HeaderMap) -> Response {
     if !matches!(*method, Method::GET | Method::HEAD) {
-        let refusal = Error::OtherMethod {
-            method: method.to_string(),
-            path: "/".to_owned(),
-        };
+        let refusal = Error::OtherMethod { method: method.to_string(), path: "/".to_owned() };
         let allowed = [(header::ALLOW, "GET, HEAD")];
         return (allowed, refusal).into_response();
     }
@@ -48,12 +45,7 @@ pub async fn asset(Path(name): Path<String>, headers: HeaderMap) -> Response {
         _ => FOR_GOOD,
     };
     let found = known.then(|| file(&format!("assets/{name}"), &headers, kept));
-    found.flatten().unwrap_or_else(|| {
-        Error::UnknownPath {
-            path: format!("/assets/{name}"),
-        }
-        .into_response()
-    })
+    found.flatten().unwrap_or_else(|| Error::UnknownPath { path: format!("/assets/{name}") }.into_response())
 }
 
 /// Returns a file in the smallest form that the client accepts.
@@ -81,12 +73,7 @@ fn accepts_encoding(headers: &HeaderMap, encoding: &str) -> bool {
     })
 }
 
-fn answer(
-    path: &str,
-    kept: &'static str,
-    data: &'static [u8],
-    encoding: Option<&'static str>,
-) -> Response {
+fn answer(path: &str, kept: &'static str, data: &'static [u8], encoding: Option<&'static str>) -> Response {
     let headers = [
         (header::CONTENT_TYPE, media_type(path)),
         (header::CACHE_CONTROL, kept),
@@ -98,9 +85,7 @@ fn answer(
     let mut answer = (headers, data).into_response();
     if let Some(encoding) = encoding {
         let encoding = HeaderValue::from_static(encoding);
-        answer
-            .headers_mut()
-            .insert(header::CONTENT_ENCODING, encoding);
+        answer.headers_mut().insert(header::CONTENT_ENCODING, encoding);
     }
     answer
 }
@@ -140,11 +125,7 @@ mod tests {
             ("browse", "br", false),
             ("", "gzip", false),
         ] {
-            assert_eq!(
-                accepts_encoding(&headers(accepts), encoding),
-                taken,
-                "{accepts:?} {encoding}"
-            );
+            assert_eq!(accepts_encoding(&headers(accepts), encoding), taken, "{accepts:?} {encoding}");
         }
         assert!(!accepts_encoding(&HeaderMap::new(), "gzip"));
     }

@@ -50,11 +50,8 @@ mod tests {
         let (one, other) = std::os::unix::net::UnixStream::pair().expect("a pair");
         let mut told = peer_groups(&one).expect("told");
         assert_eq!(told, peer_groups(&other).expect("told"));
-        let mut own: Vec<_> = nix::unistd::getgroups()
-            .expect("told")
-            .into_iter()
-            .map(nix::unistd::Gid::as_raw)
-            .collect();
+        let mut own: Vec<_> =
+            nix::unistd::getgroups().expect("told").into_iter().map(nix::unistd::Gid::as_raw).collect();
         told.sort_unstable();
         own.sort_unstable();
         assert_eq!(told, own);

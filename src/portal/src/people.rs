@@ -33,24 +33,16 @@ use passwords::{Attempt, PasswordVerdict};
 /// Maximum size of a body in bytes: a name, a password, and service patterns.
 const LARGEST: usize = 16 << 10;
 
-async fn read_json<T: DeserializeOwned>(
-    app: &App,
-    caller: &Caller,
-    body: Body,
-    what: &str,
-) -> Result<T, Error> {
+async fn read_json<T: DeserializeOwned>(app: &App, caller: &Caller, body: Body, what: &str) -> Result<T, Error> {
     let body = read_body(app, caller, body, LARGEST).await?.bytes;
-    serde_json::from_slice(&body)
-        .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
+    serde_json::from_slice(&body).map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
 }
 
 /// Forbids caching of responses that reveal who is signed in.
 fn no_store(answer: impl IntoResponse) -> Response {
     let no_store = HeaderValue::from_static("no-store");
     let mut response = answer.into_response();
-    response
-        .headers_mut()
-        .insert(header::CACHE_CONTROL, no_store);
+    response.headers_mut().insert(header::CACHE_CONTROL, no_store);
     response
 }
 
@@ -63,9 +55,7 @@ fn describe_session(app: &App, caller: &Caller, secret: Option<&str>) -> Session
     Session {
         name: caller.is_known().then(|| principal.name.clone()),
         role: principal.roles.first().copied(),
-        csrf: secret
-            .filter(|_| expires.is_some())
-            .map(cookies::csrf_token),
+        csrf: secret.filter(|_| expires.is_some()).map(cookies::csrf_token),
         expires,
         needed: !app.principals.has_no_credentials(),
         accounts: app.principals.has_accounts(),
@@ -80,11 +70,7 @@ pub async fn session(
     headers: HeaderMap,
 ) -> Result<Response, Error> {
     let secret = cookies::session_cookie(&caller.connection(), &headers)?;
-    Ok(no_store(Json(describe_session(
-        &app,
-        &caller,
-        secret.as_deref(),
-    ))))
+    Ok(no_store(Json(describe_session(&app, &caller, secret.as_deref()))))
 }
 
 /// Refuses to accept secrets, such as a password or a session's cookie, on a connection that can be intercepted.
@@ -115,24 +101,16 @@ fn finish_sign_in(
     {
         tracing::warn!("the previous session could not be ended: {error}");
     }
-    let now = Caller {
-        who: begun.identity.clone(),
-        ..caller.clone()
-    };
+    let now = Caller { who: begun.identity.clone(), ..caller.clone() };
     let object = format!("{kind} {}", now.who.principal.name);
-    app.audit
-        .record(&now, AccessAction::Enter, did, &object, 200);
+    app.audit.record(&now, AccessAction::Enter, did, &object, 200);
     let left = begun.expires.saturating_sub(store::now()) / 1000;
     let cookie = cookies::set_session(caller.secure, &begun.secret, left);
     (now, cookie)
 }
 
 /// Signs a person in. The browser always gets a new session.
-pub async fn sign_in(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-    request: Request,
-) -> Response {
+pub async fn sign_in(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>, request: Request) -> Response {
     let (head, body) = request.into_parts();
     let (path, headers) = (head.uri.path(), &head.headers);
     let signed = try_sign_in(&app, &caller, headers, body).await;
@@ -150,8 +128,7 @@ pub async fn sign_in(
                 None => "an unknown account".to_owned(),
             };
             let status = error.problem().status;
-            app.audit
-                .record_throttled(&caller, AccessAction::Enter, &did, &object, status);
+            app.audit.record_throttled(&caller, AccessAction::Enter, &did, &object, status);
             no_store(error)
         }
     }
@@ -172,16 +149,11 @@ async fn try_sign_in(
     // Otherwise another site could sign a person in under another name, to watch what is done then.
     cookies::check_origin(&connection, headers, false).map_err(refused)?;
     let earlier = cookies::session_cookie(&connection, headers).map_err(refused)?;
-    let asked: SignIn = read_json(app, caller, body, "name and password")
-        .await
-        .map_err(refused)?;
+    let asked: SignIn = read_json(app, caller, body, "name and password").await.map_err(refused)?;
     access::principal::check_name(&asked.name)
         .map_err(|_| refused(Error::BadRequest("no account can have such a name".into())))?;
     if asked.password.len() > passwords::LONGEST {
-        return Err(refused(Error::BadRequest(format!(
-            "a password has at most {} bytes",
-            passwords::LONGEST
-        ))));
+        return Err(refused(Error::BadRequest(format!("a password has at most {} bytes", passwords::LONGEST))));
     }
     let SignIn { name, password } = asked;
     let mut candidate = app.principals.candidate(&name);
@@ -190,9 +162,7 @@ async fn try_sign_in(
     let attempt = Attempt {
         from,
         name: name.clone(),
-        known: candidate
-            .as_ref()
-            .map(|candidate| candidate.password.clone()),
+        known: candidate.as_ref().map(|candidate| candidate.password.clone()),
         password,
     };
     let may_try = || Ok(app.principals.check_sign_in(&name, from, store::now())?);
@@ -207,17 +177,14 @@ async fn try_sign_in(
                 let kept = app.principals.rehash(candidate, better);
                 kept.map_err(|error| (known.clone(), error))?;
             }
-            let begun = app
-                .principals
-                .begin_session(candidate, &caller.peer.to_string());
+            let begun = app.principals.begin_session(candidate, &caller.peer.to_string());
             begun.map_err(|error| (known.clone(), error))?
         }
     };
     match begun {
         Some(begun) => Ok((begun, earlier)),
         None => {
-            app.principals
-                .record_wrong_password(&name, from, store::now());
+            app.principals.record_wrong_password(&name, from, store::now());
             Err((known, Error::WrongPassword))
         }
     }
@@ -247,13 +214,7 @@ pub async fn sign_out(
         app.principals.end_session(id)?
     }
     let object = format!("account {name}");
-    app.audit.record(
-        &caller,
-        AccessAction::Enter,
-        "DELETE /api/v1/session",
-        &object,
-        204,
-    );
+    app.audit.record(&caller, AccessAction::Enter, "DELETE /api/v1/session", &object, 204);
     let cookie = cookies::clear_session(caller.secure);
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
 }
@@ -284,9 +245,7 @@ pub async fn create(
     let first = app.principals.has_no_credentials();
     app.principals.create_account(&new, &hash)?;
     if first {
-        tracing::warn!(
-            "the first account was created: from now on every request over TCP needs a session or a token"
-        );
+        tracing::warn!("the first account was created: from now on every request over TCP needs a session or a token");
     }
     Ok(Json(app.principals.accounts()))
 }
@@ -305,9 +264,7 @@ pub async fn change(
     let what = [
         change.password.is_some().then(|| "password".to_owned()),
         change.role.map(|role| role.to_string()),
-        change
-            .disabled
-            .map(|disabled| if disabled { "disabled" } else { "enabled" }.to_owned()),
+        change.disabled.map(|disabled| if disabled { "disabled" } else { "enabled" }.to_owned()),
     ];
     let what: Vec<String> = what.into_iter().flatten().collect();
     about.set(format!("account {name}: {}", what.join(", ")));
@@ -318,8 +275,7 @@ pub async fn change(
         }
         None => None,
     };
-    app.principals
-        .change_account(&name, &change, hash.as_deref())?;
+    app.principals.change_account(&name, &change, hash.as_deref())?;
     Ok(Json(app.principals.accounts()))
 }
 

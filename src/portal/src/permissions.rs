@@ -15,29 +15,18 @@ const DEFAULT: &str = "default";
 
 impl Caller {
     /// Checks whether the caller may perform the action on the object.
-    pub fn check_access(
-        &self,
-        action: AccessAction,
-        object: &AccessObject<'_>,
-    ) -> Result<(), Error> {
+    pub fn check_access(&self, action: AccessAction, object: &AccessObject<'_>) -> Result<(), Error> {
         Ok(decide(&self.who.principal, action, object)?)
     }
 
     /// Returns true if the caller may see the service.
     pub fn can_see(&self, app: &App, service: &str) -> bool {
-        self.who.principal.sees_all()
-            || self
-                .check_service_access(app, AccessAction::See, service, None)
-                .is_ok()
+        self.who.principal.sees_all() || self.check_service_access(app, AccessAction::See, service, None).is_ok()
     }
 
     /// Waits until responses about a service must end: the daemon stops, or the caller's credential has become
     /// invalid.
-    pub fn wait_for_end(
-        &self,
-        app: &Arc<App>,
-        service: &str,
-    ) -> impl Future<Output = ()> + Send + use<> {
+    pub fn wait_for_end(&self, app: &Arc<App>, service: &str) -> impl Future<Output = ()> + Send + use<> {
         let (app, who, service) = (Arc::clone(app), self.who.clone(), service.to_owned());
         async move {
             tokio::select! {
@@ -66,17 +55,8 @@ impl Caller {
 
     /// Returns true if the caller may perform the action on what belongs to a robot at a service; robots are limited
     /// to their own.
-    pub fn is_allowed_for_robot(
-        &self,
-        app: &App,
-        action: AccessAction,
-        service: &str,
-        robot: &str,
-    ) -> bool {
-        self.can_act_for_robot(robot)
-            && self
-                .check_service_access(app, action, service, None)
-                .is_ok()
+    pub fn is_allowed_for_robot(&self, app: &App, action: AccessAction, service: &str, robot: &str) -> bool {
+        self.can_act_for_robot(robot) && self.check_service_access(app, action, service, None).is_ok()
     }
 
     /// Checks whether the caller may perform the action on a service, as a robot if one is named.
@@ -96,12 +76,7 @@ impl Caller {
         } else {
             (true, None)
         };
-        let object = AccessObject {
-            service: Some(service),
-            exists,
-            owner: owner.as_deref(),
-            robot,
-        };
+        let object = AccessObject { service: Some(service), exists, owner: owner.as_deref(), robot };
         self.check_access(action, &object)
     }
 
@@ -110,9 +85,7 @@ impl Caller {
         if class == DEFAULT || can_use_class(&self.who.principal, class) {
             Ok(())
         } else {
-            Err(Error::Forbidden {
-                what: format!("{} may not use class {class}", self.who.principal.name),
-            })
+            Err(Error::Forbidden { what: format!("{} may not use class {class}", self.who.principal.name) })
         }
     }
 }

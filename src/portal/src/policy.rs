@@ -81,12 +81,7 @@ pub async fn add_rule(
 ) -> JsonResult<Vec<Rule>> {
     let new: NewRule = read_json(&app, &caller, body, "rule").await?;
     let allow: Vec<String> = new.allow.iter().map(ToString::to_string).collect();
-    about.set(format!(
-        "{} at {}: {}",
-        new.who,
-        new.services,
-        allow.join(" ")
-    ));
+    about.set(format!("{} at {}: {}", new.who, new.services, allow.join(" ")));
     app.principals.add_rule(&new)?;
     Ok(Json(app.principals.rules()))
 }
@@ -98,11 +93,7 @@ pub async fn remove_rule(
     Extension(about): Extension<AuditObject>,
 ) -> JsonResult<Vec<Rule>> {
     let number = id.parse().ok();
-    let named = app
-        .principals
-        .rules()
-        .into_iter()
-        .find(|rule| Some(rule.id) == number);
+    let named = app.principals.rules().into_iter().find(|rule| Some(rule.id) == number);
     match named {
         Some(rule) => about.set_value("rule", &rule),
         None => about.set(format!("rule {id}")),
@@ -113,10 +104,7 @@ pub async fn remove_rule(
     };
     let rules = app.principals.rules();
     if !removed {
-        return Err(Error::UnknownRule {
-            id,
-            exists: rules.iter().map(|rule| rule.id.to_string()).collect(),
-        });
+        return Err(Error::UnknownRule { id, exists: rules.iter().map(|rule| rule.id.to_string()).collect() });
     }
     Ok(Json(rules))
 }

@@ -98,20 +98,11 @@ impl Principals {
 
     /// Returns the limiter that counts wrong passwords for this account name.
     fn failure_counter(&self, account: &str) -> &Mutex<GuessLimiter<String>> {
-        if self.has_account(account) {
-            &self.wrong
-        } else {
-            &self.in_vain
-        }
+        if self.has_account(account) { &self.wrong } else { &self.in_vain }
     }
 
     /// Checks whether a password for this account from this address may be looked at.
-    pub fn check_sign_in(
-        &self,
-        account: &str,
-        from: IpAddr,
-        now: Millis,
-    ) -> Result<(), AuthenticationError> {
+    pub fn check_sign_in(&self, account: &str, from: IpAddr, now: Millis) -> Result<(), AuthenticationError> {
         let by_account = self.failure_counter(account).lock().check(account, now);
         let by_address = by_account.and_then(|()| self.guesses.lock().check(from, now));
         by_address.map_err(AuthenticationError::SlowedSignIn)
@@ -119,10 +110,7 @@ impl Principals {
 
     /// Records a wrong password.
     pub fn record_wrong_password(&self, account: &str, from: IpAddr, now: Millis) {
-        let by_account = self
-            .failure_counter(account)
-            .lock()
-            .record_failure(account, now);
+        let by_account = self.failure_counter(account).lock().record_failure(account, now);
         let by_address = self.guesses.lock().record_failure(from, now);
         if let Some(wait) = by_account.max(by_address) {
             let seconds = wait.div_ceil(1000);
@@ -131,11 +119,7 @@ impl Principals {
     }
 
     /// Checks whether a sign-in through the identity provider from this address may proceed.
-    pub fn check_provider_sign_in(
-        &self,
-        from: IpAddr,
-        now: Millis,
-    ) -> Result<(), AuthenticationError> {
+    pub fn check_provider_sign_in(&self, from: IpAddr, now: Millis) -> Result<(), AuthenticationError> {
         let asked = self.guesses.lock().check(from, now);
         asked.map_err(AuthenticationError::SlowedSignIn)
     }
@@ -206,10 +190,7 @@ impl Principals {
         let due = stored.find_token(id).is_some_and(|known| {
             let last = known.last_used.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
-                && known
-                    .last_used
-                    .compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed)
-                    .is_ok()
+                && known.last_used.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);
         if due && let Err(error) = self.state.record_token_use(id, now) {
@@ -224,10 +205,7 @@ impl Principals {
             known.last_used.fetch_max(now, Ordering::Relaxed);
             let last = known.written.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
-                && known
-                    .written
-                    .compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed)
-                    .is_ok()
+                && known.written.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);
         if due && let Err(error) = self.state.record_session_use(id, now) {

@@ -27,9 +27,7 @@ pub struct IpNetwork {
 
 /// Error for text that is not a network.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{written:?} is neither an address nor a network: {why}; write one such as 192.0.2.7 or 10.0.0.0/8"
-)]
+#[error("{written:?} is neither an address nor a network: {why}; write one such as 192.0.2.7 or 10.0.0.0/8")]
 pub struct ParseIpNetworkError {
     written: String,
     why: String,
@@ -53,8 +51,7 @@ fn prefix_bits(address: u128, prefix: u32) -> u128 {
 impl IpNetwork {
     /// Returns true if the network contains the address.
     pub fn contains(&self, address: IpAddr) -> bool {
-        let ((own, width), (other, other_width)) =
-            (address_bits(self.address), address_bits(address));
+        let ((own, width), (other, other_width)) = (address_bits(self.address), address_bits(address));
         width == other_width && prefix_bits(own, self.prefix) == prefix_bits(other, self.prefix)
     }
 }
@@ -63,17 +60,12 @@ impl FromStr for IpNetwork {
     type Err = ParseIpNetworkError;
 
     fn from_str(written: &str) -> Result<IpNetwork, ParseIpNetworkError> {
-        let no = |why: &str| ParseIpNetworkError {
-            written: written.to_owned(),
-            why: why.to_owned(),
-        };
+        let no = |why: &str| ParseIpNetworkError { written: written.to_owned(), why: why.to_owned() };
         let (address, prefix) = match written.split_once('/') {
             Some((address, prefix)) => (address, Some(prefix)),
             None => (written, None),
         };
-        let address: IpAddr = address
-            .parse()
-            .map_err(|_| no("host names are not supported"))?;
+        let address: IpAddr = address.parse().map_err(|_| no("host names are not supported"))?;
         let (value, width) = address_bits(address);
         let prefix = match prefix {
             None => width,
@@ -133,12 +125,8 @@ impl Proxies {
                     header from its clients"
             ))
         })?;
-        let (listed, protocols) = (
-            list_values(headers, FORWARDED_FOR),
-            list_values(headers, FORWARDED_PROTO),
-        );
-        let by_standard =
-            (!written.is_empty()).then(|| self.pick_client(written.iter().map(parse_element)));
+        let (listed, protocols) = (list_values(headers, FORWARDED_FOR), list_values(headers, FORWARDED_PROTO));
+        let by_standard = (!written.is_empty()).then(|| self.pick_client(written.iter().map(parse_element)));
         let by_list = (!listed.is_empty()).then(|| {
             // A single protocol belongs to the client's own connection; of several, each belongs to the address at
             // the same position.
@@ -147,34 +135,27 @@ impl Proxies {
                 count if count == listed.len() => protocols.get(at),
                 _ => None,
             };
-            let clients = listed
-                .iter()
-                .enumerate()
-                .map(|(at, listed)| ForwardedClient {
-                    address: parse_address(listed),
-                    secure: beside(at).map(|protocol| is_secure(protocol)),
-                });
+            let clients = listed.iter().enumerate().map(|(at, listed)| ForwardedClient {
+                address: parse_address(listed),
+                secure: beside(at).map(|protocol| is_secure(protocol)),
+            });
             self.pick_client(clients)
         });
         let client = match (by_standard, by_list) {
-            (Some(one), Some(other))
-                if one.address.map(|at| at.ip()) != other.address.map(|at| at.ip()) =>
-            {
+            (Some(one), Some(other)) if one.address.map(|at| at.ip()) != other.address.map(|at| at.ip()) => {
                 return Err(Error::BadRequest(format!(
                     "the proxy {} names two clients, in Forwarded and in X-Forwarded-For; have it set one and remove \
                      the other",
                     proxy.ip()
                 )));
             }
-            (Some(one), other) => ForwardedClient {
-                secure: one.secure.or(other.and_then(|other| other.secure)),
-                ..one
-            },
+            (Some(one), other) => {
+                ForwardedClient { secure: one.secure.or(other.and_then(|other| other.secure)), ..one }
+            }
             (None, Some(other)) => other,
-            (None, None) if !protocols.is_empty() => ForwardedClient {
-                address: None,
-                secure: protocols.last().map(|protocol| is_secure(protocol)),
-            },
+            (None, None) if !protocols.is_empty() => {
+                ForwardedClient { address: None, secure: protocols.last().map(|protocol| is_secure(protocol)) }
+            }
             // The request is the proxy's own, such as a health check.
             (None, None) => return Ok(connection.clone()),
         };
@@ -189,21 +170,12 @@ impl Proxies {
     }
 
     /// Returns the right-most client that is not a trusted proxy, or else the left-most.
-    fn pick_client(
-        &self,
-        clients: impl DoubleEndedIterator<Item = ForwardedClient>,
-    ) -> ForwardedClient {
-        let mut nearest = ForwardedClient {
-            address: None,
-            secure: None,
-        };
+    fn pick_client(&self, clients: impl DoubleEndedIterator<Item = ForwardedClient>) -> ForwardedClient {
+        let mut nearest = ForwardedClient { address: None, secure: None };
         for client in clients.rev() {
             let Some(address) = client.address else {
                 // If an address is unknown, the last proxy with a known address stands for whoever is behind it.
-                return ForwardedClient {
-                    secure: client.secure,
-                    ..nearest
-                };
+                return ForwardedClient { secure: client.secure, ..nearest };
             };
             nearest = client;
             if !self.contains(address.ip()) {
@@ -219,9 +191,7 @@ fn list_values<'a>(headers: &'a HeaderMap, name: &str) -> Vec<&'a str> {
     let lines = headers.get_all(name).into_iter();
     // A value that is not text is not an address either.
     let lines = lines.map(|line| line.to_str().unwrap_or("?"));
-    lines
-        .flat_map(|line| line.split(',').map(str::trim))
-        .collect()
+    lines.flat_map(|line| line.split(',').map(str::trim)).collect()
 }
 
 /// Returns all elements of `Forwarded`, in order; commas within quotes do not count. A client that could leave a
@@ -252,10 +222,7 @@ fn split_outside_quotes(text: &str, at: char) -> impl Iterator<Item = &str> {
 
 /// Parses one element of `Forwarded`.
 fn parse_element(written: &&str) -> ForwardedClient {
-    let mut client = ForwardedClient {
-        address: None,
-        secure: None,
-    };
+    let mut client = ForwardedClient { address: None, secure: None };
     for pair in split_outside_quotes(written, ';') {
         let Some((name, value)) = pair.split_once('=') else {
             continue;
@@ -271,17 +238,13 @@ fn parse_element(written: &&str) -> ForwardedClient {
 }
 
 fn is_secure(protocol: &str) -> bool {
-    ["https", "wss"]
-        .iter()
-        .any(|secure| protocol.eq_ignore_ascii_case(secure))
+    ["https", "wss"].iter().any(|secure| protocol.eq_ignore_ascii_case(secure))
 }
 
 /// Parses an address with or without a port; the port is 0 if missing.
 fn parse_address(text: &str) -> Option<SocketAddr> {
     let bare = || {
-        let inside = text
-            .strip_prefix('[')
-            .and_then(|rest| rest.strip_suffix(']'));
+        let inside = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']'));
         let address: IpAddr = inside.unwrap_or(text).parse().ok()?;
         Some(SocketAddr::new(address, 0))
     };
@@ -313,18 +276,12 @@ mod tests {
     #[test]
     fn who_is_no_named_proxy_speaks_for_itself() {
         for headers in [
-            &[
-                ("x-forwarded-for", "192.0.2.1"),
-                ("x-forwarded-proto", "https"),
-            ][..],
+            &[("x-forwarded-for", "192.0.2.1"), ("x-forwarded-proto", "https")][..],
             &[("forwarded", "for=192.0.2.1;proto=https")],
             &[],
         ] {
             for peer in ["203.0.113.9", "127.0.0.2", "11.0.0.1", "::1"] {
-                assert_eq!(
-                    resolve(peer, headers).expect("seen"),
-                    (peer.to_owned(), false)
-                );
+                assert_eq!(resolve(peer, headers).expect("seen"), (peer.to_owned(), false));
             }
         }
     }
@@ -359,17 +316,9 @@ mod tests {
         }
         let many = vec!["10.0.0.1"; 5000].join(",");
         let long = format!("192.0.2.1,{many}");
-        assert_eq!(
-            resolve("127.0.0.1", &[("x-forwarded-for", &long)])
-                .expect("seen")
-                .0,
-            client
-        );
+        assert_eq!(resolve("127.0.0.1", &[("x-forwarded-for", &long)]).expect("seen").0, client);
         // Header lines of the same name form one list.
-        let lines = [
-            ("x-forwarded-for", "198.51.100.7"),
-            ("x-forwarded-for", client),
-        ];
+        let lines = [("x-forwarded-for", "198.51.100.7"), ("x-forwarded-for", client)];
         assert_eq!(resolve("127.0.0.1", &lines).expect("seen").0, client);
     }
 
@@ -377,22 +326,10 @@ mod tests {
     fn the_standard_header_is_read_as_it_is_written() {
         for (written, who, secure) in [
             ("for=192.0.2.1", "192.0.2.1", false),
-            (
-                "For=\"192.0.2.1:4711\";Proto=HTTPS;by=10.0.0.1",
-                "192.0.2.1",
-                true,
-            ),
+            ("For=\"192.0.2.1:4711\";Proto=HTTPS;by=10.0.0.1", "192.0.2.1", true),
             ("for=\"[2003::1]:4711\";proto=http", "2003::1", false),
-            (
-                "for=198.51.100.7;proto=http, for=192.0.2.1;proto=https",
-                "192.0.2.1",
-                true,
-            ),
-            (
-                "for=192.0.2.1;proto=https, for=10.0.0.3;proto=http",
-                "192.0.2.1",
-                true,
-            ),
+            ("for=198.51.100.7;proto=http, for=192.0.2.1;proto=https", "192.0.2.1", true),
+            ("for=192.0.2.1;proto=https, for=10.0.0.3;proto=http", "192.0.2.1", true),
             ("for=_hidden;proto=https", "127.0.0.1", true),
             ("for=192.0.2.1, for=unknown", "127.0.0.1", false),
             ("by=10.0.0.1", "127.0.0.1", false),
@@ -417,10 +354,7 @@ mod tests {
             ("198.51.100.7, 192.0.2.1", "https, http", false),
             ("192.0.2.1", "https, http", false),
         ] {
-            let headers = [
-                ("x-forwarded-for", listed),
-                ("x-forwarded-proto", protocols),
-            ];
+            let headers = [("x-forwarded-for", listed), ("x-forwarded-proto", protocols)];
             let seen = resolve("127.0.0.1", &headers).expect(listed);
             assert_eq!(seen, (client.to_owned(), secure), "{listed} {protocols}");
         }
@@ -428,20 +362,12 @@ mod tests {
 
     #[test]
     fn two_clients_in_one_request_are_refused() {
-        let headers = [
-            ("x-forwarded-for", "192.0.2.1"),
-            ("forwarded", "for=198.51.100.7"),
-        ];
-        let refused = resolve("127.0.0.1", &headers)
-            .expect_err("which?")
-            .problem();
+        let headers = [("x-forwarded-for", "192.0.2.1"), ("forwarded", "for=198.51.100.7")];
+        let refused = resolve("127.0.0.1", &headers).expect_err("which?").problem();
         assert_eq!(refused.status, 400);
         assert!(refused.detail.contains("127.0.0.1"), "{refused:?}");
-        let alike = [
-            ("x-forwarded-for", "192.0.2.1:80"),
-            ("x-forwarded-proto", "https"),
-            ("forwarded", "for=192.0.2.1"),
-        ];
+        let alike =
+            [("x-forwarded-for", "192.0.2.1:80"), ("x-forwarded-proto", "https"), ("forwarded", "for=192.0.2.1")];
         let seen = resolve("127.0.0.1", &alike).expect("one client");
         assert_eq!(seen, ("192.0.2.1".to_owned(), true));
     }
@@ -454,11 +380,7 @@ mod tests {
             let seen = resolve("127.0.0.1", &[("x-forwarded-for", &listed)]).expect(&listed);
             assert_eq!(seen.0, "192.0.2.1", "{listed}");
         }
-        for sent in [
-            "for=\"198.51.100.7",
-            "for=\"\\\"\"",
-            "for=198.51.100.7;by=\"",
-        ] {
+        for sent in ["for=\"198.51.100.7", "for=\"\\\"\"", "for=198.51.100.7;by=\""] {
             let written = format!("{sent}, for=192.0.2.1");
             let refused = resolve("127.0.0.1", &[("forwarded", &written)]).expect_err(&written);
             let refused = refused.problem();
@@ -472,26 +394,18 @@ mod tests {
         let connection = PortalConnection {
             secure: true,
             certificates: Arc::new([vec![1].into()]),
-            ..PortalConnection::without_tls(ConnectionPeer::Tcp(
-                "10.0.0.1:5".parse().expect("an address"),
-            ))
+            ..PortalConnection::without_tls(ConnectionPeer::Tcp("10.0.0.1:5".parse().expect("an address")))
         };
         let mut headers = HeaderMap::new();
         headers.insert("x-forwarded-for", "192.0.2.1".parse().expect("a header"));
-        let seen = proxies(&["10.0.0.1"])
-            .resolve_client(&connection, &headers)
-            .expect("seen");
+        let seen = proxies(&["10.0.0.1"]).resolve_client(&connection, &headers).expect("seen");
         assert!(seen.certificates.is_empty() && !seen.secure && seen.forwarded);
         headers.clear();
         headers.insert("x-forwarded-proto", "https".parse().expect("a header"));
-        let seen = proxies(&["10.0.0.1"])
-            .resolve_client(&connection, &headers)
-            .expect("seen");
+        let seen = proxies(&["10.0.0.1"]).resolve_client(&connection, &headers).expect("seen");
         assert!(seen.secure && seen.forwarded && seen.peer == connection.peer);
         // Without such headers the request is the proxy's own.
-        let itself = proxies(&["10.0.0.1"])
-            .resolve_client(&connection, &HeaderMap::new())
-            .expect("seen");
+        let itself = proxies(&["10.0.0.1"]).resolve_client(&connection, &HeaderMap::new()).expect("seen");
         assert!(!itself.certificates.is_empty() && itself.secure && !itself.forwarded);
     }
 
@@ -506,17 +420,9 @@ mod tests {
         ] {
             let network: IpNetwork = written.parse().expect(written);
             assert!(network.contains(inside.parse().expect(inside)), "{network}");
-            assert!(
-                !network.contains(outside.parse().expect(outside)),
-                "{network}"
-            );
+            assert!(!network.contains(outside.parse().expect(outside)), "{network}");
         }
-        assert!(
-            "10.0.0.0/8"
-                .parse::<IpNetwork>()
-                .expect("v4")
-                .contains("::ffff:10.1.1.1".parse().expect("mapped"))
-        );
+        assert!("10.0.0.0/8".parse::<IpNetwork>().expect("v4").contains("::ffff:10.1.1.1".parse().expect("mapped")));
         for (written, words) in [
             ("proxy.lab", "host names are not supported"),
             ("", "host names are not supported"),
@@ -526,10 +432,7 @@ mod tests {
             ("10.0.0.1/8", "beyond its prefix"),
         ] {
             let refused = written.parse::<IpNetwork>().expect_err(written).to_string();
-            assert!(
-                refused.contains(words) && refused.contains("10.0.0.0/8"),
-                "{refused}"
-            );
+            assert!(refused.contains(words) && refused.contains("10.0.0.0/8"), "{refused}");
         }
     }
 }

@@ -51,17 +51,11 @@ pub async fn push(
     let guard = pusher.start(options, by, archive, sender, |outcome| async move {
         if let Ok(published) = &outcome {
             let object = format!("service {}", published.service);
-            app.audit
-                .record(&caller, AccessAction::Deploy, "published", &object, 200);
+            app.audit.record(&caller, AccessAction::Deploy, "published", &object, 200);
         }
-        let event = match outcome
-            .map_err(Error::from)
-            .and_then(|done| done_event(&app, done))
-        {
+        let event = match outcome.map_err(Error::from).and_then(|done| done_event(&app, done)) {
             Ok(event) => event,
-            Err(error) => PushEvent::Error {
-                problem: error.problem(),
-            },
+            Err(error) => PushEvent::Error { problem: error.problem() },
         };
         // A client that does not read must not keep the push, and with it the daemon, from ending.
         let _ = tokio::time::timeout(FAREWELL, last.send(event)).await;
@@ -84,18 +78,13 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     };
     let app = Arc::clone(app);
     let may = move |name: &str| {
-        if let ConnectionAccess::Ended(reason) = app.principals.connection_access(&caller.who, name)
-        {
+        if let ConnectionAccess::Ended(reason) = app.principals.connection_access(&caller.who, name) {
             return Err(push::Error::NotAllowed(reason));
         }
         let may = caller.check_service_access(&app, AccessAction::Deploy, name, None);
         may.map_err(|error| push::Error::NotAllowed(error.to_string()))
     };
-    Deployer {
-        owner,
-        may: Box::new(may),
-        over: Box::new(over),
-    }
+    Deployer { owner, may: Box::new(may), over: Box::new(over) }
 }
 
 fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {
@@ -108,9 +97,8 @@ fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {
 
 fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
     match query_value(query_of, "options") {
-        Some(text) => serde_json::from_str(&text).map_err(|error| {
-            Error::BadRequest(format!("the push options cannot be read: {error}"))
-        }),
+        Some(text) => serde_json::from_str(&text)
+            .map_err(|error| Error::BadRequest(format!("the push options cannot be read: {error}"))),
         None => Ok(PushOptions::default()),
     }
 }
@@ -121,13 +109,10 @@ mod tests {
 
     #[test]
     fn options_come_in_the_query() {
-        let options =
-            read_options(Some("options=%7B%22apt%22%3A%22opencv_apps%22%7D")).expect("valid");
+        let options = read_options(Some("options=%7B%22apt%22%3A%22opencv_apps%22%7D")).expect("valid");
         assert_eq!(options.apt.as_deref(), Some("opencv_apps"));
         assert_eq!(read_options(None).expect("none"), PushOptions::default());
-        let refused = read_options(Some("options=%7B%22nope%22%3A1%7D"))
-            .expect_err("unknown")
-            .problem();
+        let refused = read_options(Some("options=%7B%22nope%22%3A1%7D")).expect_err("unknown").problem();
         assert_eq!(refused.status, 400);
         assert!(refused.detail.contains("nope"), "{refused:?}");
     }

@@ -21,12 +21,8 @@ impl<T: DeserializeOwned, S: Sync> FromRequestParts<S> for Query<T> {
         match axum::extract::Query::try_from_uri(&parts.uri) {
             Ok(axum::extract::Query(parameters)) => Ok(Query(parameters)),
             Err(refused) => {
-                let why = refused
-                    .source()
-                    .map_or_else(|| refused.body_text(), ToString::to_string);
-                Err(Error::BadRequest(format!(
-                    "the query cannot be read: {why}"
-                )))
+                let why = refused.source().map_or_else(|| refused.body_text(), ToString::to_string);
+                Err(Error::BadRequest(format!("the query cannot be read: {why}")))
             }
         }
     }

@@ -52,27 +52,16 @@ pub struct RecordingQuery {
 
 /// Returns the subject of events about a servant.
 pub fn event_subject(handle: &Handle) -> NewEvent<'_> {
-    NewEvent {
-        service: Some(handle.service()),
-        servant: Some(&handle.id),
-        robot: Some(&handle.robot),
-    }
+    NewEvent { service: Some(handle.service()), servant: Some(&handle.id), robot: Some(&handle.robot) }
 }
 
 /// Writes a servant's black box to a file. Must be polled to completion: otherwise the next recording would start
 /// while this one is still written.
-pub async fn write_recording(
-    app: &Arc<App>,
-    handle: &Handle,
-    why: &str,
-) -> Result<Recording, Error> {
+pub async fn write_recording(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recording, Error> {
     let Some(kept) = app.observers.black_box(&handle.id) else {
         return Err(Error::NoBlackBox(handle.id.clone()));
     };
-    let failed = |reason: String| Error::NotRecorded {
-        servant: handle.id.clone(),
-        reason,
-    };
+    let failed = |reason: String| Error::NotRecorded { servant: handle.id.clone(), reason };
     let _turn = app.observers.writing.lock().await;
     let half = directory(app).join(HALF);
     // The directory belongs to root. The content comes from strangers, so only creating the file needs root's
@@ -81,10 +70,8 @@ pub async fn write_recording(
     let file = run_privileged(move || create_file(&path)).await;
     let file = file.map_err(|error| failed(format!("{}: {error}", half.display())))?;
     let path = half.clone();
-    let written = tokio::task::spawn_blocking(move || {
-        kept.write(RecordingWriter::from_file(&path, file, kept.format())?)
-    })
-    .await;
+    let written =
+        tokio::task::spawn_blocking(move || kept.write(RecordingWriter::from_file(&path, file, kept.format())?)).await;
     let frozen = match written {
         Ok(Ok(frozen)) => frozen,
         error => {
@@ -136,11 +123,7 @@ pub async fn write_recording(
 
 /// Makes room for a new file, records it and returns its number. The service may have been removed while the file was
 /// written, and another may have its name by now; if the servant is gone, nothing is kept.
-async fn admit_recording(
-    app: &App,
-    handle: &Handle,
-    record: &RecordingRecord,
-) -> Result<u64, Error> {
+async fn admit_recording(app: &App, handle: &Handle, record: &RecordingRecord) -> Result<u64, Error> {
     let now = app.choreographer.servant(&handle.id)?;
     let is_published = app.state.service_package(handle.service())?.is_some();
     if !is_published || !std::ptr::eq(Arc::as_ptr(&now), handle) {
@@ -167,11 +150,7 @@ async fn admit_recording(
 /// Returns the files to remove for a new one. `known` lists the existing files, newest first. The service that uses
 /// most, including the new file, loses its oldest; so a service cannot drive out the files of those that use less,
 /// however many it produces.
-fn files_to_evict(
-    known: &[RecordingRecord],
-    new: &RecordingRecord,
-    options: &BlackBoxOptions,
-) -> Vec<u64> {
+fn files_to_evict(known: &[RecordingRecord], new: &RecordingRecord, options: &BlackBoxOptions) -> Vec<u64> {
     let mut left: Vec<&RecordingRecord> = known.iter().collect();
     let mut gone = Vec::new();
     loop {
@@ -182,15 +161,11 @@ fn files_to_evict(
         }
         let taken = |service: &str| {
             let all = left.iter().copied().chain([new]);
-            all.filter(|one| one.service == service)
-                .map(|one| if many { 1 } else { one.bytes })
-                .sum::<u64>()
+            all.filter(|one| one.service == service).map(|one| if many { 1 } else { one.bytes }).sum::<u64>()
         };
         // Of equals, the new file's own service.
-        let most = left
-            .iter()
-            .map(|one| one.service.as_str())
-            .max_by_key(|service| (taken(service), *service == new.service));
+        let most =
+            left.iter().map(|one| one.service.as_str()).max_by_key(|service| (taken(service), *service == new.service));
         let oldest = left.iter().rposition(|one| Some(&*one.service) == most);
         let Some(oldest) = oldest else {
             return gone;
@@ -208,9 +183,7 @@ fn recording_path(app: &App, number: u64) -> PathBuf {
 }
 
 /// Runs `work` with root's privileges.
-async fn run_privileged<T: Send + 'static>(
-    work: impl FnOnce() -> io::Result<T> + Send + 'static,
-) -> io::Result<T> {
+async fn run_privileged<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
     match privilege::spawn_blocking(work).await {
         Ok(done) => done,
         Err(error) => Err(io::Error::other(error)),
@@ -336,10 +309,7 @@ fn visible_recordings(app: &App, caller: &Caller) -> Result<Vec<RecordingRecord>
 /// Returns the recording with this number, as written in a path.
 pub fn find_recording(app: &App, number: &str) -> Result<RecordingRecord, Error> {
     let mut all = app.state.recordings()?.into_iter();
-    let found = number
-        .parse()
-        .ok()
-        .and_then(|number: u64| all.find(|one| one.id == number));
+    let found = number.parse().ok().and_then(|number: u64| all.find(|one| one.id == number));
     found.ok_or_else(|| Error::UnknownRecording(number.to_owned()))
 }
 
@@ -350,8 +320,7 @@ pub async fn list(
     Query(which): Query<RecordingQuery>,
 ) -> JsonResult<Vec<Recording>> {
     let mut all = visible_recordings(&app, &caller)?;
-    let of =
-        |wanted: &Option<String>, is: &str| wanted.as_deref().is_none_or(|wanted| wanted == is);
+    let of = |wanted: &Option<String>, is: &str| wanted.as_deref().is_none_or(|wanted| wanted == is);
     all.retain(|one| of(&which.service, &one.service) && of(&which.robot, &one.robot));
     Ok(Json(all.into_iter().map(to_api_recording).collect()))
 }
@@ -371,18 +340,12 @@ pub async fn file(
         Ok((file, size))
     });
     // The file may have been removed by hand.
-    let (file, size) = opened
-        .await
-        .map_err(|_| Error::UnknownRecording(number.clone()))?;
+    let (file, size) = opened.await.map_err(|_| Error::UnknownRecording(number.clone()))?;
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
     // The download is cut off when the caller's credential becomes invalid.
     let ended = {
         let (app, service) = (Arc::clone(&app), record.service.clone());
-        async move {
-            app.principals
-                .wait_for_end(&caller.who, &service, false)
-                .await
-        }
+        async move { app.principals.wait_for_end(&caller.who, &service, false).await }
     };
     let stream = stream.take_until(Box::pin(ended));
     let mut response = Response::new(Body::from_stream(stream));
@@ -461,31 +424,16 @@ mod tests {
     }
 
     fn options(files: usize, disk: u64) -> BlackBoxOptions {
-        BlackBoxOptions {
-            span: Duration::from_secs(1),
-            memory: 1,
-            topics: Vec::new(),
-            files,
-            disk,
-        }
+        BlackBoxOptions { span: Duration::from_secs(1), memory: 1, topics: Vec::new(), files, disk }
     }
 
     #[test]
     fn the_service_that_takes_most_loses_its_oldest() {
         let gone = |all: &[(u64, &str, u64)], new: (&str, u64), (files, disk)| {
-            let all: Vec<_> = all
-                .iter()
-                .map(|(id, service, bytes)| record(*id, service, *bytes))
-                .collect();
+            let all: Vec<_> = all.iter().map(|(id, service, bytes)| record(*id, service, *bytes)).collect();
             files_to_evict(&all, &record(0, new.0, new.1), &options(files, disk))
         };
-        let all = [
-            (5, "busy", 10),
-            (4, "busy", 10),
-            (3, "busy", 10),
-            (2, "quiet", 25),
-            (1, "quiet", 1),
-        ];
+        let all = [(5, "busy", 10), (4, "busy", 10), (3, "busy", 10), (2, "quiet", 25), (1, "quiet", 1)];
         // There is room.
         assert_eq!(gone(&all, ("busy", 4), (6, 60)), [] as [u64; 0]);
         // By number: the busy service has most, whichever is new.

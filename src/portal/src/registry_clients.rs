@@ -10,8 +10,7 @@ use serde_json::json;
 
 /// Challenge that makes registry clients ask for a token as the password of any user (RFC 7617). A bearer challenge
 /// would need the URL of a token server, but the daemon's tokens are created by an operator.
-const CHALLENGE: HeaderValue =
-    HeaderValue::from_static(r#"Basic realm="cloudroid", charset="UTF-8""#);
+const CHALLENGE: HeaderValue = HeaderValue::from_static(r#"Basic realm="cloudroid", charset="UTF-8""#);
 
 /// Returns true if the path is the registry's.
 pub fn is_registry_path(path: &str) -> bool {
@@ -68,11 +67,7 @@ fn translate(problem: &Problem, may_challenge: bool) -> Response {
 
 /// Builds an error in the format of registry clients.
 pub fn error_response(status: StatusCode, code: &str, message: &str) -> Response {
-    (
-        status,
-        Json(json!({ "errors": [{ "code": code, "message": message }] })),
-    )
-        .into_response()
+    (status, Json(json!({ "errors": [{ "code": code, "message": message }] }))).into_response()
 }
 
 #[cfg(test)]
@@ -83,16 +78,13 @@ mod tests {
 
     async fn read_errors(response: Response) -> serde_json::Value {
         let body = axum::body::to_bytes(response.into_body(), 4096).await;
-        let body: serde_json::Value =
-            serde_json::from_slice(&body.expect("a body")).expect("a document");
+        let body: serde_json::Value = serde_json::from_slice(&body.expect("a body")).expect("a document");
         body["errors"][0].clone()
     }
 
     #[test]
     fn browsers_are_not_asked_for_a_password() {
-        let agent = |agent: &'static str| {
-            HeaderMap::from_iter([(header::USER_AGENT, HeaderValue::from_static(agent))])
-        };
+        let agent = |agent: &'static str| HeaderMap::from_iter([(header::USER_AGENT, HeaderValue::from_static(agent))]);
         assert!(is_browser(&agent("Mozilla/5.0 (X11; Linux x86_64)")));
         assert!(!is_browser(&agent("skopeo/1.9.3")));
         assert!(!is_browser(&HeaderMap::new()));
@@ -118,26 +110,14 @@ mod tests {
         assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
         assert_eq!(response.headers()[header::RETRY_AFTER], "4");
         assert_eq!(read_errors(response).await["code"], "TOOMANYREQUESTS");
-        for (status, code) in [
-            (403, "DENIED"),
-            (404, "NAME_UNKNOWN"),
-            (400, "UNSUPPORTED"),
-            (503, "UNAVAILABLE"),
-            (500, "UNKNOWN"),
-        ] {
-            let problem = Problem {
-                status,
-                detail: "no".into(),
-                next: Some("ask".into()),
-                ..Problem::default()
-            };
+        for (status, code) in
+            [(403, "DENIED"), (404, "NAME_UNKNOWN"), (400, "UNSUPPORTED"), (503, "UNAVAILABLE"), (500, "UNKNOWN")]
+        {
+            let problem = Problem { status, detail: "no".into(), next: Some("ask".into()), ..Problem::default() };
             let response = translate(&problem, true);
             assert_eq!(response.status(), status);
             let error = read_errors(response).await;
-            assert_eq!(
-                (&error["code"], &error["message"]),
-                (&json!(code), &json!("no; ask"))
-            );
+            assert_eq!((&error["code"], &error["message"]), (&json!(code), &json!("no; ask")));
         }
     }
 }

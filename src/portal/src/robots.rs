@@ -39,8 +39,7 @@ const TRY_AGAIN_LATER: u16 = 1013;
 /// Close code for a policy violation.
 const POLICY: u16 = 1008;
 /// Close reason for a client that was not authenticated in time.
-const CROWDED: &str =
-    "too many unauthenticated connections; send the auth message sooner, or a token in the address";
+const CROWDED: &str = "too many unauthenticated connections; send the auth message sooner, or a token in the address";
 /// Bytes that a stub may send before its servant is ready.
 const STUB_AHEAD: usize = 64 * 1024;
 /// Queue size of messages about a waiting robot's position.
@@ -52,26 +51,18 @@ const NAMELESS: usize = 32;
 const LONGEST_NODE: usize = 256;
 
 /// `/`: the page, or the default service.
-pub async fn root(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-    request: Request,
-) -> Response {
+pub async fn root(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>, request: Request) -> Response {
     if !headers::is_upgrade(request.headers()) {
         return page::index(request.method(), request.headers());
     }
     match app.options.default_service.clone() {
-        Some(service) => connect(app, service, caller, request)
-            .await
-            .unwrap_or_else(IntoResponse::into_response),
+        Some(service) => connect(app, service, caller, request).await.unwrap_or_else(IntoResponse::into_response),
         // Only authorised callers learn which services exist.
         None if !caller.is_known() => Error::Unauthorised("a token is needed").into_response(),
         None => {
-            let refusal = check_service_known(&app, &caller, "")
-                .and_then(|()| Err(app.catalogue.unknown_service("")?.into()));
-            refusal.map_or_else(IntoResponse::into_response, |()| {
-                StatusCode::NOT_FOUND.into_response()
-            })
+            let refusal =
+                check_service_known(&app, &caller, "").and_then(|()| Err(app.catalogue.unknown_service("")?.into()));
+            refusal.map_or_else(IntoResponse::into_response, |()| StatusCode::NOT_FOUND.into_response())
         }
     }
 }
@@ -108,9 +99,7 @@ pub async fn service(
 /// Explains the service to somebody who opens its address in a browser.
 fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result<Response, Error> {
     if !matches!(*method, Method::GET | Method::HEAD) {
-        return Err(Error::BadRequest(format!(
-            "{method} is not supported here; connect to services by WebSocket"
-        )));
+        return Err(Error::BadRequest(format!("{method} is not supported here; connect to services by WebSocket")));
     }
     caller.check_service_access(app, AccessAction::See, service, None)?;
     check_service_known(app, caller, service)?;
@@ -124,12 +113,7 @@ fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result
                  again",
         "interface": format!("/api/v1/services/{service}/interface"),
     });
-    Ok((
-        StatusCode::UPGRADE_REQUIRED,
-        [(header::UPGRADE, "websocket")],
-        axum::Json(answer),
-    )
-        .into_response())
+    Ok((StatusCode::UPGRADE_REQUIRED, [(header::UPGRADE, "websocket")], axum::Json(answer)).into_response())
 }
 
 /// A robot's request, as given by the URL.
@@ -151,11 +135,7 @@ impl RobotRequest {
     fn parse(app: &App, service: String, link: bool, uri: &Uri) -> Result<RobotRequest, Error> {
         let named = query::query_value(uri.query(), "robot");
         let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
-        let robot = if shared {
-            app.options.default_robot.clone()
-        } else {
-            named
-        };
+        let robot = if shared { app.options.default_robot.clone() } else { named };
         if let Some(robot) = &robot {
             names::validate_robot(robot).map_err(catalogue::Error::from)?;
         }
@@ -196,9 +176,7 @@ impl RobotRequest {
             (self.robot, self.shared) = (Some(own.clone()), false);
         }
         if self.link && self.robot.is_none() {
-            Err(Error::BadRequest(
-                "a link needs the robot's id: ?robot=ID".to_owned(),
-            ))
+            Err(Error::BadRequest("a link needs the robot's id: ?robot=ID".to_owned()))
         } else {
             Ok(())
         }
@@ -212,19 +190,11 @@ impl RobotRequest {
     /// Returns the resume token, bound to the caller.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
-        Some(tokens::bind_resume_token(
-            caller.who.resume_binding().as_deref(),
-            token,
-        ))
+        Some(tokens::bind_resume_token(caller.who.resume_binding().as_deref(), token))
     }
 }
 
-async fn connect(
-    app: Arc<App>,
-    service: String,
-    caller: Caller,
-    mut request: Request,
-) -> Result<Response, Error> {
+async fn connect(app: Arc<App>, service: String, caller: Caller, mut request: Request) -> Result<Response, Error> {
     let accept = handshake::accept(&request)?;
     let link = asks_for_link(request.headers())?;
     let mut asked = RobotRequest::parse(&app, service, link, request.uri())?;
@@ -256,15 +226,9 @@ async fn connect(
         None
     };
     let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
-        return Err(Error::BadRequest(
-            "this connection cannot become a WebSocket".to_owned(),
-        ));
+        return Err(Error::BadRequest("this connection cannot become a WebSocket".to_owned()));
     };
-    let protocol = if asked.link {
-        Some(link::SUBPROTOCOL)
-    } else {
-        rosbridge_protocol(request.headers())?
-    };
+    let protocol = if asked.link { Some(link::SUBPROTOCOL) } else { rosbridge_protocol(request.headers())? };
     let sessions = app.sessions.clone();
     let connection = request.extensions_mut().remove::<PortalConnection>();
     if let (Some(connection), Some(_)) = (&connection, &lease) {
@@ -286,9 +250,8 @@ async fn connect(
 
 /// Returns true if a robot's stub asks in a version of the link protocol that is supported here.
 fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
-    let offered: Vec<&str> = headers::protocols(headers)
-        .filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS))
-        .collect();
+    let offered: Vec<&str> =
+        headers::protocols(headers).filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS)).collect();
     match offered.as_slice() {
         [] => Ok(false),
         offered if offered.contains(&link::SUBPROTOCOL) => Ok(true),
@@ -322,18 +285,11 @@ fn request_lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lea
     let request = match &asked.robot {
         None => {
             let (robot, anonymous) = generated_name(asked.bound_resume(caller).as_deref());
-            ServantRequest {
-                anonymous,
-                ..ServantRequest::new(service, &robot)
-            }
+            ServantRequest { anonymous, ..ServantRequest::new(service, &robot) }
         }
         Some(robot) => {
             let request = ServantRequest::new(service, robot);
-            if asked.link {
-                request.with_stub(&asked.node)
-            } else {
-                request
-            }
+            if asked.link { request.with_stub(&asked.node) } else { request }
         }
     };
     Ok(app.choreographer.ensure(request.with_stated(stated))?)
@@ -341,20 +297,13 @@ fn request_lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lea
 
 /// Checks whether the caller may act as that robot at that service, with those requirements.
 fn check_access(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
-    caller.check_service_access(
-        app,
-        AccessAction::Connect,
-        &asked.service,
-        asked.robot.as_deref(),
-    )?;
+    caller.check_service_access(app, AccessAction::Connect, &asked.service, asked.robot.as_deref())?;
     if let Some(class) = &asked.stated.class {
         caller.check_class(class)?;
     }
     // A stub is given access to everything that its node uses.
     if asked.link
-        && let ConnectionAccess::Granted(grants) = app
-            .principals
-            .connection_access(&caller.who, &asked.service)
+        && let ConnectionAccess::Granted(grants) = app.principals.connection_access(&caller.who, &asked.service)
         && !grants.is_everything()
     {
         return Err(Error::Forbidden {
@@ -373,21 +322,12 @@ fn check_access(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), 
 
 /// Records in the audit log that somebody connected or was refused. Runs in the background, because it waits for the
 /// disk.
-fn audit_connect(
-    app: &Arc<App>,
-    asked: &RobotRequest,
-    caller: &Caller,
-    allowed: &Result<(), Error>,
-) {
+fn audit_connect(app: &Arc<App>, asked: &RobotRequest, caller: &Caller, allowed: &Result<(), Error>) {
     let status = match allowed {
         Ok(()) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
         Err(error) => error.problem().status,
     };
-    let did = if asked.link {
-        "connected by a stub"
-    } else {
-        "connected by rosbridge"
-    };
+    let did = if asked.link { "connected by a stub" } else { "connected by rosbridge" };
     let object = match &asked.robot {
         Some(robot) => format!("service {} as robot {robot}", asked.service),
         None => format!("service {}", asked.service),
@@ -395,8 +335,7 @@ fn audit_connect(
     let (app, caller) = (Arc::clone(app), caller.clone());
     let sessions = app.sessions.clone();
     sessions.spawn_blocking(move || {
-        app.audit
-            .record_throttled(&caller, AccessAction::Connect, did, &object, status);
+        app.audit.record_throttled(&caller, AccessAction::Connect, did, &object, status);
     });
 }
 
@@ -499,9 +438,7 @@ async fn serve_session(
     if let Some(connection) = connection {
         connection.admit();
     }
-    let allowed = asked
-        .apply_identity(&caller)
-        .and_then(|()| check_access(&app, &asked, &caller));
+    let allowed = asked.apply_identity(&caller).and_then(|()| check_access(&app, &asked, &caller));
     if lease.is_none() {
         audit_connect(&app, &asked, &caller, &allowed);
     }
@@ -510,13 +447,10 @@ async fn serve_session(
     }
     let memory = app.choreographer.memory();
     let budget = memory.client(&caller.peer.budget_name(asked.robot.as_deref()));
-    let mut waiting = WaitingConnection::new(io, &read_ahead, app.choreographer.bridge_options())
-        .with_budget(&budget);
+    let mut waiting = WaitingConnection::new(io, &read_ahead, app.choreographer.bridge_options()).with_budget(&budget);
     let (news, told) = mpsc::channel(NEWS);
     let taking = wait_for_servant(&app, &asked, &caller, lease, &news);
-    let ended = app
-        .principals
-        .wait_for_end(&caller.who, &asked.service, false);
+    let ended = app.principals.wait_for_end(&caller.who, &asked.service, false);
     let taken = tokio::select! {
         taken = waiting.wait_for_with_news(taking, told) => taken,
         reason = ended => return waiting.refuse(POLICY, &reason).await,
@@ -535,16 +469,13 @@ async fn serve_session(
         (None, ConnectionPeer::Tcp(address)) => address.to_string(),
         (None, user) => user.to_string(),
     };
-    let now = app
-        .principals
-        .connection_access(&caller.who, &asked.service);
+    let now = app.principals.connection_access(&caller.who, &asked.service);
     let (standing, granted) = watch::channel(now);
     let options = SessionOptions {
         budget,
         client,
         resume: asked.bound_resume(&caller),
-        granted: ClientGrants::from_standing(granted)
-            .with_refusal_observer(audit_refusal(&app, &asked, &caller)),
+        granted: ClientGrants::from_standing(granted).with_refusal_observer(audit_refusal(&app, &asked, &caller)),
         ..SessionOptions::default()
     };
     let handle = lease.handle();
@@ -558,11 +489,7 @@ async fn serve_session(
             tracing::debug!("{} left servant {} (code {code})", handle.robot, handle.id);
         }
         SessionEnd::Closed { code, reason } => {
-            tracing::info!(
-                "closed the connection of {} to servant {} ({code}: {reason})",
-                handle.robot,
-                handle.id
-            );
+            tracing::info!("closed the connection of {} to servant {} ({code}: {reason})", handle.robot, handle.id);
         }
         SessionEnd::Lost(reason) => {
             tracing::info!("lost {} at servant {}: {reason}", handle.robot, handle.id)
@@ -571,28 +498,19 @@ async fn serve_session(
 }
 
 /// Returns a function that records operations refused for lack of a grant.
-fn audit_refusal(
-    app: &Arc<App>,
-    asked: &RobotRequest,
-    caller: &Caller,
-) -> impl Fn(&str) + Send + Sync + 'static {
+fn audit_refusal(app: &Arc<App>, asked: &RobotRequest, caller: &Caller) -> impl Fn(&str) + Send + Sync + 'static {
     let (app, caller, service) = (Arc::clone(app), caller.clone(), asked.service.clone());
     move |operation| {
         let did = format!("was refused {operation}");
         let object = format!("service {service}");
         let status = StatusCode::FORBIDDEN.as_u16();
-        app.audit
-            .record_throttled(&caller, AccessAction::Connect, &did, &object, status);
+        app.audit.record_throttled(&caller, AccessAction::Connect, &did, &object, status);
     }
 }
 
 /// Returns the close code for a robot that gets no servant.
 fn close_code(error: &Error) -> u16 {
-    if error.is_final() {
-        POLICY
-    } else {
-        TRY_AGAIN_LATER
-    }
+    if error.is_final() { POLICY } else { TRY_AGAIN_LATER }
 }
 
 /// Returns the requested servant once it is ready, and its lease.
@@ -614,17 +532,11 @@ async fn wait_for_servant(
 }
 
 /// Waits for admission and reports the robot's position whenever it changes.
-async fn wait_for_admission(
-    lease: &Lease,
-    news: &mpsc::Sender<String>,
-) -> Result<(), choreographer::Error> {
+async fn wait_for_admission(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), choreographer::Error> {
     let mut standing = lease.handle().watch_standing();
     let mut admitted = pin!(lease.wait_admitted());
     loop {
-        let stands = standing
-            .borrow_and_update()
-            .as_ref()
-            .map(ToString::to_string);
+        let stands = standing.borrow_and_update().as_ref().map(ToString::to_string);
         if let Some(stands) = stands {
             // A robot that does not read gets the next report.
             let _ = news.try_send(stands);
@@ -676,10 +588,7 @@ async fn serve_stub(
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
         reason = app.principals.wait_for_end(&caller.who, &asked.service, true) => reason,
     };
-    tracing::info!(
-        "the link of {robot} to servant {} ended: {lost}",
-        lease.handle().id
-    );
+    tracing::info!("the link of {robot} to servant {} ended: {lost}", lease.handle().id);
 }
 
 /// Buffers what the connection sends, up to a limit; returns when the connection has ended.
@@ -714,20 +623,14 @@ mod tests {
     fn a_token_among_the_subprotocols_is_never_chosen() {
         let offers = |text: &'static str| {
             let mut headers = HeaderMap::new();
-            headers.insert(
-                header::SEC_WEBSOCKET_PROTOCOL,
-                HeaderValue::from_static(text),
-            );
+            headers.insert(header::SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static(text));
             rosbridge_protocol(&headers).map_err(|error| error.problem().detail)
         };
         assert_eq!(offers("rosbridge, bearer.secret"), Ok(Some("rosbridge")));
         assert_eq!(offers("bearer.secret,rosbridge"), Ok(Some("rosbridge")));
         assert_eq!(offers("something.else"), Ok(None));
         let refused = offers("bearer.secret").expect_err("a token alone");
-        assert!(
-            refused.contains("offer rosbridge") && !refused.contains("secret"),
-            "{refused}"
-        );
+        assert!(refused.contains("offer rosbridge") && !refused.contains("secret"), "{refused}");
     }
 
     #[test]
@@ -737,10 +640,7 @@ mod tests {
         assert_eq!(named("secret"), named("secret"));
         assert_ne!(named("secret"), named("other"));
         assert_ne!(generated_name(None).0, generated_name(None).0);
-        assert!(
-            names::validate_robot(&named("secret").0).is_err(),
-            "no robot can claim it"
-        );
+        assert!(names::validate_robot(&named("secret").0).is_err(), "no robot can claim it");
         for name in [named("secret").0, generated_name(None).0] {
             assert!(name.len() > 32, "{name} can be found");
         }

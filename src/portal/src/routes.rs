@@ -16,9 +16,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, differences, events, goals, history, inside,
-    machines, metrics, oci, openapi, page, people, policy, push, recordings, robots, shadow,
-    stream, stubs, topics, viewers,
+    App, api_v1, audit, calibration, dictionary, differences, events, goals, history, inside, machines, metrics, oci,
+    openapi, page, people, policy, push, recordings, robots, shadow, stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -66,17 +65,8 @@ const fn route(
     access: Access,
     handler: fn() -> MethodRouter<Arc<App>>,
 ) -> Route {
-    assert!(
-        names_its_object(path, access),
-        "a row's address has no parameter of the name that its access says"
-    );
-    Route {
-        method,
-        path,
-        access,
-        handler,
-        operation: None,
-    }
+    assert!(names_its_object(path, access), "a row's address has no parameter of the name that its access says");
+    Route { method, path, access, handler, operation: None }
 }
 
 /// Returns true if the path has the parameter that names the object; otherwise the program does not compile.
@@ -111,19 +101,16 @@ const fn names_its_object(path: &str, access: Access) -> bool {
 
 impl Route {
     const fn with_operation(self, operation: fn() -> Operation) -> Self {
-        Route {
-            operation: Some(operation),
-            ..self
-        }
+        Route { operation: Some(operation), ..self }
     }
 
     /// Returns true if a request's path matches the route.
     fn matches(&self, path: &str) -> bool {
         let mut segments = path.split('/');
         self.path.split('/').all(|expected| {
-            segments.next().is_some_and(|segment| {
-                segment == expected || (expected.starts_with('{') && !segment.is_empty())
-            })
+            segments
+                .next()
+                .is_some_and(|segment| segment == expected || (expected.starts_with('{') && !segment.is_empty()))
         }) && segments.next().is_none()
     }
 }
@@ -145,23 +132,13 @@ pub const ROUTES: &[Route] = &[
     route("GET", "/api/v1/status", LOOK, || get(api_v1::status))
         .with_operation(|| operation("status", "Summary of the daemon.").answers::<api::Status>()),
     route("GET", "/api/v1/doctor", LOOK, || get(api_v1::doctor)).with_operation(|| {
-        operation(
-            "doctor",
-            "Checks what this machine needs to run servants.",
-        )
-        .answers::<api::Doctor>()
+        operation("doctor", "Checks what this machine needs to run servants.").answers::<api::Doctor>()
     }),
     route("GET", "/api/v1/clock", ENTER, || get(api_v1::clock)).with_operation(|| {
-        operation(
-            "clock",
-            "The daemon's clock, to compare another clock with.",
-        )
-        .answers::<api::Clock>()
+        operation("clock", "The daemon's clock, to compare another clock with.").answers::<api::Clock>()
     }),
     route("GET", "/api/v1/events", ENTER, || get(events::events)).with_operation(|| {
-        operation("events", "Events, oldest first.")
-            .asks::<events::EventQuery>()
-            .lists::<api::Event>()
+        operation("events", "Events, oldest first.").asks::<events::EventQuery>().lists::<api::Event>()
     }),
     route("GET", "/api/v1/events/follow", ENTER, || get(events::follow)).with_operation(|| {
         operation(
@@ -179,10 +156,7 @@ pub const ROUTES: &[Route] = &[
         )
         .sends::<api::stream::Update>()
     }),
-    route("GET", "/api/v1/history/servants", ENTER, || {
-        get(history::servants)
-    })
-    .with_operation(|| {
+    route("GET", "/api/v1/history/servants", ENTER, || get(history::servants)).with_operation(|| {
         operation(
             "servantsHistory",
             "History of servants in the last day, ended ones included, most recently requested first.",
@@ -197,31 +171,18 @@ pub const ROUTES: &[Route] = &[
     }),
     route("GET", "/api/v1/services", ENTER, || get(api_v1::services))
         .with_operation(|| operation("services", "All services.").lists::<api::ServiceSummary>()),
-    route("GET", "/api/v1/services/{name}", service(See), || {
-        get(api_v1::service)
-    })
-    .with_operation(|| {
-        operation("service", "A service with its interface and revisions.")
-            .answers::<api::ServiceDetail>()
+    route("GET", "/api/v1/services/{name}", service(See), || get(api_v1::service)).with_operation(|| {
+        operation("service", "A service with its interface and revisions.").answers::<api::ServiceDetail>()
     }),
-    route("DELETE", "/api/v1/services/{name}", service(Deploy), || {
-        delete(api_v1::remove_service)
-    })
-    .with_operation(|| {
-        operation(
-            "removeService",
-            "Removes the service, its servants, its images and its recordings.",
-        )
-        .answers::<api::Stopped>()
-    }),
-    route("GET", "/api/v1/services/{name}/interface", service(See), || {
-        get(api_v1::interface)
-    })
-    .with_operation(|| operation("interface", "The interface with all message definitions.").answers_object()),
-    route("GET", "/api/v1/services/{name}/record", service(Deploy), || {
-        get(api_v1::record)
-    })
-    .with_operation(|| {
+    route("DELETE", "/api/v1/services/{name}", service(Deploy), || delete(api_v1::remove_service)).with_operation(
+        || {
+            operation("removeService", "Removes the service, its servants, its images and its recordings.")
+                .answers::<api::Stopped>()
+        },
+    ),
+    route("GET", "/api/v1/services/{name}/interface", service(See), || get(api_v1::interface))
+        .with_operation(|| operation("interface", "The interface with all message definitions.").answers_object()),
+    route("GET", "/api/v1/services/{name}/record", service(Deploy), || get(api_v1::record)).with_operation(|| {
         operation(
             "serviceRecord",
             "Metadata of a revision that is not in its image, so that another server can publish both.",
@@ -229,65 +190,41 @@ pub const ROUTES: &[Route] = &[
         .asks::<api_v1::RevisionQuery>()
         .answers_object()
     }),
-    route("GET", "/api/v1/services/{name}/differences", service(See), || {
-        get(differences::differences)
-    })
-    .with_operation(|| {
-        operation("differences", "Differences between two revisions.")
-            .asks::<differences::DifferencesQuery>()
-            .answers::<api::differences::Differences>()
+    route("GET", "/api/v1/services/{name}/differences", service(See), || get(differences::differences)).with_operation(
+        || {
+            operation("differences", "Differences between two revisions.")
+                .asks::<differences::DifferencesQuery>()
+                .answers::<api::differences::Differences>()
+        },
+    ),
+    route("GET", "/api/v1/services/{name}/fit", service(See), || get(api_v1::fit)).with_operation(|| {
+        operation("fit", "Whether one more servant would fit, how many more would, and what it would cost the others.")
+            .asks::<dictionary::StatedQuery>()
+            .answers::<api::Fit>()
     }),
-    route("GET", "/api/v1/services/{name}/fit", service(See), || {
-        get(api_v1::fit)
-    })
-    .with_operation(|| {
-        operation(
-            "fit",
-            "Whether one more servant would fit, how many more would, and what it would cost the others.",
-        )
-        .asks::<dictionary::StatedQuery>()
-        .answers::<api::Fit>()
-    }),
-    route("POST", "/api/v1/services/{name}/rollback", service(Deploy), || {
-        post(api_v1::rollback)
-    })
-    .with_operation(|| {
-        operation("rollback", "Makes an earlier revision the current one.")
-            .takes::<api::Rollback>(Required::False)
-            .answers::<api::ServiceDetail>()
-    }),
-    route("GET", "/api/v1/services/{name}/rollout", service(See), || {
-        get(api_v1::rollout)
-    })
-    .with_operation(|| {
-        operation("rollout", "The rollout of a service.")
-            .answers::<api::Rollout>()
-    }),
-    route("POST", "/api/v1/services/{name}/rollout", service(Deploy), || {
-        post(api_v1::order_rollout)
-    })
-    .with_operation(|| {
-        operation(
-            "orderRollout",
-            "Starts a rollout, promotes its canary, or aborts it.",
-        )
-        .takes::<api::rollout::RolloutOrder>(Required::True)
-        .answers::<api::Rollout>()
-    }),
-    route("POST", "/api/v1/services/{name}/trial", service(Try), || {
-        post(api_v1::trial)
-    })
-    .with_operation(|| {
+    route("POST", "/api/v1/services/{name}/rollback", service(Deploy), || post(api_v1::rollback)).with_operation(
+        || {
+            operation("rollback", "Makes an earlier revision the current one.")
+                .takes::<api::Rollback>(Required::False)
+                .answers::<api::ServiceDetail>()
+        },
+    ),
+    route("GET", "/api/v1/services/{name}/rollout", service(See), || get(api_v1::rollout))
+        .with_operation(|| operation("rollout", "The rollout of a service.").answers::<api::Rollout>()),
+    route("POST", "/api/v1/services/{name}/rollout", service(Deploy), || post(api_v1::order_rollout)).with_operation(
+        || {
+            operation("orderRollout", "Starts a rollout, promotes its canary, or aborts it.")
+                .takes::<api::rollout::RolloutOrder>(Required::True)
+                .answers::<api::Rollout>()
+        },
+    ),
+    route("POST", "/api/v1/services/{name}/trial", service(Try), || post(api_v1::trial)).with_operation(|| {
         operation(
             "trial",
             "Runs a service on a recording (rosbag 2.0) or a picture (PNG) and returns its outputs and response times.",
         )
         .asks::<api_v1::TrialQuery>()
-        .takes_file(
-            "application/octet-stream",
-            "The recording or the picture.",
-            Required::True,
-        )
+        .takes_file("application/octet-stream", "The recording or the picture.", Required::True)
         .answers::<api::trial::Trial>()
     }),
     route("POST", "/api/v1/services/{name}/calibration", service(Try), || {
@@ -307,10 +244,7 @@ pub const ROUTES: &[Route] = &[
         )
         .streams::<api::CalibrationEvent>()
     }),
-    route("POST", "/api/v1/services/{name}/shadow", service(Try), || {
-        post(shadow::shadow)
-    })
-    .with_operation(|| {
+    route("POST", "/api/v1/services/{name}/shadow", service(Try), || post(shadow::shadow)).with_operation(|| {
         operation(
             "shadow",
             "Mirrors a robot's requests to a candidate revision, whose answers are only compared. The last line is \
@@ -319,93 +253,56 @@ pub const ROUTES: &[Route] = &[
         .takes::<api::ShadowOptions>(Required::True)
         .streams::<api::ShadowEvent>()
     }),
-    route("GET", "/api/v1/services/{name}/sla", service(See), || {
-        get(dictionary::rows)
-    })
-    .with_operation(|| {
-        operation(
-            "dictionary",
-            "The service's SLA table: the limits that each SLA needs.",
-        )
-        .lists::<api::dictionary::Row>()
+    route("GET", "/api/v1/services/{name}/sla", service(See), || get(dictionary::rows)).with_operation(|| {
+        operation("dictionary", "The service's SLA table: the limits that each SLA needs.")
+            .lists::<api::dictionary::Row>()
     }),
-    route("PUT", "/api/v1/services/{name}/sla", service(Deploy), || {
-        put(dictionary::write)
-    })
-    .with_operation(|| {
+    route("PUT", "/api/v1/services/{name}/sla", service(Deploy), || put(dictionary::write)).with_operation(|| {
         operation("writeDictionary", "Writes rows of the SLA table, all or none.")
             .takes::<api::dictionary::NewRows>(Required::True)
             .lists::<api::dictionary::Row>()
     }),
-    route("GET", "/api/v1/services/{name}/sla/explain", service(See), || {
-        get(dictionary::explain)
-    })
-    .with_operation(|| {
-        operation(
-            "explainSla",
-            "The limits that a robot with these terms would get, and why. Auxiliary parameters are aux.KEY=VALUE.",
-        )
-        .asks::<dictionary::StatedQuery>()
-        .answers::<api::dictionary::Explained>()
-    }),
-    route("DELETE", "/api/v1/services/{name}/sla/{id}", service(Deploy), || {
-        delete(dictionary::remove)
-    })
-    .with_operation(|| {
-        operation("removeFromDictionary", "Removes a row of the SLA table; returns the remaining rows.")
-            .lists::<api::dictionary::Row>()
-    }),
+    route("GET", "/api/v1/services/{name}/sla/explain", service(See), || get(dictionary::explain)).with_operation(
+        || {
+            operation(
+                "explainSla",
+                "The limits that a robot with these terms would get, and why. Auxiliary parameters are aux.KEY=VALUE.",
+            )
+            .asks::<dictionary::StatedQuery>()
+            .answers::<api::dictionary::Explained>()
+        },
+    ),
+    route("DELETE", "/api/v1/services/{name}/sla/{id}", service(Deploy), || delete(dictionary::remove)).with_operation(
+        || {
+            operation("removeFromDictionary", "Removes a row of the SLA table; returns the remaining rows.")
+                .lists::<api::dictionary::Row>()
+        },
+    ),
     route("GET", "/api/v1/servants", ENTER, || get(api_v1::servants))
         .with_operation(|| operation("servants", "All servants.").lists::<api::Servant>()),
-    route("DELETE", "/api/v1/servants", May(Operate, AccessTarget::Handler), || {
-        delete(api_v1::stop_servants)
-    })
-    .with_operation(|| {
-        operation(
-            "stopServants",
-            "Stops all servants, or those of one service.",
-        )
-        .asks::<api_v1::ServiceQuery>()
-        .answers::<api::Stopped>()
+    route("DELETE", "/api/v1/servants", May(Operate, AccessTarget::Handler), || delete(api_v1::stop_servants))
+        .with_operation(|| {
+            operation("stopServants", "Stops all servants, or those of one service.")
+                .asks::<api_v1::ServiceQuery>()
+                .answers::<api::Stopped>()
+        }),
+    route("GET", "/api/v1/servants/{id}", servant(See), || get(api_v1::servant))
+        .with_operation(|| operation("servant", "One servant.").answers::<api::Servant>()),
+    route("PATCH", "/api/v1/servants/{id}", servant(Operate), || patch(api_v1::set_limits)).with_operation(|| {
+        operation("setLimits", "Changes the given limits of a running servant.")
+            .takes::<api::Limits>(Required::True)
+            .answers::<api::Servant>()
     }),
-    route("GET", "/api/v1/servants/{id}", servant(See), || {
-        get(api_v1::servant)
-    })
-    .with_operation(|| operation("servant", "One servant.").answers::<api::Servant>()),
-    route("PATCH", "/api/v1/servants/{id}", servant(Operate), || {
-        patch(api_v1::set_limits)
-    })
-    .with_operation(|| {
-        operation(
-            "setLimits",
-            "Changes the given limits of a running servant.",
-        )
-        .takes::<api::Limits>(Required::True)
-        .answers::<api::Servant>()
+    route("DELETE", "/api/v1/servants/{id}", servant(Operate), || delete(api_v1::stop_servant))
+        .with_operation(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
+    route("GET", "/api/v1/servants/{id}/logs", servant(Logs), || get(api_v1::logs)).with_operation(|| {
+        operation("logs", "Output of its nodes.").asks::<api_v1::LogQuery>().streams::<api::LogLine>()
     }),
-    route("DELETE", "/api/v1/servants/{id}", servant(Operate), || {
-        delete(api_v1::stop_servant)
-    })
-    .with_operation(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
-    route("GET", "/api/v1/servants/{id}/logs", servant(Logs), || {
-        get(api_v1::logs)
-    })
-    .with_operation(|| {
-        operation("logs", "Output of its nodes.")
-            .asks::<api_v1::LogQuery>()
-            .streams::<api::LogLine>()
-    }),
-    route("GET", "/api/v1/servants/{id}/inside", servant(See), || {
-        get(inside::open_inside)
-    })
-    .with_operation(|| {
+    route("GET", "/api/v1/servants/{id}/inside", servant(See), || get(inside::open_inside)).with_operation(|| {
         operation("inside", "Opens a WebSocket into a servant that speaks rosbridge, besides its robot.")
             .becomes_a_websocket()
     }),
-    route("GET", "/api/v1/servants/{id}/topics", servant(See), || {
-        get(topics::topics)
-    })
-    .with_operation(|| {
+    route("GET", "/api/v1/servants/{id}/topics", servant(See), || get(topics::topics)).with_operation(|| {
         operation(
             "topics",
             "Message rates of all topics of a servant, a line each second. The daemon subscribes to all topics \
@@ -413,31 +310,24 @@ pub const ROUTES: &[Route] = &[
         )
         .streams::<api::topics::PublishedTopics>()
     }),
-    route("GET", "/api/v1/servants/{id}/goals", servant(See), || {
-        get(goals::goals)
-    })
-    .with_operation(|| {
-        operation("goals", "Goals of a servant's actions and their outcome, newest first.")
-            .lists::<api::goals::Goal>()
+    route("GET", "/api/v1/servants/{id}/goals", servant(See), || get(goals::goals)).with_operation(|| {
+        operation("goals", "Goals of a servant's actions and their outcome, newest first.").lists::<api::goals::Goal>()
     }),
-    route("POST", "/api/v1/servants/{id}/recording", servant(Operate), || {
-        post(recordings::take)
-    })
-    .with_operation(|| {
-        operation("takeRecording", "Saves the messages of the last seconds of a servant (ring-buffer recording).")
-            .answers::<api::recordings::Recording>()
-    }),
+    route("POST", "/api/v1/servants/{id}/recording", servant(Operate), || post(recordings::take)).with_operation(
+        || {
+            operation("takeRecording", "Saves the messages of the last seconds of a servant (ring-buffer recording).")
+                .answers::<api::recordings::Recording>()
+        },
+    ),
     route("GET", "/api/v1/recordings", ENTER, || get(recordings::list)).with_operation(|| {
         operation("recordings", "Ring-buffer recordings, newest first.")
             .asks::<recordings::RecordingQuery>()
             .lists::<api::recordings::Recording>()
     }),
-    route("GET", "/api/v1/recordings/{number}", May(See, AccessTarget::Recording("number")), || {
-        get(recordings::file)
-    })
-    .with_operation(|| {
-        operation("recording", "A ring-buffer recording (MCAP).").answers_file("application/octet-stream")
-    }),
+    route("GET", "/api/v1/recordings/{number}", May(See, AccessTarget::Recording("number")), || get(recordings::file))
+        .with_operation(|| {
+            operation("recording", "A ring-buffer recording (MCAP).").answers_file("application/octet-stream")
+        }),
     route("DELETE", "/api/v1/recordings/{number}", May(Operate, AccessTarget::Recording("number")), || {
         delete(recordings::remove)
     })
@@ -446,32 +336,21 @@ pub const ROUTES: &[Route] = &[
             .lists::<api::recordings::Recording>()
     }),
     route("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).with_operation(|| {
-        operation(
-            "backOffs",
-            "Servants that failed repeatedly, and when each may be started again.",
-        )
-        .lists::<api::BackOff>()
+        operation("backOffs", "Servants that failed repeatedly, and when each may be started again.")
+            .lists::<api::BackOff>()
     }),
-    route("GET", "/api/v1/robots/{name}/explain", May(See, AccessTarget::Robot("name")), || {
-        get(api_v1::explain)
-    })
-    .with_operation(|| {
-        operation(
-            "explain",
-            "Explains why a robot is slow or uses its local original.",
-        )
-        .answers::<api::explain::Explanation>()
-    }),
+    route("GET", "/api/v1/robots/{name}/explain", May(See, AccessTarget::Robot("name")), || get(api_v1::explain))
+        .with_operation(|| {
+            operation("explain", "Explains why a robot is slow or uses its local original.")
+                .answers::<api::explain::Explanation>()
+        }),
     route("GET", "/api/v1/audit", ADMINISTER, || get(audit::records::audit)).with_operation(|| {
-        operation("audit", "Audit log, oldest first.")
-            .asks::<audit::records::AuditQuery>()
-            .streams::<access::Audited>()
+        operation("audit", "Audit log, oldest first.").asks::<audit::records::AuditQuery>().streams::<access::Audited>()
     }),
     route("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
         .with_operation(|| operation("whoami", "The caller, as the daemon identified it.").answers::<access::Whoami>()),
-    route("GET", "/api/v1/session", SignIn, || get(people::session)).with_operation(|| {
-        operation("session", "The current session, if any.").answers::<api::people::Session>()
-    }),
+    route("GET", "/api/v1/session", SignIn, || get(people::session))
+        .with_operation(|| operation("session", "The current session, if any.").answers::<api::people::Session>()),
     route("POST", "/api/v1/session", SignIn, || post(people::sign_in)).with_operation(|| {
         operation("signIn", "Signs in with a password and sets the session cookie.")
             .takes::<api::people::SignIn>(Required::True)
@@ -492,12 +371,10 @@ pub const ROUTES: &[Route] = &[
             .asks::<people::provider::CallbackQuery>()
             .answers_page()
     }),
-    route("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions)).with_operation(|| {
-        operation("sessions", "All sessions.").lists::<api::people::SessionLine>()
-    }),
-    route("GET", "/api/v1/accounts", ADMINISTER, || get(people::accounts)).with_operation(|| {
-        operation("accounts", "All accounts.").lists::<api::people::Account>()
-    }),
+    route("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions))
+        .with_operation(|| operation("sessions", "All sessions.").lists::<api::people::SessionLine>()),
+    route("GET", "/api/v1/accounts", ADMINISTER, || get(people::accounts))
+        .with_operation(|| operation("accounts", "All accounts.").lists::<api::people::Account>()),
     route("POST", "/api/v1/accounts", ADMINISTER, || post(people::create)).with_operation(|| {
         operation("createAccount", "Creates an account; returns all accounts.")
             .takes::<api::people::NewAccount>(Required::True)
@@ -512,10 +389,12 @@ pub const ROUTES: &[Route] = &[
         operation("removeAccount", "Removes an account and ends its sessions; returns the remaining ones.")
             .lists::<api::people::Account>()
     }),
-    route("DELETE", "/api/v1/accounts/{name}/sessions", ADMINISTER, || delete(people::end_sessions)).with_operation(|| {
-        operation("endSessions", "Ends all sessions of an account; returns the remaining sessions.")
-            .lists::<api::people::SessionLine>()
-    }),
+    route("DELETE", "/api/v1/accounts/{name}/sessions", ADMINISTER, || delete(people::end_sessions)).with_operation(
+        || {
+            operation("endSessions", "Ends all sessions of an account; returns the remaining sessions.")
+                .lists::<api::people::SessionLine>()
+        },
+    ),
     route("GET", "/api/v1/tokens", ADMINISTER, || get(policy::tokens)).with_operation(|| {
         operation("tokens", "All tokens without their secrets, revoked ones included.").lists::<access::Token>()
     }),
@@ -525,8 +404,12 @@ pub const ROUTES: &[Route] = &[
             .answers::<access::Secret>()
     }),
     route("DELETE", "/api/v1/tokens/{name}", ADMINISTER, || delete(policy::revoke)).with_operation(|| {
-        operation("revokeToken", "Revokes a token and closes its connections; returns all \
-            tokens.").lists::<access::Token>()
+        operation(
+            "revokeToken",
+            "Revokes a token and closes its connections; returns all \
+            tokens.",
+        )
+        .lists::<access::Token>()
     }),
     route("POST", "/api/v1/tokens/{name}/rotate", ADMINISTER, || post(policy::rotate)).with_operation(|| {
         operation("rotateToken", "Replaces the secret of a token and closes connections that use the old one.")
@@ -575,17 +458,10 @@ pub const ROUTES: &[Route] = &[
         post(push::push).layer(DefaultBodyLimit::disable())
     })
     .with_operation(|| {
-        operation(
-            "push",
-            "Builds an image of a package and publishes it. The last line is `done` or `error`.",
-        )
-        .asks_json::<api::PushOptions>("options", "Options of the push.")
-        .takes_file(
-            "application/x-tar",
-            "A tar archive, optionally gzipped; empty with `apt`.",
-            Required::False,
-        )
-        .streams::<api::PushEvent>()
+        operation("push", "Builds an image of a package and publishes it. The last line is `done` or `error`.")
+            .asks_json::<api::PushOptions>("options", "Options of the push.")
+            .takes_file("application/x-tar", "A tar archive, optionally gzipped; empty with `apt`.", Required::False)
+            .streams::<api::PushEvent>()
     }),
     route("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
         .with_operation(|| operation("openapi", "This document.").answers_object()),
@@ -593,17 +469,13 @@ pub const ROUTES: &[Route] = &[
     route("GET", "/v2/", ENTER, || get(oci::version)),
     route("GET", "/v2/_catalog", ENTER, || get(oci::catalog)),
     route("GET", "/v2/{name}/tags/list", service(See), || get(oci::tags)),
-    route("GET", "/v2/{name}/manifests/{reference}", service(See), || {
-        get(oci::manifest)
-    }),
+    route("GET", "/v2/{name}/manifests/{reference}", service(See), || get(oci::manifest)),
     route("GET", "/v2/{name}/blobs/{digest}", service(See), || get(oci::blob)),
     route("GET", "/stubs", ENTER, || get(stubs::list)),
     route("GET", "/stubs/{file}", May(See, AccessTarget::Stub("file")), || get(stubs::archive)),
     route("GET", "/foxglove/{id}", servant(See), || get(viewers::viewer)),
     route("ANY", "/{service}", Connect, || any(robots::service)),
-    route("ANY", "/{service}/", Connect, || {
-        any(robots::service_with_slash)
-    }),
+    route("ANY", "/{service}/", Connect, || any(robots::service_with_slash)),
 ];
 
 /// Responds to paths without a route: 404.
@@ -611,10 +483,7 @@ pub async fn not_found(uri: OriginalUri) -> Response {
     if uri.path().starts_with("/v2/") {
         return oci::unsupported(uri).await;
     }
-    Error::UnknownPath {
-        path: uri.path().to_owned(),
-    }
-    .into_response()
+    Error::UnknownPath { path: uri.path().to_owned() }.into_response()
 }
 
 /// Responds to methods that a path does not support: 405. The router adds the supported methods.
@@ -622,9 +491,5 @@ pub async fn other_method(method: Method, OriginalUri(uri): OriginalUri) -> Resp
     if uri.path().starts_with("/v2/") {
         return oci::other_method(&method, &uri);
     }
-    Error::OtherMethod {
-        method: method.to_string(),
-        path: uri.path().to_owned(),
-    }
-    .into_response()
+    Error::OtherMethod { method: method.to_string(), path: uri.path().to_owned() }.into_response()
 }

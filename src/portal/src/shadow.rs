@@ -41,17 +41,11 @@ pub async fn shadow(
     let ending = caller.wait_for_end(&app, &name);
     let work = async move {
         let choreographer = &app.choreographer;
-        let budget = choreographer
-            .memory()
-            .client(&caller.peer.budget_name(None));
+        let budget = choreographer.memory().client(&caller.peer.budget_name(None));
         let shadow = choreographer.shadow(&name, &options, &budget, &events);
         let event = match shadow.await {
-            Ok(shadow) => ShadowEvent::Done {
-                shadow: Box::new(shadow),
-            },
-            Err(error) => ShadowEvent::Error {
-                problem: Error::from(error).problem(),
-            },
+            Ok(shadow) => ShadowEvent::Done { shadow: Box::new(shadow) },
+            Err(error) => ShadowEvent::Error { problem: Error::from(error).problem() },
         };
         let _ = events.send(event).await;
     };
@@ -69,14 +63,10 @@ fn check(options: &ShadowOptions) -> Result<(), Error> {
     let refused = |words: String| Err(Error::BadRequest(words));
     let between = |name: &str, value: f64, least: f64, most: f64| match value {
         value if (least..=most).contains(&value) => Ok(()),
-        value => refused(format!(
-            "{name} = {value} is not between {least} and {most}"
-        )),
+        value => refused(format!("{name} = {value} is not between {least} and {most}")),
     };
     if options.revision == 0 {
-        return refused(
-            "revision says which one is the candidate; they are counted from 1".to_owned(),
-        );
+        return refused("revision says which one is the candidate; they are counted from 1".to_owned());
     }
     between("seconds", options.seconds, 0.1, LONGEST)?;
     between("tolerance", options.tolerance, 0.0, 1e9)?;
@@ -96,10 +86,7 @@ mod tests {
 
     #[test]
     fn options_that_make_no_comparison_are_refused() {
-        let good = ShadowOptions {
-            revision: 2,
-            ..ShadowOptions::default()
-        };
+        let good = ShadowOptions { revision: 2, ..ShadowOptions::default() };
         check(&good).expect("a comparison");
         type Spoil = fn(&mut ShadowOptions);
         let spoilt: [(Spoil, &str); 8] = [
@@ -110,10 +97,7 @@ mod tests {
             (|options| options.tolerance = f64::INFINITY, "tolerance"),
             (|options| options.bound = -0.1, "bound = -0.1"),
             (|options| options.requests = Some(0), "requests = 0"),
-            (
-                |options| options.ignore = vec!["x".to_owned(); 101],
-                "100 fields",
-            ),
+            (|options| options.ignore = vec!["x".to_owned(); 101], "100 fields"),
         ];
         for (spoil, words) in spoilt {
             let mut options = good.clone();

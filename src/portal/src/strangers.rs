@@ -82,16 +82,9 @@ impl Strangers {
             let network = largest_network(&present);
             self.drop_oldest(&mut present, |other| Some(other.network()) == network);
         }
-        let newcomer = PresentStranger {
-            host,
-            dropped: dropped.clone(),
-        };
+        let newcomer = PresentStranger { host, dropped: dropped.clone() };
         present.insert(number, newcomer);
-        Stranger {
-            strangers: Arc::clone(self),
-            number,
-            dropped,
-        }
+        Stranger { strangers: Arc::clone(self), number, dropped }
     }
 
     /// Drops the oldest stranger of the network that has most, because no descriptor is left.
@@ -101,11 +94,7 @@ impl Strangers {
         self.drop_oldest(&mut present, |other| Some(other.network()) == network);
     }
 
-    fn drop_oldest(
-        &self,
-        present: &mut BTreeMap<u64, PresentStranger>,
-        is_meant: impl Fn(Host) -> bool,
-    ) {
+    fn drop_oldest(&self, present: &mut BTreeMap<u64, PresentStranger>, is_meant: impl Fn(Host) -> bool) {
         let oldest = present.iter().find(|(_, other)| is_meant(other.host));
         let Some(number) = oldest.map(|(number, _)| *number) else {
             return;
@@ -164,10 +153,7 @@ mod tests {
     /// Returns the positions in `held` of those that were dropped.
     fn dropped_positions(held: &[Stranger]) -> Vec<usize> {
         let dropped = held.iter().enumerate();
-        dropped
-            .filter(|(_, stranger)| stranger.dropped.is_cancelled())
-            .map(|(place, _)| place)
-            .collect()
+        dropped.filter(|(_, stranger)| stranger.dropped.is_cancelled()).map(|(place, _)| place).collect()
     }
 
     #[test]
@@ -179,10 +165,7 @@ mod tests {
         held.push(enter(&strangers, "2001:db8::ffff"));
         held.push(enter(&strangers, "2001:db8:0:1::1"));
         assert_eq!(dropped_positions(&held), [1], "the oldest of the same host");
-        assert_eq!(
-            (strangers.dropped_count(), strangers.count()),
-            (1, OF_A_HOST + 2)
-        );
+        assert_eq!((strangers.dropped_count(), strangers.count()), (1, OF_A_HOST + 2));
         drop(held);
         assert_eq!(strangers.count(), 0);
     }
@@ -191,16 +174,11 @@ mod tests {
     fn eight_hosts_that_say_nothing_keep_nobody_out_and_end_nobody_elses() {
         let strangers = Arc::new(Strangers::new(DESCRIPTORS));
         let robot = enter(&strangers, "203.0.113.9");
-        let silent: Vec<Stranger> = (0..4 * ALL)
-            .map(|n| enter(&strangers, &format!("198.51.100.{}", n % 8)))
-            .collect();
+        let silent: Vec<Stranger> = (0..4 * ALL).map(|n| enter(&strangers, &format!("198.51.100.{}", n % 8))).collect();
         let others = [robot, enter(&strangers, "203.0.113.10")];
         assert_eq!(dropped_positions(&others), [0; 0]);
         assert_eq!(strangers.count(), ALL);
-        assert_eq!(
-            dropped_positions(&silent).len(),
-            4 * ALL - (ALL - others.len())
-        );
+        assert_eq!(dropped_positions(&silent).len(), 4 * ALL - (ALL - others.len()));
     }
 
     #[test]
@@ -208,9 +186,7 @@ mod tests {
         let strangers = Arc::new(Strangers::new(DESCRIPTORS));
         let robot = enter(&strangers, "2001:db8:1::1");
         // Each is another host.
-        let silent: Vec<Stranger> = (0..2 * ALL)
-            .map(|n| enter(&strangers, &format!("2001:db8:2:{n:x}::1")))
-            .collect();
+        let silent: Vec<Stranger> = (0..2 * ALL).map(|n| enter(&strangers, &format!("2001:db8:2:{n:x}::1"))).collect();
         assert_eq!(dropped_positions(&[robot]), [0; 0]);
         assert_eq!(dropped_positions(&silent).len(), ALL + 1);
     }
@@ -219,14 +195,8 @@ mod tests {
     fn all_together_are_bounded_whoever_they_are() {
         // The usual default limit of a shell.
         let strangers = Arc::new(Strangers::new(1024));
-        let held: Vec<Stranger> = (0..1_100)
-            .map(|n| {
-                enter(
-                    &strangers,
-                    if n % 2 == 0 { "127.0.0.1" } else { "192.0.2.7" },
-                )
-            })
-            .collect();
+        let held: Vec<Stranger> =
+            (0..1_100).map(|n| enter(&strangers, if n % 2 == 0 { "127.0.0.1" } else { "192.0.2.7" })).collect();
         assert_eq!(strangers.count(), 1024 / SHARE as usize);
         let left = held.last().expect("one");
         assert!(!left.dropped.is_cancelled(), "the newest stays");
@@ -239,9 +209,7 @@ mod tests {
         let strangers = Arc::new(Strangers::new(DESCRIPTORS));
         let known = enter(&strangers, "198.51.100.1");
         known.admit();
-        let held: Vec<Stranger> = (0..=OF_A_HOST)
-            .map(|_| enter(&strangers, "198.51.100.1"))
-            .collect();
+        let held: Vec<Stranger> = (0..=OF_A_HOST).map(|_| enter(&strangers, "198.51.100.1")).collect();
         assert_eq!(dropped_positions(&held), [0]);
         held[0].wait_until_dropped().await;
         assert!(!known.dropped.is_cancelled());

@@ -26,10 +26,7 @@ const CHUNK: usize = 64 << 10;
 static PACKING: Semaphore = Semaphore::const_new(2);
 
 /// `/stubs`: services and architectures.
-pub async fn list(
-    State(app): State<Arc<App>>,
-    Extension(caller): Extension<Caller>,
-) -> Result<Json<Stubs>, Error> {
+pub async fn list(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>) -> Result<Json<Stubs>, Error> {
     let mut services = app.state.service_names()?;
     services.retain(|name| caller.can_see(&app, name));
     let programs = privilege::run_sync(StubPrograms::find_installed);
@@ -67,22 +64,17 @@ pub async fn archive(
 ) -> Result<Response, Error> {
     let Some((name, is_signature)) = parse_file_name(&file) else {
         return Err(Error::UnknownPath {
-            path: format!(
-                "{}; a stub is at /stubs/NAME.tar.gz, its signature at /stubs/NAME.tar.gz.sig",
-                uri.path()
-            ),
+            path: format!("{}; a stub is at /stubs/NAME.tar.gz, its signature at /stubs/NAME.tar.gz.sig", uri.path()),
         });
     };
     let revision = app.catalogue.current_revision(name)?;
-    let program = privilege::run_sync(StubPrograms::find_installed)
-        .for_architecture(asked.arch.as_deref())?;
+    let program = privilege::run_sync(StubPrograms::find_installed).for_architecture(asked.arch.as_deref())?;
     let portal = stub_portal(&app, &caller, &headers);
     let inventory = app.catalogue.revision_contents(&revision).await?.inventory;
     let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
     let key = Arc::clone(&app.signing);
-    let packing =
-        move || stubs::build_archive(&store, &revision, &inventory, &program, &portal, &key);
+    let packing = move || stubs::build_archive(&store, &revision, &inventory, &program, &portal, &key);
     // The semaphore is never closed.
     let turn = PACKING.acquire().await;
     let archive = privilege::spawn_blocking(packing).await;
@@ -94,18 +86,9 @@ pub async fn archive(
     }
     let headers = [
         (header::CONTENT_TYPE, "application/gzip".to_owned()),
-        (
-            header::CONTENT_DISPOSITION,
-            format!("attachment; filename=\"{name}.tar.gz\""),
-        ),
-        (
-            header::HeaderName::from_static(ARCHITECTURE),
-            architecture.to_owned(),
-        ),
-        (
-            header::HeaderName::from_static(SIGNATURE),
-            sign::to_single_line(&archive.signature),
-        ),
+        (header::CONTENT_DISPOSITION, format!("attachment; filename=\"{name}.tar.gz\"")),
+        (header::HeaderName::from_static(ARCHITECTURE), architecture.to_owned()),
+        (header::HeaderName::from_static(SIGNATURE), sign::to_single_line(&archive.signature)),
     ];
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(archive.file), CHUNK);
     Ok((headers, Body::from_stream(stream)).into_response())
@@ -116,14 +99,13 @@ pub async fn archive(
 /// its fingerprint, whatever the name; one signed by an authority is valid only for the names in it. A trusted proxy
 /// is believed.
 fn stub_portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
-    let host = headers
-        .get(header::HOST)
-        .and_then(|host| host.to_str().ok())
-        .filter(|host| stubs::is_authority(host))
-        .filter(|host| match &app.tls {
-            Some(tls) if !caller.forwarded => tls.is_self_signed() || tls.is_valid_for_host(host),
-            _ => true,
-        });
+    let host =
+        headers.get(header::HOST).and_then(|host| host.to_str().ok()).filter(|host| stubs::is_authority(host)).filter(
+            |host| match &app.tls {
+                Some(tls) if !caller.forwarded => tls.is_self_signed() || tls.is_valid_for_host(host),
+                _ => true,
+            },
+        );
     let scheme = if caller.secure { "wss" } else { "ws" };
     let address = match (caller.peer, host) {
         (ConnectionPeer::Tcp(_), Some(host)) => format!("{scheme}://{host}"),
@@ -131,12 +113,6 @@ fn stub_portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
     };
     // Behind a proxy, robots see the proxy's certificate.
     let direct = !caller.forwarded;
-    let tls = app
-        .tls
-        .as_ref()
-        .filter(|tls| direct && tls.is_self_signed());
-    Portal {
-        address,
-        fingerprint: tls.map(|tls| tls.fingerprint().to_string()),
-    }
+    let tls = app.tls.as_ref().filter(|tls| direct && tls.is_self_signed());
+    Portal { address, fingerprint: tls.map(|tls| tls.fingerprint().to_string()) }
 }

@@ -16,9 +16,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
-use tokio_rustls::rustls::pki_types::{
-    CertificateDer, CertificateRevocationListDer, PrivateKeyDer,
-};
+use tokio_rustls::rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::{ClientHello, ResolvesServerCert, WebPkiClientVerifier};
 use tokio_rustls::rustls::sign::CertifiedKey;
 use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
@@ -71,8 +69,7 @@ impl ResolvesServerCert for CertificateResolver {
 
 /// Returns true if the offered protocols are those of an authority's validation (RFC 8737, section 3: exactly one).
 fn is_challenge<'a>(offered: Option<impl Iterator<Item = &'a [u8]>>) -> bool {
-    offered
-        .is_some_and(|mut offered| offered.next() == Some(ACME_TLS_1) && offered.next().is_none())
+    offered.is_some_and(|mut offered| offered.next() == Some(ACME_TLS_1) && offered.next().is_none())
 }
 
 /// Certificate for an authority's validation of a domain name.
@@ -116,19 +113,16 @@ fn build_config(
     lists: Vec<CertificateRevocationListDer<'static>>,
 ) -> Result<Arc<ServerConfig>, TlsError> {
     let provider = Arc::new(ring::default_provider());
-    let clients =
-        WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), Arc::clone(&provider))
-            .with_crls(lists)
-            // The daemon's own authority has no list: its robots are unpaired instead.
-            .allow_unknown_revocation_status()
-            .allow_unauthenticated()
-            .build()
-            .map_err(|error| rustls::Error::General(error.to_string()))?;
-    let builder =
-        ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
-    let mut config = builder
-        .with_client_cert_verifier(clients)
-        .with_cert_resolver(Arc::clone(shown) as Arc<dyn ResolvesServerCert>);
+    let clients = WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), Arc::clone(&provider))
+        .with_crls(lists)
+        // The daemon's own authority has no list: its robots are unpaired instead.
+        .allow_unknown_revocation_status()
+        .allow_unauthenticated()
+        .build()
+        .map_err(|error| rustls::Error::General(error.to_string()))?;
+    let builder = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
+    let mut config =
+        builder.with_client_cert_verifier(clients).with_cert_resolver(Arc::clone(shown) as Arc<dyn ResolvesServerCert>);
     config.alpn_protocols = vec![HTTP_1_1.to_vec(), ACME_TLS_1.to_vec()];
     Ok(Arc::new(config))
 }
@@ -152,20 +146,12 @@ impl Tls {
             current: RwLock::new(load_certified_key(chain, key)?),
             challenges: RwLock::default(),
         });
-        Ok(Tls {
-            config: RwLock::new(build_config(&roots, &shown, Vec::new())?),
-            shown,
-            roots,
-            trusts_others,
-        })
+        Ok(Tls { config: RwLock::new(build_config(&roots, &shown, Vec::new())?), shown, roots, trusts_others })
     }
 
     /// Replaces the revocation lists: the certificates they name are refused from now on. TLS sessions cannot be
     /// resumed across this change. Expired lists remain in force, so that an authority that is late readmits nobody.
-    pub fn set_revocation_lists(
-        &self,
-        lists: Vec<CertificateRevocationListDer<'static>>,
-    ) -> Result<(), TlsError> {
+    pub fn set_revocation_lists(&self, lists: Vec<CertificateRevocationListDer<'static>>) -> Result<(), TlsError> {
         let config = build_config(&self.roots, &self.shown, lists)?;
         *self.config.write() = config;
         Ok(())
@@ -185,9 +171,7 @@ impl Tls {
     pub fn set_challenges(&self, challenges: Vec<Challenge>) -> Result<(), TlsError> {
         let answers = challenges.into_iter().map(|challenge| {
             // Not checked, because its critical extension is understood only by authorities.
-            let key = ring::default_provider()
-                .key_provider
-                .load_private_key(challenge.key)?;
+            let key = ring::default_provider().key_provider.load_private_key(challenge.key)?;
             let shown = CertifiedKey::new(vec![challenge.certificate], key);
             Ok((challenge.name.to_ascii_lowercase(), Arc::new(shown)))
         });
@@ -219,10 +203,7 @@ impl Tls {
     /// Returns true if the current certificate is valid for a host, optionally followed by a port.
     pub fn is_valid_for_host(&self, authority: &str) -> bool {
         let shown = self.shown.current.read();
-        shown
-            .cert
-            .first()
-            .is_some_and(|certificate| ::tls::is_valid_for_host(certificate, authority))
+        shown.cert.first().is_some_and(|certificate| ::tls::is_valid_for_host(certificate, authority))
     }
 
     /// Returns true if authorities other than the daemon's may sign robots' certificates.
@@ -286,15 +267,8 @@ pub(crate) fn plain_text_router() -> Router {
 }
 
 async fn refuse(uri: Uri, headers: HeaderMap) -> Response {
-    let host = headers
-        .get(header::HOST)
-        .and_then(|host| host.to_str().ok())
-        .unwrap_or("HOST:PORT");
-    let scheme = if crate::headers::is_upgrade(&headers) {
-        "wss"
-    } else {
-        "https"
-    };
+    let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or("HOST:PORT");
+    let scheme = if crate::headers::is_upgrade(&headers) { "wss" } else { "https" };
     let instead = format!("{scheme}://{host}{}", uri.path());
     let mut response = Error::PlainText { instead }.into_response();
     let close = HeaderValue::from_static("close");

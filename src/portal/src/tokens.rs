@@ -37,9 +37,7 @@ pub enum AuthRefusal {
     #[error("the auth message neither contains a known token nor is signed by one")]
     Unknown,
     /// It was accepted before.
-    #[error(
-        "this auth message was used before; each is valid once: sign a new one (t, rand) for each connection"
-    )]
+    #[error("this auth message was used before; each is valid once: sign a new one (t, rand) for each connection")]
     Used,
 }
 
@@ -83,9 +81,7 @@ impl Tokens {
         let mut tokens = Tokens::default();
         for text in written {
             match text.strip_prefix("sha256:") {
-                Some(digest)
-                    if digest.len() == 64 && digest.chars().all(|c| c.is_ascii_hexdigit()) =>
-                {
+                Some(digest) if digest.len() == 64 && digest.chars().all(|c| c.is_ascii_hexdigit()) => {
                     tokens.hashes.push(digest.to_ascii_lowercase());
                 }
                 Some(digest) => return Err(TokenError::Digest(digest.to_owned())),
@@ -117,21 +113,14 @@ impl Tokens {
 
     /// Returns the hash of the token that `message` contains or is signed with, at `now` (seconds since 1970). A
     /// signed message is accepted once, so it cannot be replayed.
-    pub fn recognise_auth(
-        &self,
-        message: &AuthMessage,
-        now: f64,
-    ) -> Result<TokenHash, AuthRefusal> {
+    pub fn recognise_auth(&self, message: &AuthMessage, now: f64) -> Result<TokenHash, AuthRefusal> {
         if let Some(known) = self.recognise(&message.mac) {
             return Ok(known);
         }
         let mac = message.mac.to_ascii_lowercase();
         let fresh = (message.t - now).abs() <= CLOCK_DIFFERENCE && message.end > now;
-        let secret = self
-            .secrets
-            .iter()
-            .find(|secret| fresh && message.signature(secret) == mac)
-            .ok_or(AuthRefusal::Unknown)?;
+        let secret =
+            self.secrets.iter().find(|secret| fresh && message.signature(secret) == mac).ok_or(AuthRefusal::Unknown)?;
         let mut used = self.used.lock();
         used.retain(|_, until| *until >= now);
         // The MAC does not cover the fraction of `t`.
@@ -166,29 +155,16 @@ mod tests {
     use super::*;
 
     fn tokens(written: &[&str]) -> Tokens {
-        Tokens::new(
-            &written
-                .iter()
-                .map(|text| (*text).to_owned())
-                .collect::<Vec<_>>(),
-        )
-        .expect("valid tokens")
+        Tokens::new(&written.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>()).expect("valid tokens")
     }
 
     #[test]
     fn a_token_is_recognised_in_clear_and_by_its_hash() {
-        let known = tokens(&[
-            "open-sesame",
-            &format!("sha256:{}", hash("other-secret").to_uppercase()),
-        ]);
+        let known = tokens(&["open-sesame", &format!("sha256:{}", hash("other-secret").to_uppercase())]);
         assert_eq!(known.recognise("open-sesame"), Some(hash("open-sesame")));
         assert_eq!(known.recognise("other-secret"), Some(hash("other-secret")));
         assert_eq!(known.recognise("guess"), None);
-        assert_eq!(
-            known.recognise(&hash("other-secret")),
-            None,
-            "the hash itself opens nothing"
-        );
+        assert_eq!(known.recognise(&hash("other-secret")), None, "the hash itself opens nothing");
     }
 
     #[test]
@@ -217,28 +193,11 @@ mod tests {
     fn rosauth_messages_are_verified() {
         let known = tokens(&["open-sesame"]);
         let message = signed_message("open-sesame");
-        assert_eq!(
-            known.recognise_auth(&message, 1010.0),
-            Err(AuthRefusal::Unknown),
-            "too old"
-        );
-        let forged = AuthMessage {
-            client: "10.0.0.3".into(),
-            ..message.clone()
-        };
-        assert_eq!(
-            known.recognise_auth(&forged, 1003.0),
-            Err(AuthRefusal::Unknown),
-            "signed for another"
-        );
-        assert_eq!(
-            known.recognise_auth(&message, 1003.0),
-            Ok(hash("open-sesame"))
-        );
-        let plain = AuthMessage {
-            mac: "open-sesame".into(),
-            ..message
-        };
+        assert_eq!(known.recognise_auth(&message, 1010.0), Err(AuthRefusal::Unknown), "too old");
+        let forged = AuthMessage { client: "10.0.0.3".into(), ..message.clone() };
+        assert_eq!(known.recognise_auth(&forged, 1003.0), Err(AuthRefusal::Unknown), "signed for another");
+        assert_eq!(known.recognise_auth(&message, 1003.0), Ok(hash("open-sesame")));
+        let plain = AuthMessage { mac: "open-sesame".into(), ..message };
         for _ in 0..2 {
             assert_eq!(known.recognise_auth(&plain, 9e9), Ok(hash("open-sesame")));
         }
@@ -250,41 +209,23 @@ mod tests {
         let message = signed_message("open-sesame");
         let later = tokens(&["open-sesame"]);
         known.recognise_auth(&message, 996.0).expect("the first");
-        let upper = AuthMessage {
-            mac: message.mac.to_uppercase(),
-            ..message.clone()
-        };
-        let delayed = AuthMessage {
-            t: 1000.9,
-            ..message.clone()
-        };
+        let upper = AuthMessage { mac: message.mac.to_uppercase(), ..message.clone() };
+        let delayed = AuthMessage { t: 1000.9, ..message.clone() };
         for (again, now) in [(&message, 996.0), (&upper, 1004.0), (&delayed, 1005.8)] {
-            assert_eq!(
-                known.recognise_auth(again, now),
-                Err(AuthRefusal::Used),
-                "{now}"
-            );
+            assert_eq!(known.recognise_auth(again, now), Err(AuthRefusal::Used), "{now}");
         }
         // Messages too old to be accepted are forgotten.
-        let mut next = AuthMessage {
-            t: 1010.0,
-            ..message.clone()
-        };
+        let mut next = AuthMessage { t: 1010.0, ..message.clone() };
         next.mac = next.signature("open-sesame");
         known.recognise_auth(&next, 1010.0).expect("another one");
         assert_eq!(known.used.lock().len(), 1);
-        later
-            .recognise_auth(&message, 1000.0)
-            .expect("not used there");
+        later.recognise_auth(&message, 1000.0).expect("not used there");
     }
 
     #[test]
     fn a_resume_token_is_bound_to_who_shows_it() {
         let (one, two) = (hash("one"), hash("two"));
-        assert_eq!(
-            bind_resume_token(Some(&one), "mine"),
-            bind_resume_token(Some(&one), "mine")
-        );
+        assert_eq!(bind_resume_token(Some(&one), "mine"), bind_resume_token(Some(&one), "mine"));
         for other in [
             bind_resume_token(Some(&two), "mine"),
             bind_resume_token(None, "mine"),

@@ -35,11 +35,8 @@ pub async fn topics(
         return Err(Error::NotThereYet(id));
     };
     let part = {
-        let whose = InsideTarget {
-            service: handle.service(),
-            robot: &handle.robot,
-            object: format_args!("servant {id}"),
-        };
+        let whose =
+            InsideTarget { service: handle.service(), robot: &handle.robot, object: format_args!("servant {id}") };
         inside::inside_role(&app, &caller, whose)?
     };
     let place = app.inside.acquire(&id, &caller.who.principal.name)?;
@@ -61,12 +58,7 @@ pub async fn topics(
                 let ConnectionAccess::Granted(grants) = standing else {
                     return;
                 };
-                if ended
-                    || lines_of
-                        .send(to_published_topics(&figures, &grants))
-                        .await
-                        .is_err()
-                {
+                if ended || lines_of.send(to_published_topics(&figures, &grants)).await.is_err() {
                     return;
                 }
             }
@@ -92,8 +84,5 @@ fn to_published_topics(figures: &Figures, grants: &Grants) -> PublishedTopics {
         bandwidth: figures.bytes as f64 / seconds,
         latency: figures.age,
     };
-    PublishedTopics {
-        seconds,
-        topics: all.into_iter().map(topic).collect(),
-    }
+    PublishedTopics { seconds, topics: all.into_iter().map(topic).collect() }
 }

@@ -18,9 +18,7 @@ use crate::query;
 
 /// Returns the newest subprotocol that the viewer offers and this server supports.
 fn choose_protocol(headers: &HeaderMap) -> Result<&'static str, Error> {
-    let spoken = PROTOCOLS
-        .into_iter()
-        .find(|protocol| headers::protocols(headers).any(|offered| offered == *protocol));
+    let spoken = PROTOCOLS.into_iter().find(|protocol| headers::protocols(headers).any(|offered| offered == *protocol));
     spoken.ok_or_else(|| {
         Error::BadRequest(format!(
             "this address speaks {} to viewers, but the client offers none of these; Foxglove and Lichtblick do \
@@ -38,9 +36,7 @@ fn parse_depth(query: Option<&str>) -> Result<usize, Error> {
     let depth = said.parse().ok().filter(|depth| DEPTH.contains(depth));
     depth.ok_or_else(|| {
         let (least, most) = (DEPTH.start(), DEPTH.end());
-        Error::BadRequest(format!(
-            "depth={said:?} is not a number of messages from {least} to {most}"
-        ))
+        Error::BadRequest(format!("depth={said:?} is not a number of messages from {least} to {most}"))
     })
 }
 
@@ -55,29 +51,25 @@ pub async fn viewer(
     let protocol = choose_protocol(request.headers())?;
     let depth = parse_depth(request.uri().query())?;
     let unfinished = app.choreographer.bridge_options().unfinished;
-    door.upgrade(
-        request,
-        Some(protocol),
-        async move |looker, io, read_ahead| {
-            let handle = &looker.handle;
-            let options = ViewerOptions {
-                name: format!("{} at {} ({id})", handle.robot, handle.service()),
-                granted: looker.granted,
-                budget: looker.budget,
-                unfinished,
-                depth,
-            };
-            let servant = async {
-                let looked = looker.reach.open_inside().await;
-                looked.map(|looked| viewer::ViewedServant {
-                    bus: Arc::clone(&looked.bus),
-                    registry: Arc::clone(&looked.registry),
-                    ended: looked.ended.clone(),
-                    held: Box::new(looked),
-                })
-            };
-            viewer::serve(io, read_ahead, servant, options).await;
-            tracing::debug!("a viewer left servant {id}");
-        },
-    )
+    door.upgrade(request, Some(protocol), async move |looker, io, read_ahead| {
+        let handle = &looker.handle;
+        let options = ViewerOptions {
+            name: format!("{} at {} ({id})", handle.robot, handle.service()),
+            granted: looker.granted,
+            budget: looker.budget,
+            unfinished,
+            depth,
+        };
+        let servant = async {
+            let looked = looker.reach.open_inside().await;
+            looked.map(|looked| viewer::ViewedServant {
+                bus: Arc::clone(&looked.bus),
+                registry: Arc::clone(&looked.registry),
+                ended: looked.ended.clone(),
+                held: Box::new(looked),
+            })
+        };
+        viewer::serve(io, read_ahead, servant, options).await;
+        tracing::debug!("a viewer left servant {id}");
+    })
 }

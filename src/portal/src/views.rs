@@ -26,10 +26,7 @@ pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
         services: interface.services.len(),
         actions: interface.actions.len(),
         parameters: interface.parameters.len(),
-        servants: servants
-            .iter()
-            .filter(|servant| servant.service() == revision.service)
-            .count(),
+        servants: servants.iter().filter(|servant| servant.service() == revision.service).count(),
         limits: revision.plan.limits.or(app.choreographer.default_limits()),
     }
 }
@@ -54,10 +51,7 @@ pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
             .plan
             .nodes
             .iter()
-            .map(|node| Node {
-                name: node.name.clone(),
-                argv: node.argv.clone(),
-            })
+            .map(|node| Node { name: node.name.clone(), argv: node.argv.clone() })
             .collect(),
         interface: interface(current.flavour.ros.ros_version(), &current.interface),
         shared: current.plan.shared,
@@ -100,10 +94,7 @@ fn interface(ros: RosVersion, of: &recorded::Interface) -> Interface {
         needs: of
             .needs
             .iter()
-            .map(|need| api::interface::Need {
-                name: need.name.clone(),
-                nodes: need.nodes.clone(),
-            })
+            .map(|need| api::interface::Need { name: need.name.clone(), nodes: need.nodes.clone() })
             .collect(),
         requests: of.decided_requests(ros).iter().map(request).collect(),
     }
@@ -203,10 +194,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
 
 /// Returns the servants' total usage, and the machine's pressure.
 async fn total_usage(servants: &[Arc<Handle>]) -> api::Usage {
-    let mut sum = api::Usage {
-        pressure: servant::host::pressure(),
-        ..api::Usage::default()
-    };
+    let mut sum = api::Usage { pressure: servant::host::pressure(), ..api::Usage::default() };
     for servant in servants {
         if let Some(usage) = choreographer::usage(servant).await {
             sum.cpu_usec += usage.cpu_usec;

@@ -53,40 +53,25 @@ pub struct Account {
 
 impl Default for Account {
     fn default() -> Self {
-        Self {
-            user: DEFAULT_USER,
-            group: DEFAULT_USER,
-        }
+        Self { user: DEFAULT_USER, group: DEFAULT_USER }
     }
 }
 
 impl Account {
     /// Looks up a user by name or number. A number need not have a name.
     pub fn find(written: &str) -> Result<Self, Error> {
-        let unknown = || Error::Unknown {
-            written: written.to_owned(),
-        };
+        let unknown = || Error::Unknown { written: written.to_owned() };
         let account = match written.parse::<u32>() {
-            Ok(number) => Self {
-                user: number,
-                group: number,
-            },
+            Ok(number) => Self { user: number, group: number },
             Err(_) => {
                 let found = User::from_name(written).ok().flatten();
                 let found = found.ok_or_else(unknown)?;
-                Self {
-                    user: found.uid.as_raw(),
-                    group: found.gid.as_raw(),
-                }
+                Self { user: found.uid.as_raw(), group: found.gid.as_raw() }
             }
         };
         // The largest number means "unchanged" to setresuid(2).
         let real = |number| number != 0 && number != u32::MAX;
-        if real(account.user) && real(account.group) {
-            Ok(account)
-        } else {
-            Err(unknown())
-        }
+        if real(account.user) && real(account.group) { Ok(account) } else { Err(unknown()) }
     }
 }
 
@@ -107,8 +92,7 @@ pub fn retain_capabilities(capabilities: &[Capability]) -> Result<(), Error> {
 }
 
 fn set_capabilities(kept: &CapsHashSet) -> Result<(), Error> {
-    let bounding =
-        caps::read(None, CapSet::Bounding).map_err(capabilities_error("read the bounding set"))?;
+    let bounding = caps::read(None, CapSet::Bounding).map_err(capabilities_error("read the bounding set"))?;
     // Without this capability nothing can be removed from the bounding set; nor can an executed program gain from the
     // set what this thread does not have.
     let may = caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP);
@@ -118,15 +102,11 @@ fn set_capabilities(kept: &CapsHashSet) -> Result<(), Error> {
                 .map_err(capabilities_error("give up a capability for good"))?;
         }
     }
-    let held =
-        caps::read(None, CapSet::Permitted).map_err(capabilities_error("read the capabilities"))?;
+    let held = caps::read(None, CapSet::Permitted).map_err(capabilities_error("read the capabilities"))?;
     let kept: CapsHashSet = held.intersection(kept).copied().collect();
-    caps::clear(None, CapSet::Ambient)
-        .map_err(capabilities_error("clear the ambient capabilities"))?;
-    caps::clear(None, CapSet::Inheritable)
-        .map_err(capabilities_error("clear the inheritable capabilities"))?;
-    caps::set(None, CapSet::Effective, &kept)
-        .map_err(capabilities_error("give up capabilities"))?;
+    caps::clear(None, CapSet::Ambient).map_err(capabilities_error("clear the ambient capabilities"))?;
+    caps::clear(None, CapSet::Inheritable).map_err(capabilities_error("clear the inheritable capabilities"))?;
+    caps::set(None, CapSet::Effective, &kept).map_err(capabilities_error("give up capabilities"))?;
     caps::set(None, CapSet::Permitted, &kept).map_err(capabilities_error("give up capabilities"))
 }
 
@@ -139,11 +119,8 @@ pub fn confine(account: Account) -> Result<(), Error> {
 
 /// Confines the calling thread like [`confine`], but leaves it the right to read every file.
 pub(crate) fn confine_to_reading(account: Account) -> Result<(), Error> {
-    let failed = |errno: nix::errno::Errno| Error::Account {
-        user: account.user,
-        group: account.group,
-        source: errno.into(),
-    };
+    let failed =
+        |errno: nix::errno::Errno| Error::Account { user: account.user, group: account.group, source: errno.into() };
     // Otherwise changing the user id would clear the capabilities.
     nix::sys::prctl::set_keepcaps(true).map_err(failed)?;
     confine_to(account, &CapsHashSet::from([READING]))?;
@@ -151,16 +128,11 @@ pub(crate) fn confine_to_reading(account: Account) -> Result<(), Error> {
 }
 
 fn confine_to(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
-    let failed_for_account = |source| Error::Account {
-        user: account.user,
-        group: account.group,
-        source,
-    };
+    let failed_for_account = |source| Error::Account { user: account.user, group: account.group, source };
     let user = nix::unistd::geteuid().as_raw();
     if user != account.user {
         // The bounding set goes first: changing it needs a capability.
-        let bounding = caps::read(None, CapSet::Bounding)
-            .map_err(capabilities_error("read the bounding set"))?;
+        let bounding = caps::read(None, CapSet::Bounding).map_err(capabilities_error("read the bounding set"))?;
         for capability in bounding.difference(kept) {
             caps::drop(None, CapSet::Bounding, *capability)
                 .map_err(capabilities_error("give up a capability for good"))?;
@@ -191,13 +163,7 @@ fn become_account(account: Account) -> io::Result<()> {
 /// Verifies with the kernel that the calling thread has nothing beyond `kept`.
 fn verify_confined(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
     let left = |left: String| Err(Error::Left { left });
-    for set in [
-        CapSet::Effective,
-        CapSet::Permitted,
-        CapSet::Inheritable,
-        CapSet::Ambient,
-        CapSet::Bounding,
-    ] {
+    for set in [CapSet::Effective, CapSet::Permitted, CapSet::Inheritable, CapSet::Ambient, CapSet::Bounding] {
         let held = caps::read(None, set).map_err(capabilities_error("read the capabilities"))?;
         let more = held.difference(kept).count();
         if more > 0 {

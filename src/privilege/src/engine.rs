@@ -74,9 +74,9 @@ impl<T> Future for Task<T> {
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
         match &mut self.0 {
             EngineHandle::Here(task) => Pin::new(task).poll(context),
-            EngineHandle::There(task) => Pin::new(task)
-                .poll(context)
-                .map(|outcome| outcome.and_then(|outcome| outcome)),
+            EngineHandle::There(task) => {
+                Pin::new(task).poll(context).map(|outcome| outcome.and_then(|outcome| outcome))
+            }
         }
     }
 }
@@ -88,9 +88,7 @@ pub fn spawn_blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'stat
     Task(match handoff_target() {
         None => EngineHandle::Here(tokio::task::spawn_blocking(work)),
         // Spawned from there, since a thread inherits the privileges of the one that starts it.
-        Some(engine) => {
-            EngineHandle::There(engine.spawn(async { tokio::task::spawn_blocking(work).await }))
-        }
+        Some(engine) => EngineHandle::There(engine.spawn(async { tokio::task::spawn_blocking(work).await })),
     })
 }
 
@@ -129,9 +127,7 @@ pub fn run_sync<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) ->
         let _ = sender.send(work());
     };
     engine.spawn(handed_over.in_current_span());
-    receiver
-        .recv()
-        .expect("the engine's threads outlive the others, and their work does not panic")
+    receiver.recv().expect("the engine's threads outlive the others, and their work does not panic")
 }
 
 #[cfg(test)]

@@ -51,9 +51,7 @@ pub enum Error {
         left: String,
     },
     /// Not a user, or not one that can be used.
-    #[error(
-        "portal_user = {written:?} is not a user of this machine, nor the number of one other than root"
-    )]
+    #[error("portal_user = {written:?} is not a user of this machine, nor the number of one other than root")]
     Unknown {
         /// Value in the configuration.
         written: String,

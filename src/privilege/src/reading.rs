@@ -17,9 +17,7 @@ pub fn run_as_reader<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     }
     thread::scope(|scope| {
         let reader = spawn_reader(scope, work);
-        reader
-            .join()
-            .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        reader.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     })
 }
 

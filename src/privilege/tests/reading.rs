@@ -40,14 +40,9 @@ fn what_is_roots_is_read_and_nothing_else_is_done() {
         let said = broken.expect_err("it panicked");
         assert_eq!(said.downcast_ref(), Some(&"of the work"));
     };
-    let others = tokio::runtime::Builder::new_current_thread()
-        .build()
-        .expect("a runtime");
+    let others = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
     others.block_on(async { spawn_blocking(work).await.expect("done") });
     // Without privileges to drop, the work runs on the calling thread.
-    assert_eq!(
-        run_as_reader(|| thread::current().id()),
-        thread::current().id()
-    );
+    assert_eq!(run_as_reader(|| thread::current().id()), thread::current().id());
     engine.end(std::time::Duration::from_secs(1));
 }

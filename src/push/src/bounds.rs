@@ -36,24 +36,12 @@ pub(super) struct PushBudget<'a> {
 
 impl<'a> PushBudget<'a> {
     /// Creates the budget of a push that works in `directory`.
-    pub(super) fn new(
-        options: &'a Options,
-        directory: PathBuf,
-        disks: &'a Disks,
-    ) -> PushBudget<'a> {
-        PushBudget {
-            options,
-            directory,
-            disks,
-            time: options.time,
-        }
+    pub(super) fn new(options: &'a Options, directory: PathBuf, disks: &'a Disks) -> PushBudget<'a> {
+        PushBudget { options, directory, disks, time: options.time }
     }
 
     /// Runs a part of the push within the remaining budget; cancels it if the budget is exceeded.
-    pub(super) async fn run_within<T>(
-        &mut self,
-        work: impl Future<Output = Result<T, Error>>,
-    ) -> Result<T, Error> {
+    pub(super) async fn run_within<T>(&mut self, work: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
         let began = Instant::now();
         let outcome = tokio::select! {
             outcome = work => outcome,
@@ -78,11 +66,7 @@ async fn wait_until_exceeded(options: &Options, time: Duration, directory: &Path
             "push fewer files, or raise disk in [push] of the configuration",
         ),
     };
-    Error::Failed {
-        message: format!("the push was aborted: {what}"),
-        next: Some(next.to_owned()),
-        log: Vec::new(),
-    }
+    Error::Failed { message: format!("the push was aborted: {what}"), next: Some(next.to_owned()), log: Vec::new() }
 }
 
 /// Waits until the files of a build exceed their limit; returns the reason.
@@ -93,9 +77,7 @@ async fn wait_until_overfull(most: Size, directory: &Path) -> String {
     loop {
         ticks.tick().await;
         let of = directory.to_owned();
-        let taken = privilege::spawn_blocking(move || used_bytes(&of))
-            .await
-            .unwrap_or(0);
+        let taken = privilege::spawn_blocking(move || used_bytes(&of)).await.unwrap_or(0);
         if let Some((at, size, then)) = known
             && Instant::now() < at + MEASURE_EVERY
             && size + taken.saturating_sub(then) <= most.0
@@ -153,10 +135,7 @@ mod tests {
     use super::*;
 
     fn options() -> Options {
-        Options {
-            disk: Size(1 << 20),
-            ..Options::unlimited()
-        }
+        Options { disk: Size(1 << 20), ..Options::unlimited() }
     }
 
     #[tokio::test]
@@ -175,10 +154,7 @@ mod tests {
         .await
         .expect("no panic");
         let told = exceeded.await.message_and_advice();
-        assert!(
-            told.contains("1M") && told.contains("raise disk in [push] of the configuration"),
-            "{told}"
-        );
+        assert!(told.contains("1M") && told.contains("raise disk in [push] of the configuration"), "{told}");
     }
 
     #[tokio::test]
@@ -186,26 +162,17 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let directory = place.path().join("push-1");
         std::fs::create_dir_all(directory.join(vec!["d"; 300].join("/"))).expect("made");
-        let options = Options {
-            disk: Size(1 << 30),
-            ..options()
-        };
-        let told = wait_until_exceeded(&options, options.time, &directory)
-            .await
-            .message_and_advice();
+        let options = Options { disk: Size(1 << 30), ..options() };
+        let told = wait_until_exceeded(&options, options.time, &directory).await.message_and_advice();
         assert!(told.contains("directories deep"), "{told}");
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_push_that_takes_too_long_is_told_so() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = wait_until_exceeded(&options(), options().time, &place.path().join("none"))
-            .await
-            .message_and_advice();
-        assert!(
-            told.contains("longer than 7200 s") && told.contains("raise time"),
-            "{told}"
-        );
+        let told =
+            wait_until_exceeded(&options(), options().time, &place.path().join("none")).await.message_and_advice();
+        assert!(told.contains("longer than 7200 s") && told.contains("raise time"), "{told}");
     }
 
     #[test]
@@ -219,8 +186,7 @@ mod tests {
         let first = place.path().join("0");
         std::fs::write(&first, vec![1; 1 << 20]).expect("written");
         for number in 0..10 {
-            std::fs::hard_link(&first, place.path().join(format!("again-{number}")))
-                .expect("linked");
+            std::fs::hard_link(&first, place.path().join(format!("again-{number}"))).expect("linked");
         }
         let after = measure_tree(place.path().to_owned(), u64::MAX).expect("measured");
         let grown = after - before;

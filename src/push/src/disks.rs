@@ -24,10 +24,7 @@ pub(super) struct Disks {
 impl Disks {
     /// Requires `free` bytes on each disk, or 1/20 of its size if that is less.
     pub(super) fn new(home: &Path, cache: &Path, free: Size) -> Self {
-        Self {
-            directories: vec![home.to_owned(), cache.to_owned()],
-            free,
-        }
+        Self { directories: vec![home.to_owned(), cache.to_owned()], free }
     }
 
     /// Rejects a push if one of the disks has less free space.
@@ -56,9 +53,7 @@ impl Disks {
         self.directories.iter().find_map(|directory| {
             let about = statvfs(directory).ok()?;
             let size = about.blocks().saturating_mul(about.fragment_size());
-            let left = about
-                .blocks_available()
-                .saturating_mul(about.fragment_size());
+            let left = about.blocks_available().saturating_mul(about.fragment_size());
             let needed = self.free.0.min(size / PART);
             (left < needed).then(|| {
                 format!(
@@ -128,14 +123,8 @@ mod tests {
         });
         assert_eq!(said.0, None);
         let lacking = said.1.expect("it is full");
-        assert!(
-            lacking.contains("no space") && lacking.contains("small"),
-            "{lacking}"
-        );
-        assert!(
-            lacking.contains(&format!("{} must stay free", (4 << 20) / PART)),
-            "{lacking}"
-        );
+        assert!(lacking.contains("no space") && lacking.contains("small"), "{lacking}");
+        assert!(lacking.contains(&format!("{} must stay free", (4 << 20) / PART)), "{lacking}");
         let words = no_space_error(lacking).message_and_advice();
         assert!(words.contains("lower free or cache"), "{words}");
     }

@@ -14,9 +14,7 @@ use package::interface::Interface;
 use package::inventory::{Inventory, SearchHints};
 use package::names::{is_graph_name, is_package};
 use package::requests::Reason;
-use rootfs_builder::{
-    BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, find_components_problem,
-};
+use rootfs_builder::{BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, find_components_problem};
 use ros::flavour::Flavour;
 use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
@@ -76,35 +74,23 @@ impl ServiceRecord {
     fn read(layout: &Tree, annotations: &BTreeMap<String, String>) -> Result<Self, Error> {
         let Some(digest) = annotations.get(RECORD) else {
             return Err(refusal(
-                "the image is not an exported service: it does not state how its nodes are started"
-                    .to_owned(),
+                "the image is not an exported service: it does not state how its nodes are started".to_owned(),
                 "push the package itself, or a file of cloudroidctl export",
             ));
         };
-        let bytes = digest
-            .parse()
-            .and_then(|digest| image::read_layout_document(layout, &digest))
-            .map_err(receive_error)?;
+        let bytes =
+            digest.parse().and_then(|digest| image::read_layout_document(layout, &digest)).map_err(receive_error)?;
         if bytes.len() > LARGEST_RECORD {
-            return Err(unreadable_record(&format!(
-                "it has {} bytes; the limit is {LARGEST_RECORD}",
-                bytes.len()
-            )));
+            return Err(unreadable_record(&format!("it has {} bytes; the limit is {LARGEST_RECORD}", bytes.len())));
         }
-        let record: Self = serde_json::from_slice(&bytes)
-            .map_err(|error| unreadable_record(&error.to_string()))?;
+        let record: Self = serde_json::from_slice(&bytes).map_err(|error| unreadable_record(&error.to_string()))?;
         if record.format != FORMAT {
             return Err(refusal(
-                format!(
-                    "the record of the exported service has format {}; supported is {FORMAT}",
-                    record.format
-                ),
+                format!("the record of the exported service has format {}; supported is {FORMAT}", record.format),
                 "export it with this server's version of cloudroidctl",
             ));
         }
-        record
-            .check()
-            .map_err(|error| unreadable_record(&error.to_string()))?;
+        record.check().map_err(|error| unreadable_record(&error.to_string()))?;
         Ok(record)
     }
 
@@ -134,12 +120,7 @@ impl ServiceRecord {
         if let Some(problem) = find_components_problem(&self.plan.components, &is_node) {
             return Err(RecordError::Components(problem));
         }
-        if let Some(name) = self
-            .plan
-            .parameters
-            .keys()
-            .find(|name| !is_graph_name(name))
-        {
+        if let Some(name) = self.plan.parameters.keys().find(|name| !is_graph_name(name)) {
             return Err(RecordError::Parameter(name.clone()));
         }
         Ok(())
@@ -152,11 +133,7 @@ impl ServiceRecord {
         let interface = interface.map_err(|error| unreadable_record(&error.to_string()))?;
         let printable = self.source.chars().filter(|c| !c.is_control());
         let before: String = printable.take(LONGEST_SOURCE).collect();
-        let source = if asked.source.is_empty() {
-            before
-        } else {
-            format!("{}, exported from {before}", asked.source)
-        };
+        let source = if asked.source.is_empty() { before } else { format!("{}, exported from {before}", asked.source) };
         Ok(PushOptions {
             name: Some(asked.name.clone().unwrap_or_else(|| self.service.clone())),
             limits: plan.limits,
@@ -180,10 +157,7 @@ impl ServiceRecord {
 
     /// Returns the rows to write if the service has no dictionary yet.
     pub(super) fn new_rows(&self) -> NewRows {
-        NewRows {
-            rows: self.dictionary.clone(),
-            replace: false,
-        }
+        NewRows { rows: self.dictionary.clone(), replace: false }
     }
 }
 
@@ -228,9 +202,8 @@ fn check_node(node: &NodeSpec) -> Result<(), RecordError> {
 }
 
 fn check_environment(variables: &BTreeMap<String, String>) -> Result<(), RecordError> {
-    let is_good = |(name, value): &(&String, &String)| {
-        !name.is_empty() && !name.contains(['=', '\0']) && !value.contains('\0')
-    };
+    let is_good =
+        |(name, value): &(&String, &String)| !name.is_empty() && !name.contains(['=', '\0']) && !value.contains('\0');
     match variables.iter().find(|variable| !is_good(variable)) {
         Some((name, _)) => Err(RecordError::Environment(name.clone())),
         None => Ok(()),
@@ -256,11 +229,9 @@ impl Pusher {
         report.step("importing the exported service").await;
         let store = Arc::clone(self.catalogue.images());
         let (asked, limits) = (options.clone(), self.options.clone());
-        let work =
-            blocking::cancel_with_caller(move || import_image(&store, &tree, &asked, &limits));
-        let imported = privilege::spawn_blocking(work)
-            .await
-            .map_err(|_| Error::Internal("importing an exported service"))??;
+        let work = blocking::cancel_with_caller(move || import_image(&store, &tree, &asked, &limits));
+        let imported =
+            privilege::spawn_blocking(work).await.map_err(|_| Error::Internal("importing an exported service"))??;
         Ok(PushedImage::Imported(Box::new(imported)))
     }
 
@@ -272,12 +243,9 @@ impl Pusher {
             return;
         }
         let outcome = match rows.rows.iter().try_for_each(choreographer::check_row) {
-            _ if rows.rows.len() > choreographer::MOST_ROWS => {
-                Err("it has too many entries".to_owned())
-            }
+            _ if rows.rows.len() > choreographer::MOST_ROWS => Err("it has too many entries".to_owned()),
             Err(error) => Err(error.to_string()),
-            Ok(()) => (self.catalogue.initialize_dictionary(name, &rows))
-                .map_err(|error| error.to_string()),
+            Ok(()) => (self.catalogue.initialize_dictionary(name, &rows)).map_err(|error| error.to_string()),
         };
         let count = rows.rows.len();
         let words = match outcome {
@@ -285,9 +253,7 @@ impl Pusher {
                 "its SLA table has {count} entries that were measured on another machine; measure again here with: \
                     cloudroidctl calibrate {name}"
             ),
-            Ok(false) => format!(
-                "{name} keeps its existing SLA table; the {count} exported entries were not imported"
-            ),
+            Ok(false) => format!("{name} keeps its existing SLA table; the {count} exported entries were not imported"),
             Err(reason) => format!("the exported SLA table was not imported: {reason}"),
         };
         report.try_warning(words);
@@ -301,12 +267,7 @@ pub(super) fn is_exported(tree: &Path) -> bool {
 
 /// Rejects options that are determined by the exported service.
 fn check_options(asked: &PushOptions) -> Result<(), Error> {
-    let left = PushOptions {
-        name: None,
-        rollout: None,
-        source: String::new(),
-        ..asked.clone()
-    };
+    let left = PushOptions { name: None, rollout: None, source: String::new(), ..asked.clone() };
     if left != PushOptions::default() {
         return Err(OptionsError::Exported.into());
     }
@@ -322,11 +283,7 @@ fn import_image(
 ) -> Result<ImportedService, Error> {
     let hold = store.hold()?;
     let layout = Tree::open(tree).map_err(|error| unreadable_record(&error.to_string()))?;
-    let bounds = image::Limits {
-        entries: limits.entries,
-        bytes: limits.unpacked.0,
-        ..image::Limits::default()
-    };
+    let bounds = image::Limits { entries: limits.entries, bytes: limits.unpacked.0, ..image::Limits::default() };
     let received = store.receive(&layout, &bounds).map_err(receive_error)?;
     let record = privilege::run_as_reader(|| ServiceRecord::read(&layout, &received.annotations))?;
     let inventory = take_inventory(store, &received, &record)?;
@@ -347,37 +304,19 @@ fn import_image(
         inventory,
         hold,
     };
-    Ok(ImportedService {
-        record,
-        options,
-        built,
-    })
+    Ok(ImportedService { record, options, built })
 }
 
 /// Takes the inventory of the image, regardless of the record.
-fn take_inventory(
-    store: &image::Store,
-    received: &ReceivedImage,
-    record: &ServiceRecord,
-) -> Result<Inventory, Error> {
+fn take_inventory(store: &image::Store, received: &ReceivedImage, record: &ServiceRecord) -> Result<Inventory, Error> {
     let layers = received.image.spec.layers.iter();
-    let trees: Result<Vec<_>, _> = layers
-        .map(|layer| store.ensure_extracted(&layer.diff_id))
-        .collect();
+    let trees: Result<Vec<_>, _> = layers.map(|layer| store.ensure_extracted(&layer.diff_id)).collect();
     let trees = trees.map_err(receive_error)?;
     let nodes = &record.plan.nodes;
     let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
-    let of = SearchHints {
-        package: &record.package,
-        environment: &record.plan.environment,
-        commands: &commands,
-    };
-    privilege::run_as_reader(|| Inventory::scan(&trees, of)).map_err(|error| {
-        refusal(
-            format!("cannot read the image's contents: {error}"),
-            "export the service again",
-        )
-    })
+    let of = SearchHints { package: &record.package, environment: &record.plan.environment, commands: &commands };
+    privilege::run_as_reader(|| Inventory::scan(&trees, of))
+        .map_err(|error| refusal(format!("cannot read the image's contents: {error}"), "export the service again"))
 }
 
 fn built_layers(received: &ReceivedImage) -> Vec<BuiltLayer> {
@@ -385,11 +324,7 @@ fn built_layers(received: &ReceivedImage) -> Vec<BuiltLayer> {
     let layers = received.image.spec.layers.iter().zip(&received.known);
     let last = received.known.len().saturating_sub(1);
     let named = |at: usize| {
-        if at == last {
-            NAMES[2]
-        } else {
-            NAMES[at.min(1)]
-        }
+        if at == last { NAMES[2] } else { NAMES[at.min(1)] }
     };
     let layer = |(at, (info, known)): (usize, (&image::LayerInfo, &bool))| BuiltLayer {
         name: named(at),
@@ -418,27 +353,17 @@ fn launch_node(node: &NodeSpec) -> LaunchNode {
 
 fn receive_error(error: image::Error) -> Error {
     match error {
-        image::Error::Unreceivable { .. }
-        | image::Error::Archive { .. }
-        | image::Error::BadDigest { .. } => refusal(
-            error.to_string(),
-            "export the service again, and send the whole file",
-        ),
+        image::Error::Unreceivable { .. } | image::Error::Archive { .. } | image::Error::BadDigest { .. } => {
+            refusal(error.to_string(), "export the service again, and send the whole file")
+        }
         error => error.into(),
     }
 }
 
 fn unreadable_record(problem: &str) -> Error {
-    refusal(
-        format!("cannot read the record of the exported service: {problem}"),
-        "export the service again",
-    )
+    refusal(format!("cannot read the record of the exported service: {problem}"), "export the service again")
 }
 
 fn refusal(message: String, next: &str) -> Error {
-    Error::Failed {
-        message,
-        next: Some(next.to_owned()),
-        log: Vec::new(),
-    }
+    Error::Failed { message, next: Some(next.to_owned()), log: Vec::new() }
 }

@@ -58,15 +58,10 @@ mod tests {
             lazy: false,
             qos: None,
         };
-        let interface = |topics| Interface {
-            topics,
-            ..Interface::default()
-        };
+        let interface = |topics| Interface { topics, ..Interface::default() };
         check_interface(&interface(vec![topic("/a"), topic("/b/c")])).expect("possible");
         for bad in ["/a\x1b[2J", &"/a".repeat(1000)] {
-            let refused = check_interface(&interface(vec![topic(bad)]))
-                .expect_err(bad)
-                .message_and_advice();
+            let refused = check_interface(&interface(vec![topic(bad)])).expect_err(bad).message_and_advice();
             assert!(refused.contains("invalid name"), "{refused}");
         }
         let many = (0..=MOST_NAMES).map(|number| topic(&format!("/t{number}")));

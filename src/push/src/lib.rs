@@ -108,14 +108,7 @@ pub struct Pusher {
 impl Pusher {
     /// Creates a pusher with build directories below `home`, the state directory.
     pub fn new(options: Options, home: PathBuf, parts: PusherParts) -> Pusher {
-        let PusherParts {
-            builder,
-            catalogue,
-            engine,
-            opener,
-            choreographer,
-            journal,
-        } = parts;
+        let PusherParts { builder, catalogue, engine, opener, choreographer, journal } = parts;
         Pusher {
             places: PushQueue::new(&options),
             disks: Disks::new(&home, builder.cache_dir(), options.free),
@@ -136,10 +129,7 @@ impl Pusher {
 
     /// Returns the numbers of successful and failed pushes since the start.
     pub fn counts(&self) -> (u64, u64) {
-        (
-            self.published.load(Ordering::Relaxed),
-            self.failed.load(Ordering::Relaxed),
-        )
+        (self.published.load(Ordering::Relaxed), self.failed.load(Ordering::Relaxed))
     }
 
     /// Cancels all pushes and waits up to `patience` until they have cleaned up; what is left is removed at the next
@@ -147,10 +137,7 @@ impl Pusher {
     pub async fn cancel_all(&self, patience: Duration) {
         self.cancel.cancel();
         self.tasks.close();
-        if tokio::time::timeout(patience, self.tasks.wait())
-            .await
-            .is_err()
-        {
+        if tokio::time::timeout(patience, self.tasks.wait()).await.is_err() {
             tracing::warn!("leftovers of cancelled pushes are removed at the next start");
         }
     }
@@ -172,32 +159,18 @@ impl Pusher {
         self.check_quota(by.owner.as_deref(), None).await?;
         let build = self.home.join("build").join(id);
         let mut left = PushBudget::new(&self.options, build, &self.disks);
-        let made = left
-            .run_within(Box::pin(self.build_or_import(
-                id,
-                options,
-                archive,
-                (by, report),
-            )))
-            .await?;
+        let made = left.run_within(Box::pin(self.build_or_import(id, options, archive, (by, report)))).await?;
         let (built, imported) = match made {
             PushedImage::Built(built) => (*built, None),
             PushedImage::Imported(imported) => {
-                let ImportedService {
-                    record,
-                    options,
-                    built,
-                } = *imported;
+                let ImportedService { record, options, built } = *imported;
                 // The exporting server allowed it; this one may not.
                 self.check_request(&options, by)?;
                 (built, Some((record, options)))
             }
         };
         let options = imported.as_ref().map_or(options, |(_, options)| options);
-        let name = options
-            .name
-            .clone()
-            .unwrap_or_else(|| built.package.clone());
+        let name = options.name.clone().unwrap_or_else(|| built.package.clone());
         names::validate_service(&name).map_err(catalogue::Error::from)?;
         if asked_name.is_none() {
             tracing::Span::current().record("service", &*name);
@@ -213,8 +186,7 @@ impl Pusher {
         }
         let layers: Vec<_> = built.layers.iter().map(api_layer).collect();
         // Boxed: in an unoptimized build both together would overflow a thread's stack.
-        let shown =
-            Box::pin(self.probe_image(id, options, (built, plan), (name.clone(), by), report));
+        let shown = Box::pin(self.probe_image(id, options, (built, plan), (name.clone(), by), report));
         let (record, inventory) = left.run_within(shown).await?;
         // The token may have been revoked meanwhile.
         by.check_may_publish(&name)?;
@@ -225,11 +197,7 @@ impl Pusher {
         if let Some((record, _)) = &imported {
             self.import_dictionary(&name, record, report);
         }
-        Ok(PushResult {
-            layers,
-            service: name,
-            took: began.elapsed(),
-        })
+        Ok(PushResult { layers, service: name, took: began.elapsed() })
     }
 
     /// Builds or imports the image.
@@ -253,26 +221,20 @@ impl Pusher {
                 let tree = self.home.join("build").join(id).join(PUSHED);
                 receive::unpack(archive, &tree, &self.options, report).await?;
                 let of = tree.clone();
-                if privilege::spawn_blocking(move || exported::is_exported(&of))
-                    .await
-                    .unwrap_or(false)
-                {
+                if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
                     return self.import(options, tree, report).await;
                 }
                 if let Some(name) = &options.name {
                     let of = tree.clone();
                     let look = move || privilege::run_as_reader(|| receive::package_names(&of));
-                    let packages = privilege::spawn_blocking(look)
-                        .await
-                        .map_err(|_| Error::Internal("inspecting the package"))?;
+                    let packages =
+                        privilege::spawn_blocking(look).await.map_err(|_| Error::Internal("inspecting the package"))?;
                     self.check_owner(name, &packages)?;
                 }
                 PushSource::Tree(tree)
             }
         };
-        self.build(id, options, source, (by, report))
-            .await
-            .map(|built| PushedImage::Built(Box::new(built)))
+        self.build(id, options, source, (by, report)).await.map(|built| PushedImage::Built(Box::new(built)))
     }
 
     /// Probes the interface of an image; returns the revision to publish.
@@ -296,21 +258,14 @@ impl Pusher {
         }
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
-            let known = (
-                built.flavour.ros.ros_version(),
-                &built.inventory.definitions,
-            );
-            supplement::add(&mut interface, text, known)
-                .map_err(|error| OptionsError::Supplement(Box::new(error)))?;
+            let known = (built.flavour.ros.ros_version(), &built.inventory.definitions);
+            supplement::add(&mut interface, text, known).map_err(|error| OptionsError::Supplement(Box::new(error)))?;
         }
         interface_limits::check_interface(&interface)?;
         let ros = built.flavour.ros.ros_version();
         let decided = requests::decide_requests(ros, &interface, &found.watched);
-        let stated = options
-            .parse_requests()
-            .map_err(OptionsError::RequestPair)?;
-        let decided = requests::apply_stated(ros, &interface, &stated, decided)
-            .map_err(OptionsError::Requests)?;
+        let stated = options.parse_requests().map_err(OptionsError::RequestPair)?;
+        let decided = requests::apply_stated(ros, &interface, &stated, decided).map_err(OptionsError::Requests)?;
         for request in &decided {
             report.request(request).await;
         }
@@ -346,11 +301,9 @@ impl Pusher {
     /// Checks that the service belongs to the package that it was first built from.
     fn check_owner(&self, name: &str, packages: &[String]) -> Result<(), Error> {
         match (self.catalogue.service_package(name)?, packages) {
-            (Some(owner), [first, ..]) if !packages.contains(&owner) => Err(Error::NameTaken {
-                name: name.to_owned(),
-                package: owner,
-                newcomer: first.clone(),
-            }),
+            (Some(owner), [first, ..]) if !packages.contains(&owner) => {
+                Err(Error::NameTaken { name: name.to_owned(), package: owner, newcomer: first.clone() })
+            }
             _ => Ok(()),
         }
     }
@@ -408,12 +361,7 @@ fn api_layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
 fn make_plan(built: &BuildOutcome, options: &PushOptions) -> Plan {
     let mut environment = built.environment.clone();
     environment.extend(built.flavour.environment(HOME_INSIDE));
-    let mut nodes: Vec<_> = built
-        .plan
-        .nodes
-        .iter()
-        .map(|node| node.to_node_spec(HOME_INSIDE))
-        .collect();
+    let mut nodes: Vec<_> = built.plan.nodes.iter().map(|node| node.to_node_spec(HOME_INSIDE)).collect();
     for node in &mut nodes {
         naming::tell_parameters(&built.flavour, node, &built.plan.parameters);
     }

@@ -54,10 +54,7 @@ pub(super) async fn resolve_names(
     alive: &RoomGuard,
 ) -> Result<(), Error> {
     let planned = built.plan.nodes.iter().enumerate();
-    let unnamed: Vec<usize> = planned
-        .filter(|(_, node)| !node.named)
-        .map(|(index, _)| index)
-        .collect();
+    let unnamed: Vec<usize> = planned.filter(|(_, node)| !node.named).map(|(index, _)| index).collect();
     if unnamed.is_empty() {
         return Ok(());
     }
@@ -93,11 +90,7 @@ async fn find_names(
     alone: &Plan,
     unnamed: &[usize],
 ) -> Result<FoundNames, Error> {
-    let failed = |message: String| Error::Failed {
-        message,
-        next: None,
-        log: Vec::new(),
-    };
+    let failed = |message: String| Error::Failed { message, next: None, log: Vec::new() };
     // The host name of a container is its id.
     let host = servant.id();
     let opener = &pusher.opener;
@@ -113,13 +106,9 @@ async fn find_names(
         settle: QUIET,
         restless: MORE_NODES,
         work: Some(probe::cpu_time_source(servant)),
-        ..ProbeOptions::new(
-            alone.nodes.iter().map(|node| node.name.clone()).collect(),
-            NODE,
-        )
+        ..ProbeOptions::new(alone.nodes.iter().map(|node| node.name.clone()).collect(), NODE)
     };
-    let all_there =
-        |graph: &Arc<Graph>| names_in_graph(ros, graph, unnamed, host).len() == unnamed.len();
+    let all_there = |graph: &Arc<Graph>| names_in_graph(ros, graph, unnamed, host).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
         // If a node exits here, the error is reported when it is started again with its parameters.
@@ -172,8 +161,7 @@ fn names_in_graph(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str)
         let mut said: Vec<&str> = match ros {
             RosVersion::One => {
                 let all = graph.nodes.keys();
-                all.filter_map(|node| node.strip_prefix(&*mark)?.strip_prefix('/'))
-                    .collect()
+                all.filter_map(|node| node.strip_prefix(&*mark)?.strip_prefix('/')).collect()
             }
             RosVersion::Two => {
                 let own = graph.enclaves.get(&mark).into_iter().flatten();
@@ -189,9 +177,7 @@ fn names_in_graph(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str)
         }
         // Names registered by a program are untrusted.
         let called = said.into_iter().map(|own| classify_name(own, host));
-        let known = |called: &NodeRename| {
-            is_graph_name(&format!("/{}", called.node.trim_start_matches('/')))
-        };
+        let known = |called: &NodeRename| is_graph_name(&format!("/{}", called.node.trim_start_matches('/')));
         let mut called: Vec<NodeRename> = called.filter(known).collect();
         // No remapping rule can match one of several nodes whose name varies.
         if called.iter().any(|called| called.own.is_some()) {
@@ -207,10 +193,7 @@ fn names_in_graph(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str)
 /// Returns the stable part of the name that a program gave its node; `own` is set only if the whole name is stable.
 fn classify_name(own: &str, host: &str) -> NodeRename {
     let without = without_host(without_random_end(own), host);
-    NodeRename {
-        own: (without == own).then(|| own.to_owned()),
-        node: without,
-    }
+    NodeRename { own: (without == own).then(|| own.to_owned()), node: without }
 }
 
 /// Removes the unique suffix of an anonymous node's name: `_PID_MILLISECONDS` (rospy), `_NANOSECONDS` (roscpp).
@@ -249,23 +232,14 @@ fn without_host(name: &str, host: &str) -> String {
     };
     let parts: Vec<String> = name.split('/').map(part).collect();
     // Empty namespaces are dropped; the leading slash of an absolute name is kept.
-    let left = parts
-        .iter()
-        .enumerate()
-        .filter(|(at, part)| *at == 0 || !part.is_empty());
+    let left = parts.iter().enumerate().filter(|(at, part)| *at == 0 || !part.is_empty());
     let left: Vec<&str> = left.map(|(_, part)| part.as_str()).collect();
     left.join("/")
 }
 
 /// Writes the names into the plan and moves private parameters accordingly. A node whose name is unknown keeps the
 /// guessed one.
-fn apply_names(
-    plan: &mut Plan,
-    flavour: &Flavour,
-    unnamed: &[usize],
-    found: &FoundNames,
-    options: &PushOptions,
-) {
+fn apply_names(plan: &mut Plan, flavour: &Flavour, unnamed: &[usize], found: &FoundNames, options: &PushOptions) {
     let mut taken: BTreeSet<String> = plan
         .nodes
         .iter()
@@ -284,10 +258,7 @@ fn apply_names(
         }
         assign_free_names(&mut called, &mut taken);
         if called.is_empty() {
-            called.push(NodeRename {
-                own: None,
-                node: guess.clone(),
-            });
+            called.push(NodeRename { own: None, node: guess.clone() });
             assign_free_names(&mut called, &mut taken);
         }
         let (name, identity) = (called[0].node.clone(), flavour.rename_identity(&called));
@@ -309,10 +280,7 @@ fn apply_names(
 /// same base name get the same suffix regardless of their namespaces, since there is one remapping rule for them.
 fn assign_free_names(called: &mut [NodeRename], taken: &mut BTreeSet<String>) {
     let wanted: Vec<String> = called.iter().map(|called| called.node.clone()).collect();
-    let last = |name: &str| {
-        name.rsplit_once('/')
-            .map_or(0, |(above, _)| above.len() + 1)
-    };
+    let last = |name: &str| name.rsplit_once('/').map_or(0, |(above, _)| above.len() + 1);
     let numbered = |name: &str, number: usize| match number {
         1 => name.to_owned(),
         _ => format!("{name}_{number}"),
@@ -331,16 +299,9 @@ fn assign_free_names(called: &mut [NodeRename], taken: &mut BTreeSet<String>) {
 
 /// Passes a node its parameters on the command line, if nodes hold their own parameters, unless they are already there
 /// (a node of an exported service).
-pub(super) fn tell_parameters(
-    flavour: &Flavour,
-    node: &mut NodeSpec,
-    all: &BTreeMap<String, ParamValue>,
-) {
+pub(super) fn tell_parameters(flavour: &Flavour, node: &mut NodeSpec, all: &BTreeMap<String, ParamValue>) {
     let arguments = flavour.parameter_arguments(&node.name, all);
-    let told = |argv: &[String]| {
-        argv.windows(arguments.len().max(1))
-            .any(|part| part == arguments)
-    };
+    let told = |argv: &[String]| argv.windows(arguments.len().max(1)).any(|part| part == arguments);
     if !arguments.is_empty() && !told(&node.argv) {
         node.argv.extend(arguments);
     }
@@ -348,10 +309,7 @@ pub(super) fn tell_parameters(
 
 /// Marks nodes that were given a name but no namespace (by a launch file, for example), since their programs may choose
 /// one. Returns the marks by node name.
-pub(super) fn mark_nodes_without_namespace(
-    plan: &mut Plan,
-    flavour: &Flavour,
-) -> BTreeMap<String, String> {
+pub(super) fn mark_nodes_without_namespace(plan: &mut Plan, flavour: &Flavour) -> BTreeMap<String, String> {
     let nodes = plan.nodes.iter_mut().enumerate();
     let free = nodes.filter(|(_, node)| flavour.can_choose_namespace(&node.argv));
     free.map(|(index, node)| {
@@ -379,15 +337,9 @@ pub(super) fn move_nodes(plan: &mut Plan, moved: &BTreeMap<String, String>) {
 }
 
 /// Returns warnings about parameters that were given for an unknown node and read by none.
-pub(super) fn unused_parameters(
-    plan: &Plan,
-    interface: &Interface,
-    options: &PushOptions,
-) -> Vec<String> {
-    let below = |key: &str, name: &str| {
-        key.strip_prefix(name)
-            .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
-    };
+pub(super) fn unused_parameters(plan: &Plan, interface: &Interface, options: &PushOptions) -> Vec<String> {
+    let below =
+        |key: &str, name: &str| key.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'));
     let loaded = plan.components.values().flatten();
     let loaded: Vec<String> = loaded.filter_map(Component::full_name).collect();
     let names = plan.nodes.iter().map(|node| node.name.as_str());
@@ -398,8 +350,7 @@ pub(super) fn unused_parameters(
         let of_a_name = key.starts_with('/') && key[1..].contains('/');
         let known = names.iter().any(|name| below(key, name));
         let read = interface.parameters.iter().any(|parameter| {
-            !parameter.read_by.is_empty()
-                && (below(key, &parameter.name) || below(&parameter.name, key))
+            !parameter.read_by.is_empty() && (below(key, &parameter.name) || below(&parameter.name, key))
         });
         if of_a_name && !known && !read {
             warnings.push(format!(
@@ -408,9 +359,7 @@ pub(super) fn unused_parameters(
             ));
         }
         if let Some(has) = describe_undeclared(interface, key) {
-            warnings.push(format!(
-                "no node declares a parameter {key}, so it has no effect; {has}"
-            ));
+            warnings.push(format!("no node declares a parameter {key}, so it has no effect; {has}"));
         }
     }
     warnings
@@ -418,21 +367,14 @@ pub(super) fn unused_parameters(
 
 /// If nodes have their own parameters (ROS 2) and none has one of this name, returns a description of those that exist.
 fn describe_undeclared(interface: &Interface, key: &str) -> Option<String> {
-    let own: Vec<_> = interface
-        .parameters
-        .iter()
-        .filter(|parameter| parameter.own_name().is_some())
-        .collect();
+    let own: Vec<_> = interface.parameters.iter().filter(|parameter| parameter.own_name().is_some()).collect();
     // Levels of a name are separated by dots there; a global parameter such as `/rate` is for all nodes.
     let wanted = key.trim_start_matches(['~', '_']);
     let is_it = |parameter: &&&package::interface::Parameter| {
         let name = parameter.own_name().unwrap_or_default();
         let below = |whole: &str| {
             let whole = whole.replace('/', ".");
-            name == whole
-                || name
-                    .strip_prefix(&whole)
-                    .is_some_and(|rest| rest.starts_with('.'))
+            name == whole || name.strip_prefix(&whole).is_some_and(|rest| rest.starts_with('.'))
         };
         match wanted.strip_prefix(&parameter.node) {
             Some(rest) if rest.starts_with('/') => below(&rest[1..]),

@@ -65,18 +65,13 @@ pub(super) fn timed_chunks(
             };
             match next {
                 Ok(Some(Ok(chunk))) => {
-                    let left =
-                        patience.remaining_after(left.saturating_sub(began.elapsed()), chunk.len());
+                    let left = patience.remaining_after(left.saturating_sub(began.elapsed()), chunk.len());
                     Some((Ok(chunk), Some((stream, left))))
                 }
                 Ok(Some(Err(error))) => Some((Err(error), None)),
                 Ok(None) => None,
                 Err(_) => {
-                    let why = if left < patience.pause {
-                        TooSlow::Trickled
-                    } else {
-                        TooSlow::Paused
-                    };
+                    let why = if left < patience.pause { TooSlow::Trickled } else { TooSlow::Paused };
                     let _ = stalled.0.set(why);
                     Some((Err(io::ErrorKind::TimedOut.into()), None))
                 }
@@ -103,20 +98,12 @@ mod tests {
     use super::*;
 
     /// Returns the number of chunks of a body that get through, each of `bytes` bytes after the given pause.
-    async fn receive_chunks(
-        pause: u64,
-        bytes: usize,
-        rate: u64,
-        chunks: usize,
-    ) -> (usize, Option<TooSlow>) {
+    async fn receive_chunks(pause: u64, bytes: usize, rate: u64, chunks: usize) -> (usize, Option<TooSlow>) {
         let stream = futures_util::stream::iter(0..chunks).then(move |_| async move {
             tokio::time::sleep(Duration::from_secs(pause)).await;
             Ok(Bytes::from(vec![0_u8; bytes]))
         });
-        let patience = BodyRateLimit {
-            pause: Duration::from_secs(60),
-            rate,
-        };
+        let patience = BodyRateLimit { pause: Duration::from_secs(60), rate };
         let (stalled, ended) = (StallFlag::default(), CancellationToken::new());
         let through = super::timed_chunks(stream.boxed(), patience, stalled.clone(), ended);
         let through: Vec<_> = through.filter_map(async |chunk| chunk.ok()).collect().await;
@@ -125,29 +112,14 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_body_that_trickles_is_not_waited_for() {
-        assert_eq!(
-            receive_chunks(59, 1, 16 << 10, 100).await,
-            (1, Some(TooSlow::Trickled))
-        );
+        assert_eq!(receive_chunks(59, 1, 16 << 10, 100).await, (1, Some(TooSlow::Trickled)));
         // One chunk per pause is sufficient.
-        assert_eq!(
-            receive_chunks(59, 1 << 20, 16 << 10, 100).await,
-            (100, None)
-        );
-        assert_eq!(
-            receive_chunks(1, 20 << 10, 16 << 10, 1000).await,
-            (1000, None)
-        );
+        assert_eq!(receive_chunks(59, 1 << 20, 16 << 10, 100).await, (100, None));
+        assert_eq!(receive_chunks(1, 20 << 10, 16 << 10, 1000).await, (1000, None));
         let (came, why) = receive_chunks(1, 15 << 10, 16 << 10, 10_000).await;
-        assert!(
-            came > 100 && why == Some(TooSlow::Trickled),
-            "{came} {why:?}"
-        );
+        assert!(came > 100 && why == Some(TooSlow::Trickled), "{came} {why:?}");
         // Without a rate only pauses count.
         assert_eq!(receive_chunks(59, 1, 0, 100).await, (100, None));
-        assert_eq!(
-            receive_chunks(61, 1 << 20, 0, 100).await,
-            (0, Some(TooSlow::Paused))
-        );
+        assert_eq!(receive_chunks(61, 1 << 20, 0, 100).await, (0, Some(TooSlow::Paused)));
     }
 }

@@ -44,11 +44,7 @@ impl PushQueue {
     }
 
     /// Waits for the lock on the service, if it is known, and then for a build slot.
-    pub(super) async fn admit(
-        &self,
-        service: Option<&str>,
-        report: &Reporter,
-    ) -> Result<AdmittedPush<'_>, Error> {
+    pub(super) async fn admit(&self, service: Option<&str>, report: &Reporter) -> Result<AdmittedPush<'_>, Error> {
         let mut waiting = None;
         let turn = match service {
             None => None,
@@ -73,11 +69,7 @@ impl PushQueue {
                 self.report_and_acquire_slot(&waiting, report).await?
             }
         };
-        Ok(AdmittedPush {
-            places: self,
-            turn,
-            place: Some(place),
-        })
+        Ok(AdmittedPush { places: self, turn, place: Some(place) })
     }
 
     /// Waits for the lock on a service, without a build slot.
@@ -92,11 +84,7 @@ impl PushQueue {
     }
 
     async fn report_and_lock_service(&self, service: &str, report: &Reporter) -> ServiceLock {
-        report
-            .step(&format!(
-                "waiting: {service} is already being pushed or changed"
-            ))
-            .await;
+        report.step(&format!("waiting: {service} is already being pushed or changed")).await;
         self.lock_service(service).await
     }
 
@@ -120,14 +108,8 @@ impl PushQueue {
         let waiting = QueuedPush::count_in(&self.waiting);
         if waiting.before >= self.queue {
             return Err(Error::Failed {
-                message: format!(
-                    "{} pushes are building, and {} are already waiting",
-                    self.at_once, waiting.before
-                ),
-                next: Some(
-                    "push again later, or raise at_once or queue in [push] of the configuration"
-                        .to_owned(),
-                ),
+                message: format!("{} pushes are building, and {} are already waiting", self.at_once, waiting.before),
+                next: Some("push again later, or raise at_once or queue in [push] of the configuration".to_owned()),
                 log: Vec::new(),
             });
         }
@@ -138,11 +120,7 @@ impl PushQueue {
 impl AdmittedPush<'_> {
     /// Acquires the lock on the service, which may be known only now. If another push holds it, the build slot is
     /// released while waiting and acquired again. This is never refused, since the work is already done.
-    pub(super) async fn assign_service(
-        &mut self,
-        service: &str,
-        report: &Reporter,
-    ) -> Result<(), Error> {
+    pub(super) async fn assign_service(&mut self, service: &str, report: &Reporter) -> Result<(), Error> {
         if self.turn.as_ref().is_some_and(|(name, _)| name == service) {
             return Ok(());
         }
@@ -154,11 +132,7 @@ impl AdmittedPush<'_> {
                 let waiting = QueuedPush::count_in(&self.places.waiting);
                 self.place = None;
                 let turn = self.places.report_and_lock_service(service, report).await;
-                self.place = Some(
-                    self.places
-                        .report_and_acquire_slot(&waiting, report)
-                        .await?,
-                );
+                self.place = Some(self.places.report_and_acquire_slot(&waiting, report).await?);
                 turn
             }
         };
@@ -193,11 +167,7 @@ mod tests {
     use super::*;
 
     fn options() -> Options {
-        Options {
-            at_once: 1,
-            queue: 1,
-            ..Options::unlimited()
-        }
+        Options { at_once: 1, queue: 1, ..Options::unlimited() }
     }
 
     #[tokio::test]
@@ -214,10 +184,7 @@ mod tests {
         assert!(title.contains("1 pushes are building"), "{title}");
         let refused = places.admit(None, &report).await.map(drop);
         let refused = refused.expect_err("the queue is full").message_and_advice();
-        assert!(
-            refused.contains("1 are already waiting") && refused.contains("at_once"),
-            "{refused}"
-        );
+        assert!(refused.contains("1 are already waiting") && refused.contains("at_once"), "{refused}");
         drop(first);
         second.await.expect("no panic").expect("its turn");
         drop(places.admit(None, &report).await.expect("free again"));
@@ -225,11 +192,7 @@ mod tests {
 
     #[tokio::test]
     async fn who_waits_for_a_service_holds_no_place() {
-        let options = Options {
-            at_once: 2,
-            queue: 2,
-            ..options()
-        };
+        let options = Options { at_once: 2, queue: 2, ..options() };
         let places = Arc::new(PushQueue::new(&options));
         let (sender, mut told) = mpsc::channel(16);
         let report = Reporter::new(sender);

@@ -59,8 +59,7 @@ pub(super) async fn probe_interface(
             *plan = settled;
             return Ok(found);
         }
-        let words =
-            "a robot needs this capacity: stopping the started image, to start it again later";
+        let words = "a robot needs this capacity: stopping the started image, to start it again later";
         report.step(words).await;
         // A task stops what was started; it keeps the reservation until nothing is left of it.
         drop(alive);
@@ -116,23 +115,15 @@ pub(super) async fn start(
 }
 
 /// Reserves resources as for any servant with these limits; waits until they are available.
-async fn admit_probe(
-    pusher: &Pusher,
-    options: &PushOptions,
-    report: &Reporter,
-) -> Result<Permit, Error> {
+async fn admit_probe(pusher: &Pusher, options: &PushOptions, report: &Reporter) -> Result<Permit, Error> {
     let (full, is_full) = tokio::sync::oneshot::channel();
     let patience = pusher.options.time;
-    let admitted = pusher
-        .choreographer
-        .admit_like_a_servant(&options.limits, patience, || {
-            let _ = full.send(());
-        });
+    let admitted = pusher.choreographer.admit_like_a_servant(&options.limits, patience, || {
+        let _ = full.send(());
+    });
     let told = async {
         if is_full.await.is_ok() {
-            report
-                .step("waiting for free capacity to start it: this machine is full")
-                .await;
+            report.step("waiting for free capacity to start it: this machine is full").await;
         }
         std::future::pending::<()>().await;
     };
@@ -150,30 +141,16 @@ async fn observe_interface(
     marks: BTreeMap<String, String>,
     push: &PushOptions,
 ) -> Result<ProbeResult, Error> {
-    let failed = |message: String| Error::Failed {
-        message,
-        next: None,
-        log: Vec::new(),
-    };
-    let registry = Registry::with_definitions(
-        built.flavour.ros.ros_version(),
-        &built.inventory.definitions,
-    )
-    .map_err(|error| failed(format!("invalid message definition in the image: {error}")))?;
+    let failed = |message: String| Error::Failed { message, next: None, log: Vec::new() };
+    let registry = Registry::with_definitions(built.flavour.ros.ros_version(), &built.inventory.definitions)
+        .map_err(|error| failed(format!("invalid message definition in the image: {error}")))?;
     let options = ProbeOptions {
         patience: pusher.options.probe,
-        types: push
-            .interface
-            .as_deref()
-            .map(supplement::topic_types)
-            .unwrap_or_default(),
+        types: push.interface.as_deref().map(supplement::topic_types).unwrap_or_default(),
         components: plan.components.clone(),
         marks,
         work: Some(cpu_time_source(servant)),
-        ..ProbeOptions::new(
-            plan.nodes.iter().map(|node| node.name.clone()).collect(),
-            NODE,
-        )
+        ..ProbeOptions::new(plan.nodes.iter().map(|node| node.name.clone()).collect(), NODE)
     };
     let looking = async {
         let opener = &pusher.opener;
@@ -204,20 +181,9 @@ async fn observe_interface(
 /// Adds the options that provide what the nodes report as missing.
 async fn with_advice(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
     match error {
-        Error::Failed {
-            message,
-            next: None,
-            log,
-        } => {
-            let advice = pusher
-                .builder
-                .advice(&built.flavour.base, &log.join("\n"))
-                .await;
-            Error::Failed {
-                message,
-                next: (!advice.is_empty()).then(|| advice.join("; ")),
-                log,
-            }
+        Error::Failed { message, next: None, log } => {
+            let advice = pusher.builder.advice(&built.flavour.base, &log.join("\n")).await;
+            Error::Failed { message, next: (!advice.is_empty()).then(|| advice.join("; ")), log }
         }
         other => other,
     }
@@ -231,10 +197,7 @@ pub(super) fn cpu_time_source(servant: &Arc<dyn ServantHandle>) -> CpuTimeSource
 
 async fn measure_cpu_time(servant: Arc<dyn ServantHandle>) -> Option<CpuTime> {
     let usage = servant.usage().await.ok()?;
-    Some(CpuTime {
-        ran: Duration::from_micros(usage.cpu_usec),
-        waited: servant.cpu_wait_time().await,
-    })
+    Some(CpuTime { ran: Duration::from_micros(usage.cpu_usec), waited: servant.cpu_wait_time().await })
 }
 
 /// Waits until a node exits unexpectedly, or the container does; returns a description.
@@ -281,30 +244,18 @@ pub(super) async fn with_node_logs(error: Error, servant: &Arc<dyn ServantHandle
     match error {
         Error::Failed { message, next, log } if log.is_empty() => {
             let lines = servant.logs(LOG_LINES, None).await;
-            let log = lines
-                .into_iter()
-                .map(|line| format!("{}: {}", line.node, line.line))
-                .collect();
+            let log = lines.into_iter().map(|line| format!("{}: {}", line.node, line.line)).collect();
             Error::Failed { message, next, log }
         }
         other => other,
     }
 }
 
-pub(super) fn probe_spec(
-    pusher: &Pusher,
-    id: &str,
-    built: &BuildOutcome,
-    plan: &Plan,
-    options: &PushOptions,
-) -> Spec {
+pub(super) fn probe_spec(pusher: &Pusher, id: &str, built: &BuildOutcome, plan: &Plan, options: &PushOptions) -> Spec {
     Spec {
         id: format!("{id}-probe"),
         image: built.image.to_string(),
-        limits: options.limits.or(api::Limits {
-            cpu_weight: Some(WEIGHT),
-            ..pusher.choreographer.default_limits()
-        }),
+        limits: options.limits.or(api::Limits { cpu_weight: Some(WEIGHT), ..pusher.choreographer.default_limits() }),
         environment: plan.environment.clone(),
         nodes: plan.nodes.clone(),
         grants: plan.grants.clone(),

@@ -38,24 +38,16 @@ impl Pusher {
         };
         self.choreographer.refill_warm_pool();
         let number = published?;
-        let about = NewEvent {
-            service: Some(&service),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { service: Some(&service), ..NewEvent::default() };
         let words = format!("{service} is published, revision {number}");
         self.journal.info("published", &words, &about);
         let choreographer = &self.choreographer;
         let followed = match terms {
-            Some(terms) => choreographer
-                .begin_rollout(&service, before, number, terms)
-                .await
-                .map(|_| ()),
+            Some(terms) => choreographer.begin_rollout(&service, before, number, terms).await.map(|_| ()),
             None => choreographer.revision_changed(&service, number).await,
         };
         if let Err(error) = followed {
-            report.try_warning(format!(
-                "{words}, but its servants were not updated: {error}"
-            ));
+            report.try_warning(format!("{words}, but its servants were not updated: {error}"));
         }
         Ok(())
     }
@@ -66,10 +58,7 @@ impl Pusher {
         let RollbackResult { from, to } = self.catalogue.rollback(name, wanted).await?;
         self.choreographer.refill_warm_pool();
         self.choreographer.revision_changed(name, to).await?;
-        let about = NewEvent {
-            service: Some(name),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { service: Some(name), ..NewEvent::default() };
         let message = format!("{name} was changed from revision {from} to revision {to}");
         self.journal.info("rolled-back", &message, &about);
         Ok(to)
@@ -79,35 +68,22 @@ impl Pusher {
     pub async fn remove(&self, name: &str) -> Result<Vec<String>, Error> {
         let _turn = self.places.lock_service(name).await;
         let withdrawn = self.catalogue.withdraw(name)?;
-        let stopped = self
-            .choreographer
-            .stop("its service was removed", |handle| handle.service() == name)
-            .await;
+        let stopped = self.choreographer.stop("its service was removed", |handle| handle.service() == name).await;
         self.choreographer.forget_rollout(name).await;
         self.choreographer.end_stale_warm().await?;
         self.catalogue.untag(withdrawn).await?;
         self.collect_garbage().await;
-        let about = NewEvent {
-            service: Some(name),
-            ..NewEvent::default()
-        };
-        self.journal
-            .info("removed", &format!("{name} was removed"), &about);
+        let about = NewEvent { service: Some(name), ..NewEvent::default() };
+        self.journal.info("removed", &format!("{name} was removed"), &about);
         Ok(stopped)
     }
 
     /// Removes unused images from the store. A failure is only logged.
     pub async fn collect_garbage(&self) {
         let builder = Arc::clone(&self.builder);
-        let mut keep = privilege::spawn_blocking(move || builder.layers_to_keep())
-            .await
-            .unwrap_or_default();
+        let mut keep = privilege::spawn_blocking(move || builder.layers_to_keep()).await.unwrap_or_default();
         let in_use = self.choreographer.images_in_use();
-        keep.extend(
-            in_use
-                .iter()
-                .filter_map(|image| image.parse::<image::Digest>().ok()),
-        );
+        keep.extend(in_use.iter().filter_map(|image| image.parse::<image::Digest>().ok()));
         self.catalogue.collect_garbage(keep).await;
     }
 }

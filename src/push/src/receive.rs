@@ -35,21 +35,13 @@ const MANIFEST: u64 = 1 << 20;
 pub type Archive = BoxStream<'static, io::Result<Bytes>>;
 
 /// Unpacks the archive into `tree`, which is created.
-pub(super) async fn unpack(
-    archive: Archive,
-    tree: &Path,
-    limits: &Options,
-    report: &Reporter,
-) -> Result<(), Error> {
+pub(super) async fn unpack(archive: Archive, tree: &Path, limits: &Options, report: &Reporter) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
     // Cancels the reading thread however this function is left.
     let ended = CancellationToken::new();
     let _ended = ended.clone().drop_guard();
     let stalled = StallFlag::default();
-    let patience = BodyRateLimit {
-        pause: limits.stall,
-        rate: limits.min_rate.0,
-    };
+    let patience = BodyRateLimit { pause: limits.stall, rate: limits.min_rate.0 };
     let chunks = patience::timed_chunks(archive, patience, stalled.clone(), ended);
     let stream = StreamReader::new(chunks.boxed());
     let mut counted = CountingReader {
@@ -58,11 +50,7 @@ pub(super) async fn unpack(
         limit: limits.archive.0,
         exceeded: false,
     };
-    let unpacked = image::Limits {
-        entries: limits.entries,
-        bytes: limits.unpacked.0,
-        ..image::Limits::default()
-    };
+    let unpacked = image::Limits { entries: limits.entries, bytes: limits.unpacked.0, ..image::Limits::default() };
     let (limit, slowest) = (limits.archive, limits.min_rate);
     let destination = tree.to_owned();
     let place = privilege::spawn_blocking(move || UnpackDirectory::create(&destination))
@@ -85,13 +73,7 @@ pub(super) async fn unpack(
             ticks.tick().await;
             let done = received.load(Ordering::Relaxed);
             if done > 0 {
-                report
-                    .event(PushEvent::Progress {
-                        unit: "bytes".to_owned(),
-                        done,
-                        total: None,
-                    })
-                    .await;
+                report.event(PushEvent::Progress { unit: "bytes".to_owned(), done, total: None }).await;
             }
         }
     };
@@ -100,9 +82,7 @@ pub(super) async fn unpack(
         () = told => Ok(()),
     }?;
     let done = blocking::cancel_with_caller(move || place.finish());
-    privilege::spawn_blocking(done)
-        .await
-        .map_err(|_| Error::Internal("moving the unpacked files"))?
+    privilege::spawn_blocking(done).await.map_err(|_| Error::Internal("moving the unpacked files"))?
 }
 
 /// Directory into which an archive is unpacked by threads that may write nowhere else. It is owned by them, and they
@@ -129,19 +109,12 @@ impl UnpackDirectory {
             std::os::unix::fs::fchown(&opened, Some(account.user), Some(account.group))
                 .map_err(file_error("give away", &path))?;
         }
-        Ok(Self {
-            opened,
-            path,
-            tree: tree.to_owned(),
-        })
+        Ok(Self { opened, path, tree: tree.to_owned() })
     }
 
     /// Returns the path of the tree for those threads.
     fn confined_path(&self) -> PathBuf {
-        PathBuf::from(format!(
-            "/proc/self/fd/{}/{UNPACKED}",
-            self.opened.as_raw_fd()
-        ))
+        PathBuf::from(format!("/proc/self/fd/{}/{UNPACKED}", self.opened.as_raw_fd()))
     }
 
     /// Takes ownership of the tree and moves it to its final path.
@@ -176,11 +149,7 @@ fn chown_tree(tree: &Path) -> Result<(), foreign::Error> {
 
 fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     let path = path.display().to_string();
-    move |error| Error::Failed {
-        message: format!("cannot {action} {path}: {error}"),
-        next: None,
-        log: Vec::new(),
-    }
+    move |error| Error::Failed { message: format!("cannot {action} {path}: {error}"), next: None, log: Vec::new() }
 }
 
 fn too_slow_error(why: TooSlow, pause: Duration, rate: Size) -> Error {
@@ -194,41 +163,26 @@ fn too_slow_error(why: TooSlow, pause: Duration, rate: Size) -> Error {
             "push over a faster connection, or lower min_rate in [push] of the configuration",
         ),
     };
-    Error::Failed {
-        message,
-        next: Some(next.to_owned()),
-        log: Vec::new(),
-    }
+    Error::Failed { message, next: Some(next.to_owned()), log: Vec::new() }
 }
 
 fn refusal(error: image::Error) -> Error {
     let next = match &error {
-        image::Error::Archive {
-            problem: Refusal::TooManyEntries { .. },
-            ..
-        } => Some("push fewer files, or raise entries in [push] of the configuration".to_owned()),
-        image::Error::Archive {
-            problem: Refusal::TooLarge { .. },
-            ..
-        } => Some("push fewer files, or raise unpacked in [push] of the configuration".to_owned()),
-        image::Error::Archive {
-            problem: Refusal::LinkLeaves { .. },
-            ..
-        } => Some(
-            "replace the link with a copy; build install spaces without 'colcon build --symlink-install'"
-                .to_owned(),
+        image::Error::Archive { problem: Refusal::TooManyEntries { .. }, .. } => {
+            Some("push fewer files, or raise entries in [push] of the configuration".to_owned())
+        }
+        image::Error::Archive { problem: Refusal::TooLarge { .. }, .. } => {
+            Some("push fewer files, or raise unpacked in [push] of the configuration".to_owned())
+        }
+        image::Error::Archive { problem: Refusal::LinkLeaves { .. }, .. } => Some(
+            "replace the link with a copy; build install spaces without 'colcon build --symlink-install'".to_owned(),
         ),
-        image::Error::Archive { .. } => Some(
-            "push a tar archive of a package, workspace or install space whose links stay inside it"
-                .to_owned(),
-        ),
+        image::Error::Archive { .. } => {
+            Some("push a tar archive of a package, workspace or install space whose links stay inside it".to_owned())
+        }
         _ => None,
     };
-    Error::Failed {
-        message: error.to_string(),
-        next,
-        log: Vec::new(),
-    }
+    Error::Failed { message: error.to_string(), next, log: Vec::new() }
 }
 
 /// Reads what a refused client still sends, for a while.
@@ -257,8 +211,7 @@ pub(super) fn package_names(tree: &Path) -> Vec<String> {
 }
 
 fn collect_packages(directory: &Path, depth: usize, names: &mut Vec<String>) {
-    let manifest = foreign::Tree::open(directory)
-        .and_then(|tree| tree.read_file_following("package.xml", MANIFEST));
+    let manifest = foreign::Tree::open(directory).and_then(|tree| tree.read_file_following("package.xml", MANIFEST));
     if let Ok(Some(file)) = manifest {
         names.extend(parse_name(&String::from_utf8_lossy(&file.bytes)));
         return;
@@ -300,10 +253,7 @@ impl<R: Read> Read for CountingReader<R> {
         let total = self.received.fetch_add(read as u64, Ordering::Relaxed) + read as u64;
         if total > self.limit {
             self.exceeded = true;
-            return Err(io::Error::new(
-                io::ErrorKind::FileTooLarge,
-                "the archive is too big",
-            ));
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, "the archive is too big"));
         }
         Ok(read)
     }
@@ -324,9 +274,7 @@ mod tests {
             header.set_uid(0);
             header.set_gid(0);
             header.set_mtime(0);
-            builder
-                .append_data(&mut header, name, text.as_bytes())
-                .expect("into memory");
+            builder.append_data(&mut header, name, text.as_bytes()).expect("into memory");
         }
         builder.into_inner().expect("into memory")
     }
@@ -343,31 +291,17 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn an_archive_becomes_a_tree() {
         let bytes = archive(&[
-            (
-                "src/one/package.xml",
-                "<package><name> one </name></package>",
-            ),
+            ("src/one/package.xml", "<package><name> one </name></package>"),
             ("src/two/package.xml", "<package><name>two</name></package>"),
-            (
-                "src/two/test/package.xml",
-                "<package><name>not counted</name></package>",
-            ),
+            ("src/two/test/package.xml", "<package><name>not counted</name></package>"),
         ]);
-        assert_eq!(
-            unpack_archive(bytes, &Options::unlimited())
-                .await
-                .expect("good"),
-            ["one", "two"]
-        );
+        assert_eq!(unpack_archive(bytes, &Options::unlimited()).await.expect("good"), ["one", "two"]);
     }
 
     #[tokio::test(flavor = "multi_thread")]
     async fn an_archive_over_the_limit_is_refused() {
         let bytes = archive(&[("package.xml", &"x".repeat(10_000))]);
-        let limits = Options {
-            archive: Size(2000),
-            ..Options::unlimited()
-        };
+        let limits = Options { archive: Size(2000), ..Options::unlimited() };
         let refused = unpack_archive(bytes, &limits).await.expect_err("too big");
         assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
     }
@@ -380,19 +314,9 @@ mod tests {
         let beginning = archive(&[("package.xml", &"x".repeat(10_000))])[..2000].to_vec();
         let chunks = futures_util::stream::iter([Ok(Bytes::from(beginning))]);
         let body = chunks.chain(futures_util::stream::pending()).boxed();
-        let limits = Options {
-            stall: Duration::from_millis(50),
-            ..Options::unlimited()
-        };
-        let refused = unpack(body, &tree, &limits, &Reporter::new(sender))
-            .await
-            .expect_err("it never ends");
-        assert!(
-            refused
-                .to_string()
-                .contains("no data of the archive arrived"),
-            "{refused}"
-        );
+        let limits = Options { stall: Duration::from_millis(50), ..Options::unlimited() };
+        let refused = unpack(body, &tree, &limits, &Reporter::new(sender)).await.expect_err("it never ends");
+        assert!(refused.to_string().contains("no data of the archive arrived"), "{refused}");
         assert!(!tree.exists());
     }
 
@@ -421,12 +345,8 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread")]
     async fn what_is_no_archive_is_refused() {
-        let refused = unpack_archive(
-            b"hello, this is no archive".repeat(100),
-            &Options::unlimited(),
-        )
-        .await
-        .expect_err("text");
+        let refused =
+            unpack_archive(b"hello, this is no archive".repeat(100), &Options::unlimited()).await.expect_err("text");
         assert!(matches!(refused, Error::Failed { .. }), "{refused}");
         assert!(refused.to_string().contains("archive"), "{refused}");
     }

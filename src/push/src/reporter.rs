@@ -18,18 +18,11 @@ pub(super) struct Reporter {
 
 impl Reporter {
     pub(super) fn new(events: mpsc::Sender<PushEvent>) -> Self {
-        Self {
-            events,
-            building: TaskTracker::new(),
-            publishing: CancellationToken::new(),
-        }
+        Self { events, building: TaskTracker::new(), publishing: CancellationToken::new() }
     }
 
     pub(super) async fn step(&self, title: &str) {
-        self.event(PushEvent::Step {
-            title: title.to_owned(),
-        })
-        .await;
+        self.event(PushEvent::Step { title: title.to_owned() }).await;
     }
 
     pub(super) async fn warning(&self, message: String) {

@@ -50,9 +50,7 @@ impl Pusher {
         let span = tracing::error_span!(parent: None, "push", service = options.name, id);
         let work = async move {
             let report = Reporter::new(events);
-            let outcome = pusher
-                .run(&id, &options, &by, archive, &report, cancel)
-                .await;
+            let outcome = pusher.run(&id, &options, &by, archive, &report, cancel).await;
             let failed = outcome.is_err();
             finished(outcome).await;
             if failed && !pusher.cancel.is_cancelled() {
@@ -87,9 +85,7 @@ impl Pusher {
         }
         check_caps(options)?;
         check_sla(options)?;
-        options
-            .parse_requests()
-            .map_err(OptionsError::RequestPair)?;
+        options.parse_requests().map_err(OptionsError::RequestPair)?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;
         }
@@ -134,16 +130,9 @@ impl Pusher {
             Err(error) => {
                 self.failed.fetch_add(1, Ordering::Relaxed);
                 let name = options.name.as_deref().or(options.apt.as_deref());
-                let what = if cancel.is_cancelled() {
-                    "was cancelled".to_owned()
-                } else {
-                    format!("failed: {error}")
-                };
+                let what = if cancel.is_cancelled() { "was cancelled".to_owned() } else { format!("failed: {error}") };
                 let message = format!("the push of {} {what}", name.unwrap_or(&options.source));
-                let about = NewEvent {
-                    service: name,
-                    ..NewEvent::default()
-                };
+                let about = NewEvent { service: name, ..NewEvent::default() };
                 self.journal.warning("push-failed", &message, &about);
                 Err(error)
             }
@@ -170,11 +159,7 @@ async fn run_until_revoked<T>(
 /// Rejects caps that contradict the limits.
 fn check_caps(options: &PushOptions) -> Result<(), OptionsError> {
     let PushOptions { caps, limits, .. } = options;
-    let most = Limits {
-        cpus: caps.cpus,
-        memory: caps.memory,
-        ..Limits::default()
-    };
+    let most = Limits { cpus: caps.cpus, memory: caps.memory, ..Limits::default() };
     most.check().map_err(OptionsError::Caps)?;
     if let (Some(cpus), Some(most)) = (limits.cpus, caps.cpus)
         && cpus > most
@@ -193,16 +178,8 @@ fn check_caps(options: &PushOptions) -> Result<(), OptionsError> {
 fn check_sla(options: &PushOptions) -> Result<(), OptionsError> {
     let sla = &options.sla;
     sla.check().map_err(OptionsError::Sla)?;
-    let times = Sla {
-        rrt: sla.rrt,
-        max_rrt: sla.max_rrt,
-        ..Sla::default()
-    };
-    if *sla == times {
-        Ok(())
-    } else {
-        Err(OptionsError::SlaMeasures)
-    }
+    let times = Sla { rrt: sla.rrt, max_rrt: sla.max_rrt, ..Sla::default() };
+    if *sla == times { Ok(()) } else { Err(OptionsError::SlaMeasures) }
 }
 
 #[cfg(test)]
@@ -240,15 +217,8 @@ mod tests {
         let check = |cpus, max_cpus, memory: Option<u64>, max_memory: Option<u64>| {
             let mib = |mib: u64| Size(mib << 20);
             check_caps(&PushOptions {
-                limits: Limits {
-                    cpus,
-                    memory: memory.map(mib),
-                    ..Limits::default()
-                },
-                caps: Caps {
-                    cpus: max_cpus,
-                    memory: max_memory.map(mib),
-                },
+                limits: Limits { cpus, memory: memory.map(mib), ..Limits::default() },
+                caps: Caps { cpus: max_cpus, memory: max_memory.map(mib) },
                 ..PushOptions::default()
             })
         };
@@ -256,14 +226,8 @@ mod tests {
         check(Some(1.0), Some(1.0), Some(64), Some(64)).expect("they are equal");
         check(Some(9.0), None, None, Some(64)).expect("they are of different resources");
         for (refused, words) in [
-            (
-                check(Some(2.0), Some(1.5), None, None),
-                "--cpus 2 is more than --max-cpus 1.5; lower it",
-            ),
-            (
-                check(None, None, Some(65), Some(64)),
-                "--memory 65M is more than --max-memory 64M; lower it",
-            ),
+            (check(Some(2.0), Some(1.5), None, None), "--cpus 2 is more than --max-cpus 1.5; lower it"),
+            (check(None, None, Some(65), Some(64)), "--memory 65M is more than --max-memory 64M; lower it"),
             (check(None, Some(0.0), None, None), "max_cpus = 0 is not"),
             (check(None, None, None, Some(1)), "max_memory = 1M is too"),
         ] {
@@ -274,12 +238,7 @@ mod tests {
 
     #[test]
     fn what_stubs_cannot_promise_is_refused() {
-        let check = |sla| {
-            check_sla(&PushOptions {
-                sla,
-                ..PushOptions::default()
-            })
-        };
+        let check = |sla| check_sla(&PushOptions { sla, ..PushOptions::default() });
         let times = |rrt: u64, max_rrt: u64| Sla {
             rrt: Span::from_millis(rrt),
             max_rrt: Span::from_millis(max_rrt),
@@ -287,14 +246,8 @@ mod tests {
         };
         check(times(100, 300)).expect("times in order");
         let refused = check(times(300, 100)).expect_err("in disorder").to_string();
-        assert!(
-            refused.starts_with("--rrt (300ms) is greater than"),
-            "{refused}"
-        );
-        let rate = Sla {
-            fps: Some(5.0),
-            ..times(100, 300)
-        };
+        assert!(refused.starts_with("--rrt (300ms) is greater than"), "{refused}");
+        let rate = Sla { fps: Some(5.0), ..times(100, 300) };
         let refused = check(rate).expect_err("a rate").to_string();
         assert!(refused.contains("stub.toml"), "{refused}");
     }

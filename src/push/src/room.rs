@@ -7,11 +7,7 @@ use crate::{Error, Pusher};
 impl Pusher {
     /// Rejects a push of a deployer whose images exceed the quota, including `image` if it has been built. Operators
     /// have no quota. Concurrent pushes are not counted yet.
-    pub(super) async fn check_quota(
-        &self,
-        owner: Option<&str>,
-        image: Option<&str>,
-    ) -> Result<(), Error> {
+    pub(super) async fn check_quota(&self, owner: Option<&str>, image: Option<&str>) -> Result<(), Error> {
         let most = self.options.per_deployer;
         let Some(owner) = owner.filter(|_| most.0 > 0) else {
             return Ok(());
@@ -47,9 +43,7 @@ mod tests {
     fn a_deployers_images_take_no_more_than_allowed() {
         let most = Size(1 << 30);
         check_within_quota("ann", 1 << 30, most).expect("just as much");
-        let refused = check_within_quota("ann", (1 << 30) + 1, most)
-            .expect_err("more")
-            .message_and_advice();
+        let refused = check_within_quota("ann", (1 << 30) + 1, most).expect_err("more").message_and_advice();
         for part in ["ann", "1024 MB", "1G", "rm NAME", "per_deployer"] {
             assert!(refused.contains(part), "{part}: {refused}");
         }

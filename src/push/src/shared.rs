@@ -25,17 +25,10 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
         return Err(OptionsError::Replicas { replicas, max });
     }
     if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
-        return Err(OptionsError::ServantRange {
-            min,
-            max,
-            most: MOST,
-        });
+        return Err(OptionsError::ServantRange { min, max, most: MOST });
     }
     if !(1..=MOST).contains(&shared.calls) {
-        return Err(OptionsError::Calls {
-            calls: shared.calls,
-            most: MOST,
-        });
+        return Err(OptionsError::Calls { calls: shared.calls, most: MOST });
     }
     Ok(())
 }
@@ -47,9 +40,7 @@ const ALONE: &str = "push it without --shared, so that each robot gets its own s
 pub(crate) fn check_interface(ros: RosVersion, interface: &Interface) -> Result<(), Error> {
     shareable::check_shareable(ros, interface).map_err(|error| Error::Failed {
         message: error.to_string(),
-        next: Some(format!(
-            "{ALONE}; or push only the nodes that answer services and actions, with --node"
-        )),
+        next: Some(format!("{ALONE}; or push only the nodes that answer services and actions, with --node")),
         log: Vec::new(),
     })
 }
@@ -63,11 +54,7 @@ mod tests {
     #[test]
     fn numbers_that_contradict_each_other_are_refused() {
         let check = |shared: Shared, stateful| {
-            let options = PushOptions {
-                shared: Some(shared),
-                stateful,
-                ..PushOptions::default()
-            };
+            let options = PushOptions { shared: Some(shared), stateful, ..PushOptions::default() };
             check_options(&options).err().map(|error| error.to_string())
         };
         let fine = Shared::default();
@@ -77,32 +64,9 @@ mod tests {
             (Shared { min: 0, ..fine }, false, "--min 0"),
             (Shared { min: 5, ..fine }, false, "--max 4"),
             (Shared { max: 65, ..fine }, false, "--max 65"),
-            (
-                Shared {
-                    replicas: 0,
-                    ..fine
-                },
-                false,
-                "--replicas 0",
-            ),
-            (
-                Shared {
-                    replicas: 5,
-                    ..fine
-                },
-                false,
-                "--replicas 5",
-            ),
-            (
-                Shared {
-                    replicas: 5,
-                    min: 5,
-                    max: 2,
-                    ..fine
-                },
-                false,
-                "--replicas 5",
-            ),
+            (Shared { replicas: 0, ..fine }, false, "--replicas 0"),
+            (Shared { replicas: 5, ..fine }, false, "--replicas 5"),
+            (Shared { replicas: 5, min: 5, max: 2, ..fine }, false, "--replicas 5"),
             (Shared { calls: 0, ..fine }, false, "--calls 0"),
         ] {
             let refused = check(shared, stateful).expect("refused");

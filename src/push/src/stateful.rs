@@ -13,10 +13,8 @@ const MAPS: [&str; 5] = [
 ];
 
 /// Words in names of services that change how a node works.
-const SWITCHING: [&str; 12] = [
-    "set", "enable", "disable", "switch", "select", "toggle", "reset", "clear", "start", "stop",
-    "pause", "resume",
-];
+const SWITCHING: [&str; 12] =
+    ["set", "enable", "disable", "switch", "select", "toggle", "reset", "clear", "start", "stop", "pause", "resume"];
 
 /// Returns the signs of state, one phrase each; `growing` are outputs whose messages grew steadily.
 pub(super) fn find_signs(interface: &Interface, growing: &[String]) -> Vec<String> {
@@ -32,10 +30,7 @@ pub(super) fn find_signs(interface: &Interface, growing: &[String]) -> Vec<Strin
     let sign = |topic: &Topic| {
         let name = &topic.name;
         if topic.latched && MAPS.contains(&topic.type_name.as_str()) {
-            Some(format!(
-                "{name} is a map, and latched ({})",
-                topic.type_name
-            ))
+            Some(format!("{name} is a map, and latched ({})", topic.type_name))
         } else if name == "/tf" {
             Some("it publishes transforms on /tf".to_owned())
         } else if growing.contains(name) {
@@ -53,23 +48,14 @@ pub(super) fn find_signs(interface: &Interface, growing: &[String]) -> Vec<Strin
 /// a call, and the other side does not know of it.
 fn find_switches(interface: &Interface) -> Vec<String> {
     let requests = interface.requests.iter().flatten();
-    let Some(answer) = requests
-        .filter_map(|request| request.pair.outputs.first())
-        .next()
-    else {
+    let Some(answer) = requests.filter_map(|request| request.pair.outputs.first()).next() else {
         return Vec::new();
     };
-    let may =
-        |what: &str, name: &str| format!("its {what} {name} may change its answers on {answer}");
-    let actions = interface
-        .actions
-        .iter()
-        .map(|action| may("action", &action.name));
+    let may = |what: &str, name: &str| format!("its {what} {name} may change its answers on {answer}");
+    let actions = interface.actions.iter().map(|action| may("action", &action.name));
     let services = interface.services.iter();
     let services = services.filter(|service| is_switch(&service.name, &service.type_name));
-    actions
-        .chain(services.map(|service| may("service", &service.name)))
-        .collect()
+    actions.chain(services.map(|service| may("service", &service.name))).collect()
 }
 
 /// Returns whether a service is likely to change how its node works, judging by its type and name.
@@ -80,8 +66,7 @@ fn is_switch(name: &str, type_name: &str) -> bool {
     }
     let last = name.rsplit('/').next().unwrap_or(name).to_lowercase();
     let words: Vec<&str> = last.split('_').collect();
-    type_name.replacen("/srv/", "/", 1) == "std_srvs/SetBool"
-        || words.iter().any(|word| SWITCHING.contains(word))
+    type_name.replacen("/srv/", "/", 1) == "std_srvs/SetBool" || words.iter().any(|word| SWITCHING.contains(word))
 }
 
 /// Returns the question to the deployer; `None` without signs of state.
@@ -123,10 +108,7 @@ mod tests {
     }
 
     fn signs_from_topics(topics: Vec<Topic>, growing: &[&str]) -> Vec<String> {
-        let interface = Interface {
-            topics,
-            ..Interface::default()
-        };
+        let interface = Interface { topics, ..Interface::default() };
         let growing: Vec<String> = growing.iter().map(|name| (*name).to_owned()).collect();
         find_signs(&interface, &growing)
     }
@@ -139,37 +121,12 @@ mod tests {
         let tf = |direction| topic("/tf", "tf2_msgs/TFMessage", direction, false);
         let path = || topic("/path", "nav_msgs/Path", Output, false);
         for (what, topics, growing, words) in [
-            (
-                "gmapping",
-                vec![scan(), tf(Input), map(true), tf(Output)],
-                vec![],
-                vec!["/map is a map", "on /tf"],
-            ),
-            (
-                "a costmap, made anew each time",
-                vec![scan(), map(false)],
-                vec![],
-                vec![],
-            ),
+            ("gmapping", vec![scan(), tf(Input), map(true), tf(Output)], vec![], vec!["/map is a map", "on /tf"]),
+            ("a costmap, made anew each time", vec![scan(), map(false)], vec![], vec![]),
             ("a map server", vec![map(true)], vec![], vec![]),
-            (
-                "a publisher of fixed transforms",
-                vec![tf(Output)],
-                vec![],
-                vec![],
-            ),
-            (
-                "who hears transforms alone",
-                vec![tf(Input), map(true)],
-                vec![],
-                vec![],
-            ),
-            (
-                "a trajectory",
-                vec![scan(), path()],
-                vec!["/path"],
-                vec!["messages on /path kept growing"],
-            ),
+            ("a publisher of fixed transforms", vec![tf(Output)], vec![], vec![]),
+            ("who hears transforms alone", vec![tf(Input), map(true)], vec![], vec![]),
+            ("a trajectory", vec![scan(), path()], vec!["/path"], vec!["messages on /path kept growing"]),
             ("a plan", vec![scan(), path()], vec![], vec![]),
         ] {
             let found = signs_from_topics(topics, &growing);
@@ -199,31 +156,15 @@ mod tests {
                 service("/mux/lock", "std_srvs/srv/SetBool"),
                 service("/mux/settings", "p/Settings"),
             ],
-            actions: vec![Action {
-                name: "/priority".into(),
-                type_name: "p/Priority".into(),
-                node: "/mux".into(),
-            }],
+            actions: vec![Action { name: "/priority".into(), type_name: "p/Priority".into(), node: "/mux".into() }],
             ..Interface::default()
         };
-        assert!(
-            find_signs(&mux, &[]).is_empty(),
-            "nothing is answered, so nothing is switched"
-        );
-        mux.requests = Some(package::requests::decide_requests(
-            RosVersion::One,
-            &mux,
-            &BTreeSet::new(),
-        ));
+        assert!(find_signs(&mux, &[]).is_empty(), "nothing is answered, so nothing is switched");
+        mux.requests = Some(package::requests::decide_requests(RosVersion::One, &mux, &BTreeSet::new()));
         let switched = |what: &str| format!("its {what} may change its answers on /cmd_vel");
         assert_eq!(
             find_signs(&mux, &[]),
-            [
-                "action /priority",
-                "service /mux/select_input",
-                "service /mux/lock"
-            ]
-            .map(switched)
+            ["action /priority", "service /mux/select_input", "service /mux/lock"].map(switched)
         );
     }
 
@@ -231,12 +172,7 @@ mod tests {
     fn the_question_says_what_was_found_and_what_to_type() {
         assert_eq!(question(&[]), None);
         let asked = question(&["it publishes transforms on /tf".into()]).unwrap();
-        for words in [
-            "answers seem to depend on earlier inputs",
-            "on /tf",
-            "--stateful:",
-            "--stateful=false",
-        ] {
+        for words in ["answers seem to depend on earlier inputs", "on /tf", "--stateful:", "--stateful=false"] {
             assert!(asked.contains(words), "{asked}");
         }
     }

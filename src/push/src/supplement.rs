@@ -48,17 +48,11 @@ pub(super) fn add(
     (ros, definitions): (RosVersion, &BTreeMap<String, String>),
 ) -> Result<(), SupplementError> {
     let mut stated = read(text)?;
-    let registry =
-        Registry::with_definitions(ros, definitions).map_err(unknown_type("the image"))?;
-    let mut texts = UsedDefinitions {
-        definitions,
-        used: BTreeMap::new(),
-    };
+    let registry = Registry::with_definitions(ros, definitions).map_err(unknown_type("the image"))?;
+    let mut texts = UsedDefinitions { definitions, used: BTreeMap::new() };
     for topic in &mut stated.topics {
         check_absolute(&topic.name)?;
-        let message = registry
-            .message(&topic.type_name)
-            .map_err(unknown_type(&topic.name))?;
+        let message = registry.message(&topic.type_name).map_err(unknown_type(&topic.name))?;
         texts.add_message(&message);
         // A type may be stated with or without its kind; each ROS version has one canonical form.
         topic.type_name = message.name().to_owned();
@@ -66,9 +60,7 @@ pub(super) fn add(
     }
     for service in &mut stated.services {
         check_absolute(&service.name)?;
-        let definition = registry
-            .service(&service.type_name)
-            .map_err(unknown_type(&service.name))?;
+        let definition = registry.service(&service.type_name).map_err(unknown_type(&service.name))?;
         texts.add_definition(&service.type_name, "srv");
         texts.add_message(&definition.request);
         texts.add_message(&definition.response);
@@ -77,9 +69,7 @@ pub(super) fn add(
     }
     for action in &mut stated.actions {
         check_absolute(&action.name)?;
-        let definition = registry
-            .action(&action.type_name)
-            .map_err(unknown_type(&action.name))?;
+        let definition = registry.action(&action.type_name).map_err(unknown_type(&action.name))?;
         texts.add_definition(&action.type_name, "action");
         for message in [&definition.goal, &definition.result, &definition.feedback] {
             texts.add_message(message);
@@ -90,9 +80,7 @@ pub(super) fn add(
         check_absolute(&parameter.name)?;
     }
     stated.definitions = texts.used;
-    interface
-        .supplement(&stated)
-        .map_err(|error| SupplementError::Contradiction(error.to_string()))
+    interface.supplement(&stated).map_err(|error| SupplementError::Contradiction(error.to_string()))
 }
 
 /// Returns the topics and their types, as far as the text can be parsed; errors are reported when it is added.
@@ -103,19 +91,13 @@ pub(super) fn topic_types(text: &str) -> BTreeMap<String, String> {
 
 fn read(text: &str) -> Result<Interface, SupplementError> {
     if text.trim_start().starts_with('{') {
-        return serde_json::from_str(text)
-            .map_err(|error| SupplementError::Unreadable(error.to_string()));
+        return serde_json::from_str(text).map_err(|error| SupplementError::Unreadable(error.to_string()));
     }
-    Interface::from_toml(text, Path::new("the file"))
-        .map_err(|error| SupplementError::Unreadable(error.to_string()))
+    Interface::from_toml(text, Path::new("the file")).map_err(|error| SupplementError::Unreadable(error.to_string()))
 }
 
 fn check_absolute(name: &str) -> Result<(), SupplementError> {
-    if name.starts_with('/') && name.len() > 1 {
-        Ok(())
-    } else {
-        Err(SupplementError::Relative(name.to_owned()))
-    }
+    if name.starts_with('/') && name.len() > 1 { Ok(()) } else { Err(SupplementError::Relative(name.to_owned())) }
 }
 
 fn unknown_type(name: &str) -> impl FnOnce(SchemaError) -> SupplementError {
@@ -153,14 +135,9 @@ mod tests {
     use super::*;
 
     fn definitions() -> BTreeMap<String, String> {
-        let texts = [
-            ("a/msg/Outer", "Inner inner\n"),
-            ("a/msg/Inner", "string text\n"),
-            ("a/srv/Ask", "---\nInner answer\n"),
-        ];
-        texts
-            .map(|(key, text)| (key.to_owned(), text.to_owned()))
-            .into()
+        let texts =
+            [("a/msg/Outer", "Inner inner\n"), ("a/msg/Inner", "string text\n"), ("a/srv/Ask", "---\nInner answer\n")];
+        texts.map(|(key, text)| (key.to_owned(), text.to_owned())).into()
     }
 
     #[test]
@@ -191,10 +168,7 @@ mod tests {
         assert_eq!(interface.services[0].type_name, "a/srv/Ask");
         assert_eq!(interface.actions[0].type_name, "a/action/Go");
         let keys: Vec<&str> = interface.definitions.keys().map(String::as_str).collect();
-        assert_eq!(
-            keys,
-            ["a/action/Go", "a/msg/Inner", "a/msg/Outer", "a/srv/Ask"]
-        );
+        assert_eq!(keys, ["a/action/Go", "a/msg/Inner", "a/msg/Outer", "a/srv/Ask"]);
     }
 
     #[test]
@@ -203,12 +177,7 @@ mod tests {
         let text = r#"{"topics": [{"name": "/out", "type": "a/Inner", "direction": "output", "latched": true}]}"#;
         add(&mut interface, text, (RosVersion::One, &definitions())).expect("valid");
         let before = interface.clone();
-        add(
-            &mut interface,
-            &text.replace("true", "false"),
-            (RosVersion::One, &definitions()),
-        )
-        .expect("valid");
+        add(&mut interface, &text.replace("true", "false"), (RosVersion::One, &definitions())).expect("valid");
         assert_eq!(interface, before);
     }
 
@@ -219,20 +188,12 @@ mod tests {
                 "[[topics]]\nname = \"out\"\ntype = \"a/Inner\"\ndirection = \"output\"",
                 "\"out\" is not an absolute name",
             ),
-            (
-                "[[topics]]\nname = \"/out\"\ntype = \"b/None\"\ndirection = \"output\"",
-                "b/None",
-            ),
+            ("[[topics]]\nname = \"/out\"\ntype = \"b/None\"\ndirection = \"output\"", "b/None"),
             ("[[topics]]\nname = \"/out\"\ntyp = \"a/Inner\"", "typ"),
             ("{", "EOF"),
         ] {
-            let refused = add(
-                &mut Interface::default(),
-                text,
-                (RosVersion::One, &definitions()),
-            )
-            .expect_err(words)
-            .to_string();
+            let refused =
+                add(&mut Interface::default(), text, (RosVersion::One, &definitions())).expect_err(words).to_string();
             assert!(refused.contains(words), "{refused}");
         }
     }

@@ -18,17 +18,11 @@ pub(super) fn to_push_event(event: BuildEvent, by: &Deployer) -> PushEvent {
                 Ok(()) => format!("the push of {push}"),
                 Err(_) => "another push".to_owned(),
             };
-            PushEvent::Step {
-                title: format!("waiting: {whose} is building a layer that this one needs, too"),
-            }
+            PushEvent::Step { title: format!("waiting: {whose} is building a layer that this one needs, too") }
         }
         BuildEvent::Step { title } => PushEvent::Step { title },
         BuildEvent::Log { line } => PushEvent::Log { line },
-        BuildEvent::Progress { unit, done, total } => PushEvent::Progress {
-            unit: unit.to_owned(),
-            done,
-            total,
-        },
+        BuildEvent::Progress { unit, done, total } => PushEvent::Progress { unit: unit.to_owned(), done, total },
         BuildEvent::Warning { message } => PushEvent::Warning { message },
     }
 }
@@ -39,20 +33,12 @@ pub(super) fn to_push_error(error: &rootfs_builder::Error, home: &Path, source: 
     let mut next = None;
     let (message, log) = match error {
         // The complete log has been sent line by line.
-        rootfs_builder::Error::BuildFailed {
-            package,
-            last_lines,
-            advice,
-            ..
-        } => {
+        rootfs_builder::Error::BuildFailed { package, last_lines, advice, .. } => {
             next = (!advice.is_empty()).then(|| advice.join("; "));
             let lines = last_lines.lines().map(str::to_owned).collect();
             (format!("the build of {package} failed"), lines)
         }
-        error => (
-            strip_build_paths(&error.to_string(), home, source),
-            Vec::new(),
-        ),
+        error => (strip_build_paths(&error.to_string(), home, source), Vec::new()),
     };
     Error::Failed { message, next, log }
 }
@@ -84,14 +70,8 @@ mod tests {
     fn paths_of_the_build_are_told_as_the_pusher_knows_them() {
         let told = |text: &str, source: &str| strip_build_paths(text, Path::new("/home"), source);
         let text = "/home/build/push-1/pushed/src/a/package.xml, line 4: malformed; see /home/build/push-1/log";
-        assert_eq!(
-            told(text, "../torn/"),
-            "../torn/src/a/package.xml, line 4: malformed; see log"
-        );
-        assert_eq!(
-            told("there is no package.xml in /home/build/push-1/pushed", "."),
-            "there is no package.xml in ."
-        );
+        assert_eq!(told(text, "../torn/"), "../torn/src/a/package.xml, line 4: malformed; see log");
+        assert_eq!(told("there is no package.xml in /home/build/push-1/pushed", "."), "there is no package.xml in .");
         assert_eq!(told("nothing to fix", "x"), "nothing to fix");
     }
 
@@ -100,18 +80,11 @@ mod tests {
         let by = Deployer {
             owner: None,
             may: Box::new(|name| {
-                if name.starts_with("lab_") {
-                    Ok(())
-                } else {
-                    Err(Error::NotAllowed("not yours".to_owned()))
-                }
+                if name.starts_with("lab_") { Ok(()) } else { Err(Error::NotAllowed("not yours".to_owned())) }
             }),
             over: Box::new(|| Box::pin(std::future::pending())),
         };
-        for (push, whose) in [
-            ("lab_maps", "the push of lab_maps"),
-            ("field", "another push"),
-        ] {
+        for (push, whose) in [("lab_maps", "the push of lab_maps"), ("field", "another push")] {
             let event = BuildEvent::Waits { push: push.into() };
             let PushEvent::Step { title } = super::to_push_event(event, &by) else {
                 panic!("a step");
@@ -127,20 +100,13 @@ mod tests {
             package: "broken".into(),
             log: "/home/build/push-1/log".into(),
             last_lines: "main.cpp:3: error: expected ;\nmake: *** [all] Error 2".into(),
-            advice: vec![
-                "the CMake package warp is missing: push with `--with libwarp-dev`".into(),
-            ],
+            advice: vec!["the CMake package warp is missing: push with `--with libwarp-dev`".into()],
         };
-        let Error::Failed { message, next, log } =
-            to_push_error(&failed, Path::new("/home"), "broken")
-        else {
+        let Error::Failed { message, next, log } = to_push_error(&failed, Path::new("/home"), "broken") else {
             panic!("it failed");
         };
         assert_eq!(message, "the build of broken failed");
-        assert_eq!(
-            log,
-            ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]
-        );
+        assert_eq!(log, ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]);
         let next = next.expect("what to do");
         assert!(next.contains("`--with libwarp-dev`"), "{next}");
     }

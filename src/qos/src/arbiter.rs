@@ -24,10 +24,7 @@ pub struct RetentionLimits {
 
 impl Default for RetentionLimits {
     fn default() -> Self {
-        Self {
-            patience: Duration::from_secs(30),
-            requests: 4096,
-        }
+        Self { patience: Duration::from_secs(30), requests: 4096 }
     }
 }
 
@@ -223,9 +220,8 @@ impl<P: Clone> Arbiter<P> {
     /// because further outputs may come. A call that the cloud could not be asked counts at T_max and stays until then.
     pub(crate) fn close_call(&mut self, id: RequestId) {
         let counts = |record: &Record<P>| record.judged || record.cloud != RequestLeg::NotAsked;
-        let over = |record: &Record<P>| {
-            record.is_call() && !record.is_open() && record.awaits_nobody() && counts(record)
-        };
+        let over =
+            |record: &Record<P>| record.is_call() && !record.is_open() && record.awaits_nobody() && counts(record);
         if self.requests.get(&id).is_some_and(over) {
             self.remove(id);
         }
@@ -254,12 +250,7 @@ impl<P: Clone> Arbiter<P> {
     }
 
     /// Changes the legs of `side` that equal `from` to `to`, and returns their requests.
-    pub(crate) fn replace_legs(
-        &mut self,
-        side: Responder,
-        from: &RequestLeg,
-        to: &RequestLeg,
-    ) -> Vec<RequestId> {
+    pub(crate) fn replace_legs(&mut self, side: Responder, from: &RequestLeg, to: &RequestLeg) -> Vec<RequestId> {
         let mut turned = Vec::new();
         for (id, record) in &mut self.requests {
             if record.leg(side) == from {
@@ -277,8 +268,7 @@ impl<P: Clone> Arbiter<P> {
     pub(crate) fn next_straggler(&mut self) -> Option<RequestId> {
         while let Some(id) = self.stragglers.front().copied() {
             let waits = |record: &Record<P>| {
-                let is_free =
-                    record.local == RequestLeg::NotAsked && record.cloud != RequestLeg::LeftOut;
+                let is_free = record.local == RequestLeg::NotAsked && record.cloud != RequestLeg::LeftOut;
                 record.is_open() && record.payload.is_some() && is_free
             };
             if self.requests.get(&id).is_some_and(waits) {
@@ -341,10 +331,7 @@ impl<P: Clone> Arbiter<P> {
         }
         if self.is_crowded() {
             let crowd = self.inputs - self.limits.requests;
-            let inputs = self
-                .requests
-                .iter()
-                .filter(|(_, record)| !record.has_caller());
+            let inputs = self.requests.iter().filter(|(_, record)| !record.has_caller());
             // Goals may take arbitrarily long, so they are dropped last.
             let (inputs, goals): (Vec<_>, Vec<_>) =
                 inputs.partition(|(_, record)| matches!(record.kind, Kind::Input(_)));
@@ -376,12 +363,7 @@ mod tests {
         arbiter.open((now, MAX), Kind::Input(0), channel, None, 7)
     }
 
-    fn answer(
-        arbiter: &mut Arbiter<u8>,
-        now: Instant,
-        id: RequestId,
-        side: Responder,
-    ) -> DeliveryVerdict {
+    fn answer(arbiter: &mut Arbiter<u8>, now: Instant, id: RequestId, side: Responder) -> DeliveryVerdict {
         let verdict = arbiter.answer_with(now, id, side, 0);
         arbiter.close_call(id);
         verdict
@@ -396,23 +378,11 @@ mod tests {
         assert_eq!(arbiter.ask(now, id, Responder::Cloud), Some(7));
         assert_eq!(arbiter.ask(now, id, Responder::Cloud), None, "asked once");
         assert_eq!(arbiter.ask(now, id, Responder::Local), Some(7));
-        assert_eq!(
-            answer(&mut arbiter, now, id, Responder::Local),
-            DeliveryVerdict::Deliver
-        );
-        assert_eq!(
-            answer(&mut arbiter, now, id, Responder::Local),
-            DeliveryVerdict::Drop
-        );
-        assert_eq!(
-            answer(&mut arbiter, now, id, Responder::Cloud),
-            DeliveryVerdict::Drop
-        );
+        assert_eq!(answer(&mut arbiter, now, id, Responder::Local), DeliveryVerdict::Deliver);
+        assert_eq!(answer(&mut arbiter, now, id, Responder::Local), DeliveryVerdict::Drop);
+        assert_eq!(answer(&mut arbiter, now, id, Responder::Cloud), DeliveryVerdict::Drop);
         assert!(arbiter.get(id).is_none(), "both have spoken: it is over");
-        assert_eq!(
-            answer(&mut arbiter, now, id, Responder::Cloud),
-            DeliveryVerdict::Drop
-        );
+        assert_eq!(answer(&mut arbiter, now, id, Responder::Cloud), DeliveryVerdict::Drop);
     }
 
     #[test]
@@ -422,10 +392,7 @@ mod tests {
         arbiter.ask(now, id, Responder::Cloud);
         assert!(arbiter.fail(id));
         assert!(!arbiter.fail(id));
-        assert_eq!(
-            answer(&mut arbiter, now, id, Responder::Cloud),
-            DeliveryVerdict::Drop
-        );
+        assert_eq!(answer(&mut arbiter, now, id, Responder::Cloud), DeliveryVerdict::Drop);
         assert!(arbiter.requests.is_empty());
     }
 
@@ -435,35 +402,17 @@ mod tests {
         let id = input(&mut arbiter, now);
         arbiter.ask(now, id, Responder::Cloud);
         arbiter.ask(now, id, Responder::Local);
-        assert_eq!(
-            arbiter.answer_with(now, id, Responder::Local, 1),
-            DeliveryVerdict::Deliver
-        );
-        assert_eq!(
-            arbiter.answer_with(now, id, Responder::Cloud, 1),
-            DeliveryVerdict::Drop
-        );
-        assert_eq!(
-            arbiter.answer_with(now, id, Responder::Cloud, 0),
-            DeliveryVerdict::Deliver
-        );
-        assert_eq!(
-            arbiter.answer_with(now, id, Responder::Cloud, 0),
-            DeliveryVerdict::Deliver
-        );
-        assert_eq!(
-            arbiter.answer_with(now, id, Responder::Local, 0),
-            DeliveryVerdict::Drop
-        );
+        assert_eq!(arbiter.answer_with(now, id, Responder::Local, 1), DeliveryVerdict::Deliver);
+        assert_eq!(arbiter.answer_with(now, id, Responder::Cloud, 1), DeliveryVerdict::Drop);
+        assert_eq!(arbiter.answer_with(now, id, Responder::Cloud, 0), DeliveryVerdict::Deliver);
+        assert_eq!(arbiter.answer_with(now, id, Responder::Cloud, 0), DeliveryVerdict::Deliver);
+        assert_eq!(arbiter.answer_with(now, id, Responder::Local, 0), DeliveryVerdict::Drop);
     }
 
     #[test]
     fn memory_is_bounded_and_waiting_callers_are_not_forgotten() {
         let now = Instant::now();
-        let limits = RetentionLimits {
-            patience: Duration::from_secs(1),
-            requests: 10,
-        };
+        let limits = RetentionLimits { patience: Duration::from_secs(1), requests: 10 };
         let mut arbiter = Arbiter::new(limits);
         let call = call(&mut arbiter, now);
         for _ in 0..1000 {

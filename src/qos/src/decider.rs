@@ -145,11 +145,7 @@ impl Decider {
         }
         let why = if self.by_link {
             self.wanted = !link;
-            if link {
-                DecisionReason::LinkUp
-            } else {
-                DecisionReason::LinkDown
-            }
+            if link { DecisionReason::LinkUp } else { DecisionReason::LinkDown }
         } else if !link {
             self.wanted = true;
             self.alone = true;
@@ -163,15 +159,11 @@ impl Decider {
             } else if satisfaction.wants_cloud_alone() {
                 self.wanted = false;
             }
-            DecisionReason::Satisfaction {
-                q: satisfaction.q(),
-            }
+            DecisionReason::Satisfaction { q: satisfaction.q() }
         };
         let kept = match (self.local, self.warm) {
             (LocalPolicy::Warm, WarmStart::AtOnce) => Some(DecisionReason::Warm),
-            (LocalPolicy::Warm, WarmStart::FirstSign) if self.sign => {
-                Some(DecisionReason::FirstSign)
-            }
+            (LocalPolicy::Warm, WarmStart::FirstSign) if self.sign => Some(DecisionReason::FirstSign),
             _ => None,
         };
         let running = matches!(self.state, LocalState::Starting | LocalState::Ready);
@@ -185,11 +177,7 @@ impl Decider {
         }
         if (self.wanted || kept.is_some()) && !running {
             self.state = LocalState::Starting;
-            let why = if self.wanted {
-                why
-            } else {
-                kept.unwrap_or(why)
-            };
+            let why = if self.wanted { why } else { kept.unwrap_or(why) };
             events.push(QosEvent::Start(why));
         }
         if self.wanted && !self.fed && self.state == LocalState::Ready {
@@ -233,10 +221,7 @@ mod tests {
     fn cold_is_started_fed_and_stopped() {
         let mut decider = decider("local = 'cold'");
         let mut q = Satisfaction::new(4.0, 4.0, 16.0);
-        assert!(
-            decider.decide(&q, true).is_empty(),
-            "at the threshold nothing changes"
-        );
+        assert!(decider.decide(&q, true).is_empty(), "at the threshold nothing changes");
         observe_ms(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
         assert!(decider.decide(&q, true).is_empty(), "it is started once");
@@ -254,10 +239,7 @@ mod tests {
     fn warm_runs_at_once_and_is_only_fed() {
         let mut decider = decider("local = 'warm'");
         let mut q = Satisfaction::new(5.0, 4.0, 16.0);
-        assert_eq!(
-            decider.decide(&q, true),
-            [QosEvent::Start(DecisionReason::Warm)]
-        );
+        assert_eq!(decider.decide(&q, true), [QosEvent::Start(DecisionReason::Warm)]);
         decider.on_state_change(LocalState::Ready);
         assert!(decider.decide(&q, true).is_empty());
         observe_ms(&mut q, None);
@@ -274,10 +256,7 @@ mod tests {
         assert!(decider.decide(&q, true).is_empty());
         observe_ms(&mut q, None);
         decider.note_late();
-        assert_eq!(
-            decider.decide(&q, true),
-            [QosEvent::Start(DecisionReason::FirstSign)]
-        );
+        assert_eq!(decider.decide(&q, true), [QosEvent::Start(DecisionReason::FirstSign)]);
         decider.on_state_change(LocalState::Ready);
         for _ in 0..4 {
             observe_ms(&mut q, Some(1));
@@ -298,33 +277,18 @@ mod tests {
             observe_ms(&mut q, None);
             assert!(decider.decide(&q, true).is_empty(), "slow is not down");
         }
-        assert_eq!(
-            decider.decide(&q, false),
-            [QosEvent::Feed(DecisionReason::LinkDown)]
-        );
-        assert_eq!(
-            decider.decide(&q, true),
-            [QosEvent::StopFeeding(DecisionReason::LinkUp)]
-        );
+        assert_eq!(decider.decide(&q, false), [QosEvent::Feed(DecisionReason::LinkDown)]);
+        assert_eq!(decider.decide(&q, true), [QosEvent::StopFeeding(DecisionReason::LinkUp)]);
     }
 
     #[test]
     fn a_cloud_that_was_never_reached_is_stood_in_for_whatever_q_is() {
         let mut decider = decider("local = 'cold'");
         let mut q = Satisfaction::new(8.0, 4.0, 16.0);
-        assert_eq!(
-            decider.decide(&q, false),
-            [QosEvent::Start(DecisionReason::LinkDown)]
-        );
+        assert_eq!(decider.decide(&q, false), [QosEvent::Start(DecisionReason::LinkDown)]);
         decider.on_state_change(LocalState::Ready);
-        assert_eq!(
-            decider.decide(&q, false),
-            [QosEvent::Feed(DecisionReason::LinkDown)]
-        );
-        let back = [
-            QosEvent::StopFeeding(DecisionReason::LinkUp),
-            QosEvent::Stop(DecisionReason::LinkUp),
-        ];
+        assert_eq!(decider.decide(&q, false), [QosEvent::Feed(DecisionReason::LinkDown)]);
+        let back = [QosEvent::StopFeeding(DecisionReason::LinkUp), QosEvent::Stop(DecisionReason::LinkUp)];
         assert_eq!(decider.decide(&q, true), back);
         // If the cloud missed its goal meanwhile, the local original goes on, and Q decides.
         decider.decide(&q, false);
@@ -342,10 +306,7 @@ mod tests {
         let mut q = Satisfaction::new(4.0, 4.0, 16.0);
         observe_ms(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
-        assert_eq!(
-            names(&decider.on_state_change(LocalState::Missing)),
-            ["missing"]
-        );
+        assert_eq!(names(&decider.on_state_change(LocalState::Missing)), ["missing"]);
         assert!(decider.on_state_change(LocalState::Missing).is_empty());
         observe_ms(&mut q, None);
         assert!(decider.decide(&q, true).is_empty());

@@ -108,10 +108,7 @@ impl<P: Clone> Governor<P> {
 
     /// Returns the sides that receive messages now.
     pub fn sides(&self) -> Responders {
-        Responders {
-            cloud: self.link,
-            local: self.decider.is_fed(),
-        }
+        Responders { cloud: self.link, local: self.decider.is_fed() }
     }
 
     /// Returns the current satisfaction.
@@ -136,11 +133,7 @@ impl<P: Clone> Governor<P> {
         }
         self.update_meters(now);
         for pair in pairs {
-            match self
-                .pairs
-                .iter_mut()
-                .find(|stream| stream.pair.input == pair.input)
-            {
+            match self.pairs.iter_mut().find(|stream| stream.pair.input == pair.input) {
                 Some(stream) => stream.pair.outputs = pair.outputs,
                 None => self.pairs.push(PairState::new(pair)),
             }
@@ -149,24 +142,12 @@ impl<P: Clone> Governor<P> {
 
     /// Opens a request for a service call of the application.
     pub fn call(&mut self, now: Instant, name: &Arc<str>, payload: P) -> RequestId {
-        self.open(
-            now,
-            Kind::Call,
-            RequestChannel::Call(name.clone()),
-            None,
-            payload,
-        )
+        self.open(now, Kind::Call, RequestChannel::Call(name.clone()), None, payload)
     }
 
     /// Opens a request for a goal of an action that is made of calls (ROS 2), with the goal's id. The action's result
     /// answers it.
-    pub fn goal(
-        &mut self,
-        now: Instant,
-        action: &Arc<str>,
-        id: CorrelationKey,
-        payload: P,
-    ) -> RequestId {
+    pub fn goal(&mut self, now: Instant, action: &Arc<str>, id: CorrelationKey, payload: P) -> RequestId {
         let channel = RequestChannel::Call(action.clone());
         self.open(now, Kind::Goal, channel, Some(id), payload)
     }
@@ -189,9 +170,7 @@ impl<P: Clone> Governor<P> {
     ) -> RequestId {
         self.tick(now);
         let times = self.sla.times(channel.name());
-        let id = self
-            .arbiter
-            .open((now, times.t_max), kind, channel, key, payload);
+        let id = self.arbiter.open((now, times.t_max), kind, channel, key, payload);
         self.dispatch(now, id);
         id
     }
@@ -203,13 +182,7 @@ impl<P: Clone> Governor<P> {
     }
 
     /// Handles an input published by the application; its answer carries `key`, if the input has one.
-    pub fn input(
-        &mut self,
-        now: Instant,
-        topic: &Arc<str>,
-        key: Option<CorrelationKey>,
-        payload: P,
-    ) {
+    pub fn input(&mut self, now: Instant, topic: &Arc<str>, key: Option<CorrelationKey>, payload: P) {
         self.tick(now);
         let mut pairs = self.pairs.iter();
         let Some(index) = pairs.position(|stream| *stream.input == **topic) else {
@@ -242,12 +215,7 @@ impl<P: Clone> Governor<P> {
     pub fn on_overheard_input(&mut self, now: Instant, topic: &Arc<str>, payload: P) {
         self.tick(now);
         if self.decider.is_fed() {
-            self.give(
-                Responder::Local,
-                None,
-                RequestChannel::Topic(topic.clone()),
-                payload,
-            );
+            self.give(Responder::Local, None, RequestChannel::Topic(topic.clone()), payload);
         }
     }
 
@@ -298,16 +266,8 @@ impl<P: Clone> Governor<P> {
                 self.decide(now);
                 // It may publish before it is known to listen: without a link no other side speaks.
                 let alone = !self.link && self.decider.is_coming();
-                let speaker = if self.decider.is_fed() || alone {
-                    Responder::Local
-                } else {
-                    Responder::Cloud
-                };
-                if side == speaker {
-                    DeliveryVerdict::Deliver
-                } else {
-                    DeliveryVerdict::Drop
-                }
+                let speaker = if self.decider.is_fed() || alone { Responder::Local } else { Responder::Cloud };
+                if side == speaker { DeliveryVerdict::Deliver } else { DeliveryVerdict::Drop }
             }
         };
         if verdict == DeliveryVerdict::Deliver {
@@ -330,11 +290,7 @@ impl<P: Clone> Governor<P> {
         if self.sla.is_link_based() {
             self.decider.clear_sign();
         }
-        let next = if resumed {
-            RequestLeg::Asked
-        } else {
-            RequestLeg::NotAsked
-        };
+        let next = if resumed { RequestLeg::Asked } else { RequestLeg::NotAsked };
         if !resumed {
             for stream in &mut self.pairs {
                 stream.queues[Responder::Cloud.index()].waiting.clear();
@@ -343,20 +299,13 @@ impl<P: Clone> Governor<P> {
         // A new stateful service has lost its earlier requests, and asking again could execute them twice.
         let anew = resumed || self.sla.mode == Mode::Stateless;
         if anew {
-            self.arbiter
-                .replace_legs(Responder::Cloud, &RequestLeg::Lost, &next);
+            self.arbiter.replace_legs(Responder::Cloud, &RequestLeg::Lost, &next);
         } else {
-            for id in self
-                .arbiter
-                .select(|record| record.cloud == RequestLeg::Lost)
-            {
+            for id in self.arbiter.select(|record| record.cloud == RequestLeg::Lost) {
                 self.judge(id, None);
             }
             let reason = RequestLeg::Failed("the servant was lost with the link".into());
-            for id in self
-                .arbiter
-                .replace_legs(Responder::Cloud, &RequestLeg::Lost, &reason)
-            {
+            for id in self.arbiter.replace_legs(Responder::Cloud, &RequestLeg::Lost, &reason) {
                 self.fail_if_hopeless(id);
             }
         }
@@ -372,9 +321,7 @@ impl<P: Clone> Governor<P> {
             return;
         }
         self.on_link_lost(now);
-        let lost =
-            self.arbiter
-                .replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
+        let lost = self.arbiter.replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
         self.decide(now);
         for id in lost {
             self.fail_if_hopeless(id);

@@ -60,14 +60,11 @@ pub struct HandOver {
 impl HandOverLedger {
     /// Records an input or a call of the application.
     pub fn record_input(&mut self, now: Instant, name: &Arc<str>) {
-        let entry = self
-            .entries
-            .entry(name.clone())
-            .or_insert_with(|| LedgerEntry {
-                told: 0,
-                since: now,
-                missed: [UnsentInputs::default(); 2],
-            });
+        let entry = self.entries.entry(name.clone()).or_insert_with(|| LedgerEntry {
+            told: 0,
+            since: now,
+            missed: [UnsentInputs::default(); 2],
+        });
         entry.told += 1;
         for missed in &mut entry.missed {
             missed.count += 1;
@@ -101,10 +98,7 @@ impl HandOverLedger {
 
     fn forget(&mut self, side: Responder) {
         for entry in self.entries.values_mut() {
-            entry.missed[side.index()] = UnsentInputs {
-                count: entry.told,
-                since: Some(entry.since),
-            };
+            entry.missed[side.index()] = UnsentInputs { count: entry.told, since: Some(entry.since) };
         }
     }
 
@@ -123,11 +117,7 @@ impl HandOverLedger {
             }
         }
         missed.sort_by(|a, b| b.count.cmp(&a.count).then_with(|| a.name.cmp(&b.name)));
-        (!missed.is_empty()).then_some(HandOver {
-            to,
-            renewed,
-            missed,
-        })
+        (!missed.is_empty()).then_some(HandOver { to, renewed, missed })
     }
 }
 
@@ -142,20 +132,13 @@ impl fmt::Display for HandOver {
         for (index, missed) in self.missed.iter().take(NAMED).enumerate() {
             let comma = if index == 0 { "" } else { ", " };
             let since = missed.since.as_secs_f64();
-            write!(
-                out,
-                "{comma}{} of {} since {since:.1} s ago",
-                missed.count, missed.name
-            )?;
+            write!(out, "{comma}{} of {} since {since:.1} s ago", missed.count, missed.name)?;
         }
         match self.missed.len().saturating_sub(NAMED) {
             0 => {}
             more => write!(out, ", and {more} more names")?,
         }
-        write!(
-            out,
-            "; state that {other} built from them is not transferred"
-        )
+        write!(out, "; state that {other} built from them is not transferred")
     }
 }
 
@@ -182,9 +165,7 @@ mod tests {
         ledger.record_input(now + 4 * SECOND, &reset);
         ledger.record_delivery(Responder::Cloud, "/reset");
         ledger.on_local_start();
-        let over = ledger
-            .hand_over(now + 10 * SECOND, Responder::Local)
-            .unwrap();
+        let over = ledger.hand_over(now + 10 * SECOND, Responder::Local).unwrap();
         assert_eq!(
             over.to_string(),
             "the local original takes over without having received: 10 of /scan since 10.0 s ago, 1 of /reset since \
@@ -195,13 +176,8 @@ mod tests {
             ledger.record_delivery(Responder::Local, "/scan");
         }
         ledger.link_up(true);
-        let back = ledger
-            .hand_over(now + 14 * SECOND, Responder::Cloud)
-            .unwrap();
-        assert_eq!(
-            (back.missed[0].count, back.missed[0].since),
-            (3, 4 * SECOND)
-        );
+        let back = ledger.hand_over(now + 14 * SECOND, Responder::Cloud).unwrap();
+        assert_eq!((back.missed[0].count, back.missed[0].since), (3, 4 * SECOND));
         assert!(back.to_string().starts_with("the cloud takes over without"));
         assert_eq!(back.missed.len(), 1, "it has /reset");
         // A loss is reported once.
@@ -221,9 +197,7 @@ mod tests {
         let back = ledger.hand_over(now + SECOND, Responder::Cloud).unwrap();
         let text = back.to_string();
         assert!(
-            text.starts_with(
-                "a new servant takes over without having received: 1 of /scan since 1.0 s ago"
-            ),
+            text.starts_with("a new servant takes over without having received: 1 of /scan since 1.0 s ago"),
             "{text}"
         );
     }

@@ -28,10 +28,7 @@ pub struct Meter {
 #[derive(Debug, Clone)]
 enum Kind {
     /// Arrival times, newest last; at most `over + 1`.
-    Rate {
-        over: usize,
-        arrivals: VecDeque<Instant>,
-    },
+    Rate { over: usize, arrivals: VecDeque<Instant> },
     /// Time of the newest output's stamp.
     Age { born: Option<Instant> },
 }
@@ -44,22 +41,11 @@ impl Meter {
             Measure::Rrt | Measure::Link { .. } => return None,
             Measure::FramesPerSecond { output, over } => {
                 let arrivals = VecDeque::new();
-                (
-                    output,
-                    Kind::Rate {
-                        over: *over,
-                        arrivals,
-                    },
-                )
+                (output, Kind::Rate { over: *over, arrivals })
             }
             Measure::Age { output } => (output, Kind::Age { born: None }),
         };
-        let meter = Self {
-            kind,
-            t_max: sla.t_max,
-            deadline: None,
-            counted: false,
-        };
+        let meter = Self { kind, t_max: sla.t_max, deadline: None, counted: false };
         Some((output, meter))
     }
 
@@ -146,38 +132,20 @@ mod tests {
 
     #[test]
     fn frames_are_averaged_and_a_stall_counts_while_it_lasts() {
-        let mut meter =
-            meter("measure.frames_per_second = { output = '/m', desire = 10, min = 4, over = 2 }");
+        let mut meter = meter("measure.frames_per_second = { output = '/m', desire = 10, min = 4, over = 2 }");
         let start = Instant::now();
         meter.start(start);
-        assert_eq!(
-            meter.take_missed(start + 250 * MS),
-            0,
-            "it is still in time"
-        );
+        assert_eq!(meter.take_missed(start + 250 * MS), 0, "it is still in time");
         assert_eq!(meter.output(start + 250 * MS, Duration::ZERO), None);
-        assert_eq!(
-            meter.output(start + 329 * MS, Duration::ZERO),
-            Some(79 * MS)
-        );
-        assert_eq!(
-            meter.output(start + 449 * MS, Duration::ZERO),
-            Some(99_500 * MS / 1000)
-        );
+        assert_eq!(meter.output(start + 329 * MS, Duration::ZERO), Some(79 * MS));
+        assert_eq!(meter.output(start + 449 * MS, Duration::ZERO), Some(99_500 * MS / 1000));
         // 329 and 449 are two arrivals; with one more their mean is 250 ms at 329 + 500.
-        assert_eq!(
-            meter.take_missed(start + 829 * MS),
-            0,
-            "it is still in time"
-        );
+        assert_eq!(meter.take_missed(start + 829 * MS), 0, "it is still in time");
         assert_eq!(meter.deadline(), Some(start + 829 * MS + PAST));
         assert_eq!(meter.take_missed(start + 1100 * MS), 2);
         // The gap was counted twice already; the frame that ends it starts a new mean.
         assert_eq!(meter.output(start + 1100 * MS, Duration::ZERO), None);
-        assert_eq!(
-            meter.output(start + 1200 * MS, Duration::ZERO),
-            Some(100 * MS)
-        );
+        assert_eq!(meter.output(start + 1200 * MS, Duration::ZERO), Some(100 * MS));
     }
 
     #[test]
@@ -190,10 +158,7 @@ mod tests {
         assert_eq!(meter.take_missed(start + 2100 * MS), 0);
         assert_eq!(meter.take_missed(start + 2100 * MS + PAST), 1);
         assert_eq!(meter.output(start + 2200 * MS, Duration::ZERO), None);
-        assert_eq!(
-            meter.output(start + 2300 * MS, Duration::ZERO),
-            Some(100 * MS)
-        );
+        assert_eq!(meter.output(start + 2300 * MS, Duration::ZERO), Some(100 * MS));
     }
 
     #[test]

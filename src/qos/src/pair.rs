@@ -115,9 +115,7 @@ impl FromStr for TopicPair {
     type Err = ParsePairError;
 
     fn from_str(text: &str) -> Result<Self, ParsePairError> {
-        let (input, rest) = text
-            .split_once("->")
-            .ok_or_else(|| ParsePairError::NoArrow(text.to_owned()))?;
+        let (input, rest) = text.split_once("->").ok_or_else(|| ParsePairError::NoArrow(text.to_owned()))?;
         let (outputs, by) = match rest.rsplit_once(" by ") {
             None => (rest, None),
             Some((outputs, by)) => match by.trim() {
@@ -125,10 +123,7 @@ impl FromStr for TopicPair {
                 "goal" => (outputs, Some(Correlation::Goal)),
                 "arrival" => (outputs, Some(Correlation::Arrival)),
                 other => {
-                    return Err(ParsePairError::UnknownCorrelation {
-                        text: text.to_owned(),
-                        by: other.to_owned(),
-                    });
+                    return Err(ParsePairError::UnknownCorrelation { text: text.to_owned(), by: other.to_owned() });
                 }
             },
         };
@@ -137,17 +132,10 @@ impl FromStr for TopicPair {
             if Self::is_valid_topic(name) {
                 Ok(name.to_owned())
             } else {
-                Err(ParsePairError::InvalidTopic {
-                    text: text.to_owned(),
-                    name: name.to_owned(),
-                })
+                Err(ParsePairError::InvalidTopic { text: text.to_owned(), name: name.to_owned() })
             }
         };
-        Ok(Self {
-            input: topic(input)?,
-            outputs: outputs.split(',').map(topic).collect::<Result<_, _>>()?,
-            by,
-        })
+        Ok(Self { input: topic(input)?, outputs: outputs.split(',').map(topic).collect::<Result<_, _>>()?, by })
     }
 }
 

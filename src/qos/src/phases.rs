@@ -72,8 +72,7 @@ impl PhaseHistory {
         }
         let microseconds = |time: Duration| u32::try_from(time.as_micros()).unwrap_or(u32::MAX);
         let [a, b, c, d, e] = phases.by_name().map(|(_, time)| microseconds(time));
-        self.kept
-            .push_back([a, b, c, d, e, microseconds(phases.total())]);
+        self.kept.push_back([a, b, c, d, e, microseconds(phases.total())]);
     }
 
     /// Returns the number of recorded requests.
@@ -97,13 +96,7 @@ impl PhaseHistory {
             let mut sorted: Vec<u32> = self.kept.iter().map(|sample| sample[index]).collect();
             sorted.sort_unstable();
             let rank = |percent| nearest_rank(&sorted, percent).map_or(0.0, f64::from) / 1000.0;
-            Quantiles {
-                phase: name.to_owned(),
-                p50: rank(50),
-                p90: rank(90),
-                p99: rank(99),
-                max: rank(100),
-            }
+            Quantiles { phase: name.to_owned(), p50: rank(50), p90: rank(90), p99: rank(99), max: rank(100) }
         };
         names.map(of).collect()
     }
@@ -128,13 +121,7 @@ mod tests {
 
     fn phases(compute: u64) -> Phases {
         let ms = Duration::from_millis;
-        Phases {
-            serialise: ms(1),
-            up: ms(2),
-            queue: ms(0),
-            compute: ms(compute),
-            down: ms(3),
-        }
+        Phases { serialise: ms(1), up: ms(2), queue: ms(0), compute: ms(compute), down: ms(3) }
     }
 
     #[test]

@@ -39,21 +39,11 @@ impl Satisfaction {
     /// greater than `threshold` and may be infinite ([`QosSla`](crate::QosSla) has checked that).
     pub fn new(initial: f64, threshold: f64, cap: f64) -> Self {
         let most = next_below(cap);
-        Self {
-            q: initial.min(most),
-            threshold,
-            most,
-            full: most.min(next_below(DEFAULT_CAP * threshold)),
-        }
+        Self { q: initial.min(most), threshold, most, full: most.min(next_below(DEFAULT_CAP * threshold)) }
     }
 
     /// Counts one request that the cloud completed after `t`; `None` if it was not completed by T_max.
-    pub fn observe(
-        &mut self,
-        t: Option<Duration>,
-        t_desire: Duration,
-        t_max: Duration,
-    ) -> ResponseGrade {
+    pub fn observe(&mut self, t: Option<Duration>, t_desire: Duration, t_max: Duration) -> ResponseGrade {
         let step = match t {
             Some(t) if t <= t_desire => ResponseGrade::Desired,
             Some(t) if t <= t_max => ResponseGrade::Accepted,
@@ -114,25 +104,13 @@ mod tests {
     #[test]
     fn each_request_moves_q_as_published() {
         let mut satisfaction = Satisfaction::new(8.0, 4.0, 16.0);
-        assert_eq!(
-            satisfaction.observe(ms(100), DESIRE, MAX),
-            ResponseGrade::Desired
-        );
+        assert_eq!(satisfaction.observe(ms(100), DESIRE, MAX), ResponseGrade::Desired);
         assert_eq!(satisfaction.q(), 10.0);
-        assert_eq!(
-            satisfaction.observe(ms(101), DESIRE, MAX),
-            ResponseGrade::Accepted
-        );
+        assert_eq!(satisfaction.observe(ms(101), DESIRE, MAX), ResponseGrade::Accepted);
         assert_eq!(satisfaction.q(), 11.0);
-        assert_eq!(
-            satisfaction.observe(ms(300), DESIRE, MAX),
-            ResponseGrade::Accepted
-        );
+        assert_eq!(satisfaction.observe(ms(300), DESIRE, MAX), ResponseGrade::Accepted);
         assert_eq!(satisfaction.q(), 12.0);
-        assert_eq!(
-            satisfaction.observe(ms(301), DESIRE, MAX),
-            ResponseGrade::Late
-        );
+        assert_eq!(satisfaction.observe(ms(301), DESIRE, MAX), ResponseGrade::Late);
         assert_eq!(satisfaction.q(), 6.0);
         assert_eq!(satisfaction.observe(None, DESIRE, MAX), ResponseGrade::Late);
         assert_eq!(satisfaction.q(), 3.0);

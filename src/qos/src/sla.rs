@@ -176,18 +176,13 @@ impl QosSla {
 
     /// Returns the times of one service, action or input.
     pub fn times(&self, name: &str) -> Times {
-        self.requests.get(name).copied().unwrap_or(Times {
-            t_desire: self.t_desire,
-            t_max: self.t_max,
-        })
+        self.requests.get(name).copied().unwrap_or(Times { t_desire: self.t_desire, t_max: self.t_max })
     }
 }
 
 impl<'de> Deserialize<'de> for QosSla {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        RawSla::deserialize(from)?
-            .check()
-            .map_err(serde::de::Error::custom)
+        RawSla::deserialize(from)?.check().map_err(serde::de::Error::custom)
     }
 }
 

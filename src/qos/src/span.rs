@@ -20,11 +20,7 @@ pub struct ParseSpanError(String);
 
 impl fmt::Display for ParseSpanError {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "{:?} is not a time from a nanosecond to a day; write seconds, such as 0.3, or 300ms",
-            self.0
-        )
+        write!(out, "{:?} is not a time from a nanosecond to a day; write seconds, such as 0.3, or 300ms", self.0)
     }
 }
 
@@ -38,9 +34,7 @@ impl Span {
 
     /// Creates a span from seconds; `None` if it is zero, negative or longer than a day.
     pub fn from_seconds(seconds: f64) -> Option<Span> {
-        Duration::try_from_secs_f64(seconds)
-            .ok()
-            .and_then(Span::from_duration)
+        Duration::try_from_secs_f64(seconds).ok().and_then(Span::from_duration)
     }
 
     fn from_duration(time: Duration) -> Option<Span> {
@@ -143,18 +137,10 @@ mod tests {
 
     #[test]
     fn what_is_no_time_is_named() {
-        for text in [
-            "", "soon", "0", "0ms", "-1", "nan", "inf", "1e-12", "86401", "5 min", "ms",
-        ] {
+        for text in ["", "soon", "0", "0ms", "-1", "nan", "inf", "1e-12", "86401", "5 min", "ms"] {
             let refused = text.parse::<Span>().expect_err(text);
-            assert!(
-                refused.to_string().contains(&format!("{text:?}")),
-                "{refused}"
-            );
+            assert!(refused.to_string().contains(&format!("{text:?}")), "{refused}");
         }
-        assert_eq!(
-            (Span::from_millis(0), Span::from_seconds(1e9)),
-            (None, None)
-        );
+        assert_eq!((Span::from_millis(0), Span::from_seconds(1e9)), (None, None));
     }
 }

@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
 use qos::{
-    CorrelationKey, DeliveryVerdict, Effect, Governor, LocalState, QosEvent, QosSla,
-    RequestChannel, RequestCounts, Responder, Responders, RetentionLimits, Stamp,
+    CorrelationKey, DeliveryVerdict, Effect, Governor, LocalState, QosEvent, QosSla, RequestChannel, RequestCounts,
+    Responder, Responders, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -105,17 +105,10 @@ impl World {
             "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}
         });
         let begin = Instant::now();
-        let mut governor = Governor::new(
-            QosSla::parse(sla).unwrap(),
-            vec![],
-            RetentionLimits::default(),
-        );
+        let mut governor = Governor::new(QosSla::parse(sla).unwrap(), vec![], RetentionLimits::default());
         governor.link_up(begin, false);
         governor.begin(begin);
-        let node = || Node {
-            takes: 64,
-            ..Node::default()
-        };
+        let node = || Node { takes: 64, ..Node::default() };
         let mut world = Self {
             governor,
             begin,
@@ -157,8 +150,7 @@ impl World {
 
     fn add_action_pair(&mut self) {
         let pair = "/walk/goal -> /walk/result, /walk/feedback by goal";
-        self.governor
-            .add_pairs(self.now(), vec![pair.parse().unwrap()]);
+        self.governor.add_pairs(self.now(), vec![pair.parse().unwrap()]);
     }
 
     fn now(&self) -> Instant {
@@ -209,33 +201,21 @@ impl World {
     fn publish_picture(&mut self) {
         self.pictures += 1;
         let topic: Arc<str> = "/image".into();
-        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp {
-            secs: self.pictures,
-            nsecs: 0,
-        }));
-        self.governor
-            .input(self.now(), &topic, key, Sent::Picture(self.pictures));
+        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp { secs: self.pictures, nsecs: 0 }));
+        self.governor.input(self.now(), &topic, key, Sent::Picture(self.pictures));
         self.apply_effects();
     }
 
     fn send_goal(&mut self, number: u32) {
         let topic: Arc<str> = "/walk/goal".into();
-        self.governor
-            .input(self.now(), &topic, Some(goal(number)), Sent::Goal(number));
+        self.governor.input(self.now(), &topic, Some(goal(number)), Sent::Goal(number));
         self.apply_effects();
     }
 
     fn answer(&mut self, side: Responder, number: u32) {
         self.heard.push(self.t);
-        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp {
-            secs: number,
-            nsecs: 0,
-        }));
-        if self
-            .governor
-            .output(self.now(), side, "/found", key, Duration::ZERO)
-            == DeliveryVerdict::Deliver
-        {
+        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp { secs: number, nsecs: 0 }));
+        if self.governor.output(self.now(), side, "/found", key, Duration::ZERO) == DeliveryVerdict::Deliver {
             self.delivered.entry(number).or_default()[side.index()] += 1;
         }
         self.apply_effects();
@@ -255,14 +235,10 @@ impl World {
             for number in self.nodes[side.index()].goals.clone() {
                 let earlier = self.speakers.get(&number).copied();
                 let earlier = earlier.filter(|earlier| self.is_asked(*earlier));
-                let may_speak =
-                    self.is_asked(side) || self.governor.sides() == Responders::default();
+                let may_speak = self.is_asked(side) || self.governor.sides() == Responders::default();
                 let is_heard = may_speak && earlier.is_none_or(|earlier| earlier == side);
                 let is_told = self.publish_for_goal(side, "/walk/feedback", number);
-                assert_eq!(
-                    is_told, is_heard,
-                    "goal {number}, {side:?} after {earlier:?}"
-                );
+                assert_eq!(is_told, is_heard, "goal {number}, {side:?} after {earlier:?}");
                 if is_heard {
                     self.speakers.insert(number, side);
                 }
@@ -273,9 +249,7 @@ impl World {
     /// Publishes a message of a goal from one side. Returns true if it is delivered.
     fn publish_for_goal(&mut self, side: Responder, topic: &str, number: u32) -> bool {
         let key = Some(goal(number));
-        let verdict = self
-            .governor
-            .output(self.now(), side, topic, key, Duration::ZERO);
+        let verdict = self.governor.output(self.now(), side, topic, key, Duration::ZERO);
         self.apply_effects();
         verdict == DeliveryVerdict::Deliver
     }
@@ -290,12 +264,7 @@ impl World {
     fn apply_effects(&mut self) {
         while let Some(effect) = self.governor.next_effect() {
             match effect {
-                Effect::Give {
-                    side,
-                    payload,
-                    channel: RequestChannel::Topic(_),
-                    ..
-                } => match side {
+                Effect::Give { side, payload, channel: RequestChannel::Topic(_), .. } => match side {
                     Responder::Cloud => {
                         let is_lost = matches!(payload, Sent::Picture(number)
                             if self.loses > 0 && number % self.loses == 0);
@@ -357,26 +326,14 @@ fn a_node_that_takes_64_ms_of_a_30_hz_camera_keeps_its_promise_by_the_cloud() {
         world.advance(10_000);
         let counts = world.counts();
         println!("{by}, {delay} ms each way: {counts:?}");
-        assert_eq!(
-            (counts.late, counts.safe_stops),
-            (0, 0),
-            "{by}, {delay}: {counts:?}"
-        );
-        assert!(
-            counts.desired + counts.accepted > 100,
-            "{by}, {delay}: {counts:?}"
-        );
+        assert_eq!((counts.late, counts.safe_stops), (0, 0), "{by}, {delay}: {counts:?}");
+        assert!(counts.desired + counts.accepted > 100, "{by}, {delay}: {counts:?}");
     }
 }
 
 #[test]
 fn offline_a_warm_original_that_answers_in_time_stops_nobody() {
-    for (by, period, takes) in [
-        ("arrival", 50, 40),
-        ("arrival", 33, 64),
-        ("stamp", 50, 40),
-        ("stamp", 33, 64),
-    ] {
+    for (by, period, takes) in [("arrival", 50, 40), ("arrival", 33, 64), ("stamp", 50, 40), ("stamp", 33, 64)] {
         let mut world = World::with_pairs("warm", by);
         world.period = period;
         world.nodes[1].takes = takes;
@@ -416,10 +373,7 @@ fn who_answers_everything_too_late_stops_the_robot() {
         (world.delay, world.nodes[0].takes) = (225, takes);
         world.advance(10_000);
         let counts = world.counts();
-        assert!(
-            counts.safe_stops > 100 && counts.unanswered_in_time > 100,
-            "{takes} ms: {counts:?}"
-        );
+        assert!(counts.safe_stops > 100 && counts.unanswered_in_time > 100, "{takes} ms: {counts:?}");
     }
 }
 
@@ -450,11 +404,7 @@ fn feedback_goes_on_after_a_hand_over_and_a_long_goal_stops_nobody() {
     assert_eq!(trouble, (1, 0, 0), "{counts:?}");
     world.cut_link();
     world.advance(2000);
-    assert_eq!(
-        world.speakers[&1],
-        Responder::Local,
-        "it was given the goal"
-    );
+    assert_eq!(world.speakers[&1], Responder::Local, "it was given the goal");
     world.restore_link(true);
     world.advance(5000);
     assert_eq!(world.speakers[&1], Responder::Cloud);
@@ -492,16 +442,7 @@ fn any_times() -> impl Strategy<Value = Times> {
     let numbers = (300u64..2500, 0u64..150, [takes(), takes()], loses);
     (numbers, link, chances).prop_map(|((length, delay, takes, loses), link, chances)| {
         let [is_silent, crashes, sends_goal] = chances;
-        Times {
-            length,
-            link,
-            is_silent,
-            delay,
-            takes,
-            loses,
-            crashes,
-            sends_goal,
-        }
+        Times { length, link, is_silent, delay, takes, loses, crashes, sends_goal }
     })
 }
 

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
 use qos::{
-    DeliveryVerdict, Effect, Failure, Governor, LocalState, QosEvent, QosSla, RequestChannel,
-    RequestId, Responder, RetentionLimits, Stamp,
+    DeliveryVerdict, Effect, Failure, Governor, LocalState, QosEvent, QosSla, RequestChannel, RequestId, Responder,
+    RetentionLimits, Stamp,
 };
 
 #[derive(Debug, Clone)]
@@ -79,16 +79,9 @@ impl World {
         });
         let pair = format!("/image -> /found, /marked by {by}");
         // Longer than any run: later answers would not be recognised.
-        let limits = RetentionLimits {
-            patience: Duration::from_secs(100_000),
-            ..RetentionLimits::default()
-        };
+        let limits = RetentionLimits { patience: Duration::from_secs(100_000), ..RetentionLimits::default() };
         let mut world = Self {
-            governor: Governor::new(
-                QosSla::parse(sla).unwrap(),
-                vec![pair.parse().unwrap()],
-                limits,
-            ),
+            governor: Governor::new(QosSla::parse(sla).unwrap(), vec![pair.parse().unwrap()], limits),
             now: Instant::now(),
             given: [vec![], vec![]],
             calls: HashMap::new(),
@@ -104,33 +97,17 @@ impl World {
     fn apply_effects(&mut self) {
         while let Some(effect) = self.governor.next_effect() {
             match effect {
-                Effect::Give {
-                    side,
-                    request,
-                    channel,
-                    payload,
-                } => {
+                Effect::Give { side, request, channel, payload } => {
                     let given = match channel {
-                        RequestChannel::Call(_) => {
-                            PendingMessage::Call(request.expect("calls are requests"))
-                        }
-                        RequestChannel::Topic(_) => {
-                            PendingMessage::Input(payload.expect("inputs carry their stamp"))
-                        }
+                        RequestChannel::Call(_) => PendingMessage::Call(request.expect("calls are requests")),
+                        RequestChannel::Topic(_) => PendingMessage::Input(payload.expect("inputs carry their stamp")),
                     };
                     self.given[side as usize].push(given);
                 }
-                Effect::Fail {
-                    request,
-                    channel,
-                    reason,
-                } => {
+                Effect::Fail { request, channel, reason } => {
                     assert!(!reason.is_empty());
                     if matches!(channel, RequestChannel::Call(_)) {
-                        self.calls
-                            .get_mut(&request)
-                            .expect("only calls made fail")
-                            .1 += 1;
+                        self.calls.get_mut(&request).expect("only calls made fail").1 += 1;
                     }
                 }
                 Effect::Event(QosEvent::Stop(_)) => self.given[Responder::Local as usize].clear(),
@@ -149,13 +126,7 @@ impl World {
                 }
             }
             PendingMessage::Input(stamp) => {
-                let verdict = self.governor.output(
-                    self.now,
-                    side,
-                    "/found",
-                    Some(stamp.into()),
-                    Duration::ZERO,
-                );
+                let verdict = self.governor.output(self.now, side, "/found", Some(stamp.into()), Duration::ZERO);
                 if verdict == DeliveryVerdict::Deliver {
                     let counts = self.inputs.get_mut(&stamp).expect("it was made");
                     // Each side may answer one input several times, but only one side is delivered.
@@ -171,18 +142,13 @@ impl World {
             return None;
         }
         let which = which % given.len();
-        Some(if keep {
-            given[which]
-        } else {
-            given.swap_remove(which)
-        })
+        Some(if keep { given[which] } else { given.swap_remove(which) })
     }
 
     fn input(&mut self, stamp: Stamp) {
         self.inputs.entry(stamp).or_default();
         let name = self.input_name.clone();
-        self.governor
-            .input(self.now, &name, Some(stamp.into()), Some(stamp));
+        self.governor.input(self.now, &name, Some(stamp.into()), Some(stamp));
     }
 
     fn apply(&mut self, op: Op) {
@@ -194,15 +160,9 @@ impl World {
             }
             Op::Input => {
                 self.stamps += 1;
-                self.input(Stamp {
-                    secs: self.stamps,
-                    nsecs: 0,
-                });
+                self.input(Stamp { secs: self.stamps, nsecs: 0 });
             }
-            Op::InputAgain if self.stamps > 0 => self.input(Stamp {
-                secs: self.stamps,
-                nsecs: 0,
-            }),
+            Op::InputAgain if self.stamps > 0 => self.input(Stamp { secs: self.stamps, nsecs: 0 }),
             Op::InputAgain => {}
             Op::Pass(ms) => {
                 let until = self.now + Duration::from_millis(ms);
@@ -222,11 +182,7 @@ impl World {
             Op::Fail(side, which, refused) => {
                 if let Some(PendingMessage::Call(id)) = self.pick(side, which, false) {
                     let why = "because".to_owned();
-                    let failure = if refused {
-                        Failure::Refused(why)
-                    } else {
-                        Failure::Unreachable(why)
-                    };
+                    let failure = if refused { Failure::Refused(why) } else { Failure::Unreachable(why) };
                     self.governor.on_failure(self.now, side, id, &failure);
                 }
             }
@@ -271,10 +227,7 @@ fn run(world: &mut World, ops: Vec<Op>) -> Result<(), TestCaseError> {
     for op in ops {
         world.apply(op);
         for (answered, failed) in world.calls.values() {
-            prop_assert!(
-                answered + failed <= 1,
-                "answered {answered} times, failed {failed} times"
-            );
+            prop_assert!(answered + failed <= 1, "answered {answered} times, failed {failed} times");
         }
         for sides in world.inputs.values() {
             prop_assert!(sides.0 < 3, "both sides were heard");
@@ -282,13 +235,7 @@ fn run(world: &mut World, ops: Vec<Op>) -> Result<(), TestCaseError> {
     }
     world.settle();
     for (answered, failed) in world.calls.values() {
-        prop_assert_eq!(
-            answered + failed,
-            1,
-            "answered {} times, failed {} times",
-            answered,
-            failed
-        );
+        prop_assert_eq!(answered + failed, 1, "answered {} times, failed {} times", answered, failed);
     }
     let report = world.governor.report(world.now);
     let counts = report.counts;
@@ -298,19 +245,13 @@ fn run(world: &mut World, ops: Vec<Op>) -> Result<(), TestCaseError> {
         "each request counts once"
     );
     prop_assert_eq!(
-        counts.from_cloud + counts.from_local + counts.failed + counts.left_out + counts.late
-            >= counts.requests,
+        counts.from_cloud + counts.from_local + counts.failed + counts.left_out + counts.late >= counts.requests,
         true,
         "{:?}",
         counts
     );
     let text = serde_json::to_string(&report).unwrap();
-    prop_assert_eq!(
-        serde_json::from_str::<qos::QosReport>(&text)
-            .unwrap()
-            .counts,
-        counts
-    );
+    prop_assert_eq!(serde_json::from_str::<qos::QosReport>(&text).unwrap().counts, counts);
     Ok(())
 }
 

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::{
-    CorrelationKey, DecisionReason, DeliveryVerdict, Effect, Failure, Governor, LocalState, Phases,
-    QosEvent, QosSla, RequestChannel, RequestId, RequestOutcome, Responder, RetentionLimits, Stamp,
+    CorrelationKey, DecisionReason, DeliveryVerdict, Effect, Failure, Governor, LocalState, Phases, QosEvent, QosSla,
+    RequestChannel, RequestId, RequestOutcome, Responder, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -27,23 +27,13 @@ impl Robot {
         let pairs = vec![
             "/image -> /found by stamp".parse().unwrap(),
             "/in -> /out by arrival".parse().unwrap(),
-            "/walk/goal -> /walk/result, /walk/feedback by goal"
-                .parse()
-                .unwrap(),
+            "/walk/goal -> /walk/result, /walk/feedback by goal".parse().unwrap(),
         ];
-        let mut governor = Governor::new(
-            QosSla::parse(sla).unwrap(),
-            pairs,
-            RetentionLimits::default(),
-        );
+        let mut governor = Governor::new(QosSla::parse(sla).unwrap(), pairs, RetentionLimits::default());
         let now = Instant::now();
         governor.link_up(now, false);
         governor.begin(now);
-        Self {
-            governor,
-            now,
-            outcomes: Vec::new(),
-        }
+        Self { governor, now, outcomes: Vec::new() }
     }
 
     /// Advances the time, meets the deadlines, and returns the effects since the last call, in words.
@@ -91,12 +81,7 @@ impl Robot {
 
     fn image(&mut self, secs: u32, payload: &'static str) {
         let name: Arc<str> = "/image".into();
-        self.governor.input(
-            self.now,
-            &name,
-            Some(Stamp { secs, nsecs: 0 }.into()),
-            payload,
-        );
+        self.governor.input(self.now, &name, Some(Stamp { secs, nsecs: 0 }.into()), payload);
     }
 
     fn input(&mut self, payload: &'static str) {
@@ -106,13 +91,11 @@ impl Robot {
 
     fn output_found(&mut self, side: Responder, secs: u32) -> DeliveryVerdict {
         let stamp = Some(Stamp { secs, nsecs: 0 }.into());
-        self.governor
-            .output(self.now, side, "/found", stamp, Duration::ZERO)
+        self.governor.output(self.now, side, "/found", stamp, Duration::ZERO)
     }
 
     fn output_plain(&mut self, side: Responder) -> DeliveryVerdict {
-        self.governor
-            .output(self.now, side, "/out", None, Duration::ZERO)
+        self.governor.output(self.now, side, "/out", None, Duration::ZERO)
     }
 
     fn q(&self) -> f64 {
@@ -136,30 +119,15 @@ fn pictures_under_way_go_to_a_warm_original_as_soon_as_it_is_fed() {
     assert_eq!(robot.advance(200), ["second to Cloud"]);
     robot.image(3, "third");
     // At 500 ms the second one is late, too: Q is below the threshold, and the third is still fresh.
-    assert_eq!(
-        robot.advance(101),
-        ["third to Cloud", "feed", "third to Local"]
-    );
+    assert_eq!(robot.advance(101), ["third to Cloud", "feed", "third to Local"]);
     robot.advance(60);
-    assert_eq!(
-        robot.output_found(Responder::Local, 3),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_found(Responder::Local, 3), DeliveryVerdict::Deliver);
     robot.image(4, "fourth");
     // It has time for the first one between two fresh ones.
-    assert_eq!(
-        robot.effects(),
-        ["first to Local", "fourth to Cloud", "fourth to Local"]
-    );
+    assert_eq!(robot.effects(), ["first to Local", "fourth to Cloud", "fourth to Local"]);
     // A late answer of the cloud is delivered if no side has answered, and dropped otherwise.
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 1),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 3),
-        DeliveryVerdict::Drop
-    );
+    assert_eq!(robot.output_found(Responder::Cloud, 1), DeliveryVerdict::Deliver);
+    assert_eq!(robot.output_found(Responder::Cloud, 3), DeliveryVerdict::Drop);
 }
 
 #[test]
@@ -168,29 +136,16 @@ fn each_request_s_outcome_is_told_and_told_again_when_more_is_known() {
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.image(1, "picture");
     robot.advance(100);
-    assert_eq!(
-        robot.output_found(Responder::Local, 1),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_found(Responder::Local, 1), DeliveryVerdict::Deliver);
     robot.effects();
-    assert!(
-        robot.outcomes.is_empty(),
-        "the cloud's time has not counted"
-    );
+    assert!(robot.outcomes.is_empty(), "the cloud's time has not counted");
     robot.advance(201);
     let local = Some((Responder::Local, 100 * MS));
     let told = robot.outcomes.pop().unwrap();
     assert_eq!((told.cloud, told.answer, told.q), (None, local, 1.5));
     robot.advance(99);
-    let phases = |up: u32| Phases {
-        up: up * MS,
-        compute: 100 * MS,
-        ..Phases::default()
-    };
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 1),
-        DeliveryVerdict::Drop
-    );
+    let phases = |up: u32| Phases { up: up * MS, compute: 100 * MS, ..Phases::default() };
+    assert_eq!(robot.output_found(Responder::Cloud, 1), DeliveryVerdict::Drop);
     // Phases of another request add up to something else.
     robot.governor.record_phases(&phases(50));
     robot.governor.record_phases(&phases(300));
@@ -214,42 +169,17 @@ fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
     for (name, payload) in [("one", "first"), ("two", "second")] {
         robot.governor.input(robot.now, &goal, id(name), payload);
     }
-    assert_eq!(
-        robot.effects(),
-        [
-            "first to Cloud",
-            "first to Local",
-            "second to Cloud",
-            "second to Local"
-        ]
-    );
+    assert_eq!(robot.effects(), ["first to Cloud", "first to Local", "second to Cloud", "second to Local"]);
     let mut output = |side, end: &str, name| {
         let topic = format!("/walk/{end}");
-        robot
-            .governor
-            .output(robot.now, side, &topic, id(name), Duration::ZERO)
+        robot.governor.output(robot.now, side, &topic, id(name), Duration::ZERO)
     };
     // Feedback comes from the side that was first; results likewise, in any order.
-    assert_eq!(
-        output(Responder::Cloud, "feedback", "two"),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        output(Responder::Local, "feedback", "two"),
-        DeliveryVerdict::Drop
-    );
-    assert_eq!(
-        output(Responder::Local, "result", "two"),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        output(Responder::Cloud, "result", "two"),
-        DeliveryVerdict::Drop
-    );
-    assert_eq!(
-        output(Responder::Cloud, "result", "one"),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(output(Responder::Cloud, "feedback", "two"), DeliveryVerdict::Deliver);
+    assert_eq!(output(Responder::Local, "feedback", "two"), DeliveryVerdict::Drop);
+    assert_eq!(output(Responder::Local, "result", "two"), DeliveryVerdict::Deliver);
+    assert_eq!(output(Responder::Cloud, "result", "two"), DeliveryVerdict::Drop);
+    assert_eq!(output(Responder::Cloud, "result", "one"), DeliveryVerdict::Deliver);
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.from_cloud, counts.from_local), (1, 1));
     // The cloud was fast twice: the original is no longer fed.
@@ -267,10 +197,7 @@ fn a_late_answer_does_not_count_again() {
     robot.advance(301);
     assert_eq!(robot.q(), 4.0);
     robot.advance(700);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, id),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Deliver);
     assert_eq!(robot.q(), 4.0);
     assert_eq!(robot.governor.report(robot.now).counts.late, 1);
 }
@@ -282,20 +209,10 @@ fn the_clouds_time_counts_though_the_local_answer_won() {
     assert_eq!(robot.effects(), ["start", "feed"]);
     let id = robot.call("sum");
     assert_eq!(robot.advance(10), ["sum to Cloud", "sum to Local"]);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Local, id),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        robot.q(),
-        3.0,
-        "the local answer says nothing about the cloud"
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Local, id), DeliveryVerdict::Deliver);
+    assert_eq!(robot.q(), 3.0, "the local answer says nothing about the cloud");
     robot.advance(80);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, id),
-        DeliveryVerdict::Drop
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Drop);
     assert_eq!(robot.q(), 5.0);
     assert_eq!(robot.effects(), ["stop feeding"]);
 }
@@ -309,15 +226,9 @@ fn the_link_is_lost_while_the_local_original_runs() {
     robot.governor.link_down(robot.now);
     assert!(robot.advance(290).is_empty(), "it may be answered in time");
     assert_eq!(robot.advance(1), ["feed", "sum to Local"]);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Local, id),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Local, id), DeliveryVerdict::Deliver);
     robot.governor.link_up(robot.now, true);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, id),
-        DeliveryVerdict::Drop
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Drop);
     assert_eq!(robot.q(), 2.5, "late once, whatever comes");
 }
 
@@ -337,19 +248,13 @@ fn a_blip_of_the_link_counts_for_nothing_where_the_answers_come_in_time() {
     robot.governor.link_up(robot.now, true);
     assert_eq!(robot.advance(20), ["later sum to Cloud"]);
     for number in 1..=3 {
-        assert_eq!(
-            robot.output_found(Responder::Cloud, number),
-            DeliveryVerdict::Deliver
-        );
+        assert_eq!(robot.output_found(Responder::Cloud, number), DeliveryVerdict::Deliver);
     }
     for id in [sum, late] {
         let verdict = robot.governor.on_result(robot.now, Responder::Cloud, id);
         assert_eq!(verdict, DeliveryVerdict::Deliver);
     }
-    assert!(
-        robot.advance(10_000).is_empty(),
-        "the original is not started"
-    );
+    assert!(robot.advance(10_000).is_empty(), "the original is not started");
     assert_eq!(robot.q(), 15.0);
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.requests, counts.desired, counts.late), (5, 5, 0));
@@ -365,14 +270,8 @@ fn what_a_blip_delays_beyond_t_max_counts_once_each() {
     robot.advance(101);
     assert_eq!(robot.q(), 7.5, "the first is late, the second is not");
     robot.governor.link_up(robot.now, true);
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 1),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 2),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_found(Responder::Cloud, 1), DeliveryVerdict::Deliver);
+    assert_eq!(robot.output_found(Responder::Cloud, 2), DeliveryVerdict::Deliver);
     assert_eq!(robot.q(), 8.5);
     robot.advance(10_000);
     assert_eq!(robot.q(), 8.5);
@@ -388,14 +287,8 @@ fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
     robot.advance(20);
     robot.governor.link_up(robot.now, true);
     assert!(robot.advance(20).is_empty(), "the link has kept them");
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Deliver);
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Deliver);
     robot.advance(10_000);
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.requests, counts.late), (1, 0));
@@ -405,10 +298,7 @@ fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
     assert_eq!(robot.effects(), ["c to Cloud"]);
     robot.governor.link_up(robot.now, false);
     assert_eq!(robot.effects(), ["c to Cloud"]);
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Deliver);
     assert_eq!(robot.governor.report(robot.now).counts.late, 0);
 }
 
@@ -416,34 +306,22 @@ fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
 fn the_link_is_lost_and_there_is_no_local_original() {
     let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 3}"#));
     assert_eq!(robot.effects(), ["start"]);
-    robot
-        .governor
-        .on_local_state(robot.now, LocalState::Missing);
-    robot
-        .governor
-        .on_local_state(robot.now, LocalState::Missing);
+    robot.governor.on_local_state(robot.now, LocalState::Missing);
+    robot.governor.on_local_state(robot.now, LocalState::Missing);
     assert_eq!(robot.effects(), ["SaidOnceMissing"]);
     let (answered, lost) = (robot.call("first"), robot.call("second"));
     robot.advance(10);
     robot.governor.link_down(robot.now);
     assert!(robot.effects().is_empty(), "the link may come back in time");
     robot.governor.link_up(robot.now, true);
-    assert_eq!(
-        robot
-            .governor
-            .on_result(robot.now, Responder::Cloud, answered),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, answered), DeliveryVerdict::Deliver);
     robot.governor.link_down(robot.now);
     let words = robot.advance(301);
     assert_eq!(words.len(), 1, "{words:?}");
     assert!(words[0].contains("the link is down"), "{words:?}");
     assert!(words[0].contains("there is no local original"), "{words:?}");
     robot.governor.link_up(robot.now, true);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, lost),
-        DeliveryVerdict::Drop
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, lost), DeliveryVerdict::Drop);
 }
 
 #[test]
@@ -454,29 +332,18 @@ fn a_call_fails_only_when_both_sides_failed() {
     let id = robot.call("sum");
     robot.effects();
     let no = Failure::Unreachable("servant ended".into());
-    robot
-        .governor
-        .on_failure(robot.now, Responder::Cloud, id, &no);
+    robot.governor.on_failure(robot.now, Responder::Cloud, id, &no);
     assert!(robot.effects().is_empty());
     let no = Failure::Refused("division by zero".into());
-    robot
-        .governor
-        .on_failure(robot.now, Responder::Local, id, &no);
-    assert_eq!(
-        robot.effects(),
-        ["fail: cloud: servant ended; local: division by zero"]
-    );
-    robot
-        .governor
-        .on_failure(robot.now, Responder::Local, id, &no);
+    robot.governor.on_failure(robot.now, Responder::Local, id, &no);
+    assert_eq!(robot.effects(), ["fail: cloud: servant ended; local: division by zero"]);
+    robot.governor.on_failure(robot.now, Responder::Local, id, &no);
     assert!(robot.effects().is_empty());
 }
 
 #[test]
 fn stateful_asks_one_side_at_a_time_and_hands_back() {
-    let mut robot = Robot::new(json(
-        r#"{"local": "warm", "mode": "stateful", "initial": 1}"#,
-    ));
+    let mut robot = Robot::new(json(r#"{"local": "warm", "mode": "stateful", "initial": 1}"#));
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.input("a");
     assert_eq!(robot.effects(), ["start", "a to Cloud"]);
@@ -486,10 +353,7 @@ fn stateful_asks_one_side_at_a_time_and_hands_back() {
     assert!(!robot.governor.sides().cloud);
     robot.governor.link_up(robot.now, true);
     let report = robot.governor.report(robot.now);
-    assert_eq!(
-        report.events.last().unwrap().event,
-        QosEvent::StopFeeding(DecisionReason::LinkUp)
-    );
+    assert_eq!(report.events.last().unwrap().event, QosEvent::StopFeeding(DecisionReason::LinkUp));
     robot.effects();
     robot.input("c");
     assert!(robot.effects().iter().all(|word| !word.contains("Local")));
@@ -501,16 +365,9 @@ fn without_stamps_one_request_is_outstanding_and_forgotten_at_t_max() {
     robot.input("a");
     robot.advance(50);
     robot.input("b");
-    assert_eq!(
-        robot.governor.report(robot.now).counts.requests,
-        1,
-        "b is fed, but a is outstanding"
-    );
+    assert_eq!(robot.governor.report(robot.now).counts.requests, 1, "b is fed, but a is outstanding");
     robot.advance(40);
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Deliver);
     assert_eq!(robot.q(), 10.0);
     assert_eq!(
         robot.output_plain(Responder::Cloud),
@@ -522,10 +379,7 @@ fn without_stamps_one_request_is_outstanding_and_forgotten_at_t_max() {
     assert_eq!(robot.q(), 5.0);
     robot.input("d");
     robot.advance(100);
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Deliver);
     assert_eq!(robot.q(), 7.0);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 3);
 }
@@ -535,26 +389,12 @@ fn without_stamps_both_answer_and_one_is_heard() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.input("a");
-    assert_eq!(
-        robot.output_plain(Responder::Local),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_plain(Responder::Local), DeliveryVerdict::Deliver);
     robot.advance(301);
     robot.input("b");
-    assert_eq!(
-        robot.output_plain(Responder::Local),
-        DeliveryVerdict::Deliver
-    );
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Drop,
-        "late to a"
-    );
-    assert_eq!(
-        robot.output_plain(Responder::Cloud),
-        DeliveryVerdict::Drop,
-        "late to b"
-    );
+    assert_eq!(robot.output_plain(Responder::Local), DeliveryVerdict::Deliver);
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Drop, "late to a");
+    assert_eq!(robot.output_plain(Responder::Cloud), DeliveryVerdict::Drop, "late to b");
 }
 
 #[test]
@@ -563,29 +403,19 @@ fn a_node_that_does_not_copy_stamps_is_noticed() {
     for secs in 1..=12 {
         robot.image(secs, "scan");
         robot.advance(20);
-        assert_eq!(
-            robot.output_found(Responder::Cloud, 1000 + secs),
-            DeliveryVerdict::Deliver
-        );
+        assert_eq!(robot.output_found(Responder::Cloud, 1000 + secs), DeliveryVerdict::Deliver);
         robot.advance(20);
     }
     let words = robot.effects();
     let report = robot.governor.report(robot.now);
-    assert!(
-        report
-            .events
-            .iter()
-            .any(|event| event.event == QosEvent::Uncorrelated("/image".into())),
-        "{words:?}"
-    );
+    assert!(report.events.iter().any(|event| event.event == QosEvent::Uncorrelated("/image".into())), "{words:?}");
     assert_eq!(report.pairs[0], "/image -> /found by arrival");
     assert_eq!(report.counts.desired, 4);
 }
 
 #[test]
 fn the_safe_stop_comes_when_nobody_answers_in_time() {
-    let stop =
-        r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
+    let stop = r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
     let mut robot = Robot::new(json(stop));
     robot.image(1, "picture");
     robot.effects();
@@ -593,10 +423,7 @@ fn the_safe_stop_comes_when_nobody_answers_in_time() {
     assert_eq!(robot.advance(1), ["safe stop"]);
     robot.image(2, "picture");
     robot.advance(100);
-    assert_eq!(
-        robot.output_found(Responder::Cloud, 2),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.output_found(Responder::Cloud, 2), DeliveryVerdict::Deliver);
     assert!(robot.advance(1000).is_empty());
 }
 
@@ -609,30 +436,18 @@ fn frames_per_second_start_the_local_original_and_stop_the_robot() {
     robot.governor.set_listened(robot.now, "/found", true);
     for _ in 0..3 {
         robot.advance(100);
-        assert_eq!(
-            robot.output_found(Responder::Cloud, 1),
-            DeliveryVerdict::Deliver
-        );
+        assert_eq!(robot.output_found(Responder::Cloud, 1), DeliveryVerdict::Deliver);
     }
     assert_eq!(robot.q(), 9.0);
     // Q 9, 4.5, 2.25
-    assert!(
-        robot.advance(400).is_empty(),
-        "a frame now would be in time"
-    );
+    assert!(robot.advance(400).is_empty(), "a frame now would be in time");
     assert_eq!(robot.advance(1), ["safe stop"]);
     assert_eq!(robot.advance(250), ["safe stop", "start"]);
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["feed"]);
     robot.advance(50);
-    assert_eq!(
-        robot.output_found(Responder::Local, 1),
-        DeliveryVerdict::Deliver
-    );
-    assert!(
-        robot.advance(200).iter().all(|word| word != "safe stop"),
-        "the local original's frames count for that"
-    );
+    assert_eq!(robot.output_found(Responder::Local, 1), DeliveryVerdict::Deliver);
+    assert!(robot.advance(200).iter().all(|word| word != "safe stop"), "the local original's frames count for that");
 }
 
 #[test]
@@ -647,10 +462,7 @@ fn a_frame_that_was_on_its_way_when_nobody_listened_any_more_awaits_no_other() {
         )));
         robot.governor.set_listened(robot.now, "/found", true);
         robot.advance(100);
-        assert_eq!(
-            robot.output_found(Responder::Cloud, 1),
-            DeliveryVerdict::Deliver
-        );
+        assert_eq!(robot.output_found(Responder::Cloud, 1), DeliveryVerdict::Deliver);
         robot.governor.set_listened(robot.now, "/found", false);
         robot.advance(10);
         let q = robot.q();
@@ -708,10 +520,7 @@ fn a_crash_of_the_local_original_brings_calls_back_to_the_cloud() {
     robot.governor.on_local_crash(robot.now, "signal 11");
     let words = robot.effects();
     assert_eq!(words, ["Crashed(\"signal 11\")", "stop feeding"]);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, id),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, id), DeliveryVerdict::Deliver);
     robot.governor.on_local_state(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["feed"]);
 }
@@ -728,20 +537,10 @@ fn what_is_no_request_goes_where_requests_go() {
     assert_eq!(robot.effects(), ["info to Cloud", "info to Local"]);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 0);
     // Only one side is delivered on topics that answer nothing.
-    let status = |robot: &mut Robot, side| {
-        robot
-            .governor
-            .output(robot.now, side, "/status", None, Duration::ZERO)
-    };
-    assert_eq!(
-        status(&mut robot, Responder::Local),
-        DeliveryVerdict::Deliver
-    );
+    let status = |robot: &mut Robot, side| robot.governor.output(robot.now, side, "/status", None, Duration::ZERO);
+    assert_eq!(status(&mut robot, Responder::Local), DeliveryVerdict::Deliver);
     assert_eq!(status(&mut robot, Responder::Cloud), DeliveryVerdict::Drop);
-    assert_eq!(
-        RequestChannel::Topic(info.clone()),
-        RequestChannel::Topic(info)
-    );
+    assert_eq!(RequestChannel::Topic(info.clone()), RequestChannel::Topic(info));
 }
 
 #[test]
@@ -752,10 +551,7 @@ fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
     let slow = robot.call("slow");
     assert_eq!(robot.effects(), ["slow to Cloud"]);
     assert!(robot.advance(60_000).is_empty());
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Cloud, slow),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Cloud, slow), DeliveryVerdict::Deliver);
     // A link that comes back soon changes nothing, and messages sent meanwhile wait for it.
     robot.governor.link_down(robot.now);
     robot.governor.input(robot.now, &map, None, "map");
@@ -778,17 +574,12 @@ fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
     assert_eq!(robot.effects(), ["feed", "early to Local"]);
     robot.governor.input(robot.now, &map, None, "map");
     assert_eq!(robot.effects(), ["map to Local"]);
-    assert_eq!(
-        robot.governor.on_result(robot.now, Responder::Local, early),
-        DeliveryVerdict::Deliver
-    );
+    assert_eq!(robot.governor.on_result(robot.now, Responder::Local, early), DeliveryVerdict::Deliver);
     let report = robot.governor.report(robot.now);
     assert_eq!(report.fallback_after, Some(3.0));
     assert!(
         report.summary.contains("the local original answers")
-            && report
-                .summary
-                .contains("takes over 3 s after the link is lost"),
+            && report.summary.contains("takes over 3 s after the link is lost"),
         "{}",
         report.summary
     );
@@ -800,35 +591,21 @@ fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
 #[test]
 fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
     let sla = json(r#"{"measure": {"link": {"after": "500ms"}}}"#);
-    let mut governor = Governor::<&str>::new(
-        QosSla::parse(sla).unwrap(),
-        Vec::new(),
-        RetentionLimits::default(),
-    );
+    let mut governor = Governor::<&str>::new(QosSla::parse(sla).unwrap(), Vec::new(), RetentionLimits::default());
     let now = Instant::now();
     governor.begin(now);
     assert!(governor.next_effect().is_none());
     assert_eq!(governor.deadline(), Some(now + 500 * MS));
     governor.tick(now + 500 * MS);
     let started = governor.next_effect();
-    assert!(
-        matches!(
-            started,
-            Some(Effect::Event(QosEvent::Start(DecisionReason::LinkDown)))
-        ),
-        "{started:?}"
-    );
+    assert!(matches!(started, Some(Effect::Event(QosEvent::Start(DecisionReason::LinkDown)))), "{started:?}");
     assert_eq!(governor.deadline(), None, "said once");
 }
 
 #[test]
 fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
     let sla = json(r#"{"t_desire": 0.1, "t_max": 0.3, "unreached": "500ms"}"#);
-    let mut governor = Governor::<&str>::new(
-        QosSla::parse(sla).unwrap(),
-        Vec::new(),
-        RetentionLimits::default(),
-    );
+    let mut governor = Governor::<&str>::new(QosSla::parse(sla).unwrap(), Vec::new(), RetentionLimits::default());
     let now = Instant::now();
     let said = |governor: &mut Governor<&str>| {
         let effects = std::iter::from_fn(|| governor.next_effect());
@@ -842,20 +619,11 @@ fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
     governor.tick(now + 499 * MS);
     assert!(said(&mut governor).is_empty());
     governor.tick(now + 500 * MS);
-    assert_eq!(
-        said(&mut governor),
-        [QosEvent::Start(DecisionReason::LinkDown)]
-    );
+    assert_eq!(said(&mut governor), [QosEvent::Start(DecisionReason::LinkDown)]);
     governor.on_local_state(now + 600 * MS, LocalState::Ready);
-    assert_eq!(
-        said(&mut governor),
-        [QosEvent::Feed(DecisionReason::LinkDown)]
-    );
+    assert_eq!(said(&mut governor), [QosEvent::Feed(DecisionReason::LinkDown)]);
     governor.link_up(now + 700 * MS, false);
-    let back = [
-        QosEvent::StopFeeding(DecisionReason::LinkUp),
-        QosEvent::Stop(DecisionReason::LinkUp),
-    ];
+    let back = [QosEvent::StopFeeding(DecisionReason::LinkUp), QosEvent::Stop(DecisionReason::LinkUp)];
     assert_eq!(said(&mut governor), back);
     // From now on Q decides.
     governor.link_down(now + 800 * MS);
@@ -865,13 +633,8 @@ fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
 
 #[test]
 fn without_a_promise_warm_and_first_sign_are_ready_before_they_are_needed() {
-    for (local, begun) in [
-        (r#""warm""#, true),
-        (r#""warm", "warm": "first-sign""#, false),
-    ] {
-        let mut robot = Robot::new(json(&format!(
-            r#"{{"measure": {{"link": {{"after": 3}}}}, "local": {local}}}"#
-        )));
+    for (local, begun) in [(r#""warm""#, true), (r#""warm", "warm": "first-sign""#, false)] {
+        let mut robot = Robot::new(json(&format!(r#"{{"measure": {{"link": {{"after": 3}}}}, "local": {local}}}"#)));
         assert_eq!(robot.effects() == ["start"], begun, "{local}");
         robot.governor.link_down(robot.now);
         assert_eq!(robot.effects() == ["start"], !begun, "{local}");
@@ -910,11 +673,7 @@ fn a_goal_is_carried_out_while_the_link_is_away() {
     robot.governor.link_down(robot.now);
     robot.goal("jump");
     let said = robot.advance(1000);
-    assert!(
-        said.iter()
-            .any(|said| said.starts_with("fail: cloud: the link is down")),
-        "{said:?}"
-    );
+    assert!(said.iter().any(|said| said.starts_with("fail: cloud: the link is down")), "{said:?}");
 }
 
 #[test]
@@ -933,8 +692,7 @@ fn a_goal_that_the_cloud_was_at_goes_on_at_the_local_original() {
 
 #[test]
 fn a_goal_that_nobody_answers_for_minutes_stops_the_robot_once_and_one_that_is_accepted_never() {
-    let stop =
-        r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
+    let stop = r#"{"local": "none", "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#;
     let mut robot = Robot::new(json(stop));
     robot.goal("walk");
     robot.effects();
@@ -945,8 +703,6 @@ fn a_goal_that_nobody_answers_for_minutes_stops_the_robot_once_and_one_that_is_a
     assert!(robot.advance(300_000).is_empty());
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.unanswered_in_time, counts.late), (1, 2));
-    let verdict = robot
-        .governor
-        .on_result(robot.now, Responder::Cloud, accepted);
+    let verdict = robot.governor.on_result(robot.now, Responder::Cloud, accepted);
     assert_eq!(verdict, DeliveryVerdict::Deliver);
 }

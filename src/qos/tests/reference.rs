@@ -31,13 +31,7 @@ impl Reference {
         let q = initial.min(most);
         // Before any request: the goal may be violated from the start.
         let running = q < THRESHOLD;
-        Reference {
-            times: (T_DESIRE, T_MAX),
-            q,
-            most,
-            running,
-            log: if running { vec!["start"] } else { vec![] },
-        }
+        Reference { times: (T_DESIRE, T_MAX), q, most, running, log: if running { vec!["start"] } else { vec![] } }
     }
 
     fn request_done(&mut self, t: u64) {
@@ -181,11 +175,7 @@ impl World {
                     self.governor.on_local_state(now, LocalState::Ready);
                 }
                 Effect::Event(QosEvent::Stop(_)) => self.log.push("stop"),
-                Effect::Give {
-                    side: Responder::Cloud,
-                    payload,
-                    ..
-                } => self.given.push(payload),
+                Effect::Give { side: Responder::Cloud, payload, .. } => self.given.push(payload),
                 _ => {}
             }
         }
@@ -207,10 +197,7 @@ impl World {
 }
 
 fn stamp(number: u32) -> Stamp {
-    Stamp {
-        secs: number + 1,
-        nsecs: 0,
-    }
+    Stamp { secs: number + 1, nsecs: 0 }
 }
 
 proptest! {

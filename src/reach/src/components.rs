@@ -66,15 +66,8 @@ pub(crate) struct ComponentPlan {
 }
 
 impl ComponentPlan {
-    pub(crate) fn new(
-        components: BTreeMap<String, Vec<Component>>,
-        registry: Arc<Registry>,
-    ) -> Self {
-        Self {
-            components,
-            registry,
-            patience: PATIENCE,
-        }
+    pub(crate) fn new(components: BTreeMap<String, Vec<Component>>, registry: Arc<Registry>) -> Self {
+        Self { components, registry, patience: PATIENCE }
     }
 }
 
@@ -169,24 +162,17 @@ impl ContainerFollower {
     }
 
     async fn load_components(&self, name: &str) -> Result<Vec<String>, ContainerLoadError> {
-        let ComponentPlan {
-            components,
-            registry,
-            patience,
-        } = &self.wanted;
+        let ComponentPlan { components, registry, patience } = &self.wanted;
         let container = ComponentContainer::new(Arc::clone(&self.bus), registry, name);
-        let container = container.map_err(|source| ContainerLoadError::NoDefinitions {
-            container: name.to_owned(),
-            source,
-        })?;
+        let container =
+            container.map_err(|source| ContainerLoadError::NoDefinitions { container: name.to_owned(), source })?;
         let components = components.get(name).map_or(&[][..], Vec::as_slice);
         let loaded = container.load_all(components, *patience).await;
         loaded.map_err(|error| ContainerLoadError::NotLoaded(Box::new(error)))
     }
 
     fn show_load(&self, name: &str, load: ContainerLoad) {
-        self.shown
-            .send_modify(|all| drop(all.insert(name.to_owned(), load)));
+        self.shown.send_modify(|all| drop(all.insert(name.to_owned(), load)));
     }
 }
 

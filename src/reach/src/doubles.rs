@@ -18,10 +18,7 @@ pub struct StubNodesDouble(Vec<StubNode>);
 impl StubNodesDouble {
     /// Creates a double with one node of this name.
     pub fn node(name: &str) -> Self {
-        let node = NodeLaunch {
-            name: name.to_owned(),
-            ..NodeLaunch::default()
-        };
+        let node = NodeLaunch { name: name.to_owned(), ..NodeLaunch::default() };
         let given = Vec::new();
         Self(vec![StubNode { node, given }])
     }

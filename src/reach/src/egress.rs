@@ -15,16 +15,13 @@ pub use relay::Relays;
 /// Syntax of a destination in a push.
 const ASKED: &str = "a HOST:PORT to connect to";
 /// Syntax of a rule in the configuration.
-const WRITTEN: &str =
-    "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
+const WRITTEN: &str = "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
 
 /// Reason why a route is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum EgressError {
     /// No rule of the configuration allows it.
-    #[error(
-        "egress {name} is not allowed here; the operator can add it to egress in [allow] of the configuration"
-    )]
+    #[error("egress {name} is not allowed here; the operator can add it to egress in [allow] of the configuration")]
     NotAllowed {
         /// Destination as written.
         name: String,
@@ -165,9 +162,7 @@ impl FromStr for EgressNetwork {
             Some(prefix) => prefix.parse().map_err(drop)?,
             None => longest,
         };
-        (prefix <= longest)
-            .then_some(EgressNetwork { address, prefix })
-            .ok_or(())
+        (prefix <= longest).then_some(EgressNetwork { address, prefix }).ok_or(())
     }
 }
 
@@ -175,14 +170,9 @@ impl FromStr for EgressRule {
     type Err = EgressError;
 
     fn from_str(text: &str) -> Result<EgressRule, EgressError> {
-        let malformed = || EgressError::Malformed {
-            name: text.to_owned(),
-            form: WRITTEN,
-        };
+        let malformed = || EgressError::Malformed { name: text.to_owned(), form: WRITTEN };
         let (host, port) = split_host_port(text).ok_or_else(malformed)?;
-        let bare = host
-            .strip_prefix('[')
-            .and_then(|host| host.strip_suffix(']'));
+        let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
         let hosts = match bare.unwrap_or(host) {
             "*" => HostPattern::Any,
             host => match host.parse() {
@@ -208,45 +198,28 @@ fn is_name(host: &str) -> bool {
 
 /// Validates the rules of `egress` in `[allow]`.
 pub fn validate(allowed: &[String]) -> Result<(), EgressError> {
-    allowed
-        .iter()
-        .try_for_each(|text| text.parse::<EgressRule>().map(drop))
+    allowed.iter().try_for_each(|text| text.parse::<EgressRule>().map(drop))
 }
 
 /// Returns the routes to the hosts `asked` for, if they are `allowed`. Each host gets one address inside, so that
 /// several can be reached on the same port.
 pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, EgressError> {
-    let rules: Vec<EgressRule> = allowed
-        .iter()
-        .map(|text| text.parse())
-        .collect::<Result<_, _>>()?;
+    let rules: Vec<EgressRule> = allowed.iter().map(|text| text.parse()).collect::<Result<_, _>>()?;
     let mut hosts: Vec<&str> = Vec::new();
     let mut routes = Vec::new();
     for name in asked {
-        let malformed = || EgressError::Malformed {
-            name: name.clone(),
-            form: ASKED,
-        };
+        let malformed = || EgressError::Malformed { name: name.clone(), form: ASKED };
         let (host, port) = split_host_port(name).ok_or_else(malformed)?;
         if !is_name(host) {
             return Err(malformed());
         }
-        let index = hosts
-            .iter()
-            .position(|known| *known == host)
-            .unwrap_or_else(|| {
-                hosts.push(host);
-                hosts.len() - 1
-            });
+        let index = hosts.iter().position(|known| *known == host).unwrap_or_else(|| {
+            hosts.push(host);
+            hosts.len() - 1
+        });
         // 127.0.1.1 and up: 127.0.0.1 is the servant's own.
         let number = u8::try_from(index + 1).map_err(|_| malformed())?;
-        routes.push(route(
-            name,
-            host,
-            port,
-            Ipv4Addr::new(127, 0, 1, number),
-            &rules,
-        )?);
+        routes.push(route(name, host, port, Ipv4Addr::new(127, 0, 1, number), &rules)?);
     }
     Ok(routes)
 }
@@ -256,18 +229,10 @@ pub fn hosts(asked: &[String], allowed: &[String]) -> Result<Vec<(IpAddr, String
     let routes = routes(asked, allowed)?.into_iter();
     // IP addresses have no name.
     let named = routes.filter(|route| route.host.parse::<IpAddr>().is_err());
-    Ok(named
-        .map(|route| (IpAddr::V4(route.inside), route.host))
-        .collect())
+    Ok(named.map(|route| (IpAddr::V4(route.inside), route.host)).collect())
 }
 
-fn route(
-    name: &str,
-    host: &str,
-    port: u16,
-    inside: Ipv4Addr,
-    rules: &[EgressRule],
-) -> Result<Route, EgressError> {
+fn route(name: &str, host: &str, port: u16, inside: Ipv4Addr, rules: &[EgressRule]) -> Result<Route, EgressError> {
     let literal: Option<IpAddr> = host.parse().ok();
     let of_port = || rules.iter().filter(|rule| rule.port == port);
     let networks: Vec<EgressNetwork> = of_port()
@@ -276,32 +241,17 @@ fn route(
             _ => None,
         })
         .collect();
-    let by_name = of_port().any(
-        |rule| matches!(&rule.hosts, HostPattern::Name(known) if known.eq_ignore_ascii_case(host)),
-    );
+    let by_name =
+        of_port().any(|rule| matches!(&rule.hosts, HostPattern::Name(known) if known.eq_ignore_ascii_case(host)));
     let any = of_port().any(|rule| rule.hosts == HostPattern::Any);
-    let in_network =
-        literal.is_some_and(|address| networks.iter().any(|network| network.contains(address)));
+    let in_network = literal.is_some_and(|address| networks.iter().any(|network| network.contains(address)));
     if !(any || by_name || in_network) {
-        return Err(EgressError::NotAllowed {
-            name: name.to_owned(),
-        });
+        return Err(EgressError::NotAllowed { name: name.to_owned() });
     }
-    let route = Route {
-        host: host.to_owned(),
-        inside,
-        port,
-        by_name,
-        networks,
-    };
+    let route = Route { host: host.to_owned(), inside, port, by_name, networks };
     // A literal address is checked immediately, not at its first connection.
     match literal.map(|address| (address, route.permits(address))) {
-        Some((address, Err(reach))) => Err(EgressError::Inward {
-            name: name.to_owned(),
-            address,
-            port,
-            reach,
-        }),
+        Some((address, Err(reach))) => Err(EgressError::Inward { name: name.to_owned(), address, port, reach }),
         _ => Ok(route),
     }
 }
@@ -310,22 +260,14 @@ impl Route {
     /// Returns whether a connection may be made to this address, to which the host was resolved; otherwise the kind of
     /// the address.
     pub fn permits(&self, address: IpAddr) -> Result<(), Destination> {
-        if self
-            .networks
-            .iter()
-            .any(|network| network.contains(address))
-        {
+        if self.networks.iter().any(|network| network.contains(address)) {
             return Ok(());
         }
         match classify_address(address) {
             Destination::Public => Ok(()),
             // An operator who names a host of their own network means that.
             Destination::Private | Destination::ThisMachine if self.by_name => Ok(()),
-            Destination::Loopback
-                if self.by_name && self.host.eq_ignore_ascii_case("localhost") =>
-            {
-                Ok(())
-            }
+            Destination::Loopback if self.by_name && self.host.eq_ignore_ascii_case("localhost") => Ok(()),
             reach => Err(reach),
         }
     }
@@ -338,11 +280,7 @@ fn classify_address(address: IpAddr) -> Destination {
         IpAddr::V6(address) => classify_v6(address),
     };
     let may_be_ours = matches!(reach, Destination::Public | Destination::Private);
-    if may_be_ours && is_local_address(address) {
-        Destination::ThisMachine
-    } else {
-        reach
-    }
+    if may_be_ours && is_local_address(address) { Destination::ThisMachine } else { reach }
 }
 
 /// Returns whether an address belongs to this machine: the kernel binds only its own addresses.
@@ -360,9 +298,7 @@ fn classify_v4(address: Ipv4Addr) -> Destination {
         [0, 0, 0, 0] => Destination::Unspecified,
         [0, ..] | [240..=255, ..] => Destination::Reserved,
         [127, ..] => Destination::Loopback,
-        [10, ..] | [172, 16..=31, ..] | [192, 168, ..] | [100, 64..=127, ..] => {
-            Destination::Private
-        }
+        [10, ..] | [172, 16..=31, ..] | [192, 168, ..] | [100, 64..=127, ..] => Destination::Private,
         [198, 18 | 19, ..] => Destination::Private,
         [192, 0, 0 | 2, _] | [198, 51, 100, _] | [203, 0, 113, _] => Destination::Reserved,
         [224..=239, ..] => Destination::Multicast,
@@ -374,11 +310,7 @@ fn classify_v4(address: Ipv4Addr) -> Destination {
 fn classify_v6(address: Ipv6Addr) -> Destination {
     let segments = address.segments();
     let [.., above, below] = segments;
-    let embedded = |above: u16, below: u16| {
-        classify_v4(Ipv4Addr::from_bits(
-            u32::from(above) << 16 | u32::from(below),
-        ))
-    };
+    let embedded = |above: u16, below: u16| classify_v4(Ipv4Addr::from_bits(u32::from(above) << 16 | u32::from(below)));
     match segments {
         [0, 0, 0, 0, 0, 0, 0, 0] => Destination::Unspecified,
         [0, 0, 0, 0, 0, 0, 0, 1] => Destination::Loopback,
@@ -412,26 +344,17 @@ mod tests {
     /// Returns whether a host that the rules allow may be dialled at an address.
     fn can_dial(allowed: &[&str], asked: &str, address: &str) -> bool {
         let routes = resolve_routes(allowed, &[asked]).expect("allowed");
-        routes[0]
-            .permits(address.parse().expect("an address"))
-            .is_ok()
+        routes[0].permits(address.parse().expect("an address")).is_ok()
     }
 
     #[test]
     fn each_host_has_an_address_inside() {
         let routes = resolve_routes(
             &["models.example.org:443", "*:80"],
-            &[
-                "models.example.org:443",
-                "a.example:80",
-                "models.example.org:80",
-            ],
+            &["models.example.org:443", "a.example:80", "models.example.org:80"],
         )
         .expect("allowed");
-        let addresses: Vec<String> = routes
-            .iter()
-            .map(|route| format!("{}:{}", route.inside, route.port))
-            .collect();
+        let addresses: Vec<String> = routes.iter().map(|route| format!("{}:{}", route.inside, route.port)).collect();
         assert_eq!(addresses, ["127.0.1.1:443", "127.0.1.2:80", "127.0.1.1:80"]);
     }
 
@@ -449,9 +372,7 @@ mod tests {
             ("127.0.0.1:80", r#"egress = ["127.0.0.1:80"]"#),
             ("169.254.169.254:80", "leads to a cloud metadata address"),
         ] {
-            let refused = resolve_routes(&allowed, &[asked])
-                .expect_err(asked)
-                .to_string();
+            let refused = resolve_routes(&allowed, &[asked]).expect_err(asked).to_string();
             assert!(refused.contains(words), "{refused}");
         }
         resolve_routes(&allowed, &["10.1.2.3:5000"]).expect("in the network");
@@ -495,12 +416,7 @@ mod tests {
         ] {
             assert!(!can_dial(&["*:80"], "a.example:80", address), "{address}");
         }
-        for address in [
-            "8.8.8.8",
-            "172.32.0.1",
-            "2606:4700::1111",
-            "64:ff9b::808:808",
-        ] {
+        for address in ["8.8.8.8", "172.32.0.1", "2606:4700::1111", "64:ff9b::808:808"] {
             assert!(can_dial(&["*:80"], "a.example:80", address), "{address}");
         }
     }
@@ -511,13 +427,7 @@ mod tests {
         for address in ["10.0.0.1", "192.168.7.7", "fd12:3456::1", "8.8.8.8"] {
             assert!(can_dial(&named, "a.lab:80", address), "{address}");
         }
-        for address in [
-            "127.0.0.1",
-            "::1",
-            "169.254.169.254",
-            "fd00:ec2::254",
-            "fe80::1",
-        ] {
+        for address in ["127.0.0.1", "::1", "169.254.169.254", "fd00:ec2::254", "fe80::1"] {
             assert!(!can_dial(&named, "a.lab:80", address), "{address}");
         }
         assert!(can_dial(&["localhost:80"], "localhost:80", "127.0.0.1"));
@@ -533,16 +443,8 @@ mod tests {
         for address in ["127.0.0.2", "10.2.0.0", "::1", "::ffff:127.0.0.1"] {
             assert!(!can_dial(&named, "a.example:80", address), "{address}");
         }
-        assert!(!can_dial(
-            &["*:80", "10.1.0.0/16:81"],
-            "a.example:80",
-            "10.1.0.1"
-        ));
-        assert!(can_dial(
-            &["*:80", "0.0.0.0/0:80"],
-            "a.example:80",
-            "127.0.0.1"
-        ));
+        assert!(!can_dial(&["*:80", "10.1.0.0/16:81"], "a.example:80", "10.1.0.1"));
+        assert!(can_dial(&["*:80", "0.0.0.0/0:80"], "a.example:80", "127.0.0.1"));
     }
 
     #[test]
@@ -554,30 +456,11 @@ mod tests {
 
     #[test]
     fn a_rule_that_cannot_be_understood_is_named() {
-        for text in [
-            "a.example",
-            "a.example:x",
-            "[a.example]:80",
-            "10.0.0.0/33:80",
-            "a/8:80",
-            ":80",
-            "::1:80:",
-        ] {
-            let refused = validate(&to_strings(&["*:80", text]))
-                .expect_err(text)
-                .to_string();
-            assert!(
-                refused.contains(text) && refused.contains("HOST:PORT"),
-                "{refused}"
-            );
+        for text in ["a.example", "a.example:x", "[a.example]:80", "10.0.0.0/33:80", "a/8:80", ":80", "::1:80:"] {
+            let refused = validate(&to_strings(&["*:80", text])).expect_err(text).to_string();
+            assert!(refused.contains(text) && refused.contains("HOST:PORT"), "{refused}");
         }
-        validate(&to_strings(&[
-            "*:80",
-            "a-b.example:443",
-            "[::1]:80",
-            "[fd00::/8]:1",
-            "10.0.0.0/8:1",
-        ]))
-        .expect("understood");
+        validate(&to_strings(&["*:80", "a-b.example:443", "[::1]:80", "[fd00::/8]:1", "10.0.0.0/8:1"]))
+            .expect("understood");
     }
 }

@@ -23,9 +23,7 @@ impl Drop for ExitNotifier {
 impl ExitNotifier {
     pub(crate) fn start(events: Receiver<NodeEvent>, bus: Arc<dyn Bus>) -> ExitNotifier {
         let told = forward_exits(events, move || bus.on_process_exit());
-        ExitNotifier {
-            task: tokio::spawn(told).abort_handle(),
-        }
+        ExitNotifier { task: tokio::spawn(told).abort_handle() }
     }
 }
 
@@ -49,12 +47,7 @@ mod tests {
     use super::*;
 
     fn exit_event() -> NodeEvent {
-        NodeEvent::Exited {
-            node: "/a".into(),
-            code: None,
-            signal: Some(9),
-            out_of_memory: false,
-        }
+        NodeEvent::Exited { node: "/a".into(), code: None, signal: Some(9), out_of_memory: false }
     }
 
     /// Returns the number of notifications for these events.
@@ -75,10 +68,7 @@ mod tests {
     #[tokio::test]
     async fn each_end_of_a_process_is_told_and_nothing_else() {
         let started = NodeEvent::Started { node: "/a".into() };
-        assert_eq!(
-            count_notifications(&[started.clone(), exit_event(), started, exit_event()]).await,
-            2
-        );
+        assert_eq!(count_notifications(&[started.clone(), exit_event(), started, exit_event()]).await, 2);
     }
 
     #[tokio::test]

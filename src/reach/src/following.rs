@@ -68,10 +68,7 @@ mod tests {
     fn graph(nodes: &[(&str, &str)]) -> Arc<Graph> {
         let nodes = nodes.iter();
         let nodes = nodes.map(|(name, address)| ((*name).to_owned(), (*address).to_owned()));
-        Arc::new(Graph {
-            nodes: nodes.collect(),
-            ..Graph::default()
-        })
+        Arc::new(Graph { nodes: nodes.collect(), ..Graph::default() })
     }
 
     /// Reports when it is dropped.
@@ -108,12 +105,7 @@ mod tests {
         let mut next = async |count: usize| {
             let mut heard = Vec::new();
             while heard.len() < count {
-                heard.push(
-                    timeout(LONG, told.recv())
-                        .await
-                        .expect("told")
-                        .expect("open"),
-                );
+                heard.push(timeout(LONG, told.recv()).await.expect("told").expect("open"));
             }
             heard.sort();
             heard
@@ -125,14 +117,8 @@ mod tests {
         shown.send_replace(graph(&[("/box", "2"), ("/late", "1")]));
         assert_eq!(next(1).await, ["began /late"]);
         shown.send_replace(graph(&[]));
-        assert_eq!(
-            next(4).await,
-            ["ended /box", "ended /late", "gone /box", "gone /late"]
-        );
+        assert_eq!(next(4).await, ["ended /box", "ended /late", "gone /box", "gone /late"]);
         drop(shown);
-        timeout(LONG, following)
-            .await
-            .expect("it ends")
-            .expect("it does not panic");
+        timeout(LONG, following).await.expect("it ends").expect("it does not panic");
     }
 }

@@ -41,8 +41,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use dispatch::{
-    AttemptOutcome, DispatchOrder, Dispatcher, GroupLoad, Kind, LossReason, Member, RobotNumber,
-    Rules, Ticket,
+    AttemptOutcome, DispatchOrder, Dispatcher, GroupLoad, Kind, LossReason, Member, RobotNumber, Rules, Ticket,
 };
 
 use view::GroupView;
@@ -157,12 +156,7 @@ impl MemberServant {
 
 impl ServantGroup {
     /// Creates a group without servants for robots of a service with this interface.
-    pub fn new(
-        ros: RosVersion,
-        distribution: &str,
-        interface: &Interface,
-        rules: Rules,
-    ) -> Arc<ServantGroup> {
+    pub fn new(ros: RosVersion, distribution: &str, interface: &Interface, rules: Rules) -> Arc<ServantGroup> {
         let values = interface.parameters.iter().filter_map(|parameter| {
             let value = parameter.value.clone()?;
             Some((parameter.name.clone(), value))
@@ -302,13 +296,7 @@ impl ServantGroup {
         state.doors.insert(ticket, door);
         self.deliver_orders(&mut state, orders);
         drop(state);
-        PendingRequest {
-            group: Arc::clone(self),
-            kind,
-            ticket,
-            told,
-            over: false,
-        }
+        PendingRequest { group: Arc::clone(self), kind, ticket, told, over: false }
     }
 
     /// Schedules another attempt with a servant that did not take a request or lost it: a restarting node registers its
@@ -335,8 +323,7 @@ impl ServantGroup {
         request: Bytes,
         patience: Duration,
     ) -> Result<Bytes, BusError> {
-        type Asked<'a> =
-            BoxFuture<'a, Result<(Arc<MemberServant>, Result<Bytes, BusError>), Aborted>>;
+        type Asked<'a> = BoxFuture<'a, Result<(Arc<MemberServant>, Result<Bytes, BusError>), Aborted>>;
         let began = Instant::now();
         let deadline = began + patience;
         let mut errand = self.begin_request(robot, Kind::Call(service.into()));
@@ -392,18 +379,9 @@ impl ServantGroup {
         }
     }
 
-    fn fail_request(
-        &self,
-        service: &str,
-        last: Option<&MemberServant>,
-        why: LossReason,
-    ) -> BusError {
+    fn fail_request(&self, service: &str, last: Option<&MemberServant>, why: LossReason) -> BusError {
         self.counts.failed.fetch_add(1, Ordering::Relaxed);
-        BusError::CallFailed {
-            service: service.to_owned(),
-            reason: describe_loss(last, why),
-            fate: CallFate::Unknown,
-        }
+        BusError::CallFailed { service: service.to_owned(), reason: describe_loss(last, why), fate: CallFate::Unknown }
     }
 }
 
@@ -472,10 +450,7 @@ impl PendingRequest {
             let wasted = orders.iter().filter(others).count() as u64;
             ((answered, wasted), orders)
         });
-        self.group
-            .counts
-            .wasted
-            .fetch_add(wasted, Ordering::Relaxed);
+        self.group.counts.wasted.fetch_add(wasted, Ordering::Relaxed);
         self.over |= answered;
         if end != AttemptOutcome::Answered {
             self.group.resume_later(servant, &self.kind);
@@ -502,11 +477,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn requests_at_a_time_are_a_mean_over_time() {
-        let rules = Rules {
-            window: 1,
-            replicas: 1,
-            idempotent: false,
-        };
+        let rules = Rules { window: 1, replicas: 1, idempotent: false };
         let group = ServantGroup::new(RosVersion::One, "noetic", &Interface::default(), rules);
         let second = Duration::from_secs(1);
         let begin = || group.begin_request(1, Kind::Call("/work".into()));

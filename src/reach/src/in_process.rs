@@ -54,24 +54,13 @@ pub(crate) struct InProcessParts {
 
 impl InProcess {
     pub(crate) fn new(behind: InProcessParts, options: ReachOptions) -> InProcess {
-        let InProcessParts {
-            id,
-            bus,
-            linked: (linked, nodes),
-            inside,
-            registry,
-            lifecycles,
-            components,
-            keeps,
-        } = behind;
+        let InProcessParts { id, bus, linked: (linked, nodes), inside, registry, lifecycles, components, keeps } =
+            behind;
         let tap = Arc::new(Tap::default());
         let shown = tap.wrap(Arc::clone(&bus));
         // Stubs of a robot that shares its servants see them under names of their own.
-        let linked = if std::ptr::addr_eq(Arc::as_ptr(&bus), Arc::as_ptr(&linked)) {
-            Arc::clone(&shown)
-        } else {
-            linked
-        };
+        let linked =
+            if std::ptr::addr_eq(Arc::as_ptr(&bus), Arc::as_ptr(&linked)) { Arc::clone(&shown) } else { linked };
         let bus = shown;
         let habits = HubOptions {
             grace: options.grace,
@@ -79,17 +68,8 @@ impl InProcess {
             unfinished: options.unfinished,
             ..HubOptions::default()
         };
-        let hub = Hub::new(
-            &id,
-            linked,
-            Arc::clone(&registry),
-            Arc::clone(&nodes),
-            habits,
-        );
-        let options = BridgeOptions {
-            budget: options.budget,
-            ..options.bridge
-        };
+        let hub = Hub::new(&id, linked, Arc::clone(&registry), Arc::clone(&nodes), habits);
+        let options = BridgeOptions { budget: options.budget, ..options.bridge };
         InProcess {
             inside: InsideHost::new(inside, Arc::clone(&registry), &options),
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
@@ -114,19 +94,11 @@ impl Reach for InProcess {
         self.bus.graph()
     }
 
-    async fn serve_rosbridge(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        options: SessionOptions,
-    ) -> SessionEnd {
+    async fn serve_rosbridge(&self, client: WaitingConnection<UpgradedStream>, options: SessionOptions) -> SessionEnd {
         self.bridge.serve_waiting(client, options).await
     }
 
-    async fn serve_inside(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        options: SessionOptions,
-    ) -> SessionEnd {
+    async fn serve_inside(&self, client: WaitingConnection<UpgradedStream>, options: SessionOptions) -> SessionEnd {
         self.inside.serve(client, options).await
     }
 
@@ -172,10 +144,7 @@ impl Reach for InProcess {
     fn flows(&self) -> Vec<FlowCounts> {
         let metrics = self.bridge.metrics();
         // The bridge itself answers calls that are refused, time out or reach no node.
-        let by_bridge = metrics
-            .calls_failed
-            .get()
-            .saturating_sub(metrics.calls_denied.get());
+        let by_bridge = metrics.calls_failed.get().saturating_sub(metrics.calls_denied.get());
         let answers = metrics.answers.get().saturating_sub(by_bridge);
         let clients = FlowCounts {
             node: String::new(),

@@ -5,9 +5,7 @@
 
 use std::sync::{Arc, Weak};
 
-use bridge::{
-    Bridge, BridgeOptions, RequestObserver, SessionEnd, SessionOptions, WaitingConnection,
-};
+use bridge::{Bridge, BridgeOptions, RequestObserver, SessionEnd, SessionOptions, WaitingConnection};
 use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError};
@@ -23,8 +21,7 @@ const FAILED: u16 = 1011;
 const ENDS: u16 = 1012;
 
 /// Joins the servant's ROS graph, once for all viewers.
-pub(crate) type JoinFn =
-    Box<dyn Fn() -> BoxFuture<'static, Result<JoinedBus, BusError>> + Send + Sync>;
+pub(crate) type JoinFn = Box<dyn Fn() -> BoxFuture<'static, Result<JoinedBus, BusError>> + Send + Sync>;
 
 /// A node of ours in the servant's ROS graph.
 pub(crate) struct JoinedBus {
@@ -71,11 +68,7 @@ pub struct InsideView {
 
 impl InsideHost {
     /// Creates the access; `options` are those of the robot's bridge.
-    pub(crate) fn new(
-        join: JoinFn,
-        registry: Arc<Registry>,
-        options: &BridgeOptions,
-    ) -> InsideHost {
+    pub(crate) fn new(join: JoinFn, registry: Arc<Registry>, options: &BridgeOptions) -> InsideHost {
         let options = BridgeOptions {
             // A web page shows the newest data and requests little at once.
             topic_messages: 64,
@@ -89,13 +82,7 @@ impl InsideHost {
             pair: None,
             ..options.clone()
         };
-        InsideHost {
-            join,
-            registry,
-            options,
-            turn: tokio::sync::Mutex::default(),
-            state: Mutex::default(),
-        }
+        InsideHost { join, registry, options, turn: tokio::sync::Mutex::default(), state: Mutex::default() }
     }
 
     /// Serves a rosbridge client of a viewer until it ends.
@@ -147,15 +134,10 @@ impl InsideHost {
             return Ok(looking);
         }
         let joined = (self.join)().await;
-        let JoinedBus { bus, endings } =
-            joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
+        let JoinedBus { bus, endings } = joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
         let registry = Arc::clone(&self.registry);
         let bridge = Bridge::new(Arc::clone(&bus), registry, self.options.clone());
-        let looking = Arc::new(InsideNode {
-            bus,
-            bridge,
-            _endings: endings,
-        });
+        let looking = Arc::new(InsideNode { bus, bridge, _endings: endings });
         let mut state = self.state.lock();
         // It may have been closed meanwhile.
         state.check_open()?;

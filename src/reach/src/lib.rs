@@ -149,18 +149,10 @@ pub trait Reach: Send + Sync + 'static {
     /// Returns a watch on its ROS graph.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Serves a rosbridge client that has waited for the servant, until it ends.
-    async fn serve_rosbridge(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        options: SessionOptions,
-    ) -> SessionEnd;
+    async fn serve_rosbridge(&self, client: WaitingConnection<UpgradedStream>, options: SessionOptions) -> SessionEnd;
     /// Serves a rosbridge client of somebody who looks inside, until it ends. Independent of the robot and not one of
     /// its sessions.
-    async fn serve_inside(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        options: SessionOptions,
-    ) -> SessionEnd;
+    async fn serve_inside(&self, client: WaitingConnection<UpgradedStream>, options: SessionOptions) -> SessionEnd;
     /// Returns its ROS graph for a viewer of another protocol, or the close code (RFC 6455) and reason.
     async fn open_inside(&self) -> Result<InsideView, (u16, String)>;
     /// Serves a stub's connection after its upgrade until it ends; `read_ahead` was already read from it.
@@ -185,9 +177,7 @@ pub trait Reach: Send + Sync + 'static {
     }
     /// Starts a node as a stub would, with the parameters from the push of this servant's revision.
     async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
-        Err(Error::Linked(Box::new(NodeError::OnlyByStubs(
-            node.name.clone(),
-        ))))
+        Err(Error::Linked(Box::new(NodeError::OnlyByStubs(node.name.clone()))))
     }
     /// Returns the counts of messages and calls by user.
     fn flows(&self) -> Vec<FlowCounts> {

@@ -63,12 +63,8 @@ impl LifecycleDriver {
             return None;
         }
         let shown = watch::Sender::default();
-        let followed = LifecycleFollower {
-            bus: Arc::clone(bus),
-            nodes: Arc::clone(nodes),
-            observer: Arc::clone(observer),
-            shown,
-        };
+        let followed =
+            LifecycleFollower { bus: Arc::clone(bus), nodes: Arc::clone(nodes), observer: Arc::clone(observer), shown };
         Some(LifecycleDriver {
             shown: followed.shown.subscribe(),
             task: tokio::spawn(Arc::new(followed).run().in_current_span()).abort_handle(),

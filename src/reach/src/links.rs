@@ -72,11 +72,8 @@ const GREETING: &str = "a robot's hello";
 /// Timeout for the robot's hello.
 const HELLO: Duration = Duration::from_secs(10);
 /// Signals for stopping a node of an earlier run, with the time after each.
-const STOP: [(i32, Duration); 3] = [
-    (2, Duration::from_secs(5)),
-    (15, Duration::from_secs(2)),
-    (9, Duration::from_secs(5)),
-];
+const STOP: [(i32, Duration); 3] =
+    [(2, Duration::from_secs(5)), (15, Duration::from_secs(2)), (9, Duration::from_secs(5))];
 
 impl Default for HubOptions {
     fn default() -> Self {
@@ -135,10 +132,7 @@ impl Hub {
     pub fn warn(&self, node: &str, what: &str) {
         let link = self.links.lock().get(node).cloned();
         if let Some(link) = link {
-            link.session.send_control(&FromCloud::Notice {
-                warning: true,
-                text: what.to_owned(),
-            });
+            link.session.send_control(&FromCloud::Notice { warning: true, text: what.to_owned() });
         }
     }
 
@@ -183,25 +177,14 @@ impl Hub {
             Ok(attached) => attached,
             Err(refusal) => {
                 tracing::info!("a link was refused: {}", refusal.reason);
-                let welcome = Welcome::Refused {
-                    reason: refusal.reason.clone(),
-                    again: refusal.again,
-                };
+                let welcome = Welcome::Refused { reason: refusal.reason.clone(), again: refusal.again };
                 let _ = send_open(&mut socket, &welcome).await;
                 socket.queue_close(1008, "refused");
                 let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
-                return DisconnectReason::Closed {
-                    code: 1008,
-                    reason: refusal.reason,
-                };
+                return DisconnectReason::Closed { code: 1008, reason: refusal.reason };
             }
         };
-        let mut carrying = ConnectionGuard {
-            hub: self,
-            link: &link,
-            turn,
-            is_ended: false,
-        };
+        let mut carrying = ConnectionGuard { hub: self, link: &link, turn, is_ended: false };
         // They have been set in the servant, so little of a hello is kept.
         hello.parameters.clear();
         drop(held);
@@ -272,10 +255,7 @@ impl Hub {
     }
 
     /// Finds or starts the link for a hello. Returns whether it was resumed, and the turn of this connection.
-    async fn attach(
-        self: &Arc<Self>,
-        hello: &Hello,
-    ) -> Result<(Arc<NodeLink>, bool, u64), LinkRefusal> {
+    async fn attach(self: &Arc<Self>, hello: &Hello) -> Result<(Arc<NodeLink>, bool, u64), LinkRefusal> {
         let node = &hello.node.name;
         self.check_ros(hello.ros)?;
         let is_global = match self.bus.version() {
@@ -283,17 +263,12 @@ impl Hub {
             RosVersion::Two => ros::ros2::names::is_global,
         };
         if !is_global(node) {
-            return Err(LinkRefusal::permanent(format!(
-                "{node:?} is not an absolute node name"
-            )));
+            return Err(LinkRefusal::permanent(format!("{node:?} is not an absolute node name")));
         }
         let _turn = self.turns.acquire(node).await;
         self.check_open()?;
         if !self.attempts.is_newest(&hello.run, hello.attempt) {
-            return Err(LinkRefusal {
-                reason: format!("{node} has connected again since, or has ended"),
-                again: true,
-            });
+            return Err(LinkRefusal { reason: format!("{node} has connected again since, or has ended"), again: true });
         }
         let machine = RobotMachine::from_hello(hello);
         let earlier = self.links.lock().get(node).cloned();
@@ -345,16 +320,12 @@ impl Hub {
         }
         if let Some(text) = self.nodes.describe_unused_settings(hello) {
             let warning = true;
-            link.session
-                .send_control(&FromCloud::Notice { warning, text });
+            link.session.send_control(&FromCloud::Notice { warning, text });
         }
         // Parameters that the node has set before there was a link.
         if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {
-            let set = set
-                .into_iter()
-                .map(|(key, value)| (format!("{node}/{key}"), Some(value)));
-            link.session
-                .send_control(&FromCloud::Parameters(set.collect()));
+            let set = set.into_iter().map(|(key, value)| (format!("{node}/{key}"), Some(value)));
+            link.session.send_control(&FromCloud::Parameters(set.collect()));
         }
         self.notify_changed();
         let turn = *link.kick.borrow();
@@ -380,10 +351,7 @@ impl Hub {
 
     fn check_open(&self) -> Result<(), LinkRefusal> {
         match &*self.closed.borrow() {
-            Some(reason) => Err(LinkRefusal {
-                reason: reason.clone(),
-                again: true,
-            }),
+            Some(reason) => Err(LinkRefusal { reason: reason.clone(), again: true }),
             None => Ok(()),
         }
     }
@@ -397,9 +365,7 @@ impl Hub {
         let links = self.links.lock();
         let mut listening = links.values().filter(|link| link.listens_to(topic));
         let first = listening.clone().find(|link| link.session.is_up());
-        first
-            .or_else(|| listening.next())
-            .map(|link| link.node.clone())
+        first.or_else(|| listening.next()).map(|link| link.node.clone())
     }
 
     /// Returns the nodes of other links, with all nodes of their processes.
@@ -413,10 +379,7 @@ impl Hub {
     /// Removes the link from the hub.
     fn remove_link(&self, link: &Arc<NodeLink>) {
         let mut links = self.links.lock();
-        if links
-            .get(&link.node)
-            .is_some_and(|known| Arc::ptr_eq(known, link))
-        {
+        if links.get(&link.node).is_some_and(|known| Arc::ptr_eq(known, link)) {
             links.remove(&link.node);
         }
         drop(links);
@@ -451,8 +414,7 @@ impl Hub {
 
     async fn stop_node(&self, node: &str) {
         for (signal, patience) in STOP {
-            if !self.nodes.is_running(node).await || self.nodes.signal(node, signal).await.is_err()
-            {
+            if !self.nodes.is_running(node).await || self.nodes.signal(node, signal).await.is_err() {
                 return;
             }
             if timeout(patience, self.nodes.wait_exit(node)).await.is_ok() {
@@ -487,10 +449,7 @@ struct LinkRefusal {
 
 impl LinkRefusal {
     fn permanent(reason: impl Into<String>) -> Self {
-        Self {
-            reason: reason.into(),
-            again: false,
-        }
+        Self { reason: reason.into(), again: false }
     }
 }
 
@@ -507,10 +466,7 @@ where
 }
 
 fn replaced_disconnect() -> DisconnectReason {
-    DisconnectReason::Closed {
-        code: 1012,
-        reason: "the robot came back on another connection".into(),
-    }
+    DisconnectReason::Closed { code: 1012, reason: "the robot came back on another connection".into() }
 }
 
 /// Returns the options with which the cloud supervises a link: the robot pings often, so the cloud need not.

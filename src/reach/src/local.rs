@@ -71,10 +71,7 @@ impl Opener for LocalOpener {
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));
-        let looking = JoinOptions {
-            node: bridge::INSIDE.to_owned(),
-            ..joining.clone()
-        };
+        let looking = JoinOptions { node: bridge::INSIDE.to_owned(), ..joining.clone() };
         let (ros, beside) = (options.ros, Arc::clone(&sockets));
         // Whoever looks inside first, this bus is not of that connection.
         let (looked_at, span) = (Arc::clone(servant), Span::current());
@@ -122,16 +119,11 @@ impl Opener for LocalOpener {
         let relays = self.open_relays(&local, egress).await;
         let sockets = Arc::new(ServantSockets::new(local.network()));
         let joining = JoinOptions::new(master::ADDRESS, name);
-        Ok(ObservedBus {
-            bus: ros::connect(ros, sockets, joining).await?,
-            _relays: relays,
-        })
+        Ok(ObservedBus { bus: ros::connect(ros, sockets, joining).await?, _relays: relays })
     }
 
     fn process_ids(&self, servant: &str) -> Vec<i32> {
         let servant = self.engine.servant(servant);
-        servant
-            .and_then(|servant| servant.processes().ok())
-            .unwrap_or_default()
+        servant.and_then(|servant| servant.processes().ok()).unwrap_or_default()
     }
 }

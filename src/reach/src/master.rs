@@ -29,19 +29,13 @@ fn yes() -> bool {
 
 impl Default for MasterConfig {
     fn default() -> Self {
-        Self {
-            master: yes(),
-            parameters: BTreeMap::new(),
-        }
+        Self { master: yes(), parameters: BTreeMap::new() }
     }
 }
 
 /// Returns the value for [`servant::spec::Spec::resident`]: a Master with these parameters and those that this ROS
 /// version sets itself, or none if nodes discover each other and get their parameters when they are started.
-pub fn resident_config(
-    flavour: &Flavour,
-    parameters: &BTreeMap<String, ParamValue>,
-) -> serde_json::Value {
+pub fn resident_config(flavour: &Flavour, parameters: &BTreeMap<String, ParamValue>) -> serde_json::Value {
     match flavour.ros {
         Version::Ros1 => {
             serde_json::json!({ "parameters": flavour.initial_parameters(parameters) })
@@ -66,10 +60,7 @@ mod tests {
 
     #[test]
     fn a_servant_of_ros_2_has_none() {
-        let flavour = Flavour {
-            ros: Version::Ros2,
-            ..Flavour::default()
-        };
+        let flavour = Flavour { ros: Version::Ros2, ..Flavour::default() };
         let parameters = BTreeMap::from([("/see/rate".to_owned(), ParamValue::Int(10))]);
         let written = resident_config(&flavour, &parameters);
         let read = MasterConfig::deserialize(&written).expect("what was written");

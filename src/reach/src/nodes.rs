@@ -58,8 +58,7 @@ impl LinkedNodes {
     /// Returns the working directory of the program: as on the robot, or the default of ROS.
     fn working_directory(&self, node: &NodeLaunch, program: &str) -> String {
         let overlay = Path::new(&node.share).parent().and_then(Path::parent);
-        let beside = overlay
-            .is_some_and(|overlay| Path::new(&node.directory).starts_with(overlay.join("lib")));
+        let beside = overlay.is_some_and(|overlay| Path::new(&node.directory).starts_with(overlay.join("lib")));
         if beside {
             let parent = Path::new(program).parent().unwrap_or(Path::new("/"));
             return parent.to_string_lossy().into_owned();
@@ -68,11 +67,7 @@ impl LinkedNodes {
         if translated != node.directory {
             return translated;
         }
-        let RecordedRevision {
-            flavour,
-            environment,
-            ..
-        } = &self.recorded;
+        let RecordedRevision { flavour, environment, .. } = &self.recorded;
         flavour.home(environment).to_owned()
     }
 
@@ -85,10 +80,7 @@ impl LinkedNodes {
 
 /// Finds the program for a stub's node. Because a robot names it, only programs recorded by the push are run, and no
 /// others of the image by any path.
-pub(crate) fn find_program<'a>(
-    recorded: &'a RecordedRevision,
-    node: &NodeLaunch,
-) -> Result<&'a String, NodeError> {
+pub(crate) fn find_program<'a>(recorded: &'a RecordedRevision, node: &NodeLaunch) -> Result<&'a String, NodeError> {
     let same = node.package == recorded.package;
     let programs = &recorded.inventory.programs;
     let known = programs.get(&node.executable).filter(|_| same);
@@ -135,10 +127,7 @@ fn naming_for(recorded: &RecordedRevision, node: &NodeLaunch) -> Naming {
     let planned: Vec<_> = nodes_running(recorded, &node.executable).collect();
     match arguments::node_for_stub(planned, |planned| &planned.argv) {
         Some(planned) => recorded.flavour.global_naming(&planned.argv),
-        None => Naming {
-            name: false,
-            namespace: false,
-        },
+        None => Naming { name: false, namespace: false },
     }
 }
 
@@ -150,9 +139,7 @@ impl NodeController for LinkedNodes {
 
     async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError> {
         let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
-        self.told
-            .observer()
-            .check_stub(node.revision, &node.image)?;
+        self.told.observer().check_stub(node.revision, &node.image)?;
         let program = find_program(&self.recorded, node)?;
         self.end_own_nodes(&*tenant).await;
         let says = naming_for(&self.recorded, node);
@@ -162,12 +149,7 @@ impl NodeController for LinkedNodes {
         let robots = node.argv.iter();
         let robots = robots.map(|argument| self.translate(node, argument));
         let flavour = &self.recorded.flavour;
-        let argv = command_line(
-            program,
-            robots,
-            flavour.parameter_arguments(&node.name, &given),
-            &identity,
-        );
+        let argv = command_line(program, robots, flavour.parameter_arguments(&node.name, &given), &identity);
         let directory = self.working_directory(node, program);
         let mut environment = identity.environment;
         if !run.is_empty() {
@@ -183,10 +165,7 @@ impl NodeController for LinkedNodes {
             required: false,
         };
         let started = self.container.start_node(spec).await;
-        started.map_err(|source| NodeError::Start {
-            node: node.name.clone(),
-            source,
-        })?;
+        started.map_err(|source| NodeError::Start { node: node.name.clone(), source })?;
         self.started.lock().insert(node.name.clone(), node.clone());
         Ok(())
     }
@@ -213,21 +192,12 @@ impl NodeController for LinkedNodes {
     }
 
     async fn wait_exit(&self, node: &str) -> Exit {
-        let limits = self
-            .told
-            .tenant()
-            .map(|tenant| tenant.limits())
-            .unwrap_or_default();
+        let limits = self.told.tenant().map(|tenant| tenant.limits()).unwrap_or_default();
         match self.container.wait_node(node).await {
-            Ok(exit) => Exit {
-                code: exit.code,
-                signal: exit.signal,
-                text: format!("{node} {}", describe_exit(&exit, &limits)),
-            },
-            Err(error) => Exit {
-                text: error.to_string(),
-                ..Exit::default()
-            },
+            Ok(exit) => {
+                Exit { code: exit.code, signal: exit.signal, text: format!("{node} {}", describe_exit(&exit, &limits)) }
+            }
+            Err(error) => Exit { text: error.to_string(), ..Exit::default() },
         }
     }
 
@@ -319,12 +289,9 @@ mod tests {
             parameters: Default::default(),
             components: Default::default(),
             inventory: Arc::new(Inventory {
-                programs: [
-                    ("see", "/opt/mine/lib/vision/see"),
-                    ("look.py", "/opt/mine/share/vision/scripts/look.py"),
-                ]
-                .map(|(name, path)| (name.to_owned(), path.to_owned()))
-                .into(),
+                programs: [("see", "/opt/mine/lib/vision/see"), ("look.py", "/opt/mine/share/vision/scripts/look.py")]
+                    .map(|(name, path)| (name.to_owned(), path.to_owned()))
+                    .into(),
                 ..Inventory::default()
             }),
             registry: Default::default(),
@@ -351,14 +318,8 @@ mod tests {
     #[test]
     fn a_stub_starts_what_its_push_recorded_and_nothing_else() {
         let path = |text: &str| Some(text.to_owned());
-        assert_eq!(
-            program_of("vision", "see"),
-            path("/opt/mine/lib/vision/see")
-        );
-        assert_eq!(
-            program_of("vision", "look.py"),
-            path("/opt/mine/share/vision/scripts/look.py")
-        );
+        assert_eq!(program_of("vision", "see"), path("/opt/mine/lib/vision/see"));
+        assert_eq!(program_of("vision", "look.py"), path("/opt/mine/share/vision/scripts/look.py"));
         for (package, executable) in [
             ("vision", "/bin/sh"),
             ("vision", "../../../../bin/sh"),
@@ -370,11 +331,7 @@ mod tests {
             ("../lib/vision", "see"),
             ("/bin", "sh"),
         ] {
-            assert_eq!(
-                program_of(package, executable),
-                None,
-                "{package} {executable}"
-            );
+            assert_eq!(program_of(package, executable), None, "{package} {executable}");
         }
     }
 
@@ -382,10 +339,7 @@ mod tests {
     fn the_deployers_parameters_come_behind_the_robots() {
         let given = BTreeMap::from([("/camera/see/gain".to_owned(), ParamValue::Int(2))]);
         let started = |ros, argv: &[&str]| {
-            let flavour = Flavour {
-                ros,
-                ..Flavour::default()
-            };
+            let flavour = Flavour { ros, ..Flavour::default() };
             let robots = argv.iter().map(|argument| (*argument).to_owned());
             let given = flavour.parameter_arguments("/camera/see", &given);
             let identity = flavour.robot_identity("/camera/see", Naming::default());
@@ -398,10 +352,7 @@ mod tests {
              -r __ns:=/camera --enclave /cloudroid_link/camera/see"
         );
         // In ROS 1 they are on the parameter server.
-        assert_eq!(
-            started(Version::Ros1, &["_gain:=1", "scan:=/front"]),
-            "/opt/see _gain:=1 scan:=/front __name:=see"
-        );
+        assert_eq!(started(Version::Ros1, &["_gain:=1", "scan:=/front"]), "/opt/see _gain:=1 scan:=/front __name:=see");
     }
 
     #[test]

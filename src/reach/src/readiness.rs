@@ -12,14 +12,8 @@ pub fn missing_endpoints(interface: &Interface, graph: &Graph) -> Vec<String> {
     for topic in interface.topics.iter().filter(|topic| !topic.lazy) {
         let mut nodes = topic.nodes.iter();
         let (there, what) = match topic.direction {
-            Direction::Output => (
-                nodes.all(|node| graph.publishes(node, &topic.name)),
-                "publisher",
-            ),
-            Direction::Input => (
-                nodes.all(|node| graph.subscribes(node, &topic.name)),
-                "subscriber",
-            ),
+            Direction::Output => (nodes.all(|node| graph.publishes(node, &topic.name)), "publisher"),
+            Direction::Input => (nodes.all(|node| graph.subscribes(node, &topic.name)), "subscriber"),
         };
         if !there {
             missing.push(format!("the {what} of {}", topic.name));
@@ -45,11 +39,7 @@ pub fn missing_nodes(interface: &Interface, graph: &Graph) -> Vec<String> {
     let services = interface.services.iter().map(|service| &service.node);
     let actions = interface.actions.iter().map(|action| &action.node);
     let expected: BTreeSet<&String> = topics.chain(services).chain(actions).collect();
-    expected
-        .into_iter()
-        .filter(|node| !node.is_empty() && !graph.has_node(node))
-        .cloned()
-        .collect()
+    expected.into_iter().filter(|node| !node.is_empty() && !graph.has_node(node)).cloned().collect()
 }
 
 #[cfg(test)]
@@ -85,11 +75,7 @@ mod tests {
                 md5: String::new(),
                 node: "/node".into(),
             }],
-            actions: vec![Action {
-                name: "/go".into(),
-                type_name: "a/Go".into(),
-                node: "/node".into(),
-            }],
+            actions: vec![Action { name: "/go".into(), type_name: "a/Go".into(), node: "/node".into() }],
             ..Interface::default()
         }
     }
@@ -108,37 +94,22 @@ mod tests {
         let mut graph = Graph::default();
         assert_eq!(
             missing_endpoints(&interface(), &graph),
-            [
-                "the publisher of /out",
-                "the subscriber of /in",
-                "the service /add",
-                "the action /go"
-            ]
+            ["the publisher of /out", "the subscriber of /in", "the service /add", "the action /go"]
         );
         assert_eq!(missing_nodes(&interface(), &graph), ["/node"]);
         graph.topics.insert("/out".into(), ends(&["/node"], &[]));
-        graph
-            .topics
-            .insert("/in".into(), ends(&["/node"], &["/other"]));
-        let served = ActionNodes {
-            servers: vec!["/node".into()],
-            ..ActionNodes::default()
-        };
+        graph.topics.insert("/in".into(), ends(&["/node"], &["/other"]));
+        let served = ActionNodes { servers: vec!["/node".into()], ..ActionNodes::default() };
         graph.actions.insert("/go".into(), served);
         graph.services.insert("/add".into(), "/node".into());
-        graph
-            .nodes
-            .insert("/node".into(), "http://localhost:1".into());
+        graph.nodes.insert("/node".into(), "http://localhost:1".into());
         assert_eq!(
             missing_endpoints(&interface(), &graph),
             ["the subscriber of /in"],
             "another node's end does not count"
         );
         graph.topics.insert("/in".into(), ends(&[], &["/node"]));
-        assert!(
-            missing_endpoints(&interface(), &graph).is_empty(),
-            "lazy inputs are not awaited"
-        );
+        assert!(missing_endpoints(&interface(), &graph).is_empty(), "lazy inputs are not awaited");
         assert!(missing_nodes(&interface(), &graph).is_empty());
     }
 
@@ -146,19 +117,13 @@ mod tests {
     fn what_comes_only_with_a_robot_is_not_awaited() {
         let mut promised = interface();
         promised.late = vec!["/add".into(), "/go".into()];
-        assert_eq!(
-            missing_endpoints(&promised, &Graph::default()),
-            ["the publisher of /out", "the subscriber of /in"]
-        );
+        assert_eq!(missing_endpoints(&promised, &Graph::default()), ["the publisher of /out", "the subscriber of /in"]);
     }
 
     #[test]
     fn what_only_a_supplement_promises_is_not_awaited() {
         let mut promised = interface();
-        promised.topics = vec![Topic {
-            nodes: Vec::new(),
-            ..topic("/later", Direction::Input, false)
-        }];
+        promised.topics = vec![Topic { nodes: Vec::new(), ..topic("/later", Direction::Input, false) }];
         promised.services[0].node.clear();
         promised.actions[0].node.clear();
         assert!(missing_endpoints(&promised, &Graph::default()).is_empty());
@@ -171,25 +136,15 @@ mod tests {
         let node = "/_box";
         let promised = Interface {
             topics: vec![
-                Topic {
-                    nodes: vec![node.into()],
-                    ..topic("/_box/seen", Direction::Output, false)
-                },
-                Topic {
-                    nodes: vec![node.into()],
-                    ..topic("/_box/told", Direction::Input, false)
-                },
+                Topic { nodes: vec![node.into()], ..topic("/_box/seen", Direction::Output, false) },
+                Topic { nodes: vec![node.into()], ..topic("/_box/told", Direction::Input, false) },
             ],
             services: vec![Service {
                 name: "/_box/load_node".into(),
                 node: node.into(),
                 ..interface().services.remove(0)
             }],
-            actions: vec![Action {
-                name: "/_box/go".into(),
-                node: node.into(),
-                ..interface().actions.remove(0)
-            }],
+            actions: vec![Action { name: "/_box/go".into(), node: node.into(), ..interface().actions.remove(0) }],
             ..Interface::default()
         };
         let mut graph = Graph::default();
@@ -200,11 +155,7 @@ mod tests {
         let ends = NodeEntities {
             publishers: [("/_box/seen".to_owned(), of())].into(),
             subscribers: [("/_box/told".to_owned(), of())].into(),
-            services: [
-                service("/_box/load_node"),
-                service("/_box/go/_action/send_goal"),
-            ]
-            .into(),
+            services: [service("/_box/load_node"), service("/_box/go/_action/send_goal")].into(),
             ..NodeEntities::default()
         };
         graph.ends.insert(node.into(), ends);

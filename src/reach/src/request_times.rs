@@ -8,9 +8,7 @@ use link::control::RequestTiming;
 use parking_lot::Mutex;
 
 /// Upper bounds in seconds: from a relay on loopback to a link that is almost dead.
-const BOUNDS: [f64; 13] = [
-    0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0,
-];
+const BOUNDS: [f64; 13] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0];
 /// Replacement in milliseconds for invalid times; robots are not trusted.
 const LONGEST: f64 = 1e9;
 
@@ -48,13 +46,7 @@ impl RequestTimes {
             None => services.entry(service.to_owned()).or_default(),
         };
         service.total.record(total);
-        let phases = [
-            request.serialise,
-            request.up,
-            request.queue,
-            request.compute,
-            request.down,
-        ];
+        let phases = [request.serialise, request.up, request.queue, request.compute, request.down];
         // They are unknown for some responses.
         if phases.iter().any(|time| *time > 0.0) {
             for (histogram, time) in service.phases.iter_mut().zip(phases) {
@@ -76,9 +68,7 @@ impl RequestTimes {
         );
         for (name, service) in &*services {
             let labels = format!("service=\"{name}\"");
-            service
-                .total
-                .write_prometheus(out, "cloudroid_request_seconds", &labels);
+            service.total.write_prometheus(out, "cloudroid_request_seconds", &labels);
         }
         let _ = writeln!(
             out,
@@ -97,11 +87,7 @@ impl RequestTimes {
 impl Histogram {
     fn record(&mut self, milliseconds: f64) {
         let sane = milliseconds.is_finite() && milliseconds >= 0.0;
-        let seconds = if sane {
-            milliseconds.min(LONGEST)
-        } else {
-            LONGEST
-        } / 1e3;
+        let seconds = if sane { milliseconds.min(LONGEST) } else { LONGEST } / 1e3;
         let at = BOUNDS.iter().position(|bound| seconds <= *bound);
         self.counts[at.unwrap_or(BOUNDS.len())] += 1;
         self.sum += seconds;
@@ -126,12 +112,8 @@ mod tests {
     #[test]
     fn requests_are_counted_by_service_and_phase() {
         let times = RequestTimes::default();
-        let request = |total| RequestTiming {
-            total: Some(total),
-            up: 4.0,
-            compute: total - 4.0,
-            ..RequestTiming::default()
-        };
+        let request =
+            |total| RequestTiming { total: Some(total), up: 4.0, compute: total - 4.0, ..RequestTiming::default() };
         times.record("people", &request(90.0));
         times.record("people", &request(20_000.0));
         times.record("people", &RequestTiming::default());

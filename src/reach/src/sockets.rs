@@ -18,9 +18,7 @@ pub struct ServantSockets {
 impl ServantSockets {
     /// Creates the sockets of the servant with this namespace.
     pub fn new(netns: &Arc<NetNs>) -> ServantSockets {
-        ServantSockets {
-            netns: Arc::clone(netns),
-        }
+        ServantSockets { netns: Arc::clone(netns) }
     }
 }
 

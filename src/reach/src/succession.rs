@@ -50,24 +50,16 @@ fn this_run() -> u64 {
 
 impl DaemonParticipants {
     pub(crate) fn new(servant: &Arc<LocalServant>) -> DaemonParticipants {
-        DaemonParticipants {
-            servant: Arc::clone(servant),
-            known: Mutex::default(),
-        }
+        DaemonParticipants { servant: Arc::clone(servant), known: Mutex::default() }
     }
 }
 
 impl ParticipantLedger {
     /// Creates the record of a run from what was read.
-    fn from_persisted(
-        run: u64,
-        mut left: PersistedParticipants,
-        since: Instant,
-    ) -> ParticipantLedger {
+    fn from_persisted(run: u64, mut left: PersistedParticipants, since: Instant) -> ParticipantLedger {
         // Participants recorded by this run are alive.
         if left.run != run {
-            left.earlier
-                .extend(std::mem::take(&mut left.own).into_values());
+            left.earlier.extend(std::mem::take(&mut left.own).into_values());
             let surplus = left.earlier.len().saturating_sub(EARLIER);
             left.earlier.drain(..surplus);
             left.run = run;
@@ -83,21 +75,13 @@ impl ParticipantLedger {
     /// Returns the participants whose departure must be announced now.
     fn gone_participants(&self, now: Instant) -> Vec<ParticipantPrefix> {
         let is_believed = now.duration_since(self.since) < BELIEVED;
-        if is_believed {
-            self.left.earlier.clone()
-        } else {
-            Vec::new()
-        }
+        if is_believed { self.left.earlier.clone() } else { Vec::new() }
     }
 }
 
 #[async_trait]
 impl Succession for DaemonParticipants {
-    async fn record_join(
-        &self,
-        node: &str,
-        participant: ParticipantPrefix,
-    ) -> Vec<ParticipantPrefix> {
+    async fn record_join(&self, node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix> {
         let mut known = self.known.lock().await;
         let known = match &mut *known {
             Some(known) => known,
@@ -106,19 +90,11 @@ impl Succession for DaemonParticipants {
                     tracing::warn!(%error, "ROS 2 nodes may wait for an earlier daemon until its lease expires");
                     None
                 });
-                none.insert(ParticipantLedger::from_persisted(
-                    this_run(),
-                    left.unwrap_or_default(),
-                    Instant::now(),
-                ))
+                none.insert(ParticipantLedger::from_persisted(this_run(), left.unwrap_or_default(), Instant::now()))
             }
         };
         // Recorded before it joins, so that the next daemon announces its departure to everybody who knows it.
-        if let Err(error) = self
-            .servant
-            .save_handover(known.record_join(node, participant))
-            .await
-        {
+        if let Err(error) = self.servant.save_handover(known.record_join(node, participant)).await {
             tracing::warn!(%error, "ROS 2 nodes may wait for this daemon after it was killed");
         }
         known.gone_participants(Instant::now())
@@ -144,33 +120,27 @@ mod tests {
         let mut left = next.record_join("/bridge", [4; 12]);
         left.earlier.splice(..0, (5..12).map(|number| [number; 12]));
         let last = ParticipantLedger::from_persisted(3, left, now);
-        let expected: Vec<_> = (7..12)
-            .chain([1, 3, 4])
-            .map(|number| [number; 12])
-            .collect();
+        let expected: Vec<_> = (7..12).chain([1, 3, 4]).map(|number| [number; 12]).collect();
         assert_eq!(last.gone_participants(now), expected);
     }
 
     #[test]
     fn nobody_is_told_that_those_of_this_daemon_are_gone() {
         let now = Instant::now();
-        let left = ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now)
-            .record_join("/bridge", [1; 12]);
+        let left =
+            ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now).record_join("/bridge", [1; 12]);
         let mut again = ParticipantLedger::from_persisted(1, left, now);
         assert!(again.gone_participants(now).is_empty());
         // The next one announces all.
         let left = again.record_join("/inside", [2; 12]);
-        assert_eq!(
-            ParticipantLedger::from_persisted(2, left, now).gone_participants(now),
-            [[1; 12], [2; 12]]
-        );
+        assert_eq!(ParticipantLedger::from_persisted(2, left, now).gone_participants(now), [[1; 12], [2; 12]]);
     }
 
     #[test]
     fn nobody_is_told_of_those_in_whom_nobody_believes_any_more() {
         let now = Instant::now();
-        let left = ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now)
-            .record_join("/bridge", [1; 12]);
+        let left =
+            ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now).record_join("/bridge", [1; 12]);
         let mut next = ParticipantLedger::from_persisted(2, left, now);
         assert_eq!(next.gone_participants(now).len(), 1);
         assert!(next.gone_participants(now + BELIEVED).is_empty());

@@ -12,9 +12,9 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd,
-    GoalError, GoalEvents, GoalOutcome, Graph, Lending, NodeParameters, Publisher,
-    PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd, GoalError, GoalEvents,
+    GoalOutcome, Graph, Lending, NodeParameters, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler,
+    ServiceType, Subscription, WireType,
 };
 use ros::ros2::names;
 use ros::schema::ActionDef;
@@ -148,32 +148,17 @@ impl Tap {
         }
         let (sender, told) = mpsc::channel(QUEUE);
         let left_out = Arc::<AtomicU64>::default();
-        *listener = Some(TapListener {
-            told: sender,
-            budget: budget.clone(),
-            left_out: Arc::clone(&left_out),
-        });
-        Some(TapReceiver {
-            told,
-            tap: Arc::clone(self),
-            left_out,
-        })
+        *listener = Some(TapListener { told: sender, budget: budget.clone(), left_out: Arc::clone(&left_out) });
+        Some(TapReceiver { told, tap: Arc::clone(self), left_out })
     }
 
     /// Wraps `bus` so that the listener receives its calls and goals.
     pub fn wrap(self: &Arc<Self>, bus: Arc<dyn Bus>) -> Arc<dyn Bus> {
-        Arc::new(TappedBus {
-            bus,
-            tap: Arc::clone(self),
-        })
+        Arc::new(TappedBus { bus, tap: Arc::clone(self) })
     }
 
     /// Reports a request, if there is a listener.
-    fn begin_exchange(
-        &self,
-        content: &Bytes,
-        what: impl FnOnce(Bytes) -> TapEventKind,
-    ) -> Option<TapExchange> {
+    fn begin_exchange(&self, content: &Bytes, what: impl FnOnce(Bytes) -> TapEventKind) -> Option<TapExchange> {
         let listener = self.listener.read().clone()?;
         let number = self.numbers.fetch_add(1, Ordering::Relaxed);
         let Ok(permit) = listener.budget.take(content.len()) else {
@@ -181,12 +166,7 @@ impl Tap {
             return None;
         };
         let what = what(permit.wrap_bytes(content.clone()));
-        listener.send(number, what).then(|| TapExchange {
-            listener,
-            number,
-            asked: Instant::now(),
-            answered: false,
-        })
+        listener.send(number, what).then(|| TapExchange { listener, number, asked: Instant::now(), answered: false })
     }
 }
 
@@ -218,15 +198,11 @@ impl TapExchange {
         self.answered = true;
         let took = self.asked.elapsed();
         match answer.charge(&self.listener.budget) {
-            Some(answer) => drop(
-                self.listener
-                    .send(self.number, TapEventKind::Answered { answer, took }),
-            ),
+            Some(answer) => drop(self.listener.send(self.number, TapEventKind::Answered { answer, took })),
             None => {
                 self.listener.left_out.fetch_add(1, Ordering::Relaxed);
                 let answer = TapAnswer::GivenUp;
-                self.listener
-                    .send(self.number, TapEventKind::Answered { answer, took });
+                self.listener.send(self.number, TapEventKind::Answered { answer, took });
             }
         }
     }
@@ -251,11 +227,7 @@ impl TappedBus {
         if self.bus.version() == RosVersion::Two && names::is_hidden(service) {
             return None;
         }
-        self.tap
-            .begin_exchange(request, |request| TapEventKind::Call {
-                service: service.to_owned(),
-                request,
-            })
+        self.tap.begin_exchange(request, |request| TapEventKind::Call { service: service.to_owned(), request })
     }
 }
 
@@ -277,30 +249,15 @@ impl Bus for TappedBus {
         self.bus.graph()
     }
 
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError> {
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
         self.bus.subscribe(topic, of, qos).await
     }
 
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError> {
+    async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
         self.bus.advertise(topic, of, qos).await
     }
 
-    async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
+    async fn call(&self, service: &str, request: Bytes, timeout: Duration) -> Result<Bytes, BusError> {
         let noted = self.begin_call(service, &request);
         let response = self.bus.call(service, request, timeout).await;
         if let Some(noted) = noted {
@@ -341,11 +298,7 @@ impl Bus for TappedBus {
         self.bus.serve(service, service_type, handler).await
     }
 
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError> {
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         Ok(Box::new(TappedClient {
             client: self.bus.action_client(action, of)?,
             action: action.to_owned(),
@@ -420,11 +373,7 @@ impl ActionClient for TappedClient {
             return self.client.send_goal(id, goal, events);
         };
         self.under_way.lock().insert(id.to_owned(), noted);
-        let events = Arc::new(TappedEvents {
-            events,
-            id: id.to_owned(),
-            under_way: Arc::clone(&self.under_way),
-        });
+        let events = Arc::new(TappedEvents { events, id: id.to_owned(), under_way: Arc::clone(&self.under_way) });
         self.client.send_goal(id, goal, events);
     }
 

@@ -72,10 +72,7 @@ pub fn check_material(
     ReplayPlan::new(interface, &registry, material, input).map(|_| ())
 }
 
-fn build_registry(
-    (service, ros): (&str, RosVersion),
-    interface: &Interface,
-) -> Result<Registry, Error> {
+fn build_registry((service, ros): (&str, RosVersion), interface: &Interface) -> Result<Registry, Error> {
     Registry::with_definitions(ros, &interface.definitions)
         .map_err(|error| Error::Trial(format!("a definition of {service}: {error}")))
 }
@@ -93,21 +90,11 @@ pub(crate) async fn replay(
     let mut ears = OutputListeners::open(bus, interface).await?;
     let first_answer = pace.answer.max(PATIENCE);
     let mut mouths = Vec::new();
-    for PlannedInput {
-        topic,
-        wire_type,
-        qos,
-    } in &plan.inputs
-    {
-        let publisher = bus
-            .advertise(topic, wire_type.clone(), *qos)
-            .await
-            .map_err(trial_error)?;
+    for PlannedInput { topic, wire_type, qos } in &plan.inputs {
+        let publisher = bus.advertise(topic, wire_type.clone(), *qos).await.map_err(trial_error)?;
         let listening = wait_for_connected(publisher.matched_subscribers(), 1);
         if timeout(first_answer, listening).await.is_err() {
-            return Err(Error::Trial(format!(
-                "no node of {service} listens to {topic}"
-            )));
+            return Err(Error::Trial(format!("no node of {service} listens to {topic}")));
         }
         mouths.push(InputPublisher { publisher, sent: 0 });
     }
@@ -193,9 +180,7 @@ impl ReplayProgress {
     }
 
     fn rate(&self) -> f64 {
-        let between = self
-            .made
-            .map_or(Duration::ZERO, |(first, last)| last - first);
+        let between = self.made.map_or(Duration::ZERO, |(first, last)| last - first);
         if between.is_zero() {
             return 0.0;
         }
@@ -225,13 +210,7 @@ fn summarize_times(mut times: Vec<Duration>) -> Option<Times> {
     let rank = |percent| Some(qos::nearest_rank(&times, percent)?.as_secs_f64() * 1000.0);
     let (p50, p90, max) = (rank(50)?, rank(90)?, rank(100)?);
     let desire = p50 * 1.5;
-    Some(Times {
-        p50,
-        p90,
-        max,
-        desire,
-        acceptable: (p90 * 2.0).max(desire * 2.0),
-    })
+    Some(Times { p50, p90, max, desire, acceptable: (p90 * 2.0).max(desire * 2.0) })
 }
 
 #[cfg(test)]
@@ -249,17 +228,12 @@ mod tests {
 
     #[test]
     fn requests_in_vain_end_a_replay_when_they_come_one_after_the_other() {
-        let pace = ReplayPace {
-            in_vain: Some(2),
-            ..ReplayPace::once(Duration::ZERO)
-        };
+        let pace = ReplayPace { in_vain: Some(2), ..ReplayPace::once(Duration::ZERO) };
         let mut done = ReplayProgress::default();
         let now = Instant::now();
         let some = Some(Duration::from_millis(1));
         for (number, (took, given_up)) in
-            [(None, false), (some, false), (None, false), (None, true)]
-                .into_iter()
-                .enumerate()
+            [(None, false), (some, false), (None, false), (None, true)].into_iter().enumerate()
         {
             done.record(now + Duration::from_millis(100 * number as u64), took);
             assert_eq!(done.should_give_up(&pace), given_up, "{:?}", done.times);

@@ -71,11 +71,7 @@ async fn servant() -> Servant {
     let (bus, node) = (join("/bridge").await.unwrap(), join("/node").await.unwrap());
     let registry = Arc::new(Registry::new());
     let options = HubOptions::default();
-    Servant {
-        hub: Hub::new("s", bus.clone(), registry, Arc::new(RunningNodes), options),
-        bus,
-        node,
-    }
+    Servant { hub: Hub::new("s", bus.clone(), registry, Arc::new(RunningNodes), options), bus, node }
 }
 
 /// Messages to the robot's end about services.
@@ -90,11 +86,7 @@ struct LinkEventForwarder(mpsc::UnboundedSender<LinkEvent>);
 impl SessionHandler<FromCloud> for LinkEventForwarder {
     fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
-            Record::Call {
-                id,
-                service,
-                request,
-            } => LinkEvent::Call(id, service, request),
+            Record::Call { id, service, request } => LinkEvent::Call(id, service, request),
             Record::Control(FromCloud::Lookup { service }) => LinkEvent::Lookup(service),
             _ => return,
         };
@@ -124,10 +116,7 @@ impl ManualRobot {
             session: Arc::new(RobotSession::new(options)),
             hello: Hello {
                 run: "run".to_owned(),
-                node: NodeLaunch {
-                    name: "/node".to_owned(),
-                    ..NodeLaunch::default()
-                },
+                node: NodeLaunch { name: "/node".to_owned(), ..NodeLaunch::default() },
                 lends,
                 ..Hello::default()
             },
@@ -142,8 +131,7 @@ impl ManualRobot {
         let (theirs, ours) = tokio::io::duplex(1 << 16);
         let hub = Arc::clone(&servant.hub);
         tokio::spawn(async move { hub.serve(theirs, &[]).await });
-        let mut socket: WebSocket<DuplexStream> =
-            WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
+        let mut socket: WebSocket<DuplexStream> = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
         let (have, ahead, next) = self.session.position();
         self.hello.next = next;
         if let Some(resume) = &mut self.hello.resume {
@@ -151,25 +139,13 @@ impl ManualRobot {
         }
         send_open(&mut socket, &self.hello).await.unwrap();
         let mut held = Budget::without_limit().permit();
-        let welcome = receive_open(&mut socket, "welcome", &mut held)
-            .await
-            .unwrap();
-        let Welcome::Accepted {
-            session,
-            received,
-            ahead,
-            next,
-            ..
-        } = welcome
-        else {
+        let welcome = receive_open(&mut socket, "welcome", &mut held).await.unwrap();
+        let Welcome::Accepted { session, received, ahead, next, .. } = welcome else {
             panic!("{welcome:?}");
         };
         self.hello.resume.get_or_insert_default().session = session;
         self.session.reconnect(received, &ahead, next);
-        let (session, ear) = (
-            Arc::clone(&self.session),
-            LinkEventForwarder(self.ear.clone()),
-        );
+        let (session, ear) = (Arc::clone(&self.session), LinkEventForwarder(self.ear.clone()));
         self.running = Some(tokio::spawn(async move {
             session.run(&mut socket, &ear).await;
         }));
@@ -228,11 +204,7 @@ fn call_map(servant: &Servant, request: &'static str) -> JoinHandle<Result<Bytes
 
 /// Calls `/map` until something provides it, with the robot answering, and returns the response. A node that waits for
 /// a service polls fifty times a second (roscpp), because nothing announces one that is lent.
-async fn call_until_served(
-    servant: &Servant,
-    request: &'static str,
-    part: impl Future<Output = ()>,
-) -> Bytes {
+async fn call_until_served(servant: &Servant, request: &'static str, part: impl Future<Output = ()>) -> Bytes {
     let called = async {
         loop {
             match call_map(servant, request).await.unwrap() {
@@ -374,10 +346,7 @@ async fn a_call_outlives_a_cut_and_ends_with_the_link() {
     robot.expect_call(1, "three").await;
     robot.session.close(1000, "the robot's node ended");
     let error = timeout(LONG, call).await.unwrap().unwrap().unwrap_err();
-    assert!(
-        error.to_string().contains("the link to the robot was lost"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("the link to the robot was lost"), "{error}");
 }
 
 #[tokio::test]

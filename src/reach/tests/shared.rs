@@ -65,18 +65,10 @@ async fn member(servant: &'static str) -> Member {
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
     let (bus, node) = (join("/bridge").await, join("/worker").await);
-    let worker = Arc::new(WorkService {
-        servant,
-        asked: Semaphore::new(0),
-    });
+    let worker = Arc::new(WorkService { servant, asked: Semaphore::new(0) });
     let node = node.unwrap();
     let serves = node.serve("/work", work(), worker.clone()).await;
-    Member {
-        bus: bus.unwrap(),
-        worker,
-        _node: node,
-        _serves: serves.unwrap(),
-    }
+    Member { bus: bus.unwrap(), worker, _node: node, _serves: serves.unwrap() }
 }
 
 fn work() -> ServiceType {
@@ -117,11 +109,7 @@ fn group() -> Arc<ServantGroup> {
         "actions": [{ "name": "/count", "type": "x_msgs/Count", "node": "/worker" }],
     });
     let interface: Interface = serde_json::from_value(interface).unwrap();
-    let rules = Rules {
-        window: 8,
-        replicas: 1,
-        idempotent: false,
-    };
+    let rules = Rules { window: 8, replicas: 1, idempotent: false };
     ServantGroup::new(RosVersion::One, "noetic", &interface, rules)
 }
 
@@ -180,13 +168,7 @@ fn place(group: &Arc<ServantGroup>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
         budget: Budget::without_limit(),
         unfinished: LONG,
     };
-    let reach = open_seat(
-        group,
-        "place",
-        test_revision(),
-        options,
-        Arc::new(NullObserver),
-    );
+    let reach = open_seat(group, "place", test_revision(), options, Arc::new(NullObserver));
     let tenant: Arc<dyn Tenant> = Arc::new(NullObserver);
     let weak: Weak<dyn Tenant> = Arc::downgrade(&tenant);
     reach.bind_tenant(weak);
@@ -221,9 +203,7 @@ async fn send_hello(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexS
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
     let mut held = Budget::without_limit().permit();
-    let welcome = receive_open(&mut socket, "welcome", &mut held)
-        .await
-        .unwrap();
+    let welcome = receive_open(&mut socket, "welcome", &mut held).await.unwrap();
     (socket, welcome)
 }
 
@@ -236,13 +216,7 @@ async fn stub(reach: &Arc<dyn Reach>, mut hello: Hello) -> Stub {
     }));
     hello.next = session.position().2;
     let (mut socket, welcome) = send_hello(reach, &hello).await;
-    let Welcome::Accepted {
-        received,
-        ahead,
-        next,
-        ..
-    } = welcome
-    else {
+    let Welcome::Accepted { received, ahead, next, .. } = welcome else {
         panic!("{welcome:?}");
     };
     session.reconnect(received, &ahead, next);
@@ -289,10 +263,7 @@ impl Stub {
 
 fn channel(graph: &Graph, service: &str) -> u32 {
     let mut services = graph.services.iter();
-    services
-        .find(|it| it.name == service)
-        .expect(service)
-        .channel
+    services.find(|it| it.name == service).expect(service).channel
 }
 
 fn set<const N: usize>(names: [&str; N]) -> BTreeSet<String> {
@@ -323,8 +294,7 @@ async fn stubs_have_their_robots_names_and_the_groups_answers() {
     let mut by = BTreeSet::new();
     for number in 0..4 {
         let asked = [format!("plain {number}"), format!("front {number}")];
-        for (stub, channel, words) in [(&mut plain, work, &asked[0]), (&mut front, plan, &asked[1])]
-        {
+        for (stub, channel, words) in [(&mut plain, work, &asked[0]), (&mut front, plan, &asked[1])] {
             let answer = stub.call(channel, words).await.unwrap();
             let (said, servant) = answer.split_once(" by ").unwrap();
             assert_eq!(said, words);
@@ -341,9 +311,7 @@ async fn stubs_have_their_robots_names_and_the_groups_answers() {
 async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
     let group = group();
     let members = [member("one").await, member("two").await];
-    let ids = members
-        .each_ref()
-        .map(|member| group.join(member.worker.servant, member.bus.clone()));
+    let ids = members.each_ref().map(|member| group.join(member.worker.servant, member.bus.clone()));
     let (reach, _tenant) = place(&group);
     let mut stub = stub(&reach, hello("/worker", &[])).await;
     let work = channel(&stub.next_graph().await.0, "/work");
@@ -356,10 +324,7 @@ async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
     group.leave(ids[lost], "its power went");
     let reason = stub.answer(asked).await.unwrap_err().to_string();
     let servant = members[lost].worker.servant;
-    assert!(
-        reason.contains(servant) && reason.contains("its power went"),
-        "{reason}"
-    );
+    assert!(reason.contains(servant) && reason.contains("its power went"), "{reason}");
     assert!(reason.contains("--idempotent"), "{reason}");
     let other = members[1 - lost].worker.servant;
     let answer = stub.call(work, "again").await;
@@ -383,12 +348,8 @@ async fn a_stub_that_is_told_to_end_takes_its_names_back() {
     assert_eq!(exit.code, Some(0), "{exit:?}");
     assert_eq!(reach.links().len(), 2, "its link ends with its stub");
     // Other signals do not end the node.
-    other
-        .session
-        .send_control(&FromRobot::Signal { signal: 18 });
-    other
-        .session
-        .send_control(&FromRobot::Signal { signal: 15 });
+    other.session.send_control(&FromRobot::Signal { signal: 18 });
+    other.session.send_control(&FromRobot::Signal { signal: 15 });
     let exit = loop {
         if let StubEvent::Exited(exit) = other.next_event().await {
             break exit;

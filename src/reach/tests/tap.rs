@@ -46,17 +46,9 @@ async fn world() -> TapWorld {
     let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
     let (bus, node) = (join("/bridge").await.unwrap(), join("/node").await.unwrap());
     let of = ServiceType::new("p/Echo", "0123456789abcdef0123456789abcdef");
-    let echo = node
-        .serve("/echo", of, Arc::new(TapEchoService))
-        .await
-        .unwrap();
+    let echo = node.serve("/echo", of, Arc::new(TapEchoService)).await.unwrap();
     let tap = Arc::new(Tap::default());
-    TapWorld {
-        bus: tap.wrap(bus),
-        tap,
-        _node: node,
-        _echo: echo,
-    }
+    TapWorld { bus: tap.wrap(bus), tap, _node: node, _echo: echo }
 }
 
 async fn call_echo(bus: &Arc<dyn Bus>, request: &'static [u8]) -> Option<Bytes> {
@@ -93,15 +85,10 @@ async fn expect_answer(tapping: &mut TapReceiver) -> (u64, TapAnswer) {
 async fn calls_are_told_with_what_was_answered_while_somebody_listens() {
     let TapWorld { tap, bus, .. } = &world().await;
     assert!(call_echo(bus, b"before").await.is_some());
-    let mut tapping = tap
-        .listen(&Budget::without_limit())
-        .expect("nobody listens");
+    let mut tapping = tap.listen(&Budget::without_limit()).expect("nobody listens");
     assert!(tap.listen(&Budget::without_limit()).is_none(), "one does");
 
-    assert_eq!(
-        call_echo(bus, b"hello").await.as_deref(),
-        Some(&b"hello"[..])
-    );
+    assert_eq!(call_echo(bus, b"hello").await.as_deref(), Some(&b"hello"[..]));
     let number = expect_call(&mut tapping, b"hello").await;
     let given = TapAnswer::Given(None, Bytes::from_static(b"hello"));
     assert_eq!(expect_answer(&mut tapping).await, (number, given));
@@ -110,10 +97,7 @@ async fn calls_are_told_with_what_was_answered_while_somebody_listens() {
     let number = expect_call(&mut tapping, b"").await;
     let (refused, answer_of_it) = expect_answer(&mut tapping).await;
     assert_eq!(refused, number);
-    assert!(
-        matches!(&answer_of_it, TapAnswer::Refused(why) if why.contains("nothing to say")),
-        "{answer_of_it:?}"
-    );
+    assert!(matches!(&answer_of_it, TapAnswer::Refused(why) if why.contains("nothing to say")), "{answer_of_it:?}");
 
     // The caller no longer waits for it.
     let waiting = call_echo(bus, b"wait");
@@ -121,26 +105,18 @@ async fn calls_are_told_with_what_was_answered_while_somebody_listens() {
         _ = waiting => panic!("it is never answered"),
         number = expect_call(&mut tapping, b"wait") => number,
     };
-    assert_eq!(
-        expect_answer(&mut tapping).await,
-        (number, TapAnswer::GivenUp)
-    );
+    assert_eq!(expect_answer(&mut tapping).await, (number, TapAnswer::GivenUp));
     assert_eq!(tapping.omitted_count(), 0);
 
     drop(tapping);
     assert!(call_echo(bus, b"after").await.is_some());
-    assert!(
-        tap.listen(&Budget::without_limit()).is_some(),
-        "nobody does"
-    );
+    assert!(tap.listen(&Budget::without_limit()).is_some(), "nobody does");
 }
 
 #[tokio::test]
 async fn who_does_not_keep_up_is_told_less_and_holds_up_nobody() {
     let TapWorld { tap, bus, .. } = &world().await;
-    let mut tapping = tap
-        .listen(&Budget::without_limit())
-        .expect("nobody listens");
+    let mut tapping = tap.listen(&Budget::without_limit()).expect("nobody listens");
     for _ in 0..600 {
         assert!(call_echo(bus, b"hello").await.is_some());
     }
@@ -166,10 +142,7 @@ async fn what_may_not_be_held_is_left_out_and_what_is_read_is_given_back() {
     // The request fits the budget, but no response does.
     assert!(call_echo(bus, b"hello").await.is_some());
     let number = expect_call(&mut tapping, b"hello").await;
-    assert_eq!(
-        expect_answer(&mut tapping).await,
-        (number, TapAnswer::GivenUp)
-    );
+    assert_eq!(expect_answer(&mut tapping).await, (number, TapAnswer::GivenUp));
     assert_eq!((tapping.omitted_count(), budget.used_bytes()), (2, 0));
 }
 

@@ -49,14 +49,8 @@ mod tests {
 
     #[test]
     fn a_format_is_found_by_how_messages_are_written() {
-        assert_eq!(
-            RecordingFormat::from_encoding("cdr"),
-            Some(RecordingFormat::Ros2)
-        );
-        assert_eq!(
-            RecordingFormat::from_encoding("ros1"),
-            Some(RecordingFormat::Ros1)
-        );
+        assert_eq!(RecordingFormat::from_encoding("cdr"), Some(RecordingFormat::Ros2));
+        assert_eq!(RecordingFormat::from_encoding("ros1"), Some(RecordingFormat::Ros1));
         assert_eq!(RecordingFormat::from_encoding("json"), None);
     }
 }

@@ -54,10 +54,7 @@ impl RecordingReader {
     /// # Errors
     /// [`Error::Unreadable`].
     pub fn open(path: &Path) -> Result<Self, Error> {
-        let file = File::open(path).map_err(|reason| Error::Unreadable {
-            path: path.to_owned(),
-            reason,
-        })?;
+        let file = File::open(path).map_err(|reason| Error::Unreadable { path: path.to_owned(), reason })?;
         let options = LinearReaderOptions::default().with_record_length_limit(LARGEST);
         Ok(Self {
             path: path.to_owned(),
@@ -81,10 +78,7 @@ impl RecordingReader {
     /// [`Error::Unreadable`], [`Error::NoRecording`], [`Error::Broken`].
     pub fn next_message(&mut self) -> Result<Option<RecordedMessage>, Error> {
         let path = &self.path;
-        let broken = |reason: String| Error::Broken {
-            path: path.clone(),
-            reason,
-        };
+        let broken = |reason: String| Error::Broken { path: path.clone(), reason };
         let unreadable = |error: McapError| match error {
             McapError::BadMagic => Error::NoRecording { path: path.clone() },
             error => broken(error.to_string()),
@@ -94,10 +88,7 @@ impl RecordingReader {
                 None => self.ended = true,
                 Some(Ok(LinearReadEvent::ReadRequest(wanted))) => {
                     let read = self.file.read(self.records.insert(wanted));
-                    let read = read.map_err(|reason| Error::Unreadable {
-                        path: path.clone(),
-                        reason,
-                    })?;
+                    let read = read.map_err(|reason| Error::Unreadable { path: path.clone(), reason })?;
                     self.records.notify_read(read);
                 }
                 Some(Ok(LinearReadEvent::Record { data, opcode })) => {
@@ -117,9 +108,7 @@ impl RecordingReader {
                             let channel = self.channels.get(&header.channel_id).cloned();
                             let channel = channel.ok_or_else(|| {
                                 let id = header.channel_id;
-                                broken(format!(
-                                    "it has a message of channel {id}, which it does not describe"
-                                ))
+                                broken(format!("it has a message of channel {id}, which it does not describe"))
                             })?;
                             let of = self.schemas.get(&channel.schema);
                             return Ok(Some(RecordedMessage {

@@ -69,10 +69,7 @@ impl RecordingWriter {
     pub fn create(path: &Path, format: RecordingFormat) -> Result<Self, Error> {
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(path);
-        let file = file.map_err(|reason| Error::NotMade {
-            path: path.to_owned(),
-            reason,
-        })?;
+        let file = file.map_err(|reason| Error::NotMade { path: path.to_owned(), reason })?;
         Self::from_file(path, file, format)
     }
 
@@ -81,24 +78,11 @@ impl RecordingWriter {
     /// # Errors
     /// [`Error::Unwritable`].
     pub fn from_file(path: &Path, file: File, format: RecordingFormat) -> Result<Self, Error> {
-        let asked = file.try_clone().map_err(|reason| Error::NotMade {
-            path: path.to_owned(),
-            reason,
-        })?;
-        let options = WriteOptions::new()
-            .profile(format.profile())
-            .library(concat!("cloudroid ", env!("CARGO_PKG_VERSION")));
-        let file = options
-            .create(ChunkedFile::new(file))
-            .map_err(write_error(path))?;
-        Ok(Self {
-            path: path.to_owned(),
-            format,
-            asked,
-            file,
-            topics: BTreeMap::new(),
-            pending: 0,
-        })
+        let asked = file.try_clone().map_err(|reason| Error::NotMade { path: path.to_owned(), reason })?;
+        let options =
+            WriteOptions::new().profile(format.profile()).library(concat!("cloudroid ", env!("CARGO_PKG_VERSION")));
+        let file = options.create(ChunkedFile::new(file)).map_err(write_error(path))?;
+        Ok(Self { path: path.to_owned(), format, asked, file, topics: BTreeMap::new(), pending: 0 })
     }
 
     /// Returns the channel of a topic whose messages have type `of` with the given `definition`.
@@ -109,9 +93,7 @@ impl RecordingWriter {
         let schema = self.file.add_schema(of, self.format.schema(), definition);
         let schema = schema.map_err(write_error(&self.path))?;
         let encoding = self.format.encoding();
-        let channel = self
-            .file
-            .add_channel(schema, topic, encoding, &BTreeMap::new());
+        let channel = self.file.add_channel(schema, topic, encoding, &BTreeMap::new());
         let channel = channel.map_err(write_error(&self.path))?;
         self.topics.entry(channel).or_insert_with(|| ChannelTotals {
             name: topic.to_owned(),
@@ -130,20 +112,11 @@ impl RecordingWriter {
             topic.messages += 1;
             topic.bytes += message.len() as u64;
         }
-        let header = MessageHeader {
-            channel_id,
-            sequence,
-            log_time: time,
-            publish_time: time,
-        };
+        let header = MessageHeader { channel_id, sequence, log_time: time, publish_time: time };
         let written = self.file.write_to_known_channel(&header, message);
         written.map_err(write_error(&self.path))?;
         self.pending += message.len();
-        if self.pending > PENDING {
-            self.flush()
-        } else {
-            Ok(())
-        }
+        if self.pending > PENDING { self.flush() } else { Ok(()) }
     }
 
     /// Flushes pending messages to the file.
@@ -168,21 +141,11 @@ impl RecordingWriter {
         let mut topics: Vec<_> = self
             .topics
             .into_values()
-            .map(|topic| TopicSummary {
-                topic: topic.name,
-                of: topic.of,
-                messages: topic.messages,
-                bytes: topic.bytes,
-            })
+            .map(|topic| TopicSummary { topic: topic.name, of: topic.of, messages: topic.messages, bytes: topic.bytes })
             .collect();
         topics.sort_by(|a, b| a.topic.cmp(&b.topic));
         let size = self.asked.metadata().map_or(0, |found| found.len());
-        Ok(Summary {
-            file: self.path,
-            size,
-            messages,
-            topics,
-        })
+        Ok(Summary { file: self.path, size, messages, topics })
     }
 }
 
@@ -197,11 +160,7 @@ struct ChunkedFile {
 
 impl ChunkedFile {
     fn new(file: File) -> Self {
-        Self {
-            file,
-            end: 0,
-            next: Cursor::default(),
-        }
+        Self { file, end: 0, next: Cursor::default() }
     }
 }
 
@@ -232,10 +191,7 @@ impl Seek for ChunkedFile {
 }
 
 fn write_error(path: &Path) -> impl FnOnce(McapError) -> Error {
-    |reason| Error::Unwritable {
-        path: path.to_owned(),
-        reason,
-    }
+    |reason| Error::Unwritable { path: path.to_owned(), reason }
 }
 
 #[cfg(test)]
@@ -250,32 +206,19 @@ mod tests {
         let mut writer = RecordingWriter::create(&path, RecordingFormat::Ros2).expect("a new file");
         let channel = writer.add_channel("/chatter", "std_msgs/msg/String", b"string data");
         let message = [0, 1, 0, 0, 2, 0, 0, 0, b'a', 0];
-        writer
-            .add_message(channel.expect("a channel"), 7, &message)
-            .expect("is written");
+        writer.add_message(channel.expect("a channel"), 7, &message).expect("is written");
         writer.finish().expect("an end");
         let bytes = std::fs::read(&path).expect("it is there");
         // Magic, opcode and length of the header, then its first string.
         assert_eq!(&bytes[17..25], b"\x04\0\0\0ros2");
-        let summary = mcap::Summary::read(&bytes)
-            .expect("it is whole")
-            .expect("a summary");
+        let summary = mcap::Summary::read(&bytes).expect("it is whole").expect("a summary");
         let channel = summary.channels.values().next().expect("a channel");
         assert_eq!(channel.message_encoding, "cdr");
         let schema = channel.schema.as_ref().expect("a schema");
-        assert_eq!(
-            (&*schema.name, &*schema.encoding),
-            ("std_msgs/msg/String", "ros2msg")
-        );
+        assert_eq!((&*schema.name, &*schema.encoding), ("std_msgs/msg/String", "ros2msg"));
         let mut reader = RecordingReader::open(&path).expect("it opens");
-        let played = reader
-            .next_message()
-            .expect("it is read")
-            .expect("a message");
-        assert_eq!(
-            RecordingFormat::from_encoding(&played.encoding),
-            Some(RecordingFormat::Ros2)
-        );
+        let played = reader.next_message().expect("it is read").expect("a message");
+        assert_eq!(RecordingFormat::from_encoding(&played.encoding), Some(RecordingFormat::Ros2));
         assert_eq!((played.time, &*played.message), (7, &message[..]));
     }
 
@@ -290,16 +233,12 @@ mod tests {
         assert_eq!(same.expect("the same"), text);
         for time in 1..=3 {
             let message = format!("word {time}");
-            writer
-                .add_message(text, time, message.as_bytes())
-                .expect("is written");
+            writer.add_message(text, time, message.as_bytes()).expect("is written");
         }
         writer.flush().expect("is written");
         // Messages after this point, in no complete chunk, would be lost if the writer ended here.
         for time in 4..1000 {
-            writer
-                .add_message(text, time, &[b'x'; 1000])
-                .expect("is written");
+            writer.add_message(text, time, &[b'x'; 1000]).expect("is written");
         }
         let cut = place.path().join("cut.mcap");
         std::fs::copy(&path, &cut).expect("a copy");
@@ -317,9 +256,7 @@ mod tests {
             }
             (found, reader.is_truncated())
         };
-        let words: Vec<_> = (1..=3)
-            .map(|time| (time, format!("word {time}").into_bytes()))
-            .collect();
+        let words: Vec<_> = (1..=3).map(|time| (time, format!("word {time}").into_bytes())).collect();
         assert_eq!(read(&cut), (words.clone(), true));
         let (all, breaks_off) = read(&path);
         assert_eq!((&all[..3], all.len(), breaks_off), (&words[..], 999, false));
@@ -331,9 +268,7 @@ mod tests {
             assert!(breaks_off && all.starts_with(&found), "cut at {end}");
         }
 
-        let error = RecordingWriter::create(&path, RecordingFormat::Ros1)
-            .err()
-            .expect("it is there");
+        let error = RecordingWriter::create(&path, RecordingFormat::Ros1).err().expect("it is there");
         assert!(error.to_string().contains("exists"), "{error}");
     }
 }

@@ -58,11 +58,7 @@ pub fn read(file: &Bytes, limit: usize) -> Result<Vec<BagMessage>, BagError> {
             _ => BagError::Other,
         });
     }
-    let mut reader = BagReader {
-        connections: HashMap::new(),
-        messages: Vec::new(),
-        limit,
-    };
+    let mut reader = BagReader { connections: HashMap::new(), messages: Vec::new(), limit };
     reader.read_records(file, MAGIC.len(), file.len(), true)?;
     Ok(reader.messages)
 }
@@ -75,13 +71,7 @@ struct BagReader {
 
 impl BagReader {
     /// Reads the records between two positions; chunks are not nested.
-    fn read_records(
-        &mut self,
-        file: &Bytes,
-        mut at: usize,
-        end: usize,
-        chunks: bool,
-    ) -> Result<(), BagError> {
+    fn read_records(&mut self, file: &Bytes, mut at: usize, end: usize, chunks: bool) -> Result<(), BagError> {
         while at < end && self.messages.len() < self.limit {
             let began = at;
             let damaged = BagError::Damaged(began);
@@ -108,17 +98,12 @@ impl BagReader {
                     // The topic as subscribed to; the connection's own header may have another name from before
                     // remapping.
                     let topic = text_field(&fields, "topic").into();
-                    self.connections
-                        .insert(number, (topic, Arc::new(wire_type)));
+                    self.connections.insert(number, (topic, Arc::new(wire_type)));
                 }
                 Some(MESSAGE) => {
                     let number = number_field(&fields, "conn").ok_or(damaged.clone())?;
-                    let (topic, wire_type) =
-                        self.connections.get(&number).ok_or(damaged.clone())?;
-                    let time: [u8; 8] = fields
-                        .get("time")
-                        .and_then(|value| (*value).try_into().ok())
-                        .ok_or(damaged)?;
+                    let (topic, wire_type) = self.connections.get(&number).ok_or(damaged.clone())?;
+                    let time: [u8; 8] = fields.get("time").and_then(|value| (*value).try_into().ok()).ok_or(damaged)?;
                     let [a, b, c, d, e, f, g, h] = time;
                     let seconds = u64::from(u32::from_le_bytes([a, b, c, d]));
                     let nanoseconds = u64::from(u32::from_le_bytes([e, f, g, h]));
@@ -155,10 +140,7 @@ fn parse_fields(header: &[u8]) -> Option<HashMap<&str, &[u8]>> {
     while at < header.len() {
         let field = &header[take_block(header, &mut at, header.len())?];
         let equals = field.iter().position(|byte| *byte == b'=')?;
-        fields.insert(
-            std::str::from_utf8(&field[..equals]).ok()?,
-            &field[equals + 1..],
-        );
+        fields.insert(std::str::from_utf8(&field[..equals]).ok()?, &field[equals + 1..]);
     }
     Some(fields)
 }
@@ -208,26 +190,13 @@ mod tests {
         let mut time = 5u32.to_le_bytes().to_vec();
         time.extend_from_slice(&7u32.to_le_bytes());
         let conn = 3u32.to_le_bytes();
-        let mut chunk = record(
-            &[
-                ("op", &[CONNECTION]),
-                ("conn", &conn),
-                ("topic", b"/chatter"),
-            ],
-            &about,
-        );
+        let mut chunk = record(&[("op", &[CONNECTION]), ("conn", &conn), ("topic", b"/chatter")], &about);
         for text in ["\x01\0\0\0a", "\x01\0\0\0b"] {
-            chunk.extend(record(
-                &[("op", &[MESSAGE]), ("conn", &conn), ("time", &time)],
-                text.as_bytes(),
-            ));
+            chunk.extend(record(&[("op", &[MESSAGE]), ("conn", &conn), ("time", &time)], text.as_bytes()));
         }
         let mut file = MAGIC.to_vec();
         file.extend(record(&[("op", &[3])], b"    padding"));
-        file.extend(record(
-            &[("op", &[CHUNK]), ("compression", compression.as_bytes())],
-            &chunk,
-        ));
+        file.extend(record(&[("op", &[CHUNK]), ("compression", compression.as_bytes())], &chunk));
         file.extend(record(&[("op", &[4])], b"an index"));
         file
     }
@@ -256,10 +225,7 @@ mod tests {
         let text = BagError::Other.to_string();
         assert!(!text.contains("rosbag fix"), "{text}");
         let compressed = read(&Bytes::from(bag("bz2")), 1).expect_err("compressed");
-        assert!(
-            compressed.to_string().contains("rosbag decompress"),
-            "{compressed}"
-        );
+        assert!(compressed.to_string().contains("rosbag decompress"), "{compressed}");
     }
 
     #[test]

@@ -28,17 +28,15 @@ mod queue;
 mod types;
 mod version;
 
-pub use actions::{
-    ActionClient, ActionHandler, ActionServer, GoalEnd, GoalError, GoalEvents, GoalOutcome,
-};
+pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 pub use error::{BusError, CallFate};
 pub use failure_reason::FailureReason;
 pub use graph::{ActionNodes, Graph, NodeEntities, NodeNames, ParameterUse, TopicNodes};
 pub use lending::{Lender, Lending, LentService, ServiceProvider};
 pub use matched::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
 pub use node_parameters::{
-    DoubleRange, IntegerRange, NodeParameters, ParameterDescription, ParameterEvent,
-    ParameterEvents, ParameterKind, ParameterNames,
+    DoubleRange, IntegerRange, NodeParameters, ParameterDescription, ParameterEvent, ParameterEvents, ParameterKind,
+    ParameterNames,
 };
 pub use parameters::{GlobalParameters, ParamChange, ParamChangeReceiver, ParamValue};
 pub(crate) use parameters::{ParamChangeSender, param_change_channel};
@@ -138,30 +136,14 @@ pub trait Bus: Send + Sync + 'static {
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
     /// Subscribes to messages of type `of` ([`WireType::any`] for any type). Publishers that appear later are connected
     /// as they register.
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError>;
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError>;
     /// Advertises a topic. With [`QosDurability::TransientLocal`] late subscribers are given the last message of this
     /// publisher. Each advertisement keeps its own last message, so a relay for several such publishers of one topic
     /// advertises once for each.
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError>;
+    async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError>;
     /// Calls a service once; the connection is kept for the next call.
-    async fn call(
-        &self,
-        service: &str,
-        request: Bytes,
-        timeout: Duration,
-    ) -> Result<Bytes, BusError> {
-        self.call_typed(service, &Digest::any(), request, timeout)
-            .await
+    async fn call(&self, service: &str, request: Bytes, timeout: Duration) -> Result<Bytes, BusError> {
+        self.call_typed(service, &Digest::any(), request, timeout).await
     }
     /// Like [`call`](Self::call), but fails if the server's type no longer has the digest that the request was
     /// serialized with.
@@ -185,11 +167,7 @@ pub trait Bus: Send + Sync + 'static {
         handler: Arc<dyn ServiceHandler>,
     ) -> Result<Box<dyn Send + Sync>, BusError>;
     /// Creates a client of an action; its topics or services are opened in the background.
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError>;
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError>;
     /// Serves an action until the returned value is dropped; it is opened in the background.
     fn serve_action(
         &self,

@@ -51,9 +51,7 @@ use crate::schema::MessageType;
 pub use cbor_item::cbor_item_len;
 pub use fault::{CodecError, CodecErrorKind};
 pub use json_text::json_value_len;
-pub use options::{
-    CborOptions, DEFAULT_MAX_BYTES, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Time,
-};
+pub use options::{CborOptions, DEFAULT_MAX_BYTES, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Time};
 pub use stamps::Stamps;
 pub use value::Value;
 
@@ -64,9 +62,7 @@ pub fn to_json(
     out: &mut Vec<u8>,
     options: &JsonOptions,
 ) -> Result<(), CodecError> {
-    undo_on_error(message, out, |out| {
-        json_out::write(message, bytes, out, options)
-    })
+    undo_on_error(message, out, |out| json_out::write(message, bytes, out, options))
 }
 
 /// Appends the serialized message that a JSON object describes. `json` must be exactly that object.
@@ -76,9 +72,7 @@ pub fn from_json(
     out: &mut Vec<u8>,
     options: &FillOptions,
 ) -> Result<(), CodecError> {
-    undo_on_error(message, out, |out| {
-        json_in::read(message, json, out, options)
-    })
+    undo_on_error(message, out, |out| json_in::read(message, json, out, options))
 }
 
 /// Appends the message as a CBOR map.
@@ -88,9 +82,7 @@ pub fn to_cbor(
     out: &mut Vec<u8>,
     options: &CborOptions,
 ) -> Result<(), CodecError> {
-    undo_on_error(message, out, |out| {
-        cbor_out::write(message, bytes, out, options)
-    })
+    undo_on_error(message, out, |out| cbor_out::write(message, bytes, out, options))
 }
 
 /// Appends the serialized message that a CBOR map describes. `cbor` must be exactly that map.
@@ -100,9 +92,7 @@ pub fn from_cbor(
     out: &mut Vec<u8>,
     options: &FillOptions,
 ) -> Result<(), CodecError> {
-    undo_on_error(message, out, |out| {
-        cbor_in::read(message, cbor, out, options)
-    })
+    undo_on_error(message, out, |out| cbor_in::read(message, cbor, out, options))
 }
 
 /// Checks that the bytes are exactly one message of this type.
@@ -114,10 +104,7 @@ pub fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), CodecError> {
 /// definition.
 pub fn default_message(message: &MessageType) -> Vec<u8> {
     let mut out = Vec::new();
-    let unlimited = FillOptions {
-        now: None,
-        max_bytes: usize::MAX,
-    };
+    let unlimited = FillOptions { now: None, max_bytes: usize::MAX };
     // An object without fields is a valid message of any type, so this cannot fail.
     match from_json(message, b"{}", &mut out, &unlimited) {
         Ok(()) => out,
@@ -128,10 +115,7 @@ pub fn default_message(message: &MessageType) -> Vec<u8> {
 /// Returns the default message as JSON.
 pub fn default_json(message: &MessageType) -> String {
     let mut out = Vec::new();
-    let unlimited = JsonOptions {
-        max_bytes: usize::MAX,
-        ..JsonOptions::default()
-    };
+    let unlimited = JsonOptions { max_bytes: usize::MAX, ..JsonOptions::default() };
     match to_json(message, &default_message(message), &mut out, &unlimited) {
         Ok(()) => String::from_utf8(out).unwrap_or_default(),
         Err(_) => "{}".to_owned(),
@@ -147,16 +131,9 @@ pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
     let big_endian = message.version() == RosVersion::Two && bytes.get(1) == Some(&0);
     let word = |at: usize| {
         let word = bytes.get(at..at + 4)?.try_into().ok()?;
-        Some(if big_endian {
-            u32::from_be_bytes(word)
-        } else {
-            u32::from_le_bytes(word)
-        })
+        Some(if big_endian { u32::from_be_bytes(word) } else { u32::from_le_bytes(word) })
     };
-    Some(Time {
-        secs: word(4)?,
-        nsecs: word(8)?,
-    })
+    Some(Time { secs: word(4)?, nsecs: word(8)? })
 }
 
 fn undo_on_error(

@@ -43,11 +43,7 @@ impl Version {
 /// The flavour of images built before flavours were recorded.
 impl Default for Flavour {
     fn default() -> Self {
-        Self {
-            base: "bookworm-ros1".to_owned(),
-            ros: Version::Ros1,
-            distribution: "noetic".to_owned(),
-        }
+        Self { base: "bookworm-ros1".to_owned(), ros: Version::Ros1, distribution: "noetic".to_owned() }
     }
 }
 
@@ -99,10 +95,7 @@ impl Flavour {
     /// one node, the first; in ROS 2 it may be several, and nodes that already have the right name get no argument.
     pub fn rename_identity(&self, nodes: &[NodeRename]) -> NodeIdentity {
         match self.ros {
-            Version::Ros1 => nodes
-                .first()
-                .map(|called| ros1::process::identity(&called.node))
-                .unwrap_or_default(),
+            Version::Ros1 => nodes.first().map(|called| ros1::process::identity(&called.node)).unwrap_or_default(),
             Version::Ros2 => ros2::process::rename_identity(nodes),
         }
     }
@@ -134,11 +127,7 @@ impl Flavour {
 
     /// Returns the arguments that set the parameters of the node of this absolute name, where parameters belong to
     /// nodes (ROS 2). Later arguments may override them: the last one for a name applies. `all`: absolute names.
-    pub fn parameter_arguments(
-        &self,
-        node: &str,
-        all: &BTreeMap<String, ParamValue>,
-    ) -> Vec<String> {
+    pub fn parameter_arguments(&self, node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<String> {
         match self.ros {
             Version::Ros1 => Vec::new(),
             Version::Ros2 => ros2::process::parameter_arguments(node, all),
@@ -146,10 +135,7 @@ impl Flavour {
     }
 
     /// Returns the parameters set before the first node starts: the deployer's and those that ROS itself sets.
-    pub fn initial_parameters(
-        &self,
-        given: &BTreeMap<String, ParamValue>,
-    ) -> BTreeMap<String, ParamValue> {
+    pub fn initial_parameters(&self, given: &BTreeMap<String, ParamValue>) -> BTreeMap<String, ParamValue> {
         let mut parameters = match self.ros {
             Version::Ros1 => ros1::process::parameters(&self.distribution),
             Version::Ros2 => BTreeMap::new(),
@@ -166,14 +152,8 @@ mod tests {
     #[test]
     fn a_flavour_is_read_as_it_was_written() {
         for (written, ros) in [
-            (
-                r#"{"base":"lab","ros":"ros1","distribution":"melodic"}"#,
-                RosVersion::One,
-            ),
-            (
-                r#"{"base":"lab","ros":"ros2","distribution":"jazzy"}"#,
-                RosVersion::Two,
-            ),
+            (r#"{"base":"lab","ros":"ros1","distribution":"melodic"}"#, RosVersion::One),
+            (r#"{"base":"lab","ros":"ros2","distribution":"jazzy"}"#, RosVersion::Two),
         ] {
             let flavour: Flavour = serde_json::from_str(written).expect("a flavour");
             assert_eq!((&*flavour.base, flavour.ros.ros_version()), ("lab", ros));
@@ -189,15 +169,9 @@ mod tests {
         assert_eq!(all["/see/rate"], ParamValue::Int(10));
         assert_eq!(all["/rosdistro"], ParamValue::String("noetic\n".to_owned()));
         assert!(one.parameter_arguments("/see", &all).is_empty());
-        let two = Flavour {
-            ros: Version::Ros2,
-            ..Flavour::default()
-        };
+        let two = Flavour { ros: Version::Ros2, ..Flavour::default() };
         let all = two.initial_parameters(&given);
         assert_eq!(all, given);
-        assert_eq!(
-            two.parameter_arguments("/see", &all),
-            ["--ros-args", "-p", "rate:=10", "--"]
-        );
+        assert_eq!(two.parameter_arguments("/see", &all), ["--ros-args", "-p", "rate:=10", "--"]);
     }
 }

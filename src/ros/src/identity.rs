@@ -24,10 +24,7 @@ pub struct Naming {
 /// Sets both parts.
 impl Default for Naming {
     fn default() -> Self {
-        Self {
-            name: true,
-            namespace: true,
-        }
+        Self { name: true, namespace: true }
     }
 }
 

@@ -58,9 +58,6 @@ impl JoinOptions {
 
     /// Creates options for a node of this name in this domain (ROS 2).
     pub fn in_domain(domain: u16, node: &str) -> Self {
-        Self {
-            domain,
-            ..Self::new(SocketAddr::from(([0, 0, 0, 0], 0)), node)
-        }
+        Self { domain, ..Self::new(SocketAddr::from(([0, 0, 0, 0], 0)), node) }
     }
 }

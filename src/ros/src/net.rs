@@ -69,9 +69,7 @@ const GONE: Duration = Duration::from_secs(60);
 pub fn enable_keepalive(stream: &TcpStream) {
     let socket = SockRef::from(stream);
     let asking = TcpKeepalive::new().with_time(ASK).with_interval(ASK_AGAIN);
-    let asked = socket
-        .set_tcp_keepalive(&asking)
-        .and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
+    let asked = socket.set_tcp_keepalive(&asking).and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
     if let Err(error) = asked {
         tracing::debug!(%error, "a peer that disappears silently will not be noticed");
     }
@@ -121,10 +119,7 @@ pub(crate) async fn serve_connections<F, E>(
 
 /// Parses `host` as an IP address literal or `localhost`, without any lookup.
 fn parse_literal(host: &str) -> Option<IpAddr> {
-    let bare = host
-        .strip_prefix('[')
-        .and_then(|rest| rest.strip_suffix(']'))
-        .unwrap_or(host);
+    let bare = host.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(host);
     if bare.eq_ignore_ascii_case("localhost") {
         return Some(IpAddr::V4(Ipv4Addr::LOCALHOST));
     }
@@ -148,11 +143,7 @@ impl Sockets for HostSockets {
     }
 
     async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        let socket = Socket::new(
-            Domain::for_address(address),
-            Type::DGRAM.nonblocking(),
-            None,
-        )?;
+        let socket = Socket::new(Domain::for_address(address), Type::DGRAM.nonblocking(), None)?;
         // The kernel caps this at the machine's limit.
         socket.set_recv_buffer_size(DATAGRAMS)?;
         socket.set_reuse_address(shared)?;
@@ -177,12 +168,10 @@ impl Sockets for HostSockets {
         // ROS 1 nodes listen on IPv4 by default.
         let mut found: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
         found.sort_by_key(|address| !address.is_ipv4());
-        found.into_iter().next().ok_or_else(|| {
-            io::Error::new(
-                io::ErrorKind::NotFound,
-                format!("host {host} has no address"),
-            )
-        })
+        found
+            .into_iter()
+            .next()
+            .ok_or_else(|| io::Error::new(io::ErrorKind::NotFound, format!("host {host} has no address")))
     }
 }
 
@@ -228,14 +217,8 @@ mod tests {
 
     #[tokio::test]
     async fn a_watched_peer_is_gone_after_a_minute() {
-        let listener = HostSockets
-            .listen(SocketAddr::from(([127, 0, 0, 1], 0)))
-            .await
-            .unwrap();
-        let stream = HostSockets
-            .connect(listener.local_addr().unwrap())
-            .await
-            .unwrap();
+        let listener = HostSockets.listen(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
+        let stream = HostSockets.connect(listener.local_addr().unwrap()).await.unwrap();
         enable_keepalive(&stream);
         let socket = SockRef::from(&stream);
         assert!(socket.keepalive().unwrap());

@@ -19,25 +19,16 @@ const OF_NODES: [&str; 9] = [
 ];
 
 /// Services that control and query a node's lifecycle.
-const OF_LIFECYCLES: [&str; 5] = [
-    "change_state",
-    "get_state",
-    "get_available_states",
-    "get_available_transitions",
-    "get_transition_graph",
-];
+const OF_LIFECYCLES: [&str; 5] =
+    ["change_state", "get_state", "get_available_states", "get_available_transitions", "get_transition_graph"];
 
 /// Returns true for a built-in topic: logs, statistics, simulated time, heartbeats of nodelets (bond), changes of
 /// parameters and of lifecycles.
 pub fn is_builtin_topic(graph: &Graph, name: &str) -> bool {
-    let everybodys = matches!(
-        name,
-        "/rosout" | "/rosout_agg" | "/statistics" | "/clock" | "/parameter_events"
-    );
+    let everybodys = matches!(name, "/rosout" | "/rosout_agg" | "/statistics" | "/clock" | "/parameter_events");
     let of_type = graph.topics.get(name).map(|topic| topic.type_name.as_str());
-    let of_lifecycle = name
-        .strip_suffix("/transition_event")
-        .is_some_and(|node| LifecycleNode::has_lifecycle(graph, node));
+    let of_lifecycle =
+        name.strip_suffix("/transition_event").is_some_and(|node| LifecycleNode::has_lifecycle(graph, node));
     everybodys || of_lifecycle || matches!(of_type, Some("bond/Status" | "bond/msg/Status"))
 }
 
@@ -50,8 +41,7 @@ pub fn is_builtin_service(version: RosVersion, graph: &Graph, name: &str) -> boo
         RosVersion::One => matches!(last, "get_loggers" | "set_logger_level"),
         RosVersion::Two => {
             let own = graph.services.get(name).is_some_and(|node| node == above);
-            let of_lifecycle =
-                OF_LIFECYCLES.contains(&last) && LifecycleNode::has_lifecycle(graph, above);
+            let of_lifecycle = OF_LIFECYCLES.contains(&last) && LifecycleNode::has_lifecycle(graph, above);
             own && (OF_NODES.contains(&last) || of_lifecycle)
         }
     }
@@ -72,9 +62,7 @@ mod tests {
     fn graph(services: &[(&str, &str)]) -> Graph {
         let services = services.iter();
         Graph {
-            services: services
-                .map(|(name, node)| ((*name).to_owned(), (*node).to_owned()))
-                .collect(),
+            services: services.map(|(name, node)| ((*name).to_owned(), (*node).to_owned())).collect(),
             ..Graph::default()
         }
     }
@@ -91,11 +79,7 @@ mod tests {
             ("/add", "/see"),
         ]);
         let two = |name: &str| is_builtin_service(RosVersion::Two, &graph, name);
-        for own in [
-            "/see/get_parameters",
-            "/drive/change_state",
-            "/drive/get_state",
-        ] {
+        for own in ["/see/get_parameters", "/drive/change_state", "/drive/get_state"] {
             assert!(two(own), "{own}");
         }
         // A node without a lifecycle, a service of another node, a service of the package.
@@ -109,27 +93,17 @@ mod tests {
 
     #[test]
     fn ros_1_has_others() {
-        let mut graph = graph(&[
-            ("/adder/set_parameters", "/adder"),
-            ("/adder/get_loggers", "/adder"),
-        ]);
+        let mut graph = graph(&[("/adder/set_parameters", "/adder"), ("/adder/get_loggers", "/adder")]);
         let one = |name: &str| is_builtin_service(RosVersion::One, &graph, name);
         assert!(one("/adder/get_loggers") && !one("/adder/set_parameters"));
-        let bond = TopicNodes {
-            type_name: "bond/Status".to_owned(),
-            ..TopicNodes::default()
-        };
+        let bond = TopicNodes { type_name: "bond/Status".to_owned(), ..TopicNodes::default() };
         graph.topics.insert("/bond".to_owned(), bond);
         assert!(is_builtin_topic(&graph, "/bond") && !is_builtin_topic(&graph, "/image"));
     }
 
     #[test]
     fn parameters_that_every_node_has_are_known() {
-        for own in [
-            "use_sim_time",
-            "qos_overrides./parameter_events.publisher.depth",
-            "/use_sim_time",
-        ] {
+        for own in ["use_sim_time", "qos_overrides./parameter_events.publisher.depth", "/use_sim_time"] {
             assert!(is_builtin_parameter(own), "{own}");
         }
         assert!(!is_builtin_parameter("rate") && !is_builtin_parameter("/see/rate"));

@@ -26,10 +26,7 @@ impl Remaps {
                     to: ros1::names::resolve(to, node),
                 };
                 // If there are several for one name, the last one applies.
-                let given = given
-                    .filter_map(|word| word.split_once(":="))
-                    .map(remap)
-                    .rev();
+                let given = given.filter_map(|word| word.split_once(":=")).map(remap).rev();
                 Self(given.collect())
             }
             RosVersion::Two => {
@@ -37,9 +34,7 @@ impl Remaps {
                 let parts = arguments::parse(argv).unwrap_or_default().into_iter();
                 let remap = |kind: Kind| match kind {
                     Kind::Rule(rule)
-                        if rule.of.is_name()
-                            && rule.of != RemapTarget::Service
-                            && rule.applies_to(own) =>
+                        if rule.of.is_name() && rule.of != RemapTarget::Service && rule.applies_to(own) =>
                     {
                         Some(Remap {
                             from: ros2::names::resolve(&rule.from, node),
@@ -77,8 +72,7 @@ mod tests {
 
     #[test]
     fn names_are_found_both_ways() {
-        let one =
-            "3 image:=/left image:=/camera/image ~out:=boxes _rate:=2 __name:=finder /abs:=other";
+        let one = "3 image:=/left image:=/camera/image ~out:=boxes _rate:=2 __name:=finder /abs:=other";
         let two = "3 --ros-args -r image:=/camera/image -r image:=/left -r ~/out:=boxes -p rate:=2 -r __node:=finder \
                    -r other:mask:=/m -r finder:/abs:=other";
         for (ros, line) in [(RosVersion::One, one), (RosVersion::Two, two)] {
@@ -94,9 +88,6 @@ mod tests {
                 assert_eq!(remaps.undo(registered), name, "{line}");
             }
         }
-        assert_eq!(
-            parse_remaps(RosVersion::Two, "--ros-args --nonsense"),
-            Remaps::default()
-        );
+        assert_eq!(parse_remaps(RosVersion::Two, "--ros-args --nonsense"), Remaps::default());
     }
 }

@@ -34,10 +34,7 @@ pub struct RingBounds {
 impl RingBounds {
     /// Creates bounds for the queue of a subscriber or publisher: the given number of messages, and 64 MiB.
     pub fn with_messages(messages: usize) -> Self {
-        Self {
-            messages,
-            bytes: 64 << 20,
-        }
+        Self { messages, bytes: 64 << 20 }
     }
 }
 
@@ -54,10 +51,7 @@ pub struct DropTally {
 impl DropTally {
     /// Creates the tally of a single message.
     pub fn from_message(message: &impl RingItem) -> Self {
-        Self {
-            messages: 1,
-            bytes: message.memory_size() as u64,
-        }
+        Self { messages: 1, bytes: message.memory_size() as u64 }
     }
 }
 
@@ -97,19 +91,12 @@ pub struct Ring<T> {
 impl<T: RingItem> Ring<T> {
     /// Creates an empty ring.
     pub fn new(bounds: RingBounds) -> Self {
-        Self {
-            bounds,
-            waiting: VecDeque::new(),
-            bytes: 0,
-        }
+        Self { bounds, waiting: VecDeque::new(), bytes: 0 }
     }
 
     /// Creates an empty ring that drops messages only at its owner's request.
     pub fn new_unbounded() -> Self {
-        Self::new(RingBounds {
-            messages: usize::MAX,
-            bytes: usize::MAX,
-        })
+        Self::new(RingBounds { messages: usize::MAX, bytes: usize::MAX })
     }
 
     /// Adds a message at the end; drops the oldest ones if there is no room.
@@ -235,10 +222,7 @@ mod tests {
 
     #[test]
     fn one_message_always_fits() {
-        let bounds = RingBounds {
-            messages: 0,
-            bytes: 10,
-        };
+        let bounds = RingBounds { messages: 0, bytes: 10 };
         let mut ring = Ring::new(bounds);
         assert_eq!(ring.push(message(1, 100)), DropTally::default());
         let lost = ring.push(message(2, 1));

@@ -31,9 +31,7 @@ pub use limits::{ExceededLimit, MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TE
 pub use primitive::Primitive;
 pub use registry::Registry;
 pub use syntax::SyntaxError;
-pub use types::{
-    ActionDef, ActionServices, Arity, Base, Constant, Field, FieldBounds, MessageType, ServiceDef,
-};
+pub use types::{ActionDef, ActionServices, Arity, Base, Constant, Field, FieldBounds, MessageType, ServiceDef};
 
 /// Errors of definitions.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

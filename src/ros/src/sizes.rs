@@ -78,13 +78,7 @@ impl SizeCounters {
         });
         let typical = half.map_or(0, class_limit).min(largest);
         let side = |side: &AtomicU64| Some(side.load(Ordering::Relaxed)).filter(|side| *side > 0);
-        SizeSummary {
-            count,
-            largest,
-            typical,
-            width: side(&self.width),
-            height: side(&self.height),
-        }
+        SizeSummary { count, largest, typical, width: side(&self.width), height: side(&self.height) }
     }
 }
 
@@ -137,8 +131,7 @@ impl InputSizes {
     pub fn summaries(&self) -> Vec<(String, SizeSummary)> {
         let by_name = self.by_name.lock();
         let seen = by_name.iter();
-        seen.map(|(name, (_, sizes))| (name.clone(), sizes.summary()))
-            .collect()
+        seen.map(|(name, (_, sizes))| (name.clone(), sizes.summary())).collect()
     }
 }
 
@@ -152,12 +145,7 @@ mod tests {
     #[test]
     fn what_passed_is_told_by_input() {
         let registry = Registry::new();
-        registry
-            .insert(
-                "a/Grid",
-                "uint8 x\nint32 width\nuint16 height\nuint8[] data",
-            )
-            .expect("valid");
+        registry.insert("a/Grid", "uint8 x\nint32 width\nuint16 height\nuint8[] data").expect("valid");
         let grid = registry.message("a/Grid").expect("known");
         let inputs = InputSizes::default();
         let sizes = inputs.for_input("/map", Some(&grid));
@@ -175,20 +163,8 @@ mod tests {
         sizes.record(&message(1, 1, 9989));
         inputs.for_input("/text", None).record(b"1234");
         let seen = inputs.summaries();
-        let map = SizeSummary {
-            count: 4,
-            largest: 10_000,
-            typical: 111,
-            width: Some(30),
-            height: Some(50),
-        };
-        let text = SizeSummary {
-            count: 1,
-            largest: 4,
-            typical: 4,
-            width: None,
-            height: None,
-        };
+        let map = SizeSummary { count: 4, largest: 10_000, typical: 111, width: Some(30), height: Some(50) };
+        let text = SizeSummary { count: 1, largest: 4, typical: 4, width: None, height: None };
         assert_eq!(seen, [("/map".to_owned(), map), ("/text".to_owned(), text)]);
         assert!(Arc::ptr_eq(&inputs.for_input("/map", Some(&grid)), &sizes));
         // A new type starts with empty statistics.
@@ -200,9 +176,7 @@ mod tests {
     fn clients_cannot_make_it_grow() {
         let inputs = InputSizes::default();
         for number in 0..2 * MOST {
-            inputs
-                .for_input(&format!("/topic{number}"), None)
-                .record(b"");
+            inputs.for_input(&format!("/topic{number}"), None).record(b"");
         }
         assert_eq!(inputs.summaries().len(), MOST);
         let late = inputs.for_input("/topic0", None);

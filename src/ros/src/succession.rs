@@ -12,9 +12,5 @@ pub type ParticipantPrefix = [u8; 12];
 pub trait Succession: fmt::Debug + Send + Sync {
     /// Records that a node of this name is about to join with this participant. Returns the participants of earlier
     /// processes, whether or not they said goodbye; the other nodes are told that these are gone.
-    async fn record_join(
-        &self,
-        node: &str,
-        participant: ParticipantPrefix,
-    ) -> Vec<ParticipantPrefix>;
+    async fn record_join(&self, node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix>;
 }

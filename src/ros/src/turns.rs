@@ -25,11 +25,7 @@ enum QueueState {
 
 impl<K> Default for RoundRobin<K> {
     fn default() -> Self {
-        Self {
-            ready: VecDeque::new(),
-            later: BTreeSet::new(),
-            places: BTreeMap::new(),
-        }
+        Self { ready: VecDeque::new(), later: BTreeSet::new(), places: BTreeMap::new() }
     }
 }
 

@@ -34,8 +34,7 @@ fn own_sockets() -> BTreeSet<u64> {
         name.strip_suffix(']')?.parse().ok()
     };
     let all = std::fs::read_dir("/proc/self/fd").unwrap();
-    all.filter_map(|entry| inode(&std::fs::read_link(entry.ok()?.path()).ok()?))
-        .collect()
+    all.filter_map(|entry| inode(&std::fs::read_link(entry.ok()?.path()).ok()?)).collect()
 }
 
 /// Returns this process's established connections: local and remote port as formatted by the kernel, and whether a
@@ -54,40 +53,23 @@ fn connections() -> Vec<(String, bool)> {
 
 #[tokio::test]
 async fn every_connection_notices_when_its_peer_is_gone() {
-    let listener = HostSockets
-        .listen(SocketAddr::from(([127, 0, 0, 1], 0)))
-        .await
-        .unwrap();
+    let listener = HostSockets.listen(SocketAddr::from(([127, 0, 0, 1], 0))).await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions::default());
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
     let (one, two) = (join("/one").await.unwrap(), join("/two").await.unwrap());
     let wire_type = WireType::new("std_msgs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "");
-    let publisher = one
-        .advertise(
-            "/said",
-            wire_type.clone(),
-            QosProfile::keep_last(1).latching(true),
-        )
-        .await
-        .unwrap();
+    let publisher = one.advertise("/said", wire_type.clone(), QosProfile::keep_last(1).latching(true)).await.unwrap();
     publisher.publish(Bytes::new());
-    let mut subscription = two
-        .subscribe("/said", wire_type, QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let mut subscription = two.subscribe("/said", wire_type, QosProfile::keep_last(1)).await.unwrap();
     let heard = timeout(LONG, subscription.messages.recv()).await;
     heard.unwrap().unwrap();
     let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
     let _serving = one.serve("/echo", of, Arc::new(Echo)).await.unwrap();
     let answer = two.call("/echo", Bytes::from_static(b"hi"), LONG).await;
     assert_eq!(answer.unwrap(), "hi");
-    two.parameters()
-        .unwrap()
-        .set("/p", ParamValue::Int(1))
-        .await
-        .unwrap();
+    two.parameters().unwrap().set("/p", ParamValue::Int(1)).await.unwrap();
     // A connection with unacknowledged data has another timer until that is acknowledged.
     let quiet = async {
         loop {

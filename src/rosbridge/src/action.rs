@@ -70,14 +70,8 @@ pub struct SendActionGoal<'a> {
 
 impl<'a> Message<'a> for SendActionGoal<'a> {
     const OP: &'static str = "send_action_goal";
-    const FIELDS: &'static [&'static str] = &[
-        "action",
-        "action_type",
-        "args",
-        "feedback",
-        "fragment_size",
-        "compression",
-    ];
+    const FIELDS: &'static [&'static str] =
+        &["action", "action_type", "args", "feedback", "fragment_size", "compression"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         let (action, id) = split_name(fields.required_text("action", ACTION)?, id);
@@ -127,13 +121,7 @@ impl<'a> Message<'a> for CancelActionGoal<'a> {
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         let (action, id) = split_name(fields.required_text("action", ACTION)?, id);
-        Ok(Self {
-            id: id.ok_or(Problem::Missing {
-                field: "id",
-                expected: GOAL_ID,
-            })?,
-            action,
-        })
+        Ok(Self { id: id.ok_or(Problem::Missing { field: "id", expected: GOAL_ID })?, action })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -164,10 +152,7 @@ impl<'a> Message<'a> for ActionFeedback<'a> {
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
-            id: id.ok_or(Problem::Missing {
-                field: "id",
-                expected: GOAL_ID,
-            })?,
+            id: id.ok_or(Problem::Missing { field: "id", expected: GOAL_ID })?,
             action: fields.required_text("action", ACTION)?,
             values: fields.object("values")?,
             compression: Compression::read(fields)?,
@@ -204,33 +189,24 @@ pub struct ActionResult<'a> {
 
 impl<'a> Message<'a> for ActionResult<'a> {
     const OP: &'static str = "action_result";
-    const FIELDS: &'static [&'static str] =
-        &["action", "values", "status", "result", "compression"];
+    const FIELDS: &'static [&'static str] = &["action", "values", "status", "result", "compression"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        const STATUS: &str =
-            "a number of action_msgs/GoalStatus (4 succeeded, 5 canceled, 6 aborted)";
+        const STATUS: &str = "a number of action_msgs/GoalStatus (4 succeeded, 5 canceled, 6 aborted)";
         let status = match fields.integer("status")? {
             None => None,
-            Some(number) => {
-                Some(
-                    GoalStatus::from_number(number).ok_or_else(|| Problem::Mistyped {
-                        field: "status",
-                        expected: STATUS,
-                        found: number.to_string(),
-                    })?,
-                )
-            }
+            Some(number) => Some(GoalStatus::from_number(number).ok_or_else(|| Problem::Mistyped {
+                field: "status",
+                expected: STATUS,
+                found: number.to_string(),
+            })?),
         };
         Ok(Self {
             id,
             action: fields.required_text("action", ACTION)?,
             values: fields.payload("values"),
             status,
-            result: fields.boolean("result")?.ok_or(Problem::Missing {
-                field: "result",
-                expected: "true or false",
-            })?,
+            result: fields.boolean("result")?.ok_or(Problem::Missing { field: "result", expected: "true or false" })?,
             compression: Compression::read(fields)?,
         })
     }
@@ -303,10 +279,7 @@ impl<'a> Message<'a> for UnadvertiseAction<'a> {
     const FIELDS: &'static [&'static str] = &["action", "type"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            action: fields.required_text("action", ACTION)?,
-        })
+        Ok(Self { id, action: fields.required_text("action", ACTION)? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {

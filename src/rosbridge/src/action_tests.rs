@@ -19,11 +19,7 @@ fn send_action_goal_is_read_and_checked() {
         r#"{"op":"send_action_goal","id":"send_action_goal:/fibonacci:1","action":"/fibonacci","action_type":"actionlib_tutorials/Fibonacci","args":{"order":5},"feedback":true}"#,
         goal(),
     );
-    assert_survives_cbor(SendActionGoal {
-        args: None,
-        compression: Some(Compression::CborRaw),
-        ..goal()
-    });
+    assert_survives_cbor(SendActionGoal { args: None, compression: Some(Compression::CborRaw), ..goal() });
     assert_refused(
         r#"{"op":"send_action_goal","action":"/f"}"#,
         "send_action_goal: field \"action_type\" is missing, an action type such as \"actionlib_tutorials/Fibonacci\" \
@@ -37,14 +33,8 @@ fn send_action_goal_is_read_and_checked() {
 
 #[test]
 fn cancel_action_goal_is_read_and_checked() {
-    let op = CancelActionGoal {
-        id: "g1".into(),
-        action: "/f".into(),
-    };
-    assert_parses(
-        r#"{"op":"cancel_action_goal","id":"g1","action":"/f"}"#,
-        op.clone(),
-    );
+    let op = CancelActionGoal { id: "g1".into(), action: "/f".into() };
+    assert_parses(r#"{"op":"cancel_action_goal","id":"g1","action":"/f"}"#, op.clone());
     assert_survives_cbor(op);
     assert_refused(
         r#"{"op":"cancel_action_goal","action":"/f"}"#,
@@ -83,16 +73,8 @@ fn action_result_is_read_and_checked() {
         r#"{"op":"action_result","id":"g1","action":"/f","values":{"sequence":[0,1]},"status":4,"result":true}"#,
         done.clone(),
     );
-    let failed = ActionResult {
-        values: None,
-        status: None,
-        result: false,
-        ..done
-    };
-    assert_parses(
-        r#"{"op":"action_result","id":"g1","action":"/f","result":false}"#,
-        failed.clone(),
-    );
+    let failed = ActionResult { values: None, status: None, result: false, ..done };
+    assert_parses(r#"{"op":"action_result","id":"g1","action":"/f","result":false}"#, failed.clone());
     assert_survives_cbor(failed);
     assert_refused(
         r#"{"op":"action_result","action":"/f","status":77,"result":true}"#,
@@ -113,19 +95,13 @@ fn advertise_action_is_read_and_checked() {
         type_name: "actionlib_tutorials/Fibonacci".into(),
         compression: Compression::None,
     };
-    assert_parses(
-        r#"{"op":"advertise_action","type":"actionlib_tutorials/Fibonacci","action":"/f"}"#,
-        op.clone(),
-    );
+    assert_parses(r#"{"op":"advertise_action","type":"actionlib_tutorials/Fibonacci","action":"/f"}"#, op.clone());
     assert_survives_cbor(op);
     assert_refused(
         r#"{"op":"advertise_action"}"#,
         "advertise_action: field \"action\" is missing, an action name is expected",
     );
-    let op = UnadvertiseAction {
-        id: None,
-        action: "/f".into(),
-    };
+    let op = UnadvertiseAction { id: None, action: "/f".into() };
     assert_parses(r#"{"op":"unadvertise_action","action":"/f"}"#, op.clone());
     assert_survives_cbor(op);
     assert_refused(

@@ -28,15 +28,13 @@ pub struct Advertise<'a> {
 
 impl<'a> Message<'a> for Advertise<'a> {
     const OP: &'static str = "advertise";
-    const FIELDS: &'static [&'static str] =
-        &["topic", "type", "latch", "queue_size", "md5sum", "qos"];
+    const FIELDS: &'static [&'static str] = &["topic", "type", "latch", "queue_size", "md5sum", "qos"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
             id,
             topic: fields.required_text("topic", "a topic name")?,
-            type_name: fields
-                .required_text("type", "a message type such as \"std_msgs/String\"")?,
+            type_name: fields.required_text("type", "a message type such as \"std_msgs/String\"")?,
             latch: fields.boolean("latch")?.unwrap_or(false),
             queue_size: fields.count("queue_size", 0, "a number of messages")?,
             md5sum: fields.text("md5sum", "the definition's MD5 in hex, or its type hash,")?,
@@ -74,10 +72,7 @@ impl<'a> Message<'a> for Unadvertise<'a> {
     const FIELDS: &'static [&'static str] = &["topic"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            topic: fields.required_text("topic", "a topic name")?,
-        })
+        Ok(Self { id, topic: fields.required_text("topic", "a topic name")? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -115,22 +110,13 @@ mod tests {
         assert_survives_cbor(chatter());
         assert_parses(
             r#"{"op":"advertise","topic":"/chatter","type":"std_msgs/String","queue_size":null,"md5sum":"992c"}"#,
-            Advertise {
-                id: None,
-                latch: false,
-                queue_size: None,
-                md5sum: Some("992c".into()),
-                ..chatter()
-            },
+            Advertise { id: None, latch: false, queue_size: None, md5sum: Some("992c".into()), ..chatter() },
         );
     }
 
     #[test]
     fn advertise_is_checked() {
-        assert_refused(
-            r#"{"op":"advertise"}"#,
-            "advertise: field \"topic\" is missing, a topic name is expected",
-        );
+        assert_refused(r#"{"op":"advertise"}"#, "advertise: field \"topic\" is missing, a topic name is expected");
         assert_refused(
             r#"{"op":"advertise","topic":"/x"}"#,
             "advertise: field \"type\" is missing, a message type such as \"std_msgs/String\" is expected",
@@ -155,18 +141,9 @@ mod tests {
 
     #[test]
     fn unadvertise_is_read_and_checked() {
-        let op = Unadvertise {
-            id: Some(Id::Integer(3)),
-            topic: "/chatter".into(),
-        };
-        assert_parses(
-            r#"{"op":"unadvertise","id":3,"topic":"/chatter"}"#,
-            op.clone(),
-        );
+        let op = Unadvertise { id: Some(Id::Integer(3)), topic: "/chatter".into() };
+        assert_parses(r#"{"op":"unadvertise","id":3,"topic":"/chatter"}"#, op.clone());
         assert_survives_cbor(op);
-        assert_refused(
-            r#"{"op":"unadvertise"}"#,
-            "unadvertise: field \"topic\" is missing, a topic name is expected",
-        );
+        assert_refused(r#"{"op":"unadvertise"}"#, "unadvertise: field \"topic\" is missing, a topic name is expected");
     }
 }

@@ -32,12 +32,7 @@ impl<'a> Message<'a> for Auth<'a> {
     const FIELDS: &'static [&'static str] = &["mac", "client", "dest", "rand", "t", "level", "end"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let seconds = |field| {
-            fields.integer(field)?.ok_or(Problem::Missing {
-                field,
-                expected: "seconds since 1970",
-            })
-        };
+        let seconds = |field| fields.integer(field)?.ok_or(Problem::Missing { field, expected: "seconds since 1970" });
         Ok(Self {
             id,
             mac: fields.required_text("mac", "a hash in hex")?,
@@ -87,10 +82,7 @@ mod tests {
             op.clone(),
         );
         assert_survives_cbor(op);
-        assert_refused(
-            r#"{"op":"auth"}"#,
-            "auth: field \"mac\" is missing, a hash in hex is expected",
-        );
+        assert_refused(r#"{"op":"auth"}"#, "auth: field \"mac\" is missing, a hash in hex is expected");
         assert_refused(
             r#"{"op":"auth","mac":"a","client":"b","dest":"c","rand":"d","t":"now"}"#,
             "auth: field \"t\" is \"now\", an integer is expected",

@@ -16,11 +16,7 @@ const SIMPLE: u8 = 7;
 const BREAK: u8 = 0xff;
 
 fn syntax_error(at: usize, reason: &'static str) -> Problem {
-    Problem::Syntax {
-        format: "CBOR",
-        at,
-        reason,
-    }
+    Problem::Syntax { format: "CBOR", at, reason }
 }
 
 /// Head of an item: its major type and argument; `None` for indefinite length.
@@ -60,20 +56,12 @@ impl<'a> CborCursor<'a> {
             0..=23 => Some(u64::from(info)),
             24..=27 => {
                 let bytes = self.take(1 << (info - 24))?;
-                Some(
-                    bytes
-                        .iter()
-                        .fold(0, |sum, &byte| (sum << 8) | u64::from(byte)),
-                )
+                Some(bytes.iter().fold(0, |sum, &byte| (sum << 8) | u64::from(byte)))
             }
             31 if matches!(major, BYTES | TEXT | ARRAY | MAP) => None,
             _ => return Err(syntax_error(start, "a reserved length is used")),
         };
-        Ok(CborHead {
-            major,
-            info,
-            argument,
-        })
+        Ok(CborHead { major, info, argument })
     }
 
     fn take_break(&mut self) -> bool {
@@ -103,38 +91,21 @@ impl<'a> CborCursor<'a> {
             }
             let start = self.at;
             let key = self.head()?;
-            let CborHead {
-                major: TEXT,
-                argument: Some(length),
-                ..
-            } = key
-            else {
-                return Err(syntax_error(
-                    start,
-                    "a field name (a text string of definite length) is expected",
-                ));
+            let CborHead { major: TEXT, argument: Some(length), .. } = key else {
+                return Err(syntax_error(start, "a field name (a text string of definite length) is expected"));
             };
-            let key = std::str::from_utf8(self.take(length)?)
-                .map_err(|_| syntax_error(start, "a name is not UTF-8"))?;
+            let key =
+                std::str::from_utf8(self.take(length)?).map_err(|_| syntax_error(start, "a name is not UTF-8"))?;
             let value = self.at;
             self.skip(0)?;
             each(key, &self.bytes[value..self.at])?;
         }
-        if self.at == self.bytes.len() {
-            Ok(())
-        } else {
-            Err(syntax_error(self.at, "nothing may follow the map"))
-        }
+        if self.at == self.bytes.len() { Ok(()) } else { Err(syntax_error(self.at, "nothing may follow the map")) }
     }
 
     /// Returns the slices of an array's items.
     pub(crate) fn list(&mut self) -> Option<Vec<&'a [u8]>> {
-        let CborHead {
-            major: ARRAY,
-            argument,
-            ..
-        } = self.head().ok()?
-        else {
+        let CborHead { major: ARRAY, argument, .. } = self.head().ok()? else {
             return None;
         };
         let mut items = Vec::new();
@@ -240,11 +211,7 @@ fn half_to_f64(bits: u16) -> f64 {
         31 => f64::NAN,
         _ => (mantissa + 1024.0) * 2f64.powi(exponent - 25),
     };
-    if bits & 0x8000 == 0 {
-        magnitude
-    } else {
-        -magnitude
-    }
+    if bits & 0x8000 == 0 { magnitude } else { -magnitude }
 }
 
 /// Appends the head of an item in its shortest form.
@@ -299,30 +266,17 @@ mod tests {
     #[test]
     fn fields_are_found_with_their_slices() {
         // {"a": 1, "b": [_ h'00', {"x": 1.5}], "c": 64(h'0102')}
-        let bytes =
-            b"\xa3\x61a\x01\x61b\x9f\x41\x00\xa1\x61x\xf9\x3e\x00\xff\x61c\xd8\x40\x42\x01\x02";
+        let bytes = b"\xa3\x61a\x01\x61b\x9f\x41\x00\xa1\x61x\xf9\x3e\x00\xff\x61c\xd8\x40\x42\x01\x02";
         let found = fields(bytes).unwrap();
         assert_eq!(found[0], ("a".to_owned(), vec![1]));
-        assert_eq!(
-            found[1],
-            (
-                "b".to_owned(),
-                b"\x9f\x41\x00\xa1\x61x\xf9\x3e\x00\xff".to_vec()
-            )
-        );
+        assert_eq!(found[1], ("b".to_owned(), b"\x9f\x41\x00\xa1\x61x\xf9\x3e\x00\xff".to_vec()));
         assert_eq!(found[2], ("c".to_owned(), b"\xd8\x40\x42\x01\x02".to_vec()));
-        assert_eq!(
-            fields(b"\xbf\x61a\x20\xff").unwrap(),
-            [("a".to_owned(), vec![0x20])]
-        );
+        assert_eq!(fields(b"\xbf\x61a\x20\xff").unwrap(), [("a".to_owned(), vec![0x20])]);
     }
 
     #[test]
     fn broken_cbor_is_refused_and_never_trusted() {
-        assert_eq!(
-            fields(b""),
-            Err(syntax_error(0, "the frame ends too early"))
-        );
+        assert_eq!(fields(b""), Err(syntax_error(0, "the frame ends too early")));
         assert_eq!(fields(b"\x01"), Err(Problem::NotAnObject("CBOR map")));
         // A byte string that claims 2^63 bytes, an array that claims 2^63 items.
         assert!(fields(b"\xa1\x61a\x5b\x80\0\0\0\0\0\0\0").is_err());
@@ -333,10 +287,7 @@ mod tests {
         assert!(fields(b"\xa1\x61a\x1c").is_err());
         let mut deep = b"\xa1\x61a".to_vec();
         deep.extend(std::iter::repeat_n(0x81, 100_000));
-        assert_eq!(
-            fields(&deep),
-            Err(syntax_error(68, "nested deeper than 64 levels"))
-        );
+        assert_eq!(fields(&deep), Err(syntax_error(68, "nested deeper than 64 levels")));
     }
 
     #[test]
@@ -355,20 +306,7 @@ mod tests {
         ] {
             assert_eq!(CborCursor::new(bytes).number(), Some(value));
         }
-        for value in [
-            0,
-            23,
-            24,
-            255,
-            256,
-            65535,
-            65536,
-            i64::MAX,
-            -1,
-            -24,
-            -25,
-            i64::MIN,
-        ] {
+        for value in [0, 23, 24, 255, 256, 65535, 65536, i64::MAX, -1, -24, -25, i64::MIN] {
             let mut out = Vec::new();
             write_integer(&mut out, value);
             assert_eq!(CborCursor::new(&out).integer(), Some(value));

@@ -21,11 +21,7 @@ fn prefix(op: &Option<String>) -> String {
 
 impl Error {
     pub(crate) fn new(problem: Problem) -> Self {
-        Self {
-            op: None,
-            id: None,
-            problem,
-        }
+        Self { op: None, id: None, problem }
     }
 }
 

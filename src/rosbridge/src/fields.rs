@@ -21,30 +21,22 @@ impl<'a> Fields<'a> {
         match payload.format {
             Format::Json => match std::str::from_utf8(payload.bytes) {
                 Ok(text) => Self::from_json(text),
-                Err(error) => Err(Problem::Syntax {
-                    format: "JSON",
-                    at: error.valid_up_to(),
-                    reason: "the text is not UTF-8",
-                }),
+                Err(error) => {
+                    Err(Problem::Syntax { format: "JSON", at: error.valid_up_to(), reason: "the text is not UTF-8" })
+                }
             },
             Format::Cbor => Self::from_cbor(payload.bytes),
         }
     }
 
     pub(crate) fn from_json(text: &'a str) -> Result<Self, Problem> {
-        let mut fields = Self {
-            format: Format::Json,
-            found: Vec::with_capacity(8),
-        };
+        let mut fields = Self { format: Format::Json, found: Vec::with_capacity(8) };
         json::JsonCursor::new(text).object(|key, value| fields.push(key, value.as_bytes()))?;
         Ok(fields)
     }
 
     pub(crate) fn from_cbor(bytes: &'a [u8]) -> Result<Self, Problem> {
-        let mut fields = Self {
-            format: Format::Cbor,
-            found: Vec::with_capacity(8),
-        };
+        let mut fields = Self { format: Format::Cbor, found: Vec::with_capacity(8) };
         cbor::CborCursor::new(bytes).map(|key, value| fields.push(Cow::Borrowed(key), value))?;
         Ok(fields)
     }
@@ -62,11 +54,7 @@ impl<'a> Fields<'a> {
     }
 
     fn is_null(&self, value: &[u8]) -> bool {
-        Payload {
-            format: self.format,
-            bytes: value,
-        }
-        .is_null()
+        Payload { format: self.format, bytes: value }.is_null()
     }
 
     /// Returns the value of a field. The last one wins, as in every JSON parser; `null` is treated as absent.
@@ -75,11 +63,7 @@ impl<'a> Fields<'a> {
         (!self.is_null(value)).then_some(*value)
     }
 
-    pub(crate) fn require(
-        &self,
-        field: &'static str,
-        expected: &'static str,
-    ) -> Result<&'a [u8], Problem> {
+    pub(crate) fn require(&self, field: &'static str, expected: &'static str) -> Result<&'a [u8], Problem> {
         self.get(field).ok_or(Problem::Missing { field, expected })
     }
 
@@ -95,15 +79,12 @@ impl<'a> Fields<'a> {
                 }
             }
             Format::Cbor => match value.first().map_or(7, |byte| byte >> 5) {
-                cbor::UNSIGNED | cbor::NEGATIVE => cbor::CborCursor::new(value)
-                    .integer()
-                    .map_or("a number".to_owned(), |number| number.to_string()),
+                cbor::UNSIGNED | cbor::NEGATIVE => {
+                    cbor::CborCursor::new(value).integer().map_or("a number".to_owned(), |number| number.to_string())
+                }
                 cbor::BYTES => "a byte string".to_owned(),
                 cbor::TEXT => match cbor::CborCursor::new(value).string(cbor::TEXT) {
-                    Some(text) => format!(
-                        "{:?}",
-                        String::from_utf8_lossy(&text[..text.len().min(SHOWN)])
-                    ),
+                    Some(text) => format!("{:?}", String::from_utf8_lossy(&text[..text.len().min(SHOWN)])),
                     None => "a text in chunks".to_owned(),
                 },
                 cbor::ARRAY => "an array".to_owned(),
@@ -115,25 +96,12 @@ impl<'a> Fields<'a> {
         }
     }
 
-    pub(crate) fn mistyped_error(
-        &self,
-        field: &'static str,
-        expected: &'static str,
-        value: &[u8],
-    ) -> Problem {
-        Problem::Mistyped {
-            field,
-            expected,
-            found: self.describe(value),
-        }
+    pub(crate) fn mistyped_error(&self, field: &'static str, expected: &'static str, value: &[u8]) -> Problem {
+        Problem::Mistyped { field, expected, found: self.describe(value) }
     }
 
     pub(crate) fn as_text(&self, value: &'a [u8]) -> Option<Cow<'a, str>> {
-        Payload {
-            format: self.format,
-            bytes: value,
-        }
-        .text()
+        Payload { format: self.format, bytes: value }.text()
     }
 
     pub(crate) fn as_number(&self, value: &[u8]) -> Option<f64> {
@@ -141,9 +109,7 @@ impl<'a> Fields<'a> {
             Format::Json => {
                 // Rust's parser also accepts "inf" and "+1"; JSON does not.
                 let text = std::str::from_utf8(value).ok()?;
-                matches!(value.first(), Some(b'-' | b'0'..=b'9'))
-                    .then(|| text.parse().ok())
-                    .flatten()
+                matches!(value.first(), Some(b'-' | b'0'..=b'9')).then(|| text.parse().ok()).flatten()
             }
             Format::Cbor => cbor::CborCursor::new(value).number(),
         }
@@ -151,9 +117,7 @@ impl<'a> Fields<'a> {
 
     pub(crate) fn as_integer(&self, value: &[u8]) -> Option<i64> {
         let exact = match self.format {
-            Format::Json => std::str::from_utf8(value)
-                .ok()
-                .and_then(|text| text.parse().ok()),
+            Format::Json => std::str::from_utf8(value).ok().and_then(|text| text.parse().ok()),
             Format::Cbor => cbor::CborCursor::new(value).integer(),
         };
         // JavaScript and Lua clients may write 5 as 5.0.
@@ -164,54 +128,29 @@ impl<'a> Fields<'a> {
     }
 
     /// Reads a string of limited length.
-    pub(crate) fn text(
-        &self,
-        field: &'static str,
-        expected: &'static str,
-    ) -> Result<Option<Cow<'a, str>>, Problem> {
+    pub(crate) fn text(&self, field: &'static str, expected: &'static str) -> Result<Option<Cow<'a, str>>, Problem> {
         let Some(value) = self.get(field) else {
             return Ok(None);
         };
         if value.len() > MAX_TEXT {
-            return Err(Problem::TooLong {
-                field,
-                length: value.len(),
-                limit: MAX_TEXT,
-            });
+            return Err(Problem::TooLong { field, length: value.len(), limit: MAX_TEXT });
         }
-        self.as_text(value)
-            .map(Some)
-            .ok_or_else(|| self.mistyped_error(field, expected, value))
+        self.as_text(value).map(Some).ok_or_else(|| self.mistyped_error(field, expected, value))
     }
 
     /// Reads a required string, which must not be empty.
-    pub(crate) fn required_text(
-        &self,
-        field: &'static str,
-        expected: &'static str,
-    ) -> Result<Cow<'a, str>, Problem> {
-        let text = self
-            .text(field, expected)?
-            .ok_or(Problem::Missing { field, expected })?;
+    pub(crate) fn required_text(&self, field: &'static str, expected: &'static str) -> Result<Cow<'a, str>, Problem> {
+        let text = self.text(field, expected)?.ok_or(Problem::Missing { field, expected })?;
         if text.is_empty() {
-            return Err(Problem::Mistyped {
-                field,
-                expected,
-                found: "empty".to_owned(),
-            });
+            return Err(Problem::Mistyped { field, expected, found: "empty".to_owned() });
         }
         Ok(text)
     }
 
     /// Reads a required string of any length: the data of fragments and PNGs.
-    pub(crate) fn data(
-        &self,
-        field: &'static str,
-        expected: &'static str,
-    ) -> Result<Cow<'a, str>, Problem> {
+    pub(crate) fn data(&self, field: &'static str, expected: &'static str) -> Result<Cow<'a, str>, Problem> {
         let value = self.require(field, expected)?;
-        self.as_text(value)
-            .ok_or_else(|| self.mistyped_error(field, expected, value))
+        self.as_text(value).ok_or_else(|| self.mistyped_error(field, expected, value))
     }
 
     pub(crate) fn boolean(&self, field: &'static str) -> Result<Option<bool>, Problem> {
@@ -252,9 +191,7 @@ impl<'a> Fields<'a> {
         let Some(value) = self.get(field) else {
             return Ok(None);
         };
-        self.as_integer(value)
-            .map(Some)
-            .ok_or_else(|| self.mistyped_error(field, "an integer", value))
+        self.as_integer(value).map(Some).ok_or_else(|| self.mistyped_error(field, "an integer", value))
     }
 
     /// Reads a duration given as a number of `unit`s.
@@ -268,9 +205,9 @@ impl<'a> Fields<'a> {
             return Ok(None);
         };
         match self.as_number(value) {
-            Some(number) if number >= 0.0 => Ok(Some(
-                Duration::try_from_secs_f64(number * unit.as_secs_f64()).unwrap_or(Duration::MAX),
-            )),
+            Some(number) if number >= 0.0 => {
+                Ok(Some(Duration::try_from_secs_f64(number * unit.as_secs_f64()).unwrap_or(Duration::MAX)))
+            }
             _ => Err(self.mistyped_error(field, expected, value)),
         }
     }
@@ -287,25 +224,15 @@ impl<'a> Fields<'a> {
     }
 
     pub(crate) fn payload(&self, field: &'static str) -> Option<Payload<'a>> {
-        self.get(field).map(|bytes| Payload {
-            format: self.format,
-            bytes,
-        })
+        self.get(field).map(|bytes| Payload { format: self.format, bytes })
     }
 
     /// Reads a required payload, which must be an object.
     pub(crate) fn object(&self, field: &'static str) -> Result<Payload<'a>, Problem> {
         const EXPECTED: &str = "an object with the message's fields";
         let bytes = self.require(field, EXPECTED)?;
-        let payload = Payload {
-            format: self.format,
-            bytes,
-        };
-        if payload.is_object() {
-            Ok(payload)
-        } else {
-            Err(self.mistyped_error(field, EXPECTED, bytes))
-        }
+        let payload = Payload { format: self.format, bytes };
+        if payload.is_object() { Ok(payload) } else { Err(self.mistyped_error(field, EXPECTED, bytes)) }
     }
 
     /// Reads a payload, which must be an object if present; empty otherwise.
@@ -324,10 +251,7 @@ impl<'a> Fields<'a> {
         let Some(bytes) = self.get(field) else {
             return Ok(None);
         };
-        let payload = Payload {
-            format: self.format,
-            bytes,
-        };
+        let payload = Payload { format: self.format, bytes };
         if payload.is_object() || payload.is_list() {
             Ok(Some(payload))
         } else {

@@ -26,16 +26,11 @@ impl<'a> Message<'a> for Fragment<'a> {
     const FIELDS: &'static [&'static str] = &["data", "num", "total"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let part = |field, least, expected| {
-            fields
-                .count(field, least, expected)?
-                .ok_or(Problem::Missing { field, expected })
-        };
+        let part =
+            |field, least, expected| fields.count(field, least, expected)?.ok_or(Problem::Missing { field, expected });
         Ok(Self {
-            id: id.ok_or(Problem::Missing {
-                field: "id",
-                expected: "the id common to all fragments of the message",
-            })?,
+            id: id
+                .ok_or(Problem::Missing { field: "id", expected: "the id common to all fragments of the message" })?,
             data: fields.data("data", "a piece of the message's text")?,
             num: part("num", 0, "the fragment's index, from 0,")?,
             total: part("total", 1, "the number of fragments, 1 or more,")?,
@@ -68,12 +63,7 @@ pub struct FragmentLimits {
 
 impl Default for FragmentLimits {
     fn default() -> Self {
-        Self {
-            messages: 16,
-            parts: 65_536,
-            bytes: 64 << 20,
-            age: Duration::from_secs(60),
-        }
+        Self { messages: 16, parts: 65_536, bytes: 64 << 20, age: Duration::from_secs(60) }
     }
 }
 
@@ -129,11 +119,7 @@ pub struct Fragments {
 impl Fragments {
     /// Creates an empty set.
     pub fn new(limits: FragmentLimits) -> Self {
-        Self {
-            limits,
-            partial: HashMap::new(),
-            bytes: 0,
-        }
+        Self { limits, partial: HashMap::new(), bytes: 0 }
     }
 
     /// Adds a fragment; returns the message when it is complete. The order of fragments does not matter.
@@ -141,20 +127,13 @@ impl Fragments {
     /// # Errors
     /// Returns the reason why the fragment was dropped. If fragments contradict each other the whole message is
     /// dropped.
-    pub fn add(
-        &mut self,
-        fragment: &Fragment<'_>,
-        now: Instant,
-    ) -> Result<Option<String>, FragmentError> {
+    pub fn add(&mut self, fragment: &Fragment<'_>, now: Instant) -> Result<Option<String>, FragmentError> {
         let Fragment { num, total, .. } = *fragment;
         if num >= total {
             return Err(FragmentError::Index { num, total });
         }
         if total > self.limits.parts as u64 {
-            return Err(FragmentError::Parts {
-                total,
-                limit: self.limits.parts,
-            });
+            return Err(FragmentError::Parts { total, limit: self.limits.parts });
         }
         if total == 1 {
             return Ok(Some(fragment.data.to_string()));
@@ -169,12 +148,7 @@ impl Fragments {
         let mut begun = 0;
         let partial = self.partial.entry(id.clone()).or_insert_with(|| {
             begun = slots;
-            PartialMessage {
-                parts: vec![None; total as usize],
-                missing: total as usize,
-                bytes: slots,
-                touched: now,
-            }
+            PartialMessage { parts: vec![None; total as usize], missing: total as usize, bytes: slots, touched: now }
         });
         self.bytes += begun;
         partial.touched = now;
@@ -217,12 +191,7 @@ impl Fragments {
     pub fn forget_old(&mut self, now: Instant) -> usize {
         let age = self.limits.age;
         let old = |partial: &PartialMessage| now.saturating_duration_since(partial.touched) > age;
-        let ids: Vec<_> = self
-            .partial
-            .iter()
-            .filter(|(_, partial)| old(partial))
-            .map(|(id, _)| id.clone())
-            .collect();
+        let ids: Vec<_> = self.partial.iter().filter(|(_, partial)| old(partial)).map(|(id, _)| id.clone()).collect();
         for id in &ids {
             self.forget(id);
         }
@@ -231,11 +200,7 @@ impl Fragments {
 
     fn make_room(&mut self) {
         while self.partial.len() >= self.limits.messages.max(1) {
-            let oldest = self
-                .partial
-                .iter()
-                .min_by_key(|(_, partial)| partial.touched)
-                .map(|(id, _)| id.clone());
+            let oldest = self.partial.iter().min_by_key(|(_, partial)| partial.touched).map(|(id, _)| id.clone());
             match oldest {
                 Some(id) => self.forget(&id),
                 None => return,

@@ -10,11 +10,7 @@ use crate::Problem;
 const MAX_DEPTH: usize = 128;
 
 fn syntax_error(at: usize, reason: &'static str) -> Problem {
-    Problem::Syntax {
-        format: "JSON",
-        at,
-        reason,
-    }
+    Problem::Syntax { format: "JSON", at, reason }
 }
 
 /// A position in a JSON text.
@@ -73,8 +69,7 @@ impl<'a> JsonCursor<'a> {
                     return Err(syntax_error(self.at, "a field name in quotes is expected"));
                 }
                 let key = self.value()?;
-                let key = unescape(key)
-                    .ok_or_else(|| syntax_error(self.at, "a field name has a bad escape"))?;
+                let key = unescape(key).ok_or_else(|| syntax_error(self.at, "a field name has a bad escape"))?;
                 self.expect(b':', "a colon is expected")?;
                 let value = self.value()?;
                 each(key, value)?;
@@ -85,10 +80,7 @@ impl<'a> JsonCursor<'a> {
                         break;
                     }
                     _ => {
-                        return Err(syntax_error(
-                            self.at,
-                            "a comma or the object's end is expected",
-                        ));
+                        return Err(syntax_error(self.at, "a comma or the object's end is expected"));
                     }
                 }
             }
@@ -118,9 +110,7 @@ impl<'a> JsonCursor<'a> {
 
     /// Returns the slice of the value that starts here.
     fn value(&mut self) -> Result<&'a str, Problem> {
-        let first = self
-            .peek()
-            .ok_or_else(|| syntax_error(self.at, "a value is expected"))?;
+        let first = self.peek().ok_or_else(|| syntax_error(self.at, "a value is expected"))?;
         let start = self.at;
         match first {
             b'"' => self.skip_string()?,
@@ -130,10 +120,7 @@ impl<'a> JsonCursor<'a> {
             b'n' => self.skip_word("null")?,
             b'-' | b'0'..=b'9' => {
                 let bytes = self.bytes();
-                while matches!(
-                    bytes.get(self.at),
-                    Some(b'-' | b'+' | b'.' | b'e' | b'E' | b'0'..=b'9')
-                ) {
+                while matches!(bytes.get(self.at), Some(b'-' | b'+' | b'.' | b'e' | b'E' | b'0'..=b'9')) {
                     self.at += 1;
                 }
             }
@@ -204,11 +191,7 @@ impl<'a> JsonCursor<'a> {
 pub(crate) fn unescape(raw: &str) -> Option<Cow<'_, str>> {
     let inner = raw.strip_prefix('"')?.strip_suffix('"')?;
     if memchr::memchr(b'\\', inner.as_bytes()).is_none() {
-        return if inner.bytes().any(|byte| byte < 0x20) {
-            None
-        } else {
-            Some(Cow::Borrowed(inner))
-        };
+        return if inner.bytes().any(|byte| byte < 0x20) { None } else { Some(Cow::Borrowed(inner)) };
     }
     let mut text = String::with_capacity(inner.len());
     let mut rest = inner;
@@ -251,11 +234,7 @@ pub(crate) fn unescape(raw: &str) -> Option<Cow<'_, str>> {
 
 fn hex4(text: &str, at: usize) -> Option<u32> {
     let digits = text.get(at..at + 4)?;
-    digits
-        .bytes()
-        .all(|byte| byte.is_ascii_hexdigit())
-        .then(|| u32::from_str_radix(digits, 16).ok())
-        .flatten()
+    digits.bytes().all(|byte| byte.is_ascii_hexdigit()).then(|| u32::from_str_radix(digits, 16).ok()).flatten()
 }
 
 /// Appends `text` as a JSON string.
@@ -325,20 +304,9 @@ mod tests {
 
     #[test]
     fn fields_are_found_with_their_slices() {
-        let found =
-            fields(r#" { "op" : "x\"y" , "n":-1.5e3,"m":{"a":["}",{}]},"t":true,"z":null} "#)
-                .unwrap();
-        let expected = [
-            ("op", r#""x\"y""#),
-            ("n", "-1.5e3"),
-            ("m", r#"{"a":["}",{}]}"#),
-            ("t", "true"),
-            ("z", "null"),
-        ];
-        assert_eq!(
-            found,
-            expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
-        );
+        let found = fields(r#" { "op" : "x\"y" , "n":-1.5e3,"m":{"a":["}",{}]},"t":true,"z":null} "#).unwrap();
+        let expected = [("op", r#""x\"y""#), ("n", "-1.5e3"), ("m", r#"{"a":["}",{}]}"#), ("t", "true"), ("z", "null")];
+        assert_eq!(found, expected.map(|(key, value)| (key.to_owned(), value.to_owned())));
         assert_eq!(fields("{}").unwrap(), []);
     }
 
@@ -351,11 +319,7 @@ mod tests {
             ("{\"a\":1,}", 7, "a field name in quotes is expected"),
             ("{\"a\":\"x}", 5, "a string is not closed"),
             ("{\"a\":\"x\\", 5, "a string is not closed"),
-            (
-                "{\"a\":[1,2}",
-                10,
-                "a comma or the object's end is expected",
-            ),
+            ("{\"a\":[1,2}", 10, "a comma or the object's end is expected"),
             ("{\"a\":[1,2", 5, "a bracket is not closed"),
             ("{\"a\":tru}", 5, "a value is expected"),
             ("{\"a\":1} x", 8, "nothing may follow the object"),
@@ -364,10 +328,7 @@ mod tests {
         }
         assert_eq!(fields("[1]"), Err(Problem::NotAnObject("JSON object")));
         let deep = format!("{{\"a\":{}{}}}", "[".repeat(100_000), "]".repeat(100_000));
-        assert_eq!(
-            fields(&deep),
-            Err(syntax_error(133, "nested deeper than 128 levels"))
-        );
+        assert_eq!(fields(&deep), Err(syntax_error(133, "nested deeper than 128 levels")));
     }
 
     #[test]

@@ -36,8 +36,7 @@ mod subscribe;
 mod writer;
 
 pub use action::{
-    ActionFeedback, ActionResult, AdvertiseAction, CancelActionGoal, GoalStatus, SendActionGoal,
-    UnadvertiseAction,
+    ActionFeedback, ActionResult, AdvertiseAction, CancelActionGoal, GoalStatus, SendActionGoal, UnadvertiseAction,
 };
 pub use advertise::{Advertise, Unadvertise};
 pub use auth::Auth;
@@ -49,9 +48,7 @@ pub use op::{Op, ProtocolFrame, is_known_op, text_field, unknown_fields};
 pub use payload::{Format, Payload, Raw};
 pub use png::{Png, PngError, decode_png, encode_png};
 pub use publish::Publish;
-pub use qos::{
-    DurabilityPolicy, HistoryPolicy, LivelinessPolicy, Period, QosRequest, ReliabilityPolicy,
-};
+pub use qos::{DurabilityPolicy, HistoryPolicy, LivelinessPolicy, Period, QosRequest, ReliabilityPolicy};
 pub use service::{AdvertiseService, CallService, ServiceResponse, UnadvertiseService};
 pub use status::{SetLevel, Status, StatusLevel};
 pub use subscribe::{Compression, Subscribe, Unsubscribe};

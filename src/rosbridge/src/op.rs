@@ -5,10 +5,9 @@ use std::borrow::Cow;
 use crate::fields::Fields;
 use crate::message::Message;
 use crate::{
-    ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService,
-    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, QosRequest,
-    SendActionGoal, ServiceResponse, SetLevel, Status, Subscribe, Unadvertise, UnadvertiseAction,
-    UnadvertiseService, Unsubscribe, Writer,
+    ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService, CancelActionGoal,
+    Error, Format, Fragment, Id, Payload, Png, Problem, Publish, QosRequest, SendActionGoal, ServiceResponse, SetLevel,
+    Status, Subscribe, Unadvertise, UnadvertiseAction, UnadvertiseService, Unsubscribe, Writer,
 };
 
 /// One WebSocket message.
@@ -139,28 +138,16 @@ impl<'a> Op<'a> {
                 } else {
                     ""
                 };
-                return Err(Error {
-                    op: None,
-                    id: known,
-                    problem: Problem::NoOp { known: KNOWN, hint },
-                });
+                return Err(Error { op: None, id: known, problem: Problem::NoOp { known: KNOWN, hint } });
             }
             Err(problem) => {
-                return Err(Error {
-                    op: None,
-                    id: known,
-                    problem,
-                });
+                return Err(Error { op: None, id: known, problem });
             }
         };
         let read = id.and_then(|id| Op::read(&op, id, &fields));
         read.map_err(|problem| {
             let op = (!matches!(problem, Problem::UnknownOp { .. })).then(|| op.into_owned());
-            Error {
-                op,
-                id: known,
-                problem,
-            }
+            Error { op, id: known, problem }
         })
     }
 }
@@ -202,9 +189,7 @@ pub fn unknown_fields(frame: ProtocolFrame<'_>) -> Vec<String> {
     let Some(known) = op.as_deref().and_then(fields_of) else {
         return Vec::new();
     };
-    let names = fields
-        .names()
-        .filter(|name| !matches!(*name, "op" | "id") && !known.contains(name));
+    let names = fields.names().filter(|name| !matches!(*name, "op" | "id") && !known.contains(name));
     let mut unknown: Vec<String> = names.map(str::to_owned).collect();
     if known.contains(&"qos") {
         unknown.extend(QosRequest::unknown_names(&fields));
@@ -231,20 +216,11 @@ pub(crate) mod tests {
     #[track_caller]
     pub(crate) fn assert_parses(json: &str, op: impl Into<Op<'static>>) {
         let op = op.into();
-        assert_eq!(
-            Op::parse(ProtocolFrame::Text(json)).as_ref(),
-            Ok(&op),
-            "{json}"
-        );
+        assert_eq!(Op::parse(ProtocolFrame::Text(json)).as_ref(), Ok(&op), "{json}");
         let mut printed = Vec::new();
         op.print(&mut printed, Format::Json);
-        assert_eq!(
-            Op::parse(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).as_ref(),
-            Ok(&op)
-        );
-        assert!(
-            unknown_fields(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).is_empty()
-        );
+        assert_eq!(Op::parse(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).as_ref(), Ok(&op));
+        assert!(unknown_fields(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).is_empty());
         serde_json::from_slice::<serde_json::Value>(&printed).unwrap();
     }
 
@@ -260,25 +236,15 @@ pub(crate) mod tests {
     /// Asserts that `json` is refused with this text.
     #[track_caller]
     pub(crate) fn assert_refused(json: &str, text: &str) {
-        assert_eq!(
-            Op::parse(ProtocolFrame::Text(json))
-                .unwrap_err()
-                .to_string(),
-            text,
-            "{json}"
-        );
+        assert_eq!(Op::parse(ProtocolFrame::Text(json)).unwrap_err().to_string(), text, "{json}");
     }
 
     #[test]
     fn mistakes_keep_op_and_id() {
-        let error =
-            Op::parse(ProtocolFrame::Text(r#"{"op":"publish","id":7,"topic":3}"#)).unwrap_err();
+        let error = Op::parse(ProtocolFrame::Text(r#"{"op":"publish","id":7,"topic":3}"#)).unwrap_err();
         assert_eq!(error.op.as_deref(), Some("publish"));
         assert_eq!(error.id, Some(Id::Integer(7)));
-        assert_eq!(
-            error.to_string(),
-            "publish: field \"topic\" is 3, a topic name is expected"
-        );
+        assert_eq!(error.to_string(), "publish: field \"topic\" is 3, a topic name is expected");
         let error = Op::parse(ProtocolFrame::Text(r#"{"op":"dance","id":"x"}"#)).unwrap_err();
         assert_eq!((error.op, error.id), (None, Some(Id::from("x"))));
     }
@@ -289,18 +255,9 @@ pub(crate) mod tests {
                      unadvertise, advertise_service, unadvertise_service, send_action_goal, cancel_action_goal, \
                      action_feedback, action_result, advertise_action, unadvertise_action, png, set_level, status, \
                      auth";
-        assert_refused(
-            "{}",
-            &format!("field \"op\" is missing; it must be one of {names}"),
-        );
-        assert_refused(
-            r#"{"op":"dance"}"#,
-            &format!("unknown op \"dance\"; known are {names}"),
-        );
-        assert_refused(
-            r#"{"op":5}"#,
-            "field \"op\" is 5, the name of an operation is expected",
-        );
+        assert_refused("{}", &format!("field \"op\" is missing; it must be one of {names}"));
+        assert_refused(r#"{"op":"dance"}"#, &format!("unknown op \"dance\"; known are {names}"));
+        assert_refused(r#"{"op":5}"#, "field \"op\" is 5, the name of an operation is expected");
         assert_refused(
             r#"{"receiver":"/x","msg":[]}"#,
             &format!(
@@ -310,18 +267,10 @@ pub(crate) mod tests {
         );
         assert_refused("hello", "invalid JSON at byte 0: an object is expected");
         assert_refused("[]", "a frame must be one JSON object");
-        assert_eq!(
-            Op::parse(ProtocolFrame::Binary(b"\x00"))
-                .unwrap_err()
-                .to_string(),
-            "a frame must be one CBOR map"
-        );
+        assert_eq!(Op::parse(ProtocolFrame::Binary(b"\x00")).unwrap_err().to_string(), "a frame must be one CBOR map");
         assert!(Op::parse(ProtocolFrame::Binary(&[0x13, 0x37, 0xff, 0xfe])).is_err());
         let many: String = (0..1000).map(|n| format!("\"f{n}\":0,")).collect();
-        assert_refused(
-            &format!("{{{many}\"op\":\"auth\"}}"),
-            "a message has at most 64 fields",
-        );
+        assert_refused(&format!("{{{many}\"op\":\"auth\"}}"), "a message has at most 64 fields");
         let long = "x".repeat(20_000);
         assert_refused(
             &format!(r#"{{"op":"unsubscribe","topic":"{long}"}}"#),
@@ -335,8 +284,7 @@ pub(crate) mod tests {
 
     #[test]
     fn a_text_is_found_in_a_frame_that_is_refused() {
-        let frame =
-            ProtocolFrame::Text(r#"{"op":"call_service","service":"/add","args":5,"type":7}"#);
+        let frame = ProtocolFrame::Text(r#"{"op":"call_service","service":"/add","args":5,"type":7}"#);
         assert!(Op::parse(frame).is_err());
         assert_eq!(text_field(frame, "service").as_deref(), Some("/add"));
         for field in ["args", "type", "id"] {
@@ -347,14 +295,10 @@ pub(crate) mod tests {
 
     #[test]
     fn unknown_fields_are_named() {
-        let frame =
-            ProtocolFrame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
+        let frame = ProtocolFrame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
         assert!(Op::parse(frame).is_ok());
         assert_eq!(unknown_fields(frame), ["trottle_rate"]);
         let within = r#"{"op":"subscribe","topic":"/x","qos":{"depth":5,"reliabilty":"reliable"}}"#;
-        assert_eq!(
-            unknown_fields(ProtocolFrame::Text(within)),
-            ["qos.reliabilty"]
-        );
+        assert_eq!(unknown_fields(ProtocolFrame::Text(within)), ["qos.reliabilty"]);
     }
 }

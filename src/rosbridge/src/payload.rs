@@ -36,28 +36,19 @@ pub struct Raw<'a> {
 impl<'a> Payload<'a> {
     /// Creates a JSON payload.
     pub fn json(text: &'a str) -> Self {
-        Self {
-            format: Format::Json,
-            bytes: text.as_bytes(),
-        }
+        Self { format: Format::Json, bytes: text.as_bytes() }
     }
 
     /// Creates a CBOR payload.
     pub fn cbor(bytes: &'a [u8]) -> Self {
-        Self {
-            format: Format::Cbor,
-            bytes,
-        }
+        Self { format: Format::Cbor, bytes }
     }
 
     /// Returns whether it is a list (positional arguments) rather than an object.
     pub fn is_list(&self) -> bool {
         match self.format {
             Format::Json => self.bytes.first() == Some(&b'['),
-            Format::Cbor => self
-                .bytes
-                .first()
-                .is_some_and(|byte| byte >> 5 == cbor::ARRAY),
+            Format::Cbor => self.bytes.first().is_some_and(|byte| byte >> 5 == cbor::ARRAY),
         }
     }
 
@@ -65,10 +56,7 @@ impl<'a> Payload<'a> {
     pub fn is_object(&self) -> bool {
         match self.format {
             Format::Json => self.bytes.first() == Some(&b'{'),
-            Format::Cbor => self
-                .bytes
-                .first()
-                .is_some_and(|byte| byte >> 5 == cbor::MAP),
+            Format::Cbor => self.bytes.first().is_some_and(|byte| byte >> 5 == cbor::MAP),
         }
     }
 
@@ -136,9 +124,7 @@ impl<'a> Payload<'a> {
         let fields = Fields::from_payload(*self)?;
         let value = fields.require("bytes", EXPECTED)?;
         let bytes = match self.format {
-            Format::Cbor => cbor::CborCursor::new(value)
-                .string(cbor::BYTES)
-                .map(Cow::Borrowed),
+            Format::Cbor => cbor::CborCursor::new(value).string(cbor::BYTES).map(Cow::Borrowed),
             Format::Json => std::str::from_utf8(value)
                 .ok()
                 .and_then(crate::json::unescape)
@@ -147,12 +133,7 @@ impl<'a> Payload<'a> {
         };
         match bytes {
             Some(bytes) => Ok(Raw { bytes }),
-            None => Err(Problem::Mistyped {
-                field: "bytes",
-                expected: EXPECTED,
-                found: fields.describe(value),
-            }
-            .into()),
+            None => Err(Problem::Mistyped { field: "bytes", expected: EXPECTED, found: fields.describe(value) }.into()),
         }
     }
 }
@@ -167,53 +148,26 @@ mod tests {
         let raw = Payload::cbor(cbor).raw().unwrap();
         assert!(matches!(raw.bytes, Cow::Borrowed(_)));
         assert_eq!(*raw.bytes, [1, 2, 3]);
-        assert_eq!(
-            *Payload::json(r#"{"bytes":"AQID"}"#).raw().unwrap().bytes,
-            [1, 2, 3]
-        );
+        assert_eq!(*Payload::json(r#"{"bytes":"AQID"}"#).raw().unwrap().bytes, [1, 2, 3]);
         let wrong = Payload::json(r#"{"bytes":[1,2]}"#).raw().unwrap_err();
         assert_eq!(
             wrong.to_string(),
             "field \"bytes\" is [1,2], the ROS serialization as a byte string (base64 in JSON) is expected"
         );
-        assert!(
-            Payload::json("{}")
-                .raw()
-                .unwrap_err()
-                .to_string()
-                .contains("\"bytes\" is missing")
-        );
+        assert!(Payload::json("{}").raw().unwrap_err().to_string().contains("\"bytes\" is missing"));
     }
 
     #[test]
     fn positional_arguments_get_their_names() {
-        let named = Payload::json(r#"[1, "x", {"y":[2]}]"#)
-            .to_named_object(["a", "b", "c", "d"])
-            .unwrap();
-        assert_eq!(
-            std::str::from_utf8(&named).unwrap(),
-            r#"{"a":1,"b":"x","c":{"y":[2]}}"#
-        );
+        let named = Payload::json(r#"[1, "x", {"y":[2]}]"#).to_named_object(["a", "b", "c", "d"]).unwrap();
+        assert_eq!(std::str::from_utf8(&named).unwrap(), r#"{"a":1,"b":"x","c":{"y":[2]}}"#);
         assert_eq!(Payload::json("[]").to_named_object(["a"]).unwrap(), b"{}");
-        assert_eq!(
-            Payload::json("[1,2]").to_named_object(["a"]).unwrap(),
-            br#"{"a":1}"#
-        );
+        assert_eq!(Payload::json("[1,2]").to_named_object(["a"]).unwrap(), br#"{"a":1}"#);
         assert_eq!(Payload::json("[1,2]").list_len(), Some(2));
         assert_eq!(Payload::json("{}").list_len(), None);
         assert_eq!(Payload::json("{}").to_named_object(["a"]), None);
-        assert_eq!(
-            Payload::cbor(b"\x82\x01\x61x")
-                .to_named_object(["a", "b"])
-                .unwrap(),
-            b"\xa2\x61a\x01\x61b\x61x"
-        );
-        assert_eq!(
-            Payload::cbor(b"\x9f\x01\xff")
-                .to_named_object(["a", "b"])
-                .unwrap(),
-            b"\xa1\x61a\x01"
-        );
+        assert_eq!(Payload::cbor(b"\x82\x01\x61x").to_named_object(["a", "b"]).unwrap(), b"\xa2\x61a\x01\x61b\x61x");
+        assert_eq!(Payload::cbor(b"\x9f\x01\xff").to_named_object(["a", "b"]).unwrap(), b"\xa1\x61a\x01");
     }
 
     #[test]

@@ -24,12 +24,7 @@ impl<'a> Png<'a> {
     /// Returns a part as a fragment of the base64 text.
     pub fn fragment(&self) -> Option<Fragment<'a>> {
         let ((num, total), id) = (self.part?, self.id.clone()?);
-        Some(Fragment {
-            id,
-            data: self.data.clone(),
-            num,
-            total,
-        })
+        Some(Fragment { id, data: self.data.clone(), num, total })
     }
 }
 
@@ -40,36 +35,20 @@ impl<'a> Message<'a> for Png<'a> {
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         const NUM: &str = "the part's index, from 0,";
         const TOTAL: &str = "the number of parts, 1 or more,";
-        let part = match (
-            fields.count("num", 0, NUM)?,
-            fields.count("total", 1, TOTAL)?,
-        ) {
+        let part = match (fields.count("num", 0, NUM)?, fields.count("total", 1, TOTAL)?) {
             (None, None) => None,
             (Some(num), Some(total)) => Some((num, total)),
             (None, _) => {
-                return Err(Problem::Missing {
-                    field: "num",
-                    expected: NUM,
-                });
+                return Err(Problem::Missing { field: "num", expected: NUM });
             }
             (_, None) => {
-                return Err(Problem::Missing {
-                    field: "total",
-                    expected: TOTAL,
-                });
+                return Err(Problem::Missing { field: "total", expected: TOTAL });
             }
         };
         if part.is_some() && id.is_none() {
-            return Err(Problem::Missing {
-                field: "id",
-                expected: "the id common to all parts",
-            });
+            return Err(Problem::Missing { field: "id", expected: "the id common to all parts" });
         }
-        Ok(Self {
-            id,
-            data: fields.data("data", "a picture in base64")?,
-            part,
-        })
+        Ok(Self { id, data: fields.data("data", "a picture in base64")?, part })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -115,15 +94,8 @@ pub enum PngError {
 /// # Errors
 /// Fails if it is not such an image, or a decompression bomb.
 pub fn decode_png(data: &str, limit: usize) -> Result<String, PngError> {
-    let file = STANDARD
-        .decode_to_vec(data.trim_ascii())
-        .map_err(|_| PngError::Base64)?;
-    let mut decoder = png::Decoder::new_with_limits(
-        Cursor::new(file),
-        png::Limits {
-            bytes: limit.max(1 << 20),
-        },
-    );
+    let file = STANDARD.decode_to_vec(data.trim_ascii()).map_err(|_| PngError::Base64)?;
+    let mut decoder = png::Decoder::new_with_limits(Cursor::new(file), png::Limits { bytes: limit.max(1 << 20) });
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info()?;
@@ -142,10 +114,7 @@ pub fn decode_png(data: &str, limit: usize) -> Result<String, PngError> {
     let mut pixels = vec![0; found as usize];
     reader.next_frame(&mut pixels)?;
     // Encoders pad with line feeds (rosbridge) or zeros.
-    let end = pixels
-        .iter()
-        .rposition(|&byte| byte != b'\n' && byte != 0)
-        .map_or(0, |at| at + 1);
+    let end = pixels.iter().rposition(|&byte| byte != b'\n' && byte != 0).map_or(0, |at| at + 1);
     pixels.truncate(end);
     String::from_utf8(pixels).map_err(|_| PngError::Text)
 }
@@ -180,26 +149,12 @@ mod tests {
 
     #[test]
     fn png_is_read_and_checked() {
-        let whole = Png {
-            id: None,
-            data: "iVBO".into(),
-            part: None,
-        };
+        let whole = Png { id: None, data: "iVBO".into(), part: None };
         assert_parses(r#"{"op":"png","data":"iVBO"}"#, whole.clone());
         assert_survives_cbor(whole);
-        let part = Png {
-            id: Some("a".into()),
-            data: "iVBO".into(),
-            part: Some((1, 3)),
-        };
-        assert_parses(
-            r#"{"op":"png","id":"a","data":"iVBO","num":1,"total":3}"#,
-            part,
-        );
-        assert_refused(
-            r#"{"op":"png"}"#,
-            "png: field \"data\" is missing, a picture in base64 is expected",
-        );
+        let part = Png { id: Some("a".into()), data: "iVBO".into(), part: Some((1, 3)) };
+        assert_parses(r#"{"op":"png","id":"a","data":"iVBO","num":1,"total":3}"#, part);
+        assert_refused(r#"{"op":"png"}"#, "png: field \"data\" is missing, a picture in base64 is expected");
         assert_refused(
             r#"{"op":"png","id":"a","data":"","num":1}"#,
             "png: field \"total\" is missing, the number of parts, 1 or more, is expected",
@@ -224,16 +179,7 @@ mod tests {
         let bomb = encode_png(&vec![b'x'; 4 << 20]).unwrap();
         assert!(bomb.len() < 200_000);
         let error = decode_png(&bomb, 1 << 20).unwrap_err();
-        assert!(
-            matches!(
-                error,
-                PngError::TooLarge {
-                    limit: 0x10_0000,
-                    ..
-                }
-            ),
-            "{error}"
-        );
+        assert!(matches!(error, PngError::TooLarge { limit: 0x10_0000, .. }), "{error}");
         assert!(matches!(decode_png("!!", 100), Err(PngError::Base64)));
         assert!(matches!(decode_png("AAAA", 100), Err(PngError::Picture(_))));
 
@@ -250,9 +196,6 @@ mod tests {
         let mut writer = encoder.write_header().unwrap();
         writer.write_image_data(&[0xff; 6]).unwrap();
         drop(writer);
-        assert!(matches!(
-            decode_png(&STANDARD.encode_to_string(&file), 100),
-            Err(PngError::Text)
-        ));
+        assert!(matches!(decode_png(&STANDARD.encode_to_string(&file), 100), Err(PngError::Text)));
     }
 }

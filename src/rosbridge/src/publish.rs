@@ -55,15 +55,7 @@ impl<'a> Publish<'a> {
 
 impl<'a> Message<'a> for Publish<'a> {
     const OP: &'static str = "publish";
-    const FIELDS: &'static [&'static str] = &[
-        "topic",
-        "msg",
-        "compression",
-        "latch",
-        "type",
-        "queue_size",
-        "qos",
-    ];
+    const FIELDS: &'static [&'static str] = &["topic", "msg", "compression", "latch", "type", "queue_size", "qos"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
@@ -113,50 +105,32 @@ mod tests {
 
     #[test]
     fn publish_is_read() {
-        assert_parses(
-            r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#,
-            hello(),
-        );
+        assert_parses(r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#, hello());
         assert_parses(
             r#"{"msg":{"data":"hello"},"latch":true,"topic":"/chatter","id":"publish:/chatter:1","op":"publish"}"#,
-            Publish {
-                id: Some("publish:/chatter:1".into()),
-                latch: true,
-                ..hello()
-            },
+            Publish { id: Some("publish:/chatter:1".into()), latch: true, ..hello() },
         );
     }
 
     #[test]
     fn without_a_message_it_is_one_of_defaults() {
-        let empty = Publish {
-            msg: Payload::json("{}"),
-            ..hello()
-        };
+        let empty = Publish { msg: Payload::json("{}"), ..hello() };
         assert_parses(r#"{"op":"publish","topic":"/chatter"}"#, empty.clone());
         assert_parses(r#"{"op":"publish","topic":"/chatter","msg":null}"#, empty);
         let frame = b"\xa2\x62op\x67publish\x65topic\x62/x";
-        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(frame)).unwrap() else {
-            panic!("not a publish")
-        };
+        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(frame)).unwrap() else { panic!("not a publish") };
         assert_eq!(read.msg, Payload::cbor(b"\xa0"));
     }
 
     #[test]
     fn publish_is_checked() {
-        assert_refused(
-            r#"{"op":"publish","msg":{}}"#,
-            "publish: field \"topic\" is missing, a topic name is expected",
-        );
+        assert_refused(r#"{"op":"publish","msg":{}}"#, "publish: field \"topic\" is missing, a topic name is expected");
         assert_refused(
             r#"{"op":"publish","topic":"/x","msg":[1,2]}"#,
             "publish: field \"msg\" is [1,2], an object with the message's fields is expected",
         );
         assert_refused(
-            &format!(
-                r#"{{"op":"publish","topic":"/x","msg":"{}"}}"#,
-                "ü".repeat(100)
-            ),
+            &format!(r#"{{"op":"publish","topic":"/x","msg":"{}"}}"#, "ü".repeat(100)),
             &format!(
                 "publish: field \"msg\" is \"{}…, an object with the message's fields is expected",
                 "ü".repeat(47)
@@ -172,16 +146,11 @@ mod tests {
             Ok::<(), std::convert::Infallible>(())
         };
         Publish::print_with(&mut out, Format::Json, "/chatter", msg).unwrap();
-        assert_eq!(
-            String::from_utf8(out).unwrap(),
-            r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#
-        );
+        assert_eq!(String::from_utf8(out).unwrap(), r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#);
 
         let mut out = Vec::new();
         Publish::print_raw(&mut out, "/chatter", (5, 6), b"\x01\x02");
-        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(&out)).unwrap() else {
-            panic!("not a publish")
-        };
+        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(&out)).unwrap() else { panic!("not a publish") };
         assert_eq!(&*read.msg.raw().unwrap().bytes, b"\x01\x02");
         assert_eq!(
             out,

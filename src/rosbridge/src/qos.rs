@@ -9,8 +9,7 @@ use crate::{Payload, Problem, Writer};
 
 const QOS: &str = "an object such as {\"reliability\": \"best_effort\", \"depth\": 5}";
 const SECONDS: &str = "a number of seconds, {\"sec\": 0, \"nanosec\": 0} or infinite,";
-const SECONDS_OR_BEST: &str =
-    "a number of seconds, {\"sec\": 0, \"nanosec\": 0}, infinite or best_available";
+const SECONDS_OR_BEST: &str = "a number of seconds, {\"sec\": 0, \"nanosec\": 0}, infinite or best_available";
 /// Seconds that rmw treats as infinite: the largest int64 of nanoseconds.
 const NO_END: u64 = i64::MAX as u64 / 1_000_000_000;
 
@@ -263,19 +262,14 @@ fn parse_period(
     };
     let read = match (fields.as_text(value), fields.as_number(value)) {
         (Some(text), _) if text.eq_ignore_ascii_case("infinite") => Some(Period::Infinite),
-        (Some(text), _) if best && text.eq_ignore_ascii_case("best_available") => {
-            Some(Period::BestAvailable)
-        }
+        (Some(text), _) if best && text.eq_ignore_ascii_case("best_available") => Some(Period::BestAvailable),
         (Some(_), _) => None,
         (None, Some(seconds)) if seconds >= 0.0 => {
             let long = Duration::try_from_secs_f64(seconds);
             Some(long.map_or(Period::Infinite, Period::Of))
         }
         (None, Some(_)) => None,
-        (None, None) => fields
-            .payload(key)
-            .and_then(parse_time_parts)
-            .map(Period::Of),
+        (None, None) => fields.payload(key).and_then(parse_time_parts).map(Period::Of),
     };
     match read {
         None => {

@@ -83,10 +83,7 @@ fn what_says_nothing_leaves_the_choice_to_the_server() {
             "lifespan":{"sec":0,"nanosec":0},"liveliness":"System_Default"}"#,
         QosRequest::default(),
     );
-    let none = Subscribe {
-        qos: None,
-        ..subscribe_op(QosRequest::default())
-    };
+    let none = Subscribe { qos: None, ..subscribe_op(QosRequest::default()) };
     assert_parses(&subscribe_json("null"), none);
 }
 
@@ -98,79 +95,39 @@ fn the_longest_times_are_without_end() {
         r#"{"sec":9223372036854775807,"nanosec":9223372036854775807}"#,
     ] {
         let qos = format!(r#"{{"deadline":{long}}}"#);
-        assert_qos(
-            &qos,
-            QosRequest {
-                deadline: Some(Period::Infinite),
-                ..QosRequest::default()
-            },
-        );
+        assert_qos(&qos, QosRequest { deadline: Some(Period::Infinite), ..QosRequest::default() });
     }
     // The largest value that can be written.
     assert_qos(
         r#"{"depth":9000000000000000000}"#,
-        QosRequest {
-            depth: Some(9_000_000_000_000_000_000),
-            ..QosRequest::default()
-        },
+        QosRequest { depth: Some(9_000_000_000_000_000_000), ..QosRequest::default() },
     );
 }
 
 #[test]
 fn what_cannot_be_meant_is_named_with_what_can() {
     let seconds = "a number of seconds, {\"sec\": 0, \"nanosec\": 0} or infinite, is expected";
-    let or_best =
-        "a number of seconds, {\"sec\": 0, \"nanosec\": 0}, infinite or best_available is expected";
-    let reliability =
-        "reliable (1), best_effort (2), best_available (4) or system_default (0) is expected";
-    let durability =
-        "transient_local (1), volatile (2), best_available (4) or system_default (0) is expected";
+    let or_best = "a number of seconds, {\"sec\": 0, \"nanosec\": 0}, infinite or best_available is expected";
+    let reliability = "reliable (1), best_effort (2), best_available (4) or system_default (0) is expected";
+    let durability = "transient_local (1), volatile (2), best_available (4) or system_default (0) is expected";
     for (key, value, expected) in [
-        (
-            "history",
-            r#""keep_some""#,
-            "keep_last (1), keep_all (2) or system_default (0) is expected",
-        ),
-        (
-            "history",
-            "3",
-            "keep_last (1), keep_all (2) or system_default (0) is expected",
-        ),
-        (
-            "depth",
-            "-1",
-            "a number of messages, 0 or more, is expected",
-        ),
-        (
-            "depth",
-            "1.5",
-            "a number of messages, 0 or more, is expected",
-        ),
-        (
-            "depth",
-            r#""5""#,
-            "a number of messages, 0 or more, is expected",
-        ),
+        ("history", r#""keep_some""#, "keep_last (1), keep_all (2) or system_default (0) is expected"),
+        ("history", "3", "keep_last (1), keep_all (2) or system_default (0) is expected"),
+        ("depth", "-1", "a number of messages, 0 or more, is expected"),
+        ("depth", "1.5", "a number of messages, 0 or more, is expected"),
+        ("depth", r#""5""#, "a number of messages, 0 or more, is expected"),
         ("reliability", r#""best-effort""#, reliability),
         ("reliability", "3", reliability),
         ("reliability", "true", reliability),
         ("durability", r#""persistent""#, durability),
         ("durability", "[1]", durability),
-        (
-            "liveliness",
-            "2",
-            "automatic (1), manual_by_topic (3), best_available (5) or system_default (0) is expected",
-        ),
+        ("liveliness", "2", "automatic (1), manual_by_topic (3), best_available (5) or system_default (0) is expected"),
         ("deadline", "-0.5", or_best),
         ("deadline", r#""soon""#, or_best),
         ("deadline", r#"{"sec":1}"#, or_best),
         ("lifespan", r#"{"sec":-1,"nanosec":0}"#, seconds),
         ("lifespan", r#""best_available""#, seconds),
-        (
-            "avoid_ros_namespace_conventions",
-            "true",
-            "false (names are those of ROS) is expected",
-        ),
+        ("avoid_ros_namespace_conventions", "true", "false (names are those of ROS) is expected"),
     ] {
         assert_refused(
             &subscribe_json(&format!(r#"{{"{key}":{value}}}"#)),
@@ -179,10 +136,7 @@ fn what_cannot_be_meant_is_named_with_what_can() {
     }
     let object = "an object such as {\"reliability\": \"best_effort\", \"depth\": 5} is expected";
     for value in [r#""best_effort""#, "5", r#"{"depth" 5}"#, "[]"] {
-        assert_refused(
-            &subscribe_json(value),
-            &format!("subscribe: field \"qos\" is {value}, {object}"),
-        );
+        assert_refused(&subscribe_json(value), &format!("subscribe: field \"qos\" is {value}, {object}"));
     }
 }
 
@@ -216,10 +170,7 @@ fn publishers_say_what_they_offer() {
         type_name: None,
         qos,
     };
-    assert_parses(
-        r#"{"op":"publish","topic":"/x","msg":{},"qos":{"durability":1,"depth":1}}"#,
-        publish,
-    );
+    assert_parses(r#"{"op":"publish","topic":"/x","msg":{},"qos":{"durability":1,"depth":1}}"#, publish);
     assert_refused(
         r#"{"op":"publish","topic":"/x","msg":{},"qos":{"depth":{}}}"#,
         "publish: field \"qos.depth\" is {}, a number of messages, 0 or more, is expected",

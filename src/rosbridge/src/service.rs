@@ -29,14 +29,7 @@ pub struct CallService<'a> {
 
 impl<'a> Message<'a> for CallService<'a> {
     const OP: &'static str = "call_service";
-    const FIELDS: &'static [&'static str] = &[
-        "service",
-        "type",
-        "args",
-        "timeout",
-        "fragment_size",
-        "compression",
-    ];
+    const FIELDS: &'static [&'static str] = &["service", "type", "args", "timeout", "fragment_size", "compression"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         let service = fields.required_text("service", "a service name")?;
@@ -48,11 +41,7 @@ impl<'a> Message<'a> for CallService<'a> {
                 .text("type", "a service type such as \"std_srvs/Trigger\"")?
                 .filter(|name| !name.is_empty()),
             args: fields.arguments("args")?,
-            timeout: fields.duration(
-                "timeout",
-                Duration::from_secs(1),
-                "a number of seconds, 0 or more,",
-            )?,
+            timeout: fields.duration("timeout", Duration::from_secs(1), "a number of seconds, 0 or more,")?,
             fragment_size: fragment_size(fields)?,
             compression: Compression::read_optional(fields)?,
         })
@@ -79,10 +68,7 @@ impl<'a> Message<'a> for CallService<'a> {
 }
 
 /// Splits the id off a name: old clients wrote a call with id 7 as `/service#7`.
-pub(crate) fn split_name<'a>(
-    name: Cow<'a, str>,
-    id: Option<Id<'a>>,
-) -> (Cow<'a, str>, Option<Id<'a>>) {
+pub(crate) fn split_name<'a>(name: Cow<'a, str>, id: Option<Id<'a>>) -> (Cow<'a, str>, Option<Id<'a>>) {
     let Some(at) = name.find('#') else {
         return (name, id);
     };
@@ -121,10 +107,7 @@ impl<'a> Message<'a> for ServiceResponse<'a> {
             id,
             service: fields.required_text("service", "a service name")?,
             values: fields.payload("values"),
-            result: fields.boolean("result")?.ok_or(Problem::Missing {
-                field: "result",
-                expected: "true or false",
-            })?,
+            result: fields.boolean("result")?.ok_or(Problem::Missing { field: "result", expected: "true or false" })?,
             compression: Compression::read(fields)?,
         })
     }
@@ -164,8 +147,7 @@ impl<'a> Message<'a> for AdvertiseService<'a> {
         Ok(Self {
             id,
             service: fields.required_text("service", "a service name")?,
-            type_name: fields
-                .required_text("type", "a service type such as \"std_srvs/Trigger\"")?,
+            type_name: fields.required_text("type", "a service type such as \"std_srvs/Trigger\"")?,
             compression: Compression::read(fields)?,
         })
     }
@@ -195,10 +177,7 @@ impl<'a> Message<'a> for UnadvertiseService<'a> {
     const FIELDS: &'static [&'static str] = &["service", "type"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            service: fields.required_text("service", "a service name")?,
-        })
+        Ok(Self { id, service: fields.required_text("service", "a service name")? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -246,24 +225,15 @@ mod tests {
         assert_survives_cbor(bare.clone());
         assert_parses(
             r#"{"op":"call_service","service":"/add","args":[1,2]}"#,
-            CallService {
-                args: Some(Payload::json("[1,2]")),
-                ..bare.clone()
-            },
+            CallService { args: Some(Payload::json("[1,2]")), ..bare.clone() },
         );
         assert_parses(
             r#"{"op":"call_service","service":"/add#33"}"#,
-            CallService {
-                id: Some("33".into()),
-                ..bare.clone()
-            },
+            CallService { id: Some("33".into()), ..bare.clone() },
         );
         assert_parses(
             r#"{"op":"call_service","id":"mine","service":"/add#33"}"#,
-            CallService {
-                id: Some("mine".into()),
-                ..bare
-            },
+            CallService { id: Some("mine".into()), ..bare },
         );
     }
 
@@ -298,17 +268,9 @@ mod tests {
         );
         assert_parses(
             r#"{"op":"service_response","service":"/add","values":"no","result":false}"#,
-            ServiceResponse {
-                id: None,
-                values: Some(Payload::json("\"no\"")),
-                result: false,
-                ..done.clone()
-            },
+            ServiceResponse { id: None, values: Some(Payload::json("\"no\"")), result: false, ..done.clone() },
         );
-        assert_survives_cbor(ServiceResponse {
-            values: None,
-            ..done
-        });
+        assert_survives_cbor(ServiceResponse { values: None, ..done });
         assert_refused(
             r#"{"op":"service_response","service":"/add"}"#,
             "service_response: field \"result\" is missing, true or false is expected",
@@ -327,23 +289,14 @@ mod tests {
             type_name: "rospy_tutorials/AddTwoInts".into(),
             compression: Compression::None,
         };
-        assert_parses(
-            r#"{"op":"advertise_service","type":"rospy_tutorials/AddTwoInts","service":"/add"}"#,
-            op.clone(),
-        );
+        assert_parses(r#"{"op":"advertise_service","type":"rospy_tutorials/AddTwoInts","service":"/add"}"#, op.clone());
         assert_survives_cbor(op);
         assert_refused(
             r#"{"op":"advertise_service","service":"/add"}"#,
             "advertise_service: field \"type\" is missing, a service type such as \"std_srvs/Trigger\" is expected",
         );
-        let op = UnadvertiseService {
-            id: None,
-            service: "/add".into(),
-        };
-        assert_parses(
-            r#"{"op":"unadvertise_service","service":"/add"}"#,
-            op.clone(),
-        );
+        let op = UnadvertiseService { id: None, service: "/add".into() };
+        assert_parses(r#"{"op":"unadvertise_service","service":"/add"}"#, op.clone());
         assert_survives_cbor(op);
         assert_refused(
             r#"{"op":"unadvertise_service","service":[]}"#,

@@ -40,11 +40,7 @@ impl StatusLevel {
             "info" => Ok(StatusLevel::Info),
             other => {
                 let found = format!("{:?}", other.chars().take(48).collect::<String>());
-                Err(Problem::Mistyped {
-                    field: "level",
-                    expected: EXPECTED,
-                    found,
-                })
+                Err(Problem::Mistyped { field: "level", expected: EXPECTED, found })
             }
         }
     }
@@ -64,10 +60,7 @@ impl<'a> Message<'a> for SetLevel<'a> {
     const FIELDS: &'static [&'static str] = &["level"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            level: StatusLevel::read(fields)?,
-        })
+        Ok(Self { id, level: StatusLevel::read(fields)? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -95,11 +88,7 @@ impl<'a> Message<'a> for Status<'a> {
     const FIELDS: &'static [&'static str] = &["level", "msg"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            level: StatusLevel::read(fields)?,
-            msg: fields.data("msg", "a text")?,
-        })
+        Ok(Self { id, level: StatusLevel::read(fields)?, msg: fields.data("msg", "a text")? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -128,20 +117,10 @@ mod tests {
 
     #[test]
     fn status_and_set_level_are_read_and_checked() {
-        let op = Status {
-            id: Some("x".into()),
-            level: StatusLevel::Error,
-            msg: "no \"such\" topic".into(),
-        };
-        assert_parses(
-            r#"{"op":"status","id":"x","level":"error","msg":"no \"such\" topic"}"#,
-            op.clone(),
-        );
+        let op = Status { id: Some("x".into()), level: StatusLevel::Error, msg: "no \"such\" topic".into() };
+        assert_parses(r#"{"op":"status","id":"x","level":"error","msg":"no \"such\" topic"}"#, op.clone());
         assert_survives_cbor(op);
-        let op = SetLevel {
-            id: None,
-            level: StatusLevel::Info,
-        };
+        let op = SetLevel { id: None, level: StatusLevel::Info };
         assert_parses(r#"{"op":"set_level","level":"info"}"#, op.clone());
         assert_survives_cbor(op);
         assert_refused(

@@ -46,11 +46,7 @@ impl Compression {
             Some("cbor-raw") => Ok(Some(Compression::CborRaw)),
             Some(other) => {
                 let found = format!("{:?}", other.chars().take(48).collect::<String>());
-                Err(Problem::Mistyped {
-                    field: "compression",
-                    expected: EXPECTED,
-                    found,
-                })
+                Err(Problem::Mistyped { field: "compression", expected: EXPECTED, found })
             }
         }
     }
@@ -91,15 +87,8 @@ pub struct Subscribe<'a> {
 
 impl<'a> Message<'a> for Subscribe<'a> {
     const OP: &'static str = "subscribe";
-    const FIELDS: &'static [&'static str] = &[
-        "topic",
-        "type",
-        "throttle_rate",
-        "queue_length",
-        "fragment_size",
-        "compression",
-        "qos",
-    ];
+    const FIELDS: &'static [&'static str] =
+        &["topic", "type", "throttle_rate", "queue_length", "fragment_size", "compression", "qos"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         let milliseconds = "a number of milliseconds, 0 or more,";
@@ -153,10 +142,7 @@ impl<'a> Message<'a> for Unsubscribe<'a> {
     const FIELDS: &'static [&'static str] = &["topic"];
 
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            topic: fields.required_text("topic", "a topic name")?,
-        })
+        Ok(Self { id, topic: fields.required_text("topic", "a topic name")? })
     }
 
     fn id(&self) -> Option<&Id<'a>> {
@@ -193,10 +179,7 @@ mod tests {
             image(),
         );
         assert_survives_cbor(image());
-        assert_survives_cbor(Subscribe {
-            throttle_rate: Duration::from_micros(1500),
-            ..image()
-        });
+        assert_survives_cbor(Subscribe { throttle_rate: Duration::from_micros(1500), ..image() });
         assert_parses(
             r#"{"op":"subscribe","topic":"/image","type":"","throttle_rate":0.0,"fragment_size":null}"#,
             Subscribe {
@@ -213,21 +196,10 @@ mod tests {
 
     #[test]
     fn subscribe_is_checked() {
-        assert_refused(
-            r#"{"op":"subscribe"}"#,
-            "subscribe: field \"topic\" is missing, a topic name is expected",
-        );
+        assert_refused(r#"{"op":"subscribe"}"#, "subscribe: field \"topic\" is missing, a topic name is expected");
         for (field, value, expected) in [
-            (
-                "throttle_rate",
-                "\"fast\"",
-                "a number of milliseconds, 0 or more,",
-            ),
-            (
-                "throttle_rate",
-                "-1",
-                "a number of milliseconds, 0 or more,",
-            ),
+            ("throttle_rate", "\"fast\"", "a number of milliseconds, 0 or more,"),
+            ("throttle_rate", "-1", "a number of milliseconds, 0 or more,"),
             ("queue_length", "1.5", "a number of messages, 0 or more,"),
             ("fragment_size", "0", "a number of bytes, 1 or more,"),
             ("compression", "\"zip\"", "none, png, cbor or cbor-raw"),
@@ -243,18 +215,9 @@ mod tests {
 
     #[test]
     fn unsubscribe_is_read_and_checked() {
-        let op = Unsubscribe {
-            id: Some("a".into()),
-            topic: "/image".into(),
-        };
-        assert_parses(
-            r#"{"op":"unsubscribe","id":"a","topic":"/image"}"#,
-            op.clone(),
-        );
+        let op = Unsubscribe { id: Some("a".into()), topic: "/image".into() };
+        assert_parses(r#"{"op":"unsubscribe","id":"a","topic":"/image"}"#, op.clone());
         assert_survives_cbor(op);
-        assert_refused(
-            r#"{"op":"unsubscribe"}"#,
-            "unsubscribe: field \"topic\" is missing, a topic name is expected",
-        );
+        assert_refused(r#"{"op":"unsubscribe"}"#, "unsubscribe: field \"topic\" is missing, a topic name is expected");
     }
 }

@@ -24,12 +24,7 @@ impl<'o> Writer<'o> {
             // The count is filled in at the end.
             Format::Cbor => cbor::MAP << 5,
         });
-        Self {
-            out,
-            format,
-            start,
-            fields: 0,
-        }
+        Self { out, format, start, fields: 0 }
     }
 
     /// Begins a message with this op and, if given, id.
@@ -144,11 +139,7 @@ impl<'o> Writer<'o> {
     }
 
     /// Writes a field whose value `write` appends in this object's format.
-    pub fn value<E>(
-        &mut self,
-        key: &str,
-        write: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
-    ) -> Result<(), E> {
+    pub fn value<E>(&mut self, key: &str, write: impl FnOnce(&mut Vec<u8>) -> Result<(), E>) -> Result<(), E> {
         self.key(key);
         write(self.out)
     }

@@ -3,9 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use rosbridge::{
-    Format, FragmentLimits, Fragments, Op, Payload, ProtocolFrame, decode_png, unknown_fields,
-};
+use rosbridge::{Format, FragmentLimits, Fragments, Op, Payload, ProtocolFrame, decode_png, unknown_fields};
 
 const FRAMES: &[&str] = &[
     r#"{"op":"publish","id":"p:1","topic":"/a/b","msg":{"data":"x\"\\y\u00fc","n":[1,-2.5e3,true,null]},"latch":false}"#,
@@ -35,8 +33,7 @@ impl Dice {
 
     /// Changes, removes, repeats or inserts a few bytes.
     fn damage(&mut self, bytes: &mut Vec<u8>) {
-        const BYTES: &[u8] =
-            b"{}[]\",:\\u0-1.eE+tfn \x00\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xbf\xd8\xf9";
+        const BYTES: &[u8] = b"{}[]\",:\\u0-1.eE+tfn \x00\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xbf\xd8\xf9";
         for _ in 0..=self.next_below(4) {
             let at = self.next_below(bytes.len() + 1);
             let byte = BYTES[self.next_below(BYTES.len())];
@@ -83,11 +80,7 @@ fn try_all(frame: ProtocolFrame<'_>, fragments: &mut Fragments) -> bool {
     assert_round_trip(&op, frame.format());
     unknown_fields(frame);
     if let Some(payload) = payload_of(&op) {
-        let _ = (
-            payload.raw(),
-            payload.text(),
-            payload.to_named_object(["a", "b", "c"]),
-        );
+        let _ = (payload.raw(), payload.text(), payload.to_named_object(["a", "b", "c"]));
     }
     match op {
         Op::Fragment(fragment) => drop(fragments.add(&fragment, Instant::now())),
@@ -99,14 +92,8 @@ fn try_all(frame: ProtocolFrame<'_>, fragments: &mut Fragments) -> bool {
 
 #[test]
 fn damaged_json_is_read_or_refused() {
-    let limits = FragmentLimits {
-        messages: 4,
-        parts: 100,
-        bytes: 10_000,
-        age: Duration::from_secs(60),
-    };
-    let (mut dice, mut fragments, mut read) =
-        (Dice(0x9e37_79b9_7f4a_7c15), Fragments::new(limits), 0);
+    let limits = FragmentLimits { messages: 4, parts: 100, bytes: 10_000, age: Duration::from_secs(60) };
+    let (mut dice, mut fragments, mut read) = (Dice(0x9e37_79b9_7f4a_7c15), Fragments::new(limits), 0);
     for round in 0..60_000 {
         let mut bytes = FRAMES[round % FRAMES.len()].as_bytes().to_vec();
         dice.damage(&mut bytes);
@@ -119,8 +106,7 @@ fn damaged_json_is_read_or_refused() {
 
 #[test]
 fn damaged_cbor_is_read_or_refused() {
-    let (mut dice, mut fragments, mut read) =
-        (Dice(42), Fragments::new(FragmentLimits::default()), 0);
+    let (mut dice, mut fragments, mut read) = (Dice(42), Fragments::new(FragmentLimits::default()), 0);
     let frames: Vec<Vec<u8>> = FRAMES.iter().filter_map(|text| to_cbor(text)).collect();
     assert!(frames.len() >= 8);
     for round in 0..60_000 {
@@ -133,10 +119,7 @@ fn damaged_cbor_is_read_or_refused() {
 
 /// Converts ops whose payloads can be printed without a codec: none, or a map made here.
 fn to_cbor(text: &str) -> Option<Vec<u8>> {
-    const MAP: Payload<'static> = Payload {
-        format: Format::Cbor,
-        bytes: b"\xa2\x61a\x01\x65bytes\x43\x01\x02\x03",
-    };
+    const MAP: Payload<'static> = Payload { format: Format::Cbor, bytes: b"\xa2\x61a\x01\x65bytes\x43\x01\x02\x03" };
     let mut op = Op::parse(ProtocolFrame::Text(text)).ok()?;
     match &mut op {
         Op::Publish(op) => op.msg = MAP,

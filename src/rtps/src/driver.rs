@@ -13,8 +13,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use rustix::time::{
-    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create,
-    timerfd_settime,
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
 use socket2::SockRef;
 use tokio::io::Interest;
@@ -84,23 +83,9 @@ enum FlushOutcome {
 }
 
 impl DriverState {
-    pub fn new(
-        engine: Engine,
-        flow: FlowControl,
-        sockets: Sockets,
-        network: InterfaceSet,
-    ) -> io::Result<Arc<Self>> {
-        let Sockets {
-            discovery,
-            user,
-            multicast,
-        } = sockets;
-        let core = Mutex::new(Core {
-            engine,
-            flow,
-            network: InterfaceSet::new(Vec::new()),
-            stalled: None,
-        });
+    pub fn new(engine: Engine, flow: FlowControl, sockets: Sockets, network: InterfaceSet) -> io::Result<Arc<Self>> {
+        let Sockets { discovery, user, multicast } = sockets;
+        let core = Mutex::new(Core { engine, flow, network: InterfaceSet::new(Vec::new()), stalled: None });
         let shared = Self {
             core,
             wake: Notify::new(),
@@ -160,23 +145,14 @@ impl DriverState {
     }
 
     fn flush(&self, core: &mut Core) -> FlushOutcome {
-        let Core {
-            engine,
-            flow,
-            network,
-            stalled,
-        } = core;
+        let Core { engine, flow, network, stalled } = core;
         flow.take_wait();
         loop {
             let next = stalled.take().or_else(|| {
-                engine.transmit(&mut |to, length, again| {
-                    flow.try_reserve(Instant::now(), to, length, again)
-                })
+                engine.transmit(&mut |to, length, again| flow.try_reserve(Instant::now(), to, length, again))
             });
             let Some(datagram) = next else {
-                return flow
-                    .take_wait()
-                    .map_or(FlushOutcome::Nothing, FlushOutcome::Receivers);
+                return flow.take_wait().map_or(FlushOutcome::Nothing, FlushOutcome::Receivers);
             };
             if datagram.to.ip().is_multicast() {
                 self.send_to_all(&datagram, network);
@@ -300,16 +276,12 @@ pub(crate) async fn drive(shared: Arc<DriverState>, look: Duration) {
             (waits, core.engine.tick_at())
         };
         if let FlushOutcome::Receivers(wait) = waits {
-            let nothing = Timespec {
-                tv_sec: 0,
-                tv_nsec: 0,
-            };
+            let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
             let once = Itimerspec {
                 it_interval: nothing,
                 it_value: Timespec::try_from(wait.max(SHORTEST)).unwrap_or(nothing),
             };
-            if let Err(error) = timerfd_settime(timer.get_ref(), TimerfdTimerFlags::empty(), &once)
-            {
+            if let Err(error) = timerfd_settime(timer.get_ref(), TimerfdTimerFlags::empty(), &once) {
                 tracing::debug!(%error, "a timer was not set");
             }
         }

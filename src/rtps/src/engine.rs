@@ -58,12 +58,7 @@ pub(crate) struct Datagram {
 
 impl Datagram {
     fn from_writer(to: SocketAddr, writer: DatagramWriter) -> Self {
-        Self {
-            to,
-            head: writer.finish(),
-            body: Bytes::new(),
-            tail: &[],
-        }
+        Self { to, head: writer.finish(), body: Bytes::new(), tail: &[] }
     }
 
     /// Returns the parts in the order in which they are sent.
@@ -157,16 +152,7 @@ pub(crate) struct Engine {
 
 impl Engine {
     pub fn new(now: Instant, settings: Settings) -> Self {
-        let Settings {
-            own,
-            ports,
-            bounds,
-            announce_to,
-            servers,
-            network,
-            alone,
-            predecessors,
-        } = settings;
+        let Settings { own, ports, bounds, announce_to, servers, network, alone, predecessors } = settings;
         let mut engine = Self {
             predecessors: Predecessors::new(now, predecessors, own.lease),
             own,
@@ -234,16 +220,9 @@ impl Engine {
         let mut announcements = Vec::new();
         for (entity, reader) in &mut self.readers {
             let mut out = Vec::new();
-            again = again.min(
-                reader
-                    .state
-                    .tick(now, &mut answers, &mut out)
-                    .unwrap_or(again),
-            );
+            again = again.min(reader.state.tick(now, &mut answers, &mut out).unwrap_or(again));
             match &reader.sink {
-                Some(sink) => self
-                    .deliveries
-                    .extend(out.into_iter().map(|sample| (Arc::clone(sink), sample))),
+                Some(sink) => self.deliveries.extend(out.into_iter().map(|sample| (Arc::clone(sink), sample))),
                 None => announcements.extend(out.into_iter().map(|sample| (*entity, sample))),
             }
         }
@@ -276,10 +255,7 @@ impl Engine {
 
     /// Returns whether all readers have received everything written to them.
     pub fn is_settled(&self) -> bool {
-        let mut written = self
-            .writers
-            .iter()
-            .filter(|(entity, _)| !entity.is_builtin());
+        let mut written = self.writers.iter().filter(|(entity, _)| !entity.is_builtin());
         written.all(|(entity, writer)| {
             writer.state.is_settled() && !self.paths.values().any(|path| path.has_pending(*entity))
         })
@@ -292,13 +268,7 @@ impl Engine {
     }
 
     fn announcement_change(payload: Bytes) -> CacheChange {
-        CacheChange {
-            payload,
-            related: None,
-            written: WireTime::from(SystemTime::now()),
-            status: 0,
-            key: None,
-        }
+        CacheChange { payload, related: None, written: WireTime::from(SystemTime::now()), status: 0, key: None }
     }
 
     fn builtin_qos() -> EndpointQos {
@@ -310,8 +280,6 @@ impl Engine {
     }
 
     fn vendor_of(&self, prefix: GuidPrefix) -> VendorId {
-        self.remotes
-            .get(&prefix)
-            .map_or(VendorId::default(), |remote| remote.data.vendor)
+        self.remotes.get(&prefix).map_or(VendorId::default(), |remote| remote.data.vendor)
     }
 }

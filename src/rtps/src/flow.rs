@@ -82,13 +82,7 @@ impl FlowControl {
 
     /// Returns whether a receiver can take a datagram of this length now, and if so counts it as sent. `again`: the
     /// receiver has requested it again.
-    pub fn try_reserve(
-        &mut self,
-        now: Instant,
-        to: SocketAddr,
-        length: usize,
-        again: bool,
-    ) -> bool {
+    pub fn try_reserve(&mut self, now: Instant, to: SocketAddr, length: usize, again: bool) -> bool {
         let wait = match self.local_address(to) {
             Some(at) if self.reserve_credit(now, at, length) => return true,
             Some(_) => LOOK_AGAIN,
@@ -113,17 +107,9 @@ impl FlowControl {
     fn reserve_credit(&mut self, now: Instant, address: SocketAddrV4, length: usize) -> bool {
         let to = SocketAddr::V4(address);
         let cost = (length + OVERHEAD).next_power_of_two() + RECORD;
-        let credit = self.credits.entry(to).or_insert(Credit {
-            bytes: UNASKED,
-            asked: now,
-            full: false,
-        });
+        let credit = self.credits.entry(to).or_insert(Credit { bytes: UNASKED, asked: now, full: false });
         if !credit.full && now.saturating_duration_since(credit.asked) > RECENT {
-            *credit = Credit {
-                bytes: credit.bytes.max(UNASKED),
-                asked: now,
-                full: false,
-            };
+            *credit = Credit { bytes: credit.bytes.max(UNASKED), asked: now, full: false };
         }
         if credit.bytes >= cost {
             credit.bytes -= cost;
@@ -137,23 +123,14 @@ impl FlowControl {
         let free = (buffer / PART.1 * PART.0).saturating_sub(queued);
         let fits = free >= cost || queued == 0;
         let bytes = free.saturating_sub(if fits { cost } else { 0 });
-        self.credits.insert(
-            to,
-            Credit {
-                bytes: if fits { bytes } else { 0 },
-                asked: now,
-                full: !fits,
-            },
-        );
+        self.credits.insert(to, Credit { bytes: if fits { bytes } else { 0 }, asked: now, full: !fits });
         fits
     }
 
     /// Forgets receivers to which nothing was sent recently.
     pub fn remove_expired(&mut self, now: Instant) {
         self.pace.remove_expired(now);
-        self.credits.retain(|_, credit| {
-            now.saturating_duration_since(credit.asked) < Duration::from_secs(10)
-        });
+        self.credits.retain(|_, credit| now.saturating_duration_since(credit.asked) < Duration::from_secs(10));
     }
 
     /// Queries the bytes in use and the size of the receive buffer of the socket bound there; `None` if there is no
@@ -232,9 +209,7 @@ fn split_messages(mut bytes: &[u8]) -> impl Iterator<Item = (u16, &[u8])> {
 /// Parses `struct inet_diag_msg` and its attributes: bytes in use and size of the buffer.
 fn parse_buffer_usage(body: &[u8]) -> Option<(usize, usize)> {
     const MESSAGE: usize = 72;
-    let number = |bytes: &[u8], at: usize| {
-        Some(u32::from_ne_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize)
-    };
+    let number = |bytes: &[u8], at: usize| Some(u32::from_ne_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
     let queued = number(body, 56)?;
     let mut attributes = body.get(MESSAGE..)?;
     while attributes.len() >= 4 {
@@ -245,9 +220,7 @@ fn parse_buffer_usage(body: &[u8]) -> Option<(usize, usize)> {
             // SK_MEMINFO_RMEM_ALLOC, SK_MEMINFO_RCVBUF.
             return Some((queued, number(value, 4)?));
         }
-        attributes = attributes
-            .get(length.next_multiple_of(4)..)
-            .unwrap_or_default();
+        attributes = attributes.get(length.next_multiple_of(4)..).unwrap_or_default();
     }
     None
 }
@@ -262,8 +235,8 @@ mod tests {
 
     fn flow() -> FlowControl {
         // AF_NETLINK and NETLINK_SOCK_DIAG.
-        let socket = Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4)))
-            .expect("a socket of diagnostics");
+        let socket =
+            Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4))).expect("a socket of diagnostics");
         FlowControl::new(Some(socket.into()))
     }
 
@@ -281,18 +254,11 @@ mod tests {
             assert!(sent < 10_000, "never refused");
         }
         assert!(sent >= 2, "{sent} datagrams");
-        receiver
-            .set_nonblocking(true)
-            .expect("a receiver that does not wait");
+        receiver.set_nonblocking(true).expect("a receiver that does not wait");
         let mut buffer = [0; 65_536];
-        let came = (0..)
-            .take_while(|_| receiver.recv(&mut buffer).is_ok())
-            .count();
+        let came = (0..).take_while(|_| receiver.recv(&mut buffer).is_ok()).count();
         assert_eq!(came, sent, "all that was sent has come");
-        assert!(
-            flow.try_reserve(Instant::now(), to, datagram.len(), false),
-            "there is room again"
-        );
+        assert!(flow.try_reserve(Instant::now(), to, datagram.len(), false), "there is room again");
     }
 
     #[test]
@@ -307,10 +273,7 @@ mod tests {
         }
         for _ in 0..100 {
             now += 2 * RECENT;
-            assert!(
-                !flow.try_reserve(now, to, datagram.len(), false),
-                "it is still full"
-            );
+            assert!(!flow.try_reserve(now, to, datagram.len(), false), "it is still full");
         }
     }
 

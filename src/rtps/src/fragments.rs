@@ -62,13 +62,7 @@ pub(crate) enum Progress {
 impl Assembly {
     /// Creates the assembly of a sample of `size` bytes in fragments of `fragment` bytes; `None` if the sizes are
     /// invalid.
-    pub fn new(
-        size: u32,
-        fragment: u16,
-        most: usize,
-        permit: Permit,
-        now: Instant,
-    ) -> Option<Self> {
+    pub fn new(size: u32, fragment: u16, most: usize, permit: Permit, now: Instant) -> Option<Self> {
         let (size, fragment) = (usize::try_from(size).ok()?, usize::from(fragment));
         if fragment == 0 || size == 0 || size > most {
             return None;
@@ -90,18 +84,9 @@ impl Assembly {
     }
 
     /// Adds `count` fragments from number `first` on.
-    pub fn add_fragments(
-        &mut self,
-        first: FragmentNumber,
-        count: u16,
-        payload: &Bytes,
-        now: Instant,
-    ) -> Progress {
+    pub fn add_fragments(&mut self, first: FragmentNumber, count: u16, payload: &Bytes, now: Instant) -> Progress {
         for index in 0..FragmentNumber::from(count) {
-            let Some(number) = first
-                .checked_add(index)
-                .filter(|number| (1..=self.total).contains(number))
-            else {
+            let Some(number) = first.checked_add(index).filter(|number| (1..=self.total).contains(number)) else {
                 return Progress::Refused;
             };
             let start = index as usize * self.fragment;
@@ -111,10 +96,7 @@ impl Assembly {
                 self.fragment
             };
             // The last fragment may be padded.
-            let Some(end) = start
-                .checked_add(length)
-                .filter(|end| *end <= payload.len())
-            else {
+            let Some(end) = start.checked_add(length).filter(|end| *end <= payload.len()) else {
                 return Progress::Refused;
             };
             if !self.store(number, payload.slice(start..end)) {
@@ -122,11 +104,7 @@ impl Assembly {
             }
         }
         self.heard = now;
-        if self.next > self.total {
-            Progress::Whole
-        } else {
-            Progress::Missing
-        }
+        if self.next > self.total { Progress::Whole } else { Progress::Missing }
     }
 
     fn store(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
@@ -154,11 +132,7 @@ impl Assembly {
             return false;
         }
         self.held_aside += held;
-        let bytes = if bytes.len() < COPIED {
-            Bytes::copy_from_slice(&bytes)
-        } else {
-            bytes
-        };
+        let bytes = if bytes.len() < COPIED { Bytes::copy_from_slice(&bytes) } else { bytes };
         self.aside.insert(number, bytes);
         true
     }
@@ -197,9 +171,7 @@ impl Assembly {
 
     /// Returns the complete sample, which is charged to its budget until it is dropped.
     pub fn into_bytes(self) -> Bytes {
-        let Self {
-            whole, mut permit, ..
-        } = self;
+        let Self { whole, mut permit, .. } = self;
         // It shrinks if anything, so it cannot be refused.
         let _ = permit.resize(whole.capacity());
         permit.wrap_bytes(whole)
@@ -213,13 +185,7 @@ mod tests {
     use super::*;
 
     fn assembly(size: u32, fragment: u16) -> Option<Assembly> {
-        Assembly::new(
-            size,
-            fragment,
-            1 << 20,
-            Budget::without_limit().permit(),
-            Instant::now(),
-        )
+        Assembly::new(size, fragment, 1 << 20, Budget::without_limit().permit(), Instant::now())
     }
 
     #[test]
@@ -228,36 +194,12 @@ mod tests {
         let mut assembly = assembly(25, 10).expect("a size that fits");
         let now = Instant::now();
         let part = |range: std::ops::Range<usize>| Bytes::copy_from_slice(&sample[range]);
-        assert_eq!(
-            assembly.add_fragments(3, 1, &part(20..25), now),
-            Progress::Missing
-        );
-        assert_eq!(
-            assembly
-                .missing_fragments(u32::MAX)
-                .iter()
-                .collect::<Vec<_>>(),
-            [1, 2]
-        );
-        assert_eq!(
-            assembly.add_fragments(1, 1, &part(0..10), now),
-            Progress::Missing
-        );
-        assert_eq!(
-            assembly.add_fragments(1, 1, &part(0..10), now),
-            Progress::Missing
-        );
-        assert_eq!(
-            assembly
-                .missing_fragments(u32::MAX)
-                .iter()
-                .collect::<Vec<_>>(),
-            [2]
-        );
-        assert_eq!(
-            assembly.add_fragments(2, 1, &part(10..20), now),
-            Progress::Whole
-        );
+        assert_eq!(assembly.add_fragments(3, 1, &part(20..25), now), Progress::Missing);
+        assert_eq!(assembly.missing_fragments(u32::MAX).iter().collect::<Vec<_>>(), [1, 2]);
+        assert_eq!(assembly.add_fragments(1, 1, &part(0..10), now), Progress::Missing);
+        assert_eq!(assembly.add_fragments(1, 1, &part(0..10), now), Progress::Missing);
+        assert_eq!(assembly.missing_fragments(u32::MAX).iter().collect::<Vec<_>>(), [2]);
+        assert_eq!(assembly.add_fragments(2, 1, &part(10..20), now), Progress::Whole);
         assert_eq!(assembly.into_bytes(), sample);
     }
 
@@ -265,10 +207,7 @@ mod tests {
     fn several_fragments_may_come_at_once() {
         let sample: Vec<u8> = (0..25).collect();
         let mut assembly = assembly(25, 10).expect("a size that fits");
-        assert_eq!(
-            assembly.add_fragments(1, 3, &Bytes::from(sample.clone()), Instant::now()),
-            Progress::Whole
-        );
+        assert_eq!(assembly.add_fragments(1, 3, &Bytes::from(sample.clone()), Instant::now()), Progress::Whole);
         assert_eq!(assembly.into_bytes(), sample);
     }
 
@@ -279,39 +218,21 @@ mod tests {
         assert!(assembly(2 << 20, 1000).is_none());
         let mut assembly = assembly(25, 10).expect("a size that fits");
         let now = Instant::now();
-        assert_eq!(
-            assembly.add_fragments(0, 1, &Bytes::from_static(&[0; 10]), now),
-            Progress::Refused
-        );
-        assert_eq!(
-            assembly.add_fragments(4, 1, &Bytes::from_static(&[0; 10]), now),
-            Progress::Refused
-        );
-        assert_eq!(
-            assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 9]), now),
-            Progress::Refused
-        );
-        assert_eq!(
-            assembly.add_fragments(3, 1, &Bytes::from_static(&[0; 8]), now),
-            Progress::Missing
-        );
+        assert_eq!(assembly.add_fragments(0, 1, &Bytes::from_static(&[0; 10]), now), Progress::Refused);
+        assert_eq!(assembly.add_fragments(4, 1, &Bytes::from_static(&[0; 10]), now), Progress::Refused);
+        assert_eq!(assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 9]), now), Progress::Refused);
+        assert_eq!(assembly.add_fragments(3, 1, &Bytes::from_static(&[0; 8]), now), Progress::Missing);
     }
 
     #[test]
     fn an_announced_size_costs_nothing_until_bytes_come() {
         let budget = Budget::new("test", 1000);
-        let mut assembly = Assembly::new(1 << 20, 600, 1 << 20, budget.permit(), Instant::now())
-            .expect("a size that fits");
+        let mut assembly =
+            Assembly::new(1 << 20, 600, 1 << 20, budget.permit(), Instant::now()).expect("a size that fits");
         assert_eq!(budget.used_bytes(), 0);
         let now = Instant::now();
-        assert_eq!(
-            assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 600]), now),
-            Progress::Missing
-        );
-        assert_eq!(
-            assembly.add_fragments(2, 1, &Bytes::from_static(&[0; 600]), now),
-            Progress::Refused
-        );
+        assert_eq!(assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 600]), now), Progress::Missing);
+        assert_eq!(assembly.add_fragments(2, 1, &Bytes::from_static(&[0; 600]), now), Progress::Refused);
         drop(assembly);
         assert_eq!(budget.used_bytes(), 0);
     }
@@ -319,22 +240,16 @@ mod tests {
     #[test]
     fn stored_short_fragments_are_charged_with_their_overhead() {
         let budget = Budget::new("test", 1 << 20);
-        let mut assembly = Assembly::new(1 << 16, 1, 1 << 20, budget.permit(), Instant::now())
-            .expect("a size that fits");
+        let mut assembly =
+            Assembly::new(1 << 16, 1, 1 << 20, budget.permit(), Instant::now()).expect("a size that fits");
         let now = Instant::now();
         let datagram = Bytes::from(vec![0; 60_000]);
         for number in 2..2 + MOST_ASIDE as u32 {
-            assert_eq!(
-                assembly.add_fragments(number, 1, &datagram, now),
-                Progress::Missing
-            );
+            assert_eq!(assembly.add_fragments(number, 1, &datagram, now), Progress::Missing);
         }
         assert!(datagram.is_unique(), "a byte keeps its datagram");
         assert_eq!(budget.used_bytes(), MOST_ASIDE * (1 + KEEPING));
-        assert_eq!(
-            assembly.add_fragments(1, 1, &datagram, now),
-            Progress::Missing
-        );
+        assert_eq!(assembly.add_fragments(1, 1, &datagram, now), Progress::Missing);
         assert_eq!(assembly.next, 2 + MOST_ASIDE as u32);
         assert!(assembly.whole.capacity() <= budget.used_bytes());
         drop(assembly);
@@ -344,8 +259,8 @@ mod tests {
     #[test]
     fn a_whole_sample_counts_as_its_bytes() {
         let budget = Budget::new("test", 1 << 20);
-        let mut assembly = Assembly::new(3000, 1000, 1 << 20, budget.permit(), Instant::now())
-            .expect("a size that fits");
+        let mut assembly =
+            Assembly::new(3000, 1000, 1 << 20, budget.permit(), Instant::now()).expect("a size that fits");
         let now = Instant::now();
         for number in [3, 2, 1] {
             assembly.add_fragments(number, 1, &Bytes::from(vec![0; 1000]), now);

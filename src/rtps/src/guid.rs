@@ -156,19 +156,12 @@ impl fmt::Debug for Guid {
 /// Formats the GUID as DDS tools do: `01.0f.…|0.0.1.c1`.
 impl fmt::Display for Guid {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let prefix: Vec<String> = self
-            .prefix
-            .0
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect();
+        let prefix: Vec<String> = self.prefix.0.iter().map(|byte| format!("{byte:02x}")).collect();
         let [a, b, c, kind] = self.entity.0;
         write!(formatter, "{}|{a:x}.{b:x}.{c:x}.{kind:x}", prefix.join("."))
     }
 }
 
 fn hexadecimal(bytes: &[u8], formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-    bytes
-        .iter()
-        .try_for_each(|byte| write!(formatter, "{byte:02x}"))
+    bytes.iter().try_for_each(|byte| write!(formatter, "{byte:02x}"))
 }

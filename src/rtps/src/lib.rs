@@ -37,11 +37,6 @@ pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
 pub use network::{InterfaceAddress, InterfaceSelection, list_interfaces};
 pub use participant::{Config, DataReader, DataWriter, JoinError, NetworkNamespace, Participant};
-pub use qos::{
-    DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind,
-    Representations,
-};
+pub use qos::{DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind, Representations};
 pub use sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};
-pub use shared::{
-    DiscoveredGraph, DiscoveryServer, EndpointMatches, ReceivedSample, Sink, TopicDescription,
-};
+pub use shared::{DiscoveredGraph, DiscoveryServer, EndpointMatches, ReceivedSample, Sink, TopicDescription};

@@ -30,11 +30,7 @@ impl From<(Ipv4Addr, u16)> for Locator {
     fn from((ip, port): (Ipv4Addr, u16)) -> Self {
         let mut address = [0; 16];
         address[12..].copy_from_slice(&ip.octets());
-        Self {
-            kind: UDP_V4,
-            port: u32::from(port),
-            address,
-        }
+        Self { kind: UDP_V4, port: u32::from(port), address }
     }
 }
 
@@ -81,40 +77,18 @@ mod tests {
     fn ports_are_the_specifications() {
         let ports = Ports::for_domain(0).expect("a domain");
         assert_eq!(ports.discovery_multicast(), 7400);
-        assert_eq!(
-            (ports.discovery(0), ports.user(0)),
-            (Some(7410), Some(7411))
-        );
-        assert_eq!(
-            (ports.discovery(3), ports.user(3)),
-            (Some(7416), Some(7417))
-        );
-        assert_eq!(
-            Ports::for_domain(1).expect("a domain").discovery(0),
-            Some(7660)
-        );
+        assert_eq!((ports.discovery(0), ports.user(0)), (Some(7410), Some(7411)));
+        assert_eq!((ports.discovery(3), ports.user(3)), (Some(7416), Some(7417)));
+        assert_eq!(Ports::for_domain(1).expect("a domain").discovery(0), Some(7660));
         assert!(Ports::for_domain(233).is_none());
     }
 
     #[test]
     fn shared_memory_is_no_address() {
         let udp = Locator::from((Ipv4Addr::LOCALHOST, 7411));
-        assert_eq!(
-            udp.udp_address(),
-            Some(SocketAddr::from(([127, 0, 0, 1], 7411)))
-        );
+        assert_eq!(udp.udp_address(), Some(SocketAddr::from(([127, 0, 0, 1], 7411))));
         assert_eq!(Locator { kind: 16, ..udp }.udp_address(), None);
-        assert_eq!(
-            Locator {
-                port: 70_000,
-                ..udp
-            }
-            .udp_address(),
-            None
-        );
-        assert_eq!(
-            Locator::from((Ipv4Addr::UNSPECIFIED, 7411)).udp_address(),
-            None
-        );
+        assert_eq!(Locator { port: 70_000, ..udp }.udp_address(), None);
+        assert_eq!(Locator::from((Ipv4Addr::UNSPECIFIED, 7411)).udp_address(), None);
     }
 }

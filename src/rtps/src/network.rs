@@ -43,15 +43,10 @@ pub struct InterfaceAddress {
 
 impl InterfaceAddress {
     /// The loopback device.
-    pub const LOOPBACK: Self = Self {
-        address: Ipv4Addr::LOCALHOST,
-        prefix: 8,
-    };
+    pub const LOOPBACK: Self = Self { address: Ipv4Addr::LOCALHOST, prefix: 8 };
 
     fn contains(&self, other: Ipv4Addr) -> bool {
-        let mask = u32::MAX
-            .checked_shl(32 - u32::from(self.prefix.min(32)))
-            .unwrap_or(0);
+        let mask = u32::MAX.checked_shl(32 - u32::from(self.prefix.min(32))).unwrap_or(0);
         self.prefix != 0 && (self.address.to_bits() ^ other.to_bits()) & mask == 0
     }
 }
@@ -63,24 +58,14 @@ impl InterfaceAddress {
 pub fn list_interfaces() -> io::Result<Vec<InterfaceAddress>> {
     let mut found = BTreeSet::new();
     for interface in getifaddrs()? {
-        let address = interface
-            .address
-            .as_ref()
-            .and_then(|it| it.as_sockaddr_in());
-        let Some(address) = address.filter(|_| interface.flags.contains(InterfaceFlags::IFF_UP))
-        else {
+        let address = interface.address.as_ref().and_then(|it| it.as_sockaddr_in());
+        let Some(address) = address.filter(|_| interface.flags.contains(InterfaceFlags::IFF_UP)) else {
             continue;
         };
-        let mask = interface
-            .netmask
-            .as_ref()
-            .and_then(|it| it.as_sockaddr_in());
+        let mask = interface.netmask.as_ref().and_then(|it| it.as_sockaddr_in());
         // A point-to-point link has no network besides its peer.
         let prefix = mask.map_or(32, |mask| mask.ip().to_bits().leading_ones());
-        found.insert(InterfaceAddress {
-            address: address.ip(),
-            prefix: prefix as u8,
-        });
+        found.insert(InterfaceAddress { address: address.ip(), prefix: prefix as u8 });
     }
     Ok(found.into_iter().collect())
 }
@@ -123,14 +108,8 @@ impl InterfaceSet {
     /// because another machine would take it for its own.
     pub fn locators(&self, port: u16) -> Vec<Locator> {
         let outside: Vec<Ipv4Addr> = self.addresses().filter(|ip| !ip.is_loopback()).collect();
-        let told = if outside.is_empty() {
-            vec![Ipv4Addr::LOCALHOST]
-        } else {
-            outside
-        };
-        told.into_iter()
-            .map(|ip| Locator::from((ip, port)))
-            .collect()
+        let told = if outside.is_empty() { vec![Ipv4Addr::LOCALHOST] } else { outside };
+        told.into_iter().map(|ip| Locator::from((ip, port))).collect()
     }
 
     /// Returns whether an address is one of this machine.
@@ -152,11 +131,7 @@ impl InterfaceSet {
 
     /// Chooses the address of a participant with these locators; `heard` is the address from which it was heard, if
     /// known. Returns `None` if none of them leads to it.
-    pub fn choose_address(
-        &self,
-        locators: &[Locator],
-        heard: Option<IpAddr>,
-    ) -> Option<SocketAddr> {
+    pub fn choose_address(&self, locators: &[Locator], heard: Option<IpAddr>) -> Option<SocketAddr> {
         let udp = locators.iter().filter_map(Locator::udp_address);
         let told: Vec<SocketAddr> = udp.filter(|it| !it.ip().is_multicast()).collect();
         let all_here = told.iter().all(|address| self.is_local(address.ip()));
@@ -169,9 +144,7 @@ impl InterfaceSet {
             let own = || told.iter().find(|address| self.is_local(address.ip()));
             return loopback.or_else(own).or_else(|| told.first()).copied();
         }
-        let outside = told
-            .into_iter()
-            .filter(|address| !address.ip().is_loopback());
+        let outside = told.into_iter().filter(|address| !address.ip().is_loopback());
         outside.min_by_key(|address| {
             if Some(address.ip()) == heard {
                 return 0;
@@ -194,30 +167,19 @@ mod tests {
     }
 
     fn network(interfaces: &[(&str, u8)]) -> InterfaceSet {
-        let of = |(address, prefix): &(&str, u8)| InterfaceAddress {
-            address: ip(address),
-            prefix: *prefix,
-        };
+        let of = |(address, prefix): &(&str, u8)| InterfaceAddress { address: ip(address), prefix: *prefix };
         InterfaceSet::new(interfaces.iter().map(of).collect())
     }
 
     fn choose_ip(network: &InterfaceSet, told: &[&str], heard: Option<&str>) -> Option<String> {
-        let told: Vec<Locator> = told
-            .iter()
-            .map(|it| Locator::from((ip(it), 7410)))
-            .collect();
+        let told: Vec<Locator> = told.iter().map(|it| Locator::from((ip(it), 7410))).collect();
         let chosen = network.choose_address(&told, heard.map(|heard| ip(heard).into()));
         chosen.map(|address| address.ip().to_string())
     }
 
     #[test]
     fn whoever_is_elsewhere_is_reached_where_it_was_heard_or_where_both_are() {
-        let robot = network(&[
-            ("127.0.0.1", 8),
-            ("10.0.0.5", 24),
-            ("192.168.1.5", 24),
-            ("172.17.0.1", 16),
-        ]);
+        let robot = network(&[("127.0.0.1", 8), ("10.0.0.5", 24), ("192.168.1.5", 24), ("172.17.0.1", 16)]);
         let told = ["172.17.0.1", "10.0.9.7", "192.168.1.7", "10.0.0.7"];
         let to = |heard| choose_ip(&robot, &told, heard);
         assert_eq!(to(Some("10.0.0.7")).as_deref(), Some("10.0.0.7"));
@@ -270,10 +232,7 @@ mod tests {
 
     #[test]
     fn a_network_of_one_address_shares_it_with_nobody() {
-        let one = InterfaceAddress {
-            address: ip("10.0.0.5"),
-            prefix: 32,
-        };
+        let one = InterfaceAddress { address: ip("10.0.0.5"), prefix: 32 };
         assert!(one.contains(ip("10.0.0.5")) && !one.contains(ip("10.0.0.4")));
         let all = InterfaceAddress { prefix: 0, ..one };
         assert!(!all.contains(ip("10.0.0.4")));

@@ -56,11 +56,7 @@ impl TokenBucket {
             return;
         }
         self.judged = now;
-        let change = if self.again > self.sent * LOST {
-            SLOWER
-        } else {
-            FASTER
-        };
+        let change = if self.again > self.sent * LOST { SLOWER } else { FASTER };
         self.part = (self.part * change).clamp(SLOWEST, 1.0);
     }
 
@@ -83,13 +79,7 @@ pub(crate) struct Pacer {
 impl Pacer {
     /// Returns `Ok` if a datagram of this length may be sent now, and counts it as sent; otherwise the time to wait.
     /// `again`: the receiver has requested it again.
-    pub fn try_reserve(
-        &mut self,
-        now: Instant,
-        to: SocketAddr,
-        length: usize,
-        again: bool,
-    ) -> Result<(), Duration> {
+    pub fn try_reserve(&mut self, now: Instant, to: SocketAddr, length: usize, again: bool) -> Result<(), Duration> {
         let bucket = self.buckets.entry(to).or_insert(TokenBucket {
             tokens: BURST,
             sent: 0.0,
@@ -111,8 +101,7 @@ impl Pacer {
 
     /// Forgets receivers to which nothing was sent recently.
     pub fn remove_expired(&mut self, now: Instant) {
-        self.buckets
-            .retain(|_, bucket| now.saturating_duration_since(bucket.counted) < FORGOTTEN);
+        self.buckets.retain(|_, bucket| now.saturating_duration_since(bucket.counted) < FORGOTTEN);
     }
 }
 
@@ -139,20 +128,12 @@ mod tests {
         assert_eq!(send(&mut pace, &mut now, 48_000), Duration::ZERO);
         now += Duration::from_secs(1);
         let alone = send(&mut pace, &mut now, 900_000);
-        assert!(
-            (Duration::from_millis(14)..Duration::from_millis(20)).contains(&alone),
-            "{alone:?}"
-        );
+        assert!((Duration::from_millis(14)..Duration::from_millis(20)).contains(&alone), "{alone:?}");
     }
 
     #[test]
     fn what_is_sent_steadily_never_takes_longer_than_the_time_until_the_next() {
-        for (bytes, hertz) in [
-            (900_000, 30),
-            (6_000_000, 30),
-            (6_000_000, 60),
-            (100_000, 100),
-        ] {
+        for (bytes, hertz) in [(900_000, 30), (6_000_000, 30), (6_000_000, 60), (100_000, 100)] {
             let (mut pace, mut now) = (Pacer::default(), Instant::now());
             let mut next = now;
             let mut last = Duration::ZERO;

@@ -109,9 +109,7 @@ pub enum JoinError {
     #[error("ROS_DOMAIN_ID {0} is out of range: use 0 to 232")]
     NoSuchDomain(u16),
     /// All ports of the domain are in use.
-    #[error(
-        "ROS_DOMAIN_ID {0} already has all 120 participants that it can have: stop some of its nodes"
-    )]
+    #[error("ROS_DOMAIN_ID {0} already has all 120 participants that it can have: stop some of its nodes")]
     Full(u16),
     /// A socket could not be opened.
     #[error("opening a socket for DDS: {0}")]
@@ -156,10 +154,7 @@ impl Participant {
     ///
     /// # Errors
     /// The domain id is invalid, or no socket could be opened.
-    pub async fn join(
-        place: Arc<dyn NetworkNamespace>,
-        config: Config,
-    ) -> Result<Participant, JoinError> {
+    pub async fn join(place: Arc<dyn NetworkNamespace>, config: Config) -> Result<Participant, JoinError> {
         Self::join_with_port_interval(place, config, PORTS).await
     }
 
@@ -169,8 +164,7 @@ impl Participant {
         config: Config,
         ports_each: Duration,
     ) -> Result<Participant, JoinError> {
-        let ports =
-            Ports::for_domain(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
+        let ports = Ports::for_domain(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
         let network = current_interfaces(&*place, &config.interfaces).await;
         let here = match &config.interfaces {
             InterfaceSelection::These(these) if these.len() == 1 => these[0],
@@ -180,17 +174,10 @@ impl Participant {
             bind_well_known(&*place, &config, ports, here).await?
         } else {
             let any = SocketAddr::from((here, 0));
-            (
-                place.bind_udp(any, false).await?,
-                place.bind_udp(any, false).await?,
-            )
+            (place.bind_udp(any, false).await?, place.bind_udp(any, false).await?)
         };
         let by_itself = !config.alone && config.servers.is_empty();
-        let multicast = if config.multicast && by_itself {
-            bind_multicast(&*place, ports).await
-        } else {
-            None
-        };
+        let multicast = if config.multicast && by_itself { bind_multicast(&*place, ports).await } else { None };
         let diagnostics = place.open_diagnostics().await.unwrap_or_else(|error| {
             tracing::debug!(%error, "cannot read how full the receive buffers of DDS are");
             None
@@ -208,11 +195,8 @@ impl Participant {
         if !by_itself {
             announce_to.clear();
         }
-        let bounds = ReaderLimits {
-            max_sample: config.max_sample,
-            budget: config.budget,
-            unfinished: config.unfinished,
-        };
+        let bounds =
+            ReaderLimits { max_sample: config.max_sample, budget: config.budget, unfinished: config.unfinished };
         let engine = Engine::new(
             Instant::now(),
             Settings {
@@ -239,14 +223,7 @@ impl Participant {
             let looking = watch_interfaces(Arc::clone(&shared), place, config.interfaces);
             tokio::spawn(looking.in_current_span()).abort_handle()
         });
-        Ok(Participant {
-            running: Arc::new(ParticipantTask {
-                shared,
-                task,
-                looking,
-                guid,
-            }),
-        })
+        Ok(Participant { running: Arc::new(ParticipantTask { shared, task, looking, guid }) })
     }
 
     /// Returns the GUID of the participant.
@@ -260,38 +237,15 @@ impl Participant {
     }
 
     /// Creates a reader of a topic. Dropping it removes the reader.
-    pub fn reader(
-        &self,
-        topic: TopicDescription,
-        qos: EndpointQos,
-        sink: Arc<dyn Sink>,
-    ) -> DataReader {
-        let (guid, ends) = self
-            .running
-            .shared
-            .with_engine(|now, engine| engine.add_reader(now, &topic, qos, sink));
-        DataReader {
-            end: EndpointHandle {
-                running: Arc::clone(&self.running),
-                guid,
-                ends,
-            },
-        }
+    pub fn reader(&self, topic: TopicDescription, qos: EndpointQos, sink: Arc<dyn Sink>) -> DataReader {
+        let (guid, ends) = self.running.shared.with_engine(|now, engine| engine.add_reader(now, &topic, qos, sink));
+        DataReader { end: EndpointHandle { running: Arc::clone(&self.running), guid, ends } }
     }
 
     /// Creates a writer of a topic. Dropping it removes the writer.
     pub fn writer(&self, topic: TopicDescription, qos: EndpointQos) -> DataWriter {
-        let (guid, ends) = self
-            .running
-            .shared
-            .with_engine(|now, engine| engine.add_writer(now, &topic, qos));
-        DataWriter {
-            end: EndpointHandle {
-                running: Arc::clone(&self.running),
-                guid,
-                ends,
-            },
-        }
+        let (guid, ends) = self.running.shared.with_engine(|now, engine| engine.add_writer(now, &topic, qos));
+        DataWriter { end: EndpointHandle { running: Arc::clone(&self.running), guid, ends } }
     }
 
     /// Reports that a process of this machine has ended, so that its participant is removed immediately and not at the
@@ -309,9 +263,7 @@ impl Participant {
 
     /// Announces the departure. Remaining endpoints become inert.
     pub async fn close(&self) {
-        self.running
-            .shared
-            .with_engine(|now, engine| engine.close(now));
+        self.running.shared.with_engine(|now, engine| engine.close(now));
         self.running.stop();
     }
 }
@@ -327,15 +279,9 @@ const INTERFACES: Duration = Duration::from_secs(2);
 const UNSEEN: u16 = 32;
 
 /// Returns the selected interfaces.
-async fn current_interfaces(
-    place: &dyn NetworkNamespace,
-    meant: &InterfaceSelection,
-) -> InterfaceSet {
+async fn current_interfaces(place: &dyn NetworkNamespace, meant: &InterfaceSelection) -> InterfaceSet {
     if let (InterfaceSelection::These(these), true) = (meant, meant.is_loopback()) {
-        let loopback = |address: &Ipv4Addr| InterfaceAddress {
-            address: *address,
-            ..InterfaceAddress::LOOPBACK
-        };
+        let loopback = |address: &Ipv4Addr| InterfaceAddress { address: *address, ..InterfaceAddress::LOOPBACK };
         return InterfaceSet::new(these.iter().map(loopback).collect());
     }
     let found = place.interfaces().await.unwrap_or_else(|error| {
@@ -346,11 +292,7 @@ async fn current_interfaces(
 }
 
 /// Watches the interfaces of a namespace.
-async fn watch_interfaces(
-    shared: Arc<DriverState>,
-    place: Arc<dyn NetworkNamespace>,
-    meant: InterfaceSelection,
-) {
+async fn watch_interfaces(shared: Arc<DriverState>, place: Arc<dyn NetworkNamespace>, meant: InterfaceSelection) {
     loop {
         tokio::time::sleep(INTERFACES).await;
         shared.set_network(current_interfaces(&*place, &meant).await);
@@ -382,9 +324,7 @@ async fn bind_well_known(
         let (Some(discovery), Some(user)) = (ports.discovery(number), ports.user(number)) else {
             break;
         };
-        let discovery = place
-            .bind_udp(SocketAddr::from((here, discovery)), false)
-            .await;
+        let discovery = place.bind_udp(SocketAddr::from((here, discovery)), false).await;
         let user = place.bind_udp(SocketAddr::from((here, user)), false).await;
         match (discovery, user) {
             (Ok(discovery), Ok(user)) => return Ok((discovery, user)),
@@ -406,9 +346,7 @@ async fn bind_multicast(place: &dyn NetworkNamespace, ports: Ports) -> Option<Ud
         SockRef::from(&socket).set_multicast_all_v4(false)?;
         Ok(socket)
     });
-    opened
-        .map_err(|error| tracing::debug!(%error, "cannot receive DDS multicast"))
-        .ok()
+    opened.map_err(|error| tracing::debug!(%error, "cannot receive DDS multicast")).ok()
 }
 
 fn participant_data(
@@ -441,11 +379,7 @@ struct EndpointHandle {
 impl Drop for EndpointHandle {
     fn drop(&mut self) {
         // The returned value is dropped after the engine is unlocked, because a sink may own other endpoints.
-        drop(
-            self.running
-                .shared
-                .with_engine(|now, engine| engine.remove_endpoint(now, self.guid.entity)),
-        );
+        drop(self.running.shared.with_engine(|now, engine| engine.remove_endpoint(now, self.guid.entity)));
     }
 }
 
@@ -494,26 +428,17 @@ impl DataWriter {
 
     fn write_sample(&self, payload: Bytes, related: Option<SampleIdentity>) -> SequenceNumber {
         let entity = self.end.guid.entity;
-        self.end
-            .running
-            .shared
-            .with_engine(|now, engine| engine.write(now, entity, payload, related))
+        self.end.running.shared.with_engine(|now, engine| engine.write(now, entity, payload, related))
     }
 
     /// Returns the number of samples dropped before all reliable readers had acknowledged them.
     pub fn dropped_samples(&self) -> u64 {
-        self.end
-            .running
-            .shared
-            .read_engine(|engine| engine.dropped_samples(self.end.guid.entity))
+        self.end.running.shared.read_engine(|engine| engine.dropped_samples(self.end.guid.entity))
     }
 }
 
 impl fmt::Debug for Participant {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("Participant")
-            .field("guid", &self.guid())
-            .finish_non_exhaustive()
+        formatter.debug_struct("Participant").field("guid", &self.guid()).finish_non_exhaustive()
     }
 }

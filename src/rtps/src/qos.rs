@@ -67,10 +67,7 @@ impl Representations {
         };
         let known = |number: &u16| u8::try_from(*number).ok().filter(|number| *number < 8);
         let all = numbers.iter().filter_map(known);
-        Self {
-            first: known(first).unwrap_or(u8::MAX),
-            all: all.fold(0, |all, number| all | 1 << number),
-        }
+        Self { first: known(first).unwrap_or(u8::MAX), all: all.fold(0, |all, number| all | 1 << number) }
     }
 
     /// Returns all ids, the first one first.
@@ -133,15 +130,8 @@ pub struct Mismatch {
 
 impl fmt::Display for Mismatch {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            policy,
-            offered,
-            requested,
-        } = self;
-        write!(
-            formatter,
-            "{policy}: the publisher offers {offered}, the subscriber asks for {requested}"
-        )
+        let Self { policy, offered, requested } = self;
+        write!(formatter, "{policy}: the publisher offers {offered}, the subscriber asks for {requested}")
     }
 }
 
@@ -152,11 +142,7 @@ impl EndpointQos {
         let mut found = Vec::new();
         let mut check = |fits: bool, policy, offered: String, requested: String| {
             if !fits {
-                found.push(Mismatch {
-                    policy,
-                    offered,
-                    requested,
-                });
+                found.push(Mismatch { policy, offered, requested });
             }
         };
         check(
@@ -194,12 +180,7 @@ impl EndpointQos {
             requested.representations.contains(offered.first),
             "data representation",
             representation_name(u16::from(offered.first)),
-            requested
-                .representations
-                .numbers()
-                .map(representation_name)
-                .collect::<Vec<_>>()
-                .join(" or "),
+            requested.representations.numbers().map(representation_name).collect::<Vec<_>>().join(" or "),
         );
         found
     }
@@ -267,20 +248,13 @@ mod tests {
 
     #[test]
     fn mismatched_policies_are_listed() {
-        let offered = EndpointQos {
-            reliability: ReliabilityKind::BestEffort,
-            ..EndpointQos::default()
-        };
+        let offered = EndpointQos { reliability: ReliabilityKind::BestEffort, ..EndpointQos::default() };
         let requested = EndpointQos {
             durability: DurabilityKind::TransientLocal,
             deadline: Some(Duration::from_millis(500)),
             ..EndpointQos::default()
         };
-        let told: Vec<String> = offered
-            .mismatches(&requested)
-            .iter()
-            .map(Mismatch::to_string)
-            .collect();
+        let told: Vec<String> = offered.mismatches(&requested).iter().map(Mismatch::to_string).collect();
         assert_eq!(
             told,
             [
@@ -301,13 +275,8 @@ mod tests {
         for fits in [&[][..], &[0], &[2, 0], &[0, 1, 2]] {
             assert_eq!(ours.mismatches(&reader(fits)), [], "{fits:?}");
         }
-        let told: Vec<String> = ours
-            .mismatches(&reader(&[2, 1]))
-            .iter()
-            .map(Mismatch::to_string)
-            .collect();
-        let expected =
-            "data representation: the publisher offers XCDR1, the subscriber asks for XCDR2 or XML";
+        let told: Vec<String> = ours.mismatches(&reader(&[2, 1])).iter().map(Mismatch::to_string).collect();
+        let expected = "data representation: the publisher offers XCDR1, the subscriber asks for XCDR2 or XML";
         assert_eq!(told, [expected]);
         // A writer uses only its first representation.
         assert_eq!(reader(&[0, 2]).mismatches(&ours), []);

@@ -103,23 +103,11 @@ pub(crate) struct ReaderState {
 
 impl ReaderState {
     pub fn new(own: EndpointData, bounds: ReaderLimits) -> Self {
-        Self {
-            own,
-            bounds,
-            proxies: Vec::new(),
-            counted: 0,
-            refused: 0,
-        }
+        Self { own, bounds, proxies: Vec::new(), counted: 0, refused: 0 }
     }
 
     /// Matches a writer. A reliable one is asked immediately what it has.
-    pub fn add_writer(
-        &mut self,
-        now: Instant,
-        data: Arc<EndpointData>,
-        address: SocketAddr,
-        vendor: VendorId,
-    ) {
+    pub fn add_writer(&mut self, now: Instant, data: Arc<EndpointData>, address: SocketAddr, vendor: VendorId) {
         self.remove_writer(data.guid);
         let both = |qos: ReliabilityKind| qos == ReliabilityKind::Reliable;
         let reliable = both(self.own.qos.reliability) && both(data.qos.reliability);
@@ -160,9 +148,7 @@ impl ReaderState {
 
     /// Returns the matched writers in the order of discovery, each with whether it has confirmed the match.
     pub fn writers(&self) -> impl Iterator<Item = (&Arc<EndpointData>, bool)> {
-        self.proxies
-            .iter()
-            .map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
+        self.proxies.iter().map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
     }
 
     fn wants_history(&self) -> bool {
@@ -177,14 +163,8 @@ impl ReaderState {
         sample: ReceivedSample,
         out: &mut Vec<ReceivedSample>,
     ) -> bool {
-        let ReaderLimits {
-            max_sample, budget, ..
-        } = &self.bounds;
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        else {
+        let ReaderLimits { max_sample, budget, .. } = &self.bounds;
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return false;
         };
         if sample.payload.len() > *max_sample {
@@ -206,17 +186,8 @@ impl ReaderState {
     }
 
     /// Handles a number without a sample; what it disposes of does not matter here.
-    pub fn skip_sample(
-        &mut self,
-        writer: Guid,
-        number: SequenceNumber,
-        out: &mut Vec<ReceivedSample>,
-    ) {
-        if let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        {
+    pub fn skip_sample(&mut self, writer: Guid, number: SequenceNumber, out: &mut Vec<ReceivedSample>) {
+        if let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) {
             proxy.skip(number, out);
         }
     }
@@ -230,11 +201,7 @@ impl ReaderState {
         written: Option<WireTime>,
         out: &mut Vec<ReceivedSample>,
     ) -> bool {
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return false;
         };
         let heard = !std::mem::replace(&mut proxy.heard, true);
@@ -247,13 +214,7 @@ impl ReaderState {
         }
         if !proxy.assemblies.contains_key(&number) {
             let permit = self.bounds.budget.permit();
-            let made = Assembly::new(
-                frag.sample_size,
-                frag.fragment_size,
-                self.bounds.max_sample,
-                permit,
-                now,
-            );
+            let made = Assembly::new(frag.sample_size, frag.fragment_size, self.bounds.max_sample, permit, now);
             let Some(assembly) = made else {
                 self.refused += 1;
                 proxy.skip(number, out);
@@ -262,12 +223,10 @@ impl ReaderState {
             if proxy.assemblies.len() >= MOST_ASSEMBLIES {
                 // The oldest sample of a best-effort writer will not be completed; a reliable writer sends the newest
                 // again.
-                let Some(victim) = (if proxy.reliable {
-                    proxy.assemblies.keys().next_back()
-                } else {
-                    proxy.assemblies.keys().next()
-                })
-                .copied() else {
+                let Some(victim) =
+                    (if proxy.reliable { proxy.assemblies.keys().next_back() } else { proxy.assemblies.keys().next() })
+                        .copied()
+                else {
                     return heard;
                 };
                 if proxy.reliable && victim < number {
@@ -299,17 +258,7 @@ impl ReaderState {
                 if let Some(assembly) = proxy.assemblies.remove(&number) {
                     let (related, written) = (assembly.related, assembly.written);
                     let payload = assembly.into_bytes();
-                    proxy.accept(
-                        ReceivedSample {
-                            payload,
-                            writer,
-                            number,
-                            related,
-                            written,
-                            withdrawn: None,
-                        },
-                        out,
-                    );
+                    proxy.accept(ReceivedSample { payload, writer, number, related, written, withdrawn: None }, out);
                 }
             }
         }
@@ -328,11 +277,7 @@ impl ReaderState {
         beat: &wire::Heartbeat,
         out: &mut Vec<ReceivedSample>,
     ) -> bool {
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return false;
         };
         // A first number below 1, or one beyond the last by more than one, is invalid (8.3.8.6.3).
@@ -358,11 +303,7 @@ impl ReaderState {
 
     /// Handles the announcement of the fragments available of a sample.
     pub fn on_heartbeat_frag(&mut self, now: Instant, writer: Guid, beat: &wire::HeartbeatFrag) {
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return;
         };
         if proxy.reliable && proxy.assemblies.contains_key(&beat.number) {
@@ -372,11 +313,7 @@ impl ReaderState {
 
     /// Handles numbers that will never be sent.
     pub fn on_gap(&mut self, writer: Guid, gap: &wire::Gap, out: &mut Vec<ReceivedSample>) {
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == writer)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return;
         };
         if gap.start.0 < 1 || gap.set.base < gap.start {
@@ -385,11 +322,7 @@ impl ReaderState {
         if gap.start <= proxy.next {
             proxy.skip_to(gap.set.base, out);
         } else {
-            let until = gap
-                .set
-                .base
-                .0
-                .min(proxy.next.0.saturating_add(MOST_WAITING as i64));
+            let until = gap.set.base.0.min(proxy.next.0.saturating_add(MOST_WAITING as i64));
             for number in gap.start.0..until {
                 proxy.mark_absent(SequenceNumber(number));
             }
@@ -402,10 +335,7 @@ impl ReaderState {
 
     /// Returns the time at which a response to this writer is due.
     pub fn answer_at(&self, writer: Guid) -> Option<Instant> {
-        self.proxies
-            .iter()
-            .find(|proxy| proxy.data.guid == writer)?
-            .answer_at
+        self.proxies.iter().find(|proxy| proxy.data.guid == writer)?.answer_at
     }
 
     /// Collects responses that are due, and samples that waited for a heartbeat in vain. Returns the time of the next
@@ -420,11 +350,8 @@ impl ReaderState {
         let (own, unfinished) = (self.own.guid.entity, self.bounds.unfinished);
         let mut again: Option<Instant> = None;
         for proxy in &mut self.proxies {
-            proxy
-                .assemblies
-                .retain(|_, assembly| now.saturating_duration_since(assembly.heard) < unfinished);
-            if !proxy.begun && !past && now.saturating_duration_since(proxy.matched) >= NO_HEARTBEAT
-            {
+            proxy.assemblies.retain(|_, assembly| now.saturating_duration_since(assembly.heard) < unfinished);
+            if !proxy.begun && !past && now.saturating_duration_since(proxy.matched) >= NO_HEARTBEAT {
                 if let Some(first) = proxy.waiting.keys().next().copied() {
                     proxy.start_at(first, out);
                 }
@@ -432,14 +359,7 @@ impl ReaderState {
             if proxy.answer_at.is_some_and(|at| at <= now) {
                 answers.push(proxy.build_response(now, own));
             }
-            let wake = [
-                proxy.answer_at,
-                proxy
-                    .assemblies
-                    .values()
-                    .map(|assembly| assembly.heard + unfinished)
-                    .min(),
-            ];
+            let wake = [proxy.answer_at, proxy.assemblies.values().map(|assembly| assembly.heard + unfinished).min()];
             again = wake.into_iter().flatten().chain(again).min();
         }
         again
@@ -527,12 +447,7 @@ impl WriterProxy {
         }
         let later = self.waiting.split_off(&first);
         // Earlier samples that have arrived are delivered in order.
-        out.extend(
-            std::mem::replace(&mut self.waiting, later)
-                .into_values()
-                .flatten()
-                .map(|sample| *sample),
-        );
+        out.extend(std::mem::replace(&mut self.waiting, later).into_values().flatten().map(|sample| *sample));
         self.assemblies = self.assemblies.split_off(&first);
         self.next = first;
         self.deliver_ready(out);
@@ -542,11 +457,7 @@ impl WriterProxy {
         if !self.begun {
             return;
         }
-        while let Some(entry) = self
-            .waiting
-            .first_entry()
-            .filter(|entry| *entry.key() <= self.next)
-        {
+        while let Some(entry) = self.waiting.first_entry().filter(|entry| *entry.key() <= self.next) {
             let (number, sample) = entry.remove_entry();
             self.next = self.next.max(number.next());
             out.extend(sample.map(|sample| *sample));
@@ -562,15 +473,11 @@ impl WriterProxy {
             // base of 0 for that, others a base of 1.
             self.answer_at = Some(now + self.pause);
             self.pause = (self.pause * 2).min(SELDOM_ASK);
-            let set =
-                SequenceSet::empty(SequenceNumber(i64::from(self.vendor != VendorId::FAST_DDS)));
+            let set = SequenceSet::empty(SequenceNumber(i64::from(self.vendor != VendorId::FAST_DDS)));
             return self.build_acknack(reader, set, false, Vec::new());
         }
         let mut set = SequenceSet::empty(self.next);
-        let until = self
-            .last
-            .0
-            .min(self.next.0.saturating_add(i64::from(SPAN) - 1));
+        let until = self.last.0.min(self.next.0.saturating_add(i64::from(SPAN) - 1));
         let mut nack_frags = Vec::new();
         for number in (self.next.0..=until).map(SequenceNumber) {
             if self.waiting.contains_key(&number) {
@@ -585,13 +492,7 @@ impl WriterProxy {
             }
             let missing = assembly.missing_fragments(FragmentNumber::MAX);
             self.nack_frags = self.nack_frags.wrapping_add(1);
-            nack_frags.push(NackFrag {
-                reader,
-                writer,
-                number,
-                set: missing,
-                count: self.nack_frags,
-            });
+            nack_frags.push(NackFrag { reader, writer, number, set: missing, count: self.nack_frags });
         }
         if self.last >= self.next {
             self.answer_at = Some(now + ASK_AGAIN.max(self.pause));
@@ -609,22 +510,8 @@ impl WriterProxy {
         nack_frags: Vec<NackFrag>,
     ) -> AckResponse {
         self.acknacks = self.acknacks.wrapping_add(1);
-        let Guid {
-            prefix,
-            entity: writer,
-        } = self.data.guid;
-        let acknack = wire::AckNack {
-            reader,
-            writer,
-            set,
-            count: self.acknacks,
-            is_final,
-        };
-        AckResponse {
-            to: self.address,
-            prefix,
-            acknack,
-            nack_frags,
-        }
+        let Guid { prefix, entity: writer } = self.data.guid;
+        let acknack = wire::AckNack { reader, writer, set, count: self.acknacks, is_final };
+        AckResponse { to: self.address, prefix, acknack, nack_frags }
     }
 }

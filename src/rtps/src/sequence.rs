@@ -47,11 +47,7 @@ pub type FragmentSet = NumberSet<FragmentNumber>;
 impl<N: Copy> NumberSet<N> {
     /// Creates an empty set with this base.
     pub fn empty(base: N) -> Self {
-        Self {
-            base,
-            bits: 0,
-            words: [0; 8],
-        }
+        Self { base, bits: 0, words: [0; 8] }
     }
 
     /// Creates a set from its wire format; `None` if `bits` and the number of words do not match.
@@ -59,11 +55,7 @@ impl<N: Copy> NumberSet<N> {
         if bits > SPAN || words.len() != bits.div_ceil(32) as usize {
             return None;
         }
-        let mut set = Self {
-            base,
-            bits,
-            words: [0; 8],
-        };
+        let mut set = Self { base, bits, words: [0; 8] };
         set.words[..words.len()].copy_from_slice(words);
         Some(set)
     }
@@ -84,8 +76,7 @@ impl<N: Copy> NumberSet<N> {
     }
 
     fn offsets(&self) -> impl Iterator<Item = u32> + '_ {
-        (0..self.bits)
-            .filter(|offset| self.words[(offset / 32) as usize] >> (31 - offset % 32) & 1 == 1)
+        (0..self.bits).filter(|offset| self.words[(offset / 32) as usize] >> (31 - offset % 32) & 1 == 1)
     }
 }
 
@@ -102,8 +93,7 @@ impl SequenceSet {
 
     /// Returns the numbers in ascending order.
     pub fn iter(&self) -> impl Iterator<Item = SequenceNumber> + '_ {
-        self.offsets()
-            .map(|offset| SequenceNumber(self.base.0.saturating_add(i64::from(offset))))
+        self.offsets().map(|offset| SequenceNumber(self.base.0.saturating_add(i64::from(offset))))
     }
 }
 
@@ -119,8 +109,7 @@ impl FragmentSet {
 
     /// Returns the numbers in ascending order.
     pub fn iter(&self) -> impl Iterator<Item = FragmentNumber> + '_ {
-        self.offsets()
-            .map(|offset| self.base.saturating_add(offset))
+        self.offsets().map(|offset| self.base.saturating_add(offset))
     }
 }
 

@@ -13,10 +13,7 @@ pub struct WireDuration {
 
 impl WireDuration {
     /// Infinite duration.
-    pub const INFINITE: Self = Self {
-        seconds: i32::MAX,
-        fraction: u32::MAX,
-    };
+    pub const INFINITE: Self = Self { seconds: i32::MAX, fraction: u32::MAX };
 
     /// Returns the duration; `None` if it is infinite. Negative durations become zero.
     pub fn finite(self) -> Option<Duration> {
@@ -34,10 +31,7 @@ impl From<Duration> for WireDuration {
     fn from(duration: Duration) -> Self {
         match i32::try_from(duration.as_secs()) {
             Ok(i32::MAX) | Err(_) => Self::INFINITE,
-            Ok(seconds) => Self {
-                seconds,
-                fraction: fraction(duration.subsec_nanos()),
-            },
+            Ok(seconds) => Self { seconds, fraction: fraction(duration.subsec_nanos()) },
         }
     }
 }
@@ -55,10 +49,7 @@ impl From<SystemTime> for WireTime {
     fn from(time: SystemTime) -> Self {
         let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
         // The wire format ends in 2106.
-        Self {
-            seconds: since.as_secs() as u32,
-            fraction: fraction(since.subsec_nanos()),
-        }
+        Self { seconds: since.as_secs() as u32, fraction: fraction(since.subsec_nanos()) }
     }
 }
 
@@ -78,13 +69,6 @@ mod tests {
         assert_eq!(half.finite(), Some(Duration::from_millis(1500)));
         assert_eq!(WireDuration::INFINITE.finite(), None);
         assert_eq!(WireDuration::from(Duration::MAX), WireDuration::INFINITE);
-        assert_eq!(
-            WireDuration {
-                seconds: -1,
-                fraction: 0
-            }
-            .finite(),
-            Some(Duration::ZERO)
-        );
+        assert_eq!(WireDuration { seconds: -1, fraction: 0 }.finite(), Some(Duration::ZERO));
     }
 }

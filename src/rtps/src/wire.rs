@@ -28,10 +28,7 @@ pub use read::parse;
 pub use write::{DataFragHead, DatagramWriter};
 
 use crate::time::WireTime;
-use crate::{
-    EntityId, FragmentNumber, FragmentSet, GuidPrefix, SampleIdentity, SequenceNumber, SequenceSet,
-    VendorId,
-};
+use crate::{EntityId, FragmentNumber, FragmentSet, GuidPrefix, SampleIdentity, SequenceNumber, SequenceSet, VendorId};
 
 /// Errors in the wire format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -49,9 +46,7 @@ pub enum WireError {
     #[error("it has a set of {0} bits, or with an impossible base")]
     Set(u32),
     /// A fragment that does not belong to its sample.
-    #[error(
-        "fragments {first} and the {count} from it on are not of a sample of {sample} bytes in pieces of {size}"
-    )]
+    #[error("fragments {first} and the {count} from it on are not of a sample of {sample} bytes in pieces of {size}")]
     Fragments {
         /// Number of the first fragment.
         first: FragmentNumber,

@@ -146,11 +146,7 @@ impl WriterState {
 
     /// Returns the first number in the history, or the one after the last if it is empty.
     pub fn first(&self) -> SequenceNumber {
-        self.history
-            .keys()
-            .next()
-            .copied()
-            .unwrap_or(self.last.next())
+        self.history.keys().next().copied().unwrap_or(self.last.next())
     }
 
     pub fn last(&self) -> SequenceNumber {
@@ -164,12 +160,7 @@ impl WriterState {
     }
 
     /// Adds a sample to the history and requests it to be sent to all readers.
-    pub fn publish(
-        &mut self,
-        now: Instant,
-        change: CacheChange,
-        wanted: &mut SendRequests,
-    ) -> SequenceNumber {
+    pub fn publish(&mut self, now: Instant, change: CacheChange, wanted: &mut SendRequests) -> SequenceNumber {
         self.last = self.last.next();
         let number = self.last;
         let needed = self.keeps_history() || !self.proxies.is_empty();
@@ -187,13 +178,7 @@ impl WriterState {
                 proxy.ask_at = Some(now + HEARTBEAT);
             }
             if told.insert(proxy.address) {
-                let item = new_item(
-                    &self.own,
-                    EntityId::UNKNOWN,
-                    proxy.data.guid.prefix,
-                    number,
-                    length,
-                );
+                let item = new_item(&self.own, EntityId::UNKNOWN, proxy.data.guid.prefix, number, length);
                 wanted.items.push((proxy.address, item));
             }
         }
@@ -263,22 +248,11 @@ impl WriterState {
             self.trim();
             return;
         }
-        let Some(least) = self
-            .proxies
-            .iter()
-            .filter(|proxy| proxy.reliable)
-            .map(|proxy| proxy.acknowledged)
-            .min()
+        let Some(least) = self.proxies.iter().filter(|proxy| proxy.reliable).map(|proxy| proxy.acknowledged).min()
         else {
             return;
         };
-        while let Some(first) = self
-            .history
-            .keys()
-            .next()
-            .copied()
-            .filter(|first| *first <= least)
-        {
+        while let Some(first) = self.history.keys().next().copied().filter(|first| *first <= least) {
             self.forget(first);
         }
     }
@@ -310,13 +284,7 @@ impl WriterState {
         });
         if all {
             for (number, change) in &self.history {
-                let item = new_item(
-                    &self.own,
-                    guid.entity,
-                    guid.prefix,
-                    *number,
-                    change.payload.len(),
-                );
+                let item = new_item(&self.own, guid.entity, guid.prefix, *number, change.payload.len());
                 wanted.items.push((address, item));
             }
         }
@@ -336,9 +304,7 @@ impl WriterState {
 
     /// Returns the matched readers in the order of discovery, each with whether it has confirmed the match.
     pub fn readers(&self) -> impl Iterator<Item = (&Arc<EndpointData>, bool)> {
-        self.proxies
-            .iter()
-            .map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
+        self.proxies.iter().map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
     }
 
     /// Returns the number up to which a reader has received everything; `None` if it is not matched.
@@ -359,11 +325,7 @@ impl WriterState {
         wanted: &mut SendRequests,
     ) -> bool {
         let (first, last) = (self.first(), self.last);
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == reader)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == reader) else {
             return false;
         };
         if !proxy.reliable || !proxy.acknacks.accept(now, count) {
@@ -374,19 +336,9 @@ impl WriterState {
         proxy.acknowledged = proxy.acknowledged.max(acknowledged);
         let mut gaps: Vec<(SequenceNumber, SequenceNumber)> = Vec::new();
         for number in set.iter().take_while(|number| *number <= last) {
-            match self
-                .history
-                .get(&number)
-                .filter(|_| number > proxy.irrelevant)
-            {
+            match self.history.get(&number).filter(|_| number > proxy.irrelevant) {
                 Some(change) => {
-                    let item = new_item(
-                        &self.own,
-                        reader.entity,
-                        reader.prefix,
-                        number,
-                        change.payload.len(),
-                    );
+                    let item = new_item(&self.own, reader.entity, reader.prefix, number, change.payload.len());
                     wanted.items.push((proxy.address, item));
                 }
                 None => match gaps.last_mut() {
@@ -395,9 +347,7 @@ impl WriterState {
                 },
             }
         }
-        let told = gaps
-            .into_iter()
-            .map(|(start, end)| (proxy.address, reader, start, end));
+        let told = gaps.into_iter().map(|(start, end)| (proxy.address, reader, start, end));
         wanted.gaps.extend(told);
         if !is_final && set.is_empty() {
             let from = first.max(proxy.irrelevant.next());
@@ -419,20 +369,14 @@ impl WriterState {
         count: u32,
         wanted: &mut SendRequests,
     ) {
-        let Some(proxy) = self
-            .proxies
-            .iter_mut()
-            .find(|proxy| proxy.data.guid == reader)
-        else {
+        let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == reader) else {
             return;
         };
         if !proxy.reliable || !proxy.nack_frags.accept(now, count) {
             return;
         }
         let Some(change) = self.history.get(&number) else {
-            wanted
-                .gaps
-                .push((proxy.address, reader, number, number.next()));
+            wanted.gaps.push((proxy.address, reader, number, number.next()));
             return;
         };
         let total = fragments::fragment_count(change.payload.len());
@@ -468,14 +412,8 @@ impl WriterState {
                 continue;
             }
             let from = first.max(proxy.irrelevant.next());
-            wanted
-                .heartbeats
-                .push((proxy.address, proxy.data.guid, from, true));
-            proxy.pause = (proxy.pause * 2).min(if proxy.heard {
-                HEARTBEAT
-            } else {
-                HEARTBEAT * 20
-            });
+            wanted.heartbeats.push((proxy.address, proxy.data.guid, from, true));
+            proxy.pause = (proxy.pause * 2).min(if proxy.heard { HEARTBEAT } else { HEARTBEAT * 20 });
             proxy.ask_at = Some(at.max(now) + proxy.pause);
         }
         self.next_heartbeat_at()
@@ -484,15 +422,12 @@ impl WriterState {
     /// Requests a heartbeat for a reader of this participant that has answered before; returns whether there is one.
     pub fn request_ack(&self, participant: GuidPrefix, wanted: &mut SendRequests) -> bool {
         let mut proxies = self.proxies.iter();
-        let Some(proxy) = proxies
-            .find(|proxy| proxy.data.guid.prefix == participant && proxy.reliable && proxy.heard)
+        let Some(proxy) = proxies.find(|proxy| proxy.data.guid.prefix == participant && proxy.reliable && proxy.heard)
         else {
             return false;
         };
         let from = self.first().max(proxy.irrelevant.next());
-        wanted
-            .heartbeats
-            .push((proxy.address, proxy.data.guid, from, true));
+        wanted.heartbeats.push((proxy.address, proxy.data.guid, from, true));
         true
     }
 
@@ -503,26 +438,19 @@ impl WriterState {
 
     /// Returns whether all readers have received everything.
     pub fn is_settled(&self) -> bool {
-        self.proxies
-            .iter()
-            .all(|proxy| !proxy.reliable || proxy.acknowledged >= self.last)
+        self.proxies.iter().all(|proxy| !proxy.reliable || proxy.acknowledged >= self.last)
     }
 
     /// Returns the first number of a heartbeat for all readers at an address.
     pub fn relevant_from(&self, address: SocketAddr) -> SequenceNumber {
         let there = self.proxies.iter().filter(|proxy| proxy.address == address);
-        let least = there
-            .map(|proxy| proxy.irrelevant.next())
-            .min()
-            .unwrap_or(self.last.next());
+        let least = there.map(|proxy| proxy.irrelevant.next()).min().unwrap_or(self.last.next());
         self.first().max(least)
     }
 
     /// Returns whether a reader at this address must acknowledge.
     pub fn needs_ack(&self, address: SocketAddr) -> bool {
-        self.proxies
-            .iter()
-            .any(|proxy| proxy.address == address && proxy.reliable)
+        self.proxies.iter().any(|proxy| proxy.address == address && proxy.reliable)
     }
 }
 
@@ -533,19 +461,8 @@ fn new_item(
     number: SequenceNumber,
     length: usize,
 ) -> SendItem {
-    let last = if length > FRAGMENT {
-        fragments::fragment_count(length)
-    } else {
-        0
-    };
-    SendItem {
-        writer: own.guid.entity,
-        reader,
-        prefix,
-        number,
-        next: last.min(1),
-        last,
-    }
+    let last = if length > FRAGMENT { fragments::fragment_count(length) } else { 0 };
+    SendItem { writer: own.guid.entity, reader, prefix, number, next: last.min(1), last }
 }
 
 /// Filters out duplicate and late submessages by their counts (8.3.8.1, 8.3.8.6).
@@ -561,9 +478,9 @@ const TOO_LATE: Duration = Duration::from_secs(3);
 impl CountFilter {
     /// Returns whether a submessage with this count is to be processed, and if so records the count.
     pub fn accept(&mut self, now: Instant, count: u32) -> bool {
-        let heeded = self.last.is_none_or(|(before, at)| {
-            is_newer(count, before) || now.saturating_duration_since(at) > TOO_LATE
-        });
+        let heeded = self
+            .last
+            .is_none_or(|(before, at)| is_newer(count, before) || now.saturating_duration_since(at) > TOO_LATE);
         if heeded {
             self.last = Some((count, now));
         }

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use rtps::{
-    Config, DurabilityKind, EndpointQos, HistoryKind, NetworkNamespace, Participant,
-    ReceivedSample, ReliabilityKind, Sink, TopicDescription,
+    Config, DurabilityKind, EndpointQos, HistoryKind, NetworkNamespace, Participant, ReceivedSample, ReliabilityKind,
+    Sink, TopicDescription,
 };
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
@@ -46,10 +46,7 @@ impl Sink for SampleForwarder {
     }
 }
 
-fn sample_channel() -> (
-    Arc<SampleForwarder>,
-    mpsc::UnboundedReceiver<ReceivedSample>,
-) {
+fn sample_channel() -> (Arc<SampleForwarder>, mpsc::UnboundedReceiver<ReceivedSample>) {
     let (sender, receiver) = mpsc::unbounded_channel();
     (Arc::new(SampleForwarder(sender)), receiver)
 }
@@ -61,9 +58,7 @@ fn domain() -> u16 {
 }
 
 async fn join(domain: u16) -> Participant {
-    Participant::join(Arc::new(TestNamespace), Config::new(domain, "test"))
-        .await
-        .expect("a participant")
+    Participant::join(Arc::new(TestNamespace), Config::new(domain, "test")).await.expect("a participant")
 }
 
 fn topic(name: &str) -> TopicDescription {
@@ -75,11 +70,7 @@ fn topic(name: &str) -> TopicDescription {
 }
 
 fn qos(reliability: ReliabilityKind, depth: u32) -> EndpointQos {
-    EndpointQos {
-        reliability,
-        history: HistoryKind::KeepLast(depth),
-        ..EndpointQos::default()
-    }
+    EndpointQos { reliability, history: HistoryKind::KeepLast(depth), ..EndpointQos::default() }
 }
 
 fn payload(mark: u8, length: usize) -> Bytes {
@@ -93,8 +84,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 async fn next(samples: &mut mpsc::UnboundedReceiver<ReceivedSample>) -> ReceivedSample {
     let next = tokio::time::timeout(PATIENCE, samples.recv()).await;
-    next.expect("a sample in time")
-        .expect("a reader that lives")
+    next.expect("a sample in time").expect("a reader that lives")
 }
 
 #[tokio::test]
@@ -103,36 +93,24 @@ async fn a_participant_that_comes_later_is_heard() {
     let early = join(domain).await;
     let writer = early.writer(
         topic("chatter"),
-        EndpointQos {
-            durability: DurabilityKind::TransientLocal,
-            ..qos(ReliabilityKind::Reliable, 5)
-        },
+        EndpointQos { durability: DurabilityKind::TransientLocal, ..qos(ReliabilityKind::Reliable, 5) },
     );
     writer.write(payload(1, 100));
     let late = join(domain).await;
     let (sink, mut samples) = sample_channel();
     let reader = late.reader(
         topic("chatter"),
-        EndpointQos {
-            durability: DurabilityKind::TransientLocal,
-            ..qos(ReliabilityKind::Reliable, 5)
-        },
+        EndpointQos { durability: DurabilityKind::TransientLocal, ..qos(ReliabilityKind::Reliable, 5) },
         sink,
     );
     let sample = next(&mut samples).await;
     assert_eq!((sample.payload[4], sample.writer), (1, writer.guid()));
     let mut ends = writer.watch_matches();
     let confirmed = ends.wait_for(|ends| ends.confirmed == [reader.guid()]);
-    tokio::time::timeout(PATIENCE, confirmed)
-        .await
-        .expect("in time")
-        .expect("a writer that lives");
+    tokio::time::timeout(PATIENCE, confirmed).await.expect("in time").expect("a writer that lives");
     late.close().await;
     let left = ends.wait_for(|ends| ends.matched.is_empty());
-    tokio::time::timeout(PATIENCE, left)
-        .await
-        .expect("in time")
-        .expect("a writer that lives");
+    tokio::time::timeout(PATIENCE, left).await.expect("in time").expect("a writer that lives");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -166,9 +144,8 @@ async fn large_samples_come_whole_both_ways() {
 async fn a_receiver_with_a_small_buffer_loses_nothing() {
     let domain = domain();
     let sender = join(domain).await;
-    let receiver = Participant::join(Arc::new(SmallBufferNamespace), Config::new(domain, "small"))
-        .await
-        .expect("a participant");
+    let receiver =
+        Participant::join(Arc::new(SmallBufferNamespace), Config::new(domain, "small")).await.expect("a participant");
     let (sink, mut samples) = sample_channel();
     let reader = receiver.reader(topic("image"), qos(ReliabilityKind::BestEffort, 5), sink);
     let writer = sender.writer(topic("image"), qos(ReliabilityKind::BestEffort, 5));

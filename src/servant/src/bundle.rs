@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use nix::sys::resource::{Resource, getrlimit};
 use oci_spec::OciSpecError;
 use oci_spec::runtime::{
-    Capability, LinuxBuilder, LinuxCapabilitiesBuilder, LinuxNamespaceBuilder, LinuxNamespaceType,
-    Mount, MountBuilder, PosixRlimit, PosixRlimitBuilder, PosixRlimitType, Process, ProcessBuilder,
-    RootBuilder, Spec as OciSpec, SpecBuilder, UserBuilder,
+    Capability, LinuxBuilder, LinuxCapabilitiesBuilder, LinuxNamespaceBuilder, LinuxNamespaceType, Mount, MountBuilder,
+    PosixRlimit, PosixRlimitBuilder, PosixRlimitType, Process, ProcessBuilder, RootBuilder, Spec as OciSpec,
+    SpecBuilder, UserBuilder,
 };
 
 use crate::container::{ContainerSpec, Profile};
@@ -38,29 +38,16 @@ const MASKED: [&str; 9] = [
     "/proc/timer_stats",
 ];
 
-const READ_ONLY: [&str; 5] = [
-    "/proc/bus",
-    "/proc/fs",
-    "/proc/irq",
-    "/proc/sys",
-    "/proc/sysrq-trigger",
-];
+const READ_ONLY: [&str; 5] = ["/proc/bus", "/proc/fs", "/proc/irq", "/proc/sys", "/proc/sysrq-trigger"];
 
 /// Builds the configuration of a container whose root and volumes are staged. It has no network namespace: the creating
 /// process is in the servant's already, and the container inherits it. It has no limits: the cgroup is created, set and
 /// read back before. The user namespace exists already, too (see [`crate::idmap::create_user_namespace`]).
-pub fn config(
-    spec: &ContainerSpec,
-    staged: &StagedRoot,
-    quotas: &Quotas,
-) -> Result<OciSpec, OciSpecError> {
+pub fn config(spec: &ContainerSpec, staged: &StagedRoot, quotas: &Quotas) -> Result<OciSpec, OciSpecError> {
     let user = LinuxNamespaceBuilder::default()
         .typ(LinuxNamespaceType::User)
         // This descriptor is open in the process that creates the container, and in those it forks for that.
-        .path(format!(
-            "/proc/self/fd/{}",
-            staged.user_namespace.as_raw_fd()
-        ))
+        .path(format!("/proc/self/fd/{}", staged.user_namespace.as_raw_fd()))
         .build()?;
     let others = [
         LinuxNamespaceType::Mount,
@@ -71,9 +58,7 @@ pub fn config(
     ]
     .into_iter()
     .map(|kind| LinuxNamespaceBuilder::default().typ(kind).build());
-    let namespaces = std::iter::once(Ok(user))
-        .chain(others)
-        .collect::<Result<Vec<_>, _>>()?;
+    let namespaces = std::iter::once(Ok(user)).chain(others).collect::<Result<Vec<_>, _>>()?;
     let mut linux = LinuxBuilder::default()
         .namespaces(namespaces)
         // Written by the process that creates the container, which may do so in its user namespace. A container has no
@@ -95,12 +80,7 @@ pub fn config(
     SpecBuilder::default()
         .version("1.0.2")
         .hostname(spec.id.clone())
-        .root(
-            RootBuilder::default()
-                .path(&staged.root)
-                .readonly(spec.writable.is_none())
-                .build()?,
-        )
+        .root(RootBuilder::default().path(&staged.root).readonly(spec.writable.is_none()).build()?)
         .process(process(spec)?)
         .mounts(mounts(spec, &staged.volumes, quotas)?)
         .linux(linux)
@@ -120,11 +100,7 @@ fn oom_score(profile: Profile) -> i32 {
 }
 
 fn process(spec: &ContainerSpec) -> Result<Process, OciSpecError> {
-    let user = if spec.profile == Profile::Compile {
-        COMPILE_USER
-    } else {
-        0
-    };
+    let user = if spec.profile == Profile::Compile { COMPILE_USER } else { 0 };
     let capabilities = if spec.profile == Profile::Install {
         [
             Capability::Chown,
@@ -157,86 +133,34 @@ fn process(spec: &ContainerSpec) -> Result<Process, OciSpecError> {
         .no_new_privileges(true)
         .oom_score_adj(oom_score(spec.profile))
         .rlimits(vec![
-            rlimit(
-                PosixRlimitType::RlimitNofile,
-                Resource::RLIMIT_NOFILE,
-                OPEN_FILES,
-            )?,
+            rlimit(PosixRlimitType::RlimitNofile, Resource::RLIMIT_NOFILE, OPEN_FILES)?,
             rlimit(PosixRlimitType::RlimitCore, Resource::RLIMIT_CORE, 0)?,
-            rlimit(
-                PosixRlimitType::RlimitSigpending,
-                Resource::RLIMIT_SIGPENDING,
-                PENDING_SIGNALS,
-            )?,
-            rlimit(
-                PosixRlimitType::RlimitMsgqueue,
-                Resource::RLIMIT_MSGQUEUE,
-                MESSAGE_QUEUES,
-            )?,
+            rlimit(PosixRlimitType::RlimitSigpending, Resource::RLIMIT_SIGPENDING, PENDING_SIGNALS)?,
+            rlimit(PosixRlimitType::RlimitMsgqueue, Resource::RLIMIT_MSGQUEUE, MESSAGE_QUEUES)?,
         ])
         .build()
 }
 
 /// Builds a limit of at most `wanted`, and at most our own: raising a hard limit needs a capability that may be
 /// missing.
-fn rlimit(
-    kind: PosixRlimitType,
-    resource: Resource,
-    wanted: u64,
-) -> Result<PosixRlimit, OciSpecError> {
+fn rlimit(kind: PosixRlimitType, resource: Resource, wanted: u64) -> Result<PosixRlimit, OciSpecError> {
     let hard = getrlimit(resource).map_or(wanted, |(_, hard)| hard.min(wanted));
-    PosixRlimitBuilder::default()
-        .typ(kind)
-        .soft(hard)
-        .hard(hard)
-        .build()
+    PosixRlimitBuilder::default().typ(kind).soft(hard).hard(hard).build()
 }
 
-fn mounts(
-    spec: &ContainerSpec,
-    volumes: &[PathBuf],
-    quotas: &Quotas,
-) -> Result<Vec<Mount>, OciSpecError> {
+fn mounts(spec: &ContainerSpec, volumes: &[PathBuf], quotas: &Quotas) -> Result<Vec<Mount>, OciSpecError> {
     let scratch = quotas.scratch_bytes(spec.limits.memory.map(|size| size.0));
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
-        let mut options: Vec<String> = safe
-            .iter()
-            .chain(extra)
-            .map(|option| (*option).to_owned())
-            .collect();
+        let mut options: Vec<String> = safe.iter().chain(extra).map(|option| (*option).to_owned()).collect();
         let inodes = quotas.inodes;
-        options.extend([
-            format!("mode={mode}"),
-            format!("size={size}"),
-            format!("nr_inodes={inodes}"),
-        ]);
+        options.extend([format!("mode={mode}"), format!("size={size}"), format!("nr_inodes={inodes}")]);
         mount(target, "tmpfs", "tmpfs", options)
     };
-    let words = |list: &[&str]| {
-        list.iter()
-            .map(|word| (*word).to_owned())
-            .collect::<Vec<_>>()
-    };
+    let words = |list: &[&str]| list.iter().map(|word| (*word).to_owned()).collect::<Vec<_>>();
     let mut mounts = vec![
-        mount(
-            "/proc",
-            "proc",
-            "proc",
-            words(&["nosuid", "noexec", "nodev"]),
-        )?,
-        mount(
-            "/dev",
-            "tmpfs",
-            "tmpfs",
-            words(&[
-                "nosuid",
-                "strictatime",
-                "mode=755",
-                "size=64k",
-                "nr_inodes=1024",
-            ]),
-        )?,
+        mount("/proc", "proc", "proc", words(&["nosuid", "noexec", "nodev"]))?,
+        mount("/dev", "tmpfs", "tmpfs", words(&["nosuid", "strictatime", "mode=755", "size=64k", "nr_inodes=1024"]))?,
         mount(
             "/dev/pts",
             "devpts",
@@ -264,28 +188,13 @@ fn mounts(
         let devices = if extra.device { "dev" } else { "nodev" };
         let target = extra.target.to_string_lossy();
         let source = source.to_string_lossy();
-        mounts.push(mount(
-            &target,
-            "bind",
-            &source,
-            words(&["bind", "nosuid", devices, access]),
-        )?);
+        mounts.push(mount(&target, "bind", &source, words(&["bind", "nosuid", devices, access]))?);
     }
     Ok(mounts)
 }
 
-fn mount(
-    target: &str,
-    kind: &str,
-    source: &str,
-    options: Vec<String>,
-) -> Result<Mount, OciSpecError> {
-    MountBuilder::default()
-        .destination(target)
-        .typ(kind)
-        .source(source)
-        .options(options)
-        .build()
+fn mount(target: &str, kind: &str, source: &str, options: Vec<String>) -> Result<Mount, OciSpecError> {
+    MountBuilder::default().destination(target).typ(kind).source(source).options(options).build()
 }
 
 #[cfg(test)]
@@ -299,10 +208,7 @@ mod tests {
             layers: vec![],
             writable: None,
             profile,
-            limits: Limits {
-                memory: Some(Size(64 << 20)),
-                ..Limits::default()
-            },
+            limits: Limits { memory: Some(Size(64 << 20)), ..Limits::default() },
             environment: Default::default(),
             nodes: vec![],
             owned_directories: vec![],
@@ -330,26 +236,12 @@ mod tests {
 
     #[test]
     fn only_installing_has_capabilities_and_only_compiling_another_user() {
-        let count = |config: &serde_json::Value| {
-            config["process"]["capabilities"]["bounding"]
-                .as_array()
-                .unwrap()
-                .len()
-        };
+        let count =
+            |config: &serde_json::Value| config["process"]["capabilities"]["bounding"].as_array().unwrap().len();
         let user = |config: &serde_json::Value| config["process"]["user"]["uid"].as_u64().unwrap();
-        let (servant, compile, install) = (
-            json(Profile::Servant),
-            json(Profile::Compile),
-            json(Profile::Install),
-        );
-        assert_eq!(
-            (count(&servant), count(&compile), count(&install)),
-            (0, 0, 7)
-        );
-        assert_eq!(
-            (user(&servant), user(&compile), user(&install)),
-            (0, 1000, 0)
-        );
+        let (servant, compile, install) = (json(Profile::Servant), json(Profile::Compile), json(Profile::Install));
+        assert_eq!((count(&servant), count(&compile), count(&install)), (0, 0, 7));
+        assert_eq!((user(&servant), user(&compile), user(&install)), (0, 1000, 0));
         for config in [servant, compile, install] {
             assert_eq!(config["process"]["noNewPrivileges"], true);
             assert_eq!(config["linux"]["namespaces"][0]["type"], "user");

@@ -69,22 +69,15 @@ impl Cgroup {
             };
             hierarchy.unified || hierarchy.controllers.iter().any(|name| asked(name))
         };
-        let leaves = parent
-            .hierarchies
-            .iter()
-            .filter(asked)
-            .map(|hierarchy| CgroupDirectory {
-                controllers: hierarchy.controllers.clone(),
-                directory: hierarchy.directory.join(&spec.id),
-                unified: hierarchy.unified,
-            });
+        let leaves = parent.hierarchies.iter().filter(asked).map(|hierarchy| CgroupDirectory {
+            controllers: hierarchy.controllers.clone(),
+            directory: hierarchy.directory.join(&spec.id),
+            unified: hierarchy.unified,
+        });
         Self {
             version: parent.version,
             leaves: leaves.collect(),
-            disk: spec
-                .layers
-                .first()
-                .and_then(|layer| disk::whole_disk(layer)),
+            disk: spec.layers.first().and_then(|layer| disk::whole_disk(layer)),
         }
     }
 
@@ -98,26 +91,18 @@ impl Cgroup {
         let leaves = parent.hierarchies.iter().filter(limits).map(|hierarchy| {
             let wanted = ["cpu", "memory"].map(str::to_owned);
             CgroupDirectory {
-                controllers: wanted
-                    .into_iter()
-                    .filter(|name| hierarchy.controllers.contains(name))
-                    .collect(),
+                controllers: wanted.into_iter().filter(|name| hierarchy.controllers.contains(name)).collect(),
                 directory: hierarchy.directory.join(format!("{id}.shim")),
                 unified: hierarchy.unified,
             }
         });
-        Self {
-            version: parent.version,
-            leaves: leaves.collect(),
-            disk: None,
-        }
+        Self { version: parent.version, leaves: leaves.collect(), disk: None }
     }
 
     /// Creates the directories.
     pub fn create(&self) -> Result<(), Error> {
         for leaf in &self.leaves {
-            make_directory(&leaf.directory)
-                .map_err(Error::file("make the cgroup", &leaf.directory))?;
+            make_directory(&leaf.directory).map_err(Error::file("make the cgroup", &leaf.directory))?;
             if !leaf.unified && leaf.has_controller("cpuset") {
                 v1::inherit_cpuset(&leaf.directory)
                     .map_err(Error::file("hand cores and memory to", &leaf.directory))?;
@@ -139,11 +124,7 @@ impl Cgroup {
     pub fn add_self(&self) -> Result<(), Error> {
         for leaf in &self.leaves {
             // A thread that moves itself need not wait for an RCU grace period of the kernel; v2 moves processes only.
-            let name = if leaf.unified {
-                "cgroup.procs"
-            } else {
-                "tasks"
-            };
+            let name = if leaf.unified { "cgroup.procs" } else { "tasks" };
             let file = leaf.directory.join(name);
             fs::write(&file, "0").map_err(Error::file("move the shim into", &file))?;
         }
@@ -162,54 +143,26 @@ impl Cgroup {
 
     /// Reads the limits in force from the kernel.
     pub fn enforced_limits(&self) -> EnforcedLimits {
-        let limits = if self.version == 2 {
-            v2::limits(self)
-        } else {
-            v1::limits(self)
-        };
-        EnforcedLimits {
-            cgroup_version: self.version,
-            limits,
-            shim: Limits::default(),
-        }
+        let limits = if self.version == 2 { v2::limits(self) } else { v1::limits(self) };
+        EnforcedLimits { cgroup_version: self.version, limits, shim: Limits::default() }
     }
 
     /// Reads the current usage.
     pub fn usage(&self) -> Usage {
-        let counted = if self.version == 2 {
-            v2::usage(self)
-        } else {
-            v1::usage(self)
-        };
-        let pids = self
-            .control_file("pids", "pids.current")
-            .and_then(|file| read_number(&file))
-            .unwrap_or(0);
-        Usage {
-            pids,
-            oom_kills: self.oom_kills(),
-            ..counted
-        }
+        let counted = if self.version == 2 { v2::usage(self) } else { v1::usage(self) };
+        let pids = self.control_file("pids", "pids.current").and_then(|file| read_number(&file)).unwrap_or(0);
+        Usage { pids, oom_kills: self.oom_kills(), ..counted }
     }
 
     /// Returns the number of its processes killed by the kernel because of their memory.
     pub fn oom_kills(&self) -> u64 {
-        let name = if self.version == 2 {
-            "memory.events"
-        } else {
-            "memory.oom_control"
-        };
-        self.control_file("memory", name)
-            .and_then(|file| files::read_field(&file, "oom_kill"))
-            .unwrap_or(0)
+        let name = if self.version == 2 { "memory.events" } else { "memory.oom_control" };
+        self.control_file("memory", name).and_then(|file| files::read_field(&file, "oom_kill")).unwrap_or(0)
     }
 
     /// Returns the host pids of all its processes, init included.
     pub fn processes(&self) -> Vec<i32> {
-        self.leaves
-            .first()
-            .map(|leaf| read_pids(&leaf.directory))
-            .unwrap_or_default()
+        self.leaves.first().map(|leaf| read_pids(&leaf.directory)).unwrap_or_default()
     }
 
     /// Kills all its processes, waits until they are gone, and removes it. Blocks for at most `patience`.
@@ -219,29 +172,19 @@ impl Cgroup {
         let mut pause = Duration::from_micros(200);
         while self.leaves.iter().any(|leaf| leaf.directory.exists()) {
             self.kill();
-            let refused = self
-                .leaves
-                .iter()
-                .filter_map(|leaf| remove(&leaf.directory).err())
-                .next();
+            let refused = self.leaves.iter().filter_map(|leaf| remove(&leaf.directory).err()).next();
             let Some(error) = refused else { break };
             if Instant::now() > deadline {
                 let left = self.leaves.iter().find(|leaf| leaf.directory.exists());
                 let path = left.map(|leaf| leaf.directory.clone()).unwrap_or_default();
-                return Err(Error::File {
-                    action: "remove the cgroup",
-                    path,
-                    source: error,
-                });
+                return Err(Error::File { action: "remove the cgroup", path, source: error });
             }
             std::thread::sleep(pause);
             pause = (pause * 2).min(Duration::from_millis(20));
         }
         // On v2 the parent distributes the controllers; it is removed with the engine.
         if self.version == 1 {
-            self.leaves
-                .iter()
-                .for_each(|leaf| hosts::remove_if_unused(&leaf.directory));
+            self.leaves.iter().for_each(|leaf| hosts::remove_if_unused(&leaf.directory));
         }
         Ok(())
     }
@@ -255,10 +198,7 @@ impl Cgroup {
         });
         wrong.map_or(Ok(()), |leaf| {
             let reason = "it holds this very process, or the host's first".into();
-            Err(Error::Malformed {
-                path: leaf.directory.clone(),
-                reason,
-            })
+            Err(Error::Malformed { path: leaf.directory.clone(), reason })
         })
     }
 
@@ -287,10 +227,7 @@ impl Cgroup {
         switch("FROZEN");
         for leaf in &self.leaves {
             for pid in read_pids(&leaf.directory) {
-                let _ = nix::sys::signal::kill(
-                    nix::unistd::Pid::from_raw(pid),
-                    nix::sys::signal::Signal::SIGKILL,
-                );
+                let _ = nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL);
             }
         }
         switch("THAWED");
@@ -298,10 +235,7 @@ impl Cgroup {
 
     /// Returns the path of a control file if its controller is in use.
     fn control_file(&self, controller: &str, name: &str) -> Option<PathBuf> {
-        self.leaves
-            .iter()
-            .find(|leaf| leaf.has_controller(controller))
-            .map(|leaf| leaf.directory.join(name))
+        self.leaves.iter().find(|leaf| leaf.has_controller(controller)).map(|leaf| leaf.directory.join(name))
     }
 }
 

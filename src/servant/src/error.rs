@@ -63,9 +63,7 @@ pub enum Error {
         reason: String,
     },
     /// The shim runs but does not answer.
-    #[error(
-        "servant {id}: its shim does not answer; check whether it is stopped or starved, or stop the servant"
-    )]
+    #[error("servant {id}: its shim does not answer; check whether it is stopped or starved, or stop the servant")]
     Unanswered {
         /// The id.
         id: String,
@@ -116,9 +114,7 @@ pub enum Error {
         source: io::Error,
     },
     /// All uid ranges are taken.
-    #[error(
-        "all {ranges} user id ranges from {base} on are taken: stop servants or change uid_base"
-    )]
+    #[error("all {ranges} user id ranges from {base} on are taken: stop servants or change uid_base")]
     NoUidRange {
         /// First uid of the first range.
         base: u32,
@@ -148,16 +144,9 @@ pub enum Error {
 
 impl Error {
     /// Wraps an I/O error with the operation and the path.
-    pub(crate) fn file(
-        action: &'static str,
-        path: impl AsRef<Path>,
-    ) -> impl FnOnce(io::Error) -> Self {
+    pub(crate) fn file(action: &'static str, path: impl AsRef<Path>) -> impl FnOnce(io::Error) -> Self {
         let path = path.as_ref().to_path_buf();
-        move |source| Self::File {
-            action,
-            path,
-            source,
-        }
+        move |source| Self::File { action, path, source }
     }
 
     /// Wraps the error of a system call without a path.
@@ -167,9 +156,6 @@ impl Error {
 
     /// Wraps a nix error of a system call without a path.
     pub(crate) fn nix(call: &'static str) -> impl FnOnce(nix::Error) -> Self {
-        move |source| Self::Call {
-            call,
-            source: source.into(),
-        }
+        move |source| Self::Call { call, source: source.into() }
     }
 }

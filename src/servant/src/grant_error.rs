@@ -7,9 +7,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum GrantError {
     /// The configuration does not allow it.
-    #[error(
-        "{kind} {name} is not allowed here; the operator can add it to {kind}s in [allow] of the configuration"
-    )]
+    #[error("{kind} {name} is not allowed here; the operator can add it to {kind}s in [allow] of the configuration")]
     NotAllowed {
         /// `device` or `volume`.
         kind: &'static str,

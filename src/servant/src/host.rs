@@ -42,18 +42,13 @@ pub fn swapped_in_bytes() -> Option<u64> {
 }
 
 fn parse_swapped_in_pages(vmstat: &str) -> Option<u64> {
-    let pages = vmstat
-        .lines()
-        .find_map(|line| line.strip_prefix("pswpin "))?;
+    let pages = vmstat.lines().find_map(|line| line.strip_prefix("pswpin "))?;
     pages.trim().parse().ok()
 }
 
 fn page_size() -> u64 {
     let size = nix::unistd::sysconf(nix::unistd::SysconfVar::PAGE_SIZE);
-    size.ok()
-        .flatten()
-        .and_then(|size| u64::try_from(size).ok())
-        .unwrap_or(4096)
+    size.ok().flatten().and_then(|size| u64::try_from(size).ok()).unwrap_or(4096)
 }
 
 /// Reads the pressure of a directory in a v2 cgroup hierarchy, which needs no controller; `None` if the kernel was
@@ -67,19 +62,13 @@ fn read_pressure(directory: &Path, suffix: &str) -> Option<Pressure> {
         let text = fs::read_to_string(directory.join(format!("{name}{suffix}"))).ok()?;
         parse_avg10("some ", &text)
     };
-    Some(Pressure {
-        cpu: of("cpu")?,
-        memory: of("memory").unwrap_or(0.0),
-        io: of("io").unwrap_or(0.0),
-    })
+    Some(Pressure { cpu: of("cpu")?, memory: of("memory").unwrap_or(0.0), io: of("io").unwrap_or(0.0) })
 }
 
 /// Reads `avg10`, in percent, of the line of a pressure file that starts with `line`.
 fn parse_avg10(line: &str, text: &str) -> Option<f64> {
     let found = text.lines().find_map(|one| one.strip_prefix(line))?;
-    found
-        .split(' ')
-        .find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
+    found.split(' ').find_map(|pair| pair.strip_prefix("avg10=")?.parse().ok())
 }
 
 #[cfg(test)]

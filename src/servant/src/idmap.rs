@@ -32,8 +32,7 @@ pub fn check_idmap_support(directory: &Path) -> Result<(), Error> {
     let holder = NamespaceHolder::new().map_err(Error::call("unshare of a user namespace"))?;
     let namespace = write_id_maps(holder.0.id() as i32, (100_000, 65_536))?;
     let mount = sys::clone_mount(directory).map_err(Error::file("copy the mount of", directory))?;
-    sys::idmap_mount(mount.as_fd(), namespace.as_fd())
-        .map_err(Error::file("shift the user ids of", directory))
+    sys::idmap_mount(mount.as_fd(), namespace.as_fd()).map_err(Error::file("shift the user ids of", directory))
 }
 
 /// Writes the id mapping of a process's user namespace, from 0 to `count` ids starting at `first`; returns the
@@ -44,9 +43,7 @@ pub(crate) fn write_id_maps(pid: i32, (first, count): (u32, u32)) -> Result<Owne
         fs::write(&path, format!("0 {first} {count}\n")).map_err(Error::file("write", &path))?;
     }
     let path = format!("/proc/{pid}/ns/user");
-    Ok(File::open(&path)
-        .map_err(Error::file("open", &path))?
-        .into())
+    Ok(File::open(&path).map_err(Error::file("open", &path))?.into())
 }
 
 /// Creates the user namespace of a container, whose root is the first id of `range`. The calling process must have one
@@ -75,9 +72,7 @@ pub(crate) fn create_user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error>
             let read = nix::unistd::read(&unshared, &mut errno);
             let made = match (read, i32::from_ne_bytes(errno)) {
                 (Ok(4), 0) => write_id_maps(child.as_raw(), range),
-                (_, errno) => Err(Error::call("unshare of a user namespace")(
-                    io::Error::from_raw_os_error(errno),
-                )),
+                (_, errno) => Err(Error::call("unshare of a user namespace")(io::Error::from_raw_os_error(errno))),
             };
             drop(release);
             let _ = waitpid(child, None);
@@ -88,10 +83,9 @@ pub(crate) fn create_user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error>
 
 /// Moves the calling process to a user namespace created by `user`.
 fn unshare_as(user: u32) -> nix::Result<()> {
-    for (resource, most) in [
-        (Resource::RLIMIT_SIGPENDING, PENDING_SIGNALS),
-        (Resource::RLIMIT_MSGQUEUE, MESSAGE_QUEUES),
-    ] {
+    for (resource, most) in
+        [(Resource::RLIMIT_SIGPENDING, PENDING_SIGNALS), (Resource::RLIMIT_MSGQUEUE, MESSAGE_QUEUES)]
+    {
         let most = getrlimit(resource)?.1.min(most);
         setrlimit(resource, most, most)?;
     }
@@ -111,10 +105,7 @@ struct NamespaceHolder(Child);
 impl NamespaceHolder {
     fn new() -> io::Result<Self> {
         let mut command = Command::new("/bin/cat");
-        command
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null());
+        command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null());
         // SAFETY: unshare is safe to call between fork and exec.
         unsafe {
             command.pre_exec(|| unshare(CloneFlags::CLONE_NEWUSER).map_err(io::Error::from));

@@ -69,10 +69,7 @@ pub struct GracePeriods {
 
 impl Default for GracePeriods {
     fn default() -> Self {
-        Self {
-            interrupt: Duration::from_secs(3),
-            terminate: Duration::from_secs(2),
-        }
+        Self { interrupt: Duration::from_secs(3), terminate: Duration::from_secs(2) }
     }
 }
 
@@ -113,10 +110,7 @@ impl LaunchRecord {
         // The Master must be able to answer at all.
         let most = servant.cpus.map(|cpus| cpus.max(SHIM_CPUS));
         let cpus = self.shim_limits.cpus.into_iter().chain(most);
-        Limits {
-            cpus: cpus.reduce(f64::min),
-            ..self.shim_limits
-        }
+        Limits { cpus: cpus.reduce(f64::min), ..self.shim_limits }
     }
 }
 
@@ -150,18 +144,13 @@ pub fn read_record<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, Error>
         result => result.map_err(Error::file("read", path))?,
     };
     let value = serde_json::from_slice(&text);
-    value.map(Some).map_err(|error| Error::Malformed {
-        path: path.into(),
-        reason: error.to_string(),
-    })
+    value.map(Some).map_err(|error| Error::Malformed { path: path.into(), reason: error.to_string() })
 }
 
 /// Writes a record atomically.
 pub fn write_record<T: Serialize>(path: &Path, value: &T) -> Result<(), Error> {
-    let text = serde_json::to_vec(value).map_err(|error| Error::Malformed {
-        path: path.into(),
-        reason: error.to_string(),
-    })?;
+    let text =
+        serde_json::to_vec(value).map_err(|error| Error::Malformed { path: path.into(), reason: error.to_string() })?;
     let half = path.with_extension("half");
     // The record may contain an environment with secrets.
     let mut options = fs::File::options();

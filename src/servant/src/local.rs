@@ -79,16 +79,8 @@ impl LocalEngineConfig {
             home_servants_dir,
             shim_command,
             init,
-            default_limits: Limits {
-                memory: Some(Size(1 << 30)),
-                pids: Some(512),
-                ..Limits::default()
-            },
-            shim_limits: Limits {
-                cpus: Some(0.5),
-                memory: Some(Size(256 << 20)),
-                ..Limits::default()
-            },
+            default_limits: Limits { memory: Some(Size(1 << 30)), pids: Some(512), ..Limits::default() },
+            shim_limits: Limits { cpus: Some(0.5), memory: Some(Size(256 << 20)), ..Limits::default() },
             quotas: Quotas::default(),
             uid_base: DEFAULT_UID_BASE,
             uid_locks: uids::LOCKS.into(),
@@ -128,20 +120,11 @@ impl LocalEngine {
     pub fn new(config: LocalEngineConfig) -> Result<Self, Error> {
         if !nix::unistd::geteuid().is_root() {
             let source = std::io::Error::from(std::io::ErrorKind::PermissionDenied);
-            return Err(Error::Call {
-                call: "running containers as another user than root (run it as root)",
-                source,
-            });
+            return Err(Error::Call { call: "running containers as another user than root (run it as root)", source });
         }
         let directory = &config.home_servants_dir;
         std::fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
-        for program in [
-            Some(config.init.as_path()),
-            config.shim_command.first().map(Path::new),
-        ]
-        .into_iter()
-        .flatten()
-        {
+        for program in [Some(config.init.as_path()), config.shim_command.first().map(Path::new)].into_iter().flatten() {
             std::fs::metadata(program).map_err(Error::file("find the program", program))?;
         }
         let parent = CgroupParent::find()?;
@@ -184,10 +167,7 @@ impl LocalEngine {
     /// Converts a spec to the description of a container on this host.
     async fn resolve(&self, spec: Spec) -> Result<ContainerSpec, Error> {
         let layers = self.resources.layers(&spec.image).await;
-        let layers = layers.map_err(|source| Error::Image {
-            image: spec.image,
-            source,
-        })?;
+        let layers = layers.map_err(|source| Error::Image { image: spec.image, source })?;
         let granted = self.resolve_grants(&spec.grants)?;
         Ok(ContainerSpec {
             id: spec.id,
@@ -226,39 +206,23 @@ impl LocalEngine {
             };
             tokio::spawn(starting.in_current_span())
         });
-        let gone = |_| Error::Start {
-            id,
-            reason: "the engine is shutting down".into(),
-        };
+        let gone = |_| Error::Start { id, reason: "the engine is shutting down".into() };
         let servant = receiver.await.map_err(gone)??;
         self.shared.register(&servant);
         Ok(servant)
     }
 
     /// Adopts a servant; `None` if nothing of it runs.
-    async fn adopt_one(
-        &self,
-        id: &str,
-        directory: &Path,
-    ) -> Result<Option<Arc<LocalServant>>, Error> {
+    async fn adopt_one(&self, id: &str, directory: &Path) -> Result<Option<Arc<LocalServant>>, Error> {
         // Unreadable records belong to servants that were only partly created.
-        let runtime: Option<RuntimeRecord> =
-            launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
+        let runtime: Option<RuntimeRecord> = launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
         let Some(runtime) = runtime else {
             return Ok(None);
         };
-        let Some(pidfd) = runtime
-            .shim
-            .open_pidfd()
-            .map_err(Error::call("looking for a shim"))?
-        else {
+        let Some(pidfd) = runtime.shim.open_pidfd().map_err(Error::call("looking for a shim"))? else {
             return Ok(None);
         };
-        let place = handle::ServantLocation {
-            id,
-            directory,
-            watches: &self.shared.watches,
-        };
+        let place = handle::ServantLocation { id, directory, watches: &self.shared.watches };
         match handle::adopt(place, &runtime, pidfd).await {
             Ok(servant) => {
                 self.shared.register(&servant);
@@ -347,8 +311,7 @@ impl LocalEngine {
         if let Some(servant) = self.adopt_one(&id, &directory).await? {
             return Ok(FoundServant::Running(servant));
         }
-        let exit: Option<ExitRecord> =
-            launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
+        let exit: Option<ExitRecord> = launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
         let state = exit.map(|exit| exit.state);
         Ok(FoundServant::Ended(EndedServant { id, state }))
     }

@@ -102,10 +102,7 @@ impl LogWriter {
             Ok(()) => self.failed = false,
             Err(error) if !self.failed => {
                 self.failed = true;
-                eprintln!(
-                    "lines are lost: could not write {}: {error}",
-                    self.path.display()
-                );
+                eprintln!("lines are lost: could not write {}: {error}", self.path.display());
             }
             Err(_) => {}
         }
@@ -194,13 +191,9 @@ mod tests {
         writer.log_dropped();
         writer.log_dropped();
         let text = fs::read_to_string(&path).unwrap();
-        let lines: Vec<LogLine> = text
-            .lines()
-            .map(|line| serde_json::from_str(line).unwrap())
-            .collect();
+        let lines: Vec<LogLine> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         // Ten seconds' worth, and what was admitted while this ran.
-        let (told, kept): (Vec<_>, Vec<_>) =
-            lines.iter().partition(|line| line.node == "cloudroid");
+        let (told, kept): (Vec<_>, Vec<_>) = lines.iter().partition(|line| line.node == "cloudroid");
         assert!((9..500).contains(&kept.len()), "{}", kept.len());
         let count = |line: &LogLine| line.line.split(' ').next()?.parse::<usize>().ok();
         let left_out: usize = told.iter().filter_map(|line| count(line)).sum();
@@ -220,20 +213,14 @@ mod tests {
                 lines.push(part, |line| seen.push(line.to_owned()));
             }
             lines.finish(|line| seen.push(line.to_owned()));
-            assert_eq!(
-                seen,
-                ["one", "", "two \u{e9}", "rest"],
-                "read {size} bytes at a time"
-            );
+            assert_eq!(seen, ["one", "", "two \u{e9}", "rest"], "read {size} bytes at a time");
         }
     }
 
     #[test]
     fn a_line_without_an_end_is_cut() {
         let (mut lines, mut lengths) = (LineSplitter::default(), Vec::new());
-        lines.push(&[b'x'; LONGEST_LINE * 2 + 7], |line| {
-            lengths.push(line.len())
-        });
+        lines.push(&[b'x'; LONGEST_LINE * 2 + 7], |line| lengths.push(line.len()));
         lines.finish(|line| lengths.push(line.len()));
         assert_eq!(lengths, [LONGEST_LINE, LONGEST_LINE, 7]);
     }

@@ -43,8 +43,7 @@ impl NetNs {
     /// may configure it.
     pub fn create() -> Result<Self, Error> {
         in_own_thread(|| {
-            unshare(CloneFlags::CLONE_NEWNET)
-                .map_err(Error::nix("unshare of a network namespace"))?;
+            unshare(CloneFlags::CLONE_NEWNET).map_err(Error::nix("unshare of a network namespace"))?;
             bring_lo_up()?;
             Self::current()
         })
@@ -63,14 +62,8 @@ impl NetNs {
     /// Wraps an open file of nsfs.
     pub fn from_fd(fd: OwnedFd) -> Result<Self, Error> {
         let file = File::from(fd);
-        let metadata = file
-            .metadata()
-            .map_err(Error::call("fstat of a network namespace"))?;
-        Ok(Self {
-            device: metadata.dev(),
-            inode: metadata.ino(),
-            file: Arc::new(file.into()),
-        })
+        let metadata = file.metadata().map_err(Error::call("fstat of a network namespace"))?;
+        Ok(Self { device: metadata.dev(), inode: metadata.ino(), file: Arc::new(file.into()) })
     }
 
     fn from_path(path: &str) -> Result<Self, Error> {
@@ -80,16 +73,14 @@ impl NetNs {
     /// Runs `work` on a separate thread in the namespace.
     pub fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> Result<T, Error> {
         in_own_thread(|| {
-            setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
-                .map_err(Error::nix("setns to a network namespace"))?;
+            setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET).map_err(Error::nix("setns to a network namespace"))?;
             Ok(work())
         })
     }
 
     /// Moves the calling thread into the namespace for good.
     pub fn enter(&self) -> Result<(), Error> {
-        setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
-            .map_err(Error::nix("setns to a network namespace"))
+        setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET).map_err(Error::nix("setns to a network namespace"))
     }
 
     /// Connects to `address` as seen from inside. Only the socket is created there; connecting is awaited here.
@@ -118,28 +109,15 @@ impl NetNs {
 
     /// Opens a TCP socket inside, for the address family of `address`; bound if `bound` is given, which needs a
     /// capability for ports below 1024.
-    async fn socket(
-        &self,
-        address: SocketAddr,
-        bound: Option<SocketAddr>,
-    ) -> io::Result<TcpSocket> {
-        let kind = if address.is_ipv4() {
-            Kind::Stream(libc::AF_INET)
-        } else {
-            Kind::Stream(libc::AF_INET6)
-        };
+    async fn socket(&self, address: SocketAddr, bound: Option<SocketAddr>) -> io::Result<TcpSocket> {
+        let kind = if address.is_ipv4() { Kind::Stream(libc::AF_INET) } else { Kind::Stream(libc::AF_INET6) };
         let fd = self.open(kind, bound).await?;
         Ok(TcpSocket::from_std_stream(std::net::TcpStream::from(fd)))
     }
 
     async fn open(&self, kind: Kind, bound: Option<SocketAddr>) -> io::Result<OwnedFd> {
         let (answer, answered) = oneshot::channel();
-        let order = SocketRequest {
-            namespace: self.file.clone(),
-            kind,
-            bound,
-            answer,
-        };
+        let order = SocketRequest { namespace: self.file.clone(), kind, bound, answer };
         let gone = || io::Error::other("the thread that opens sockets in namespaces has ended");
         socket_opener().send(order).map_err(|_| gone())?;
         answered.await.map_err(|_| gone())?
@@ -184,10 +162,7 @@ fn socket_opener() -> &'static mpsc::Sender<SocketRequest> {
         };
         // If no thread can be started, the receiver is dropped and every request is answered with an error.
         privilege::run_sync(|| {
-            let _ = std::thread::Builder::new()
-                .name("netns-sockets".into())
-                .stack_size(64 * 1024)
-                .spawn(work);
+            let _ = std::thread::Builder::new().name("netns-sockets".into()).stack_size(64 * 1024).spawn(work);
         });
         sender
     })
@@ -195,19 +170,12 @@ fn socket_opener() -> &'static mpsc::Sender<SocketRequest> {
 
 /// Capabilities for entering namespaces, for binding to ports below 1024 there, and for larger receive buffers than
 /// ordinary users get.
-const OPENERS: [Capability; 3] = [
-    Capability::CAP_SYS_ADMIN,
-    Capability::CAP_NET_BIND_SERVICE,
-    Capability::CAP_NET_ADMIN,
-];
+const OPENERS: [Capability; 3] =
+    [Capability::CAP_SYS_ADMIN, Capability::CAP_NET_BIND_SERVICE, Capability::CAP_NET_ADMIN];
 /// Bytes of the receive buffer of UDP sockets: images arrive faster than they are read.
 const DATAGRAMS: usize = 8 << 20;
 
-fn open_socket(
-    namespace: BorrowedFd<'_>,
-    kind: Kind,
-    bound: Option<SocketAddr>,
-) -> io::Result<OwnedFd> {
+fn open_socket(namespace: BorrowedFd<'_>, kind: Kind, bound: Option<SocketAddr>) -> io::Result<OwnedFd> {
     setns(namespace, CloneFlags::CLONE_NEWNET)?;
     let (family, of, protocol) = match (kind, bound) {
         (Kind::Stream(family), _) => (family, libc::SOCK_STREAM, 0),
@@ -243,9 +211,7 @@ fn in_own_thread<T: Send>(work: impl FnOnce() -> Result<T, Error> + Send) -> Res
             .stack_size(256 * 1024)
             .spawn_scoped(scope, work)
             .map_err(Error::call("starting a thread"))?;
-        thread
-            .join()
-            .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     })
 }
 
@@ -254,9 +220,7 @@ fn bring_lo_up() -> Result<(), Error> {
     // SAFETY: no pointers.
     let fd = unsafe { libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
     if fd < 0 {
-        return Err(Error::call("opening a socket to bring lo up")(
-            io::Error::last_os_error(),
-        ));
+        return Err(Error::call("opening a socket to bring lo up")(io::Error::last_os_error()));
     }
     // SAFETY: just opened, owned by nobody else.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
@@ -294,10 +258,7 @@ mod tests {
         assert!(near.nodelay().unwrap());
         let refused = two.connect(address).await.unwrap_err();
         assert_eq!(refused.kind(), io::ErrorKind::ConnectionRefused);
-        assert!(
-            TcpStream::connect(address).await.is_err(),
-            "the host must not see it"
-        );
+        assert!(TcpStream::connect(address).await.is_err(), "the host must not see it");
     }
 
     #[tokio::test]
@@ -310,22 +271,11 @@ mod tests {
         near.send_to(b"hello", address).await.unwrap();
         let mut text = [0; 8];
         assert_eq!(far.recv_from(&mut text).await.unwrap().0, 5);
-        assert!(
-            one.bind_udp(address, false).await.is_err(),
-            "the port is taken there"
-        );
-        two.bind_udp(address, false)
-            .await
-            .expect("it is free elsewhere");
-        one.open_sock_diag()
-            .await
-            .expect("a socket of the kernel's diagnostics");
+        assert!(one.bind_udp(address, false).await.is_err(), "the port is taken there");
+        two.bind_udp(address, false).await.expect("it is free elsewhere");
+        one.open_sock_diag().await.expect("a socket of the kernel's diagnostics");
         let room = nix::sys::socket::getsockopt(&far, sockopt::RcvBuf).unwrap();
-        assert_eq!(
-            room,
-            2 * DATAGRAMS,
-            "the kernel counts twice what is asked for"
-        );
+        assert_eq!(room, 2 * DATAGRAMS, "the kernel counts twice what is asked for");
     }
 
     #[test]
@@ -335,10 +285,6 @@ mod tests {
         assert_eq!(one.run(|| NetNs::current().unwrap()).unwrap(), one);
         assert_ne!(one, two);
         assert_ne!(one, own);
-        assert_eq!(
-            NetNs::current().unwrap(),
-            own,
-            "the calling thread stays where it was"
-        );
+        assert_eq!(NetNs::current().unwrap(), own, "the calling thread stays where it was");
     }
 }

@@ -38,22 +38,15 @@ impl ProcessIdentity {
     pub fn from_pid(pid: i32) -> io::Result<Self> {
         let stat = fs::read_to_string(format!("/proc/{pid}/stat"))?;
         // The name, in parentheses, may contain anything; fields are counted after its end.
-        let start = stat
-            .rsplit_once(") ")
-            .and_then(|(_, fields)| fields.split(' ').nth(19)?.parse().ok());
+        let start = stat.rsplit_once(") ").and_then(|(_, fields)| fields.split(' ').nth(19)?.parse().ok());
         let start = start.ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))?;
-        Ok(Self {
-            pid,
-            start,
-            boot: boot_id(),
-        })
+        Ok(Self { pid, start, boot: boot_id() })
     }
 
     /// Returns whether both are the same process.
     fn matches(&self, found: &Self) -> bool {
         let boots_known = self.boot != 0 && found.boot != 0;
-        (self.pid, self.start) == (found.pid, found.start)
-            && (!boots_known || self.boot == found.boot)
+        (self.pid, self.start) == (found.pid, found.start) && (!boots_known || self.boot == found.boot)
     }
 
     /// Opens a pidfd of the process; `None` if it has ended.
@@ -80,10 +73,7 @@ fn is_process_gone(error: &io::Error) -> bool {
 
 /// Returns whether a process has ended, reaped or not: its pidfd is readable then.
 pub(crate) fn has_ended(pidfd: &OwnedFd) -> bool {
-    let mut watched = [nix::poll::PollFd::new(
-        pidfd.as_fd(),
-        nix::poll::PollFlags::POLLIN,
-    )];
+    let mut watched = [nix::poll::PollFd::new(pidfd.as_fd(), nix::poll::PollFlags::POLLIN)];
     nix::poll::poll(&mut watched, nix::poll::PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
 }
 
@@ -91,9 +81,7 @@ pub(crate) fn has_ended(pidfd: &OwnedFd) -> bool {
 pub(crate) fn pid_of(pidfd: &OwnedFd) -> Option<i32> {
     use std::os::fd::AsRawFd;
     let text = fs::read_to_string(format!("/proc/self/fdinfo/{}", pidfd.as_raw_fd())).ok()?;
-    text.lines()
-        .find_map(|line| line.strip_prefix("Pid:")?.trim().parse().ok())
-        .filter(|pid| *pid > 0)
+    text.lines().find_map(|line| line.strip_prefix("Pid:")?.trim().parse().ok()).filter(|pid| *pid > 0)
 }
 
 #[cfg(test)]
@@ -102,22 +90,13 @@ mod tests {
 
     #[test]
     fn a_process_is_found_and_another_with_its_number_is_not() {
-        let mut child = std::process::Command::new("cat")
-            .stdin(std::process::Stdio::piped())
-            .spawn()
-            .unwrap();
+        let mut child = std::process::Command::new("cat").stdin(std::process::Stdio::piped()).spawn().unwrap();
         let identity = ProcessIdentity::from_pid(child.id() as i32).unwrap();
         let pidfd = identity.open_pidfd().unwrap().expect("it runs");
         assert_eq!(pid_of(&pidfd), Some(identity.pid));
         assert!(!has_ended(&pidfd));
-        let stranger = ProcessIdentity {
-            start: identity.start + 1,
-            ..identity
-        };
-        let of_another_boot = ProcessIdentity {
-            boot: identity.boot ^ 1,
-            ..identity
-        };
+        let stranger = ProcessIdentity { start: identity.start + 1, ..identity };
+        let of_another_boot = ProcessIdentity { boot: identity.boot ^ 1, ..identity };
         for other in [stranger, of_another_boot] {
             assert!(other.open_pidfd().unwrap().is_none(), "{other:?}");
         }

@@ -44,10 +44,7 @@ pub struct Snapshot {
 impl From<ContainerState> for Snapshot {
     /// Makes a snapshot without an init.
     fn from(state: ContainerState) -> Self {
-        Self {
-            state,
-            init_pid: None,
-        }
+        Self { state, init_pid: None }
     }
 }
 
@@ -149,56 +146,24 @@ mod tests {
 
     #[test]
     fn messages_are_lines_and_read_as_written() {
-        let event = NodeEvent::Exited {
-            node: "/a\nb".into(),
-            code: Some(1),
-            signal: None,
-            out_of_memory: false,
-        };
+        let event = NodeEvent::Exited { node: "/a\nb".into(), code: Some(1), signal: None, out_of_memory: false };
         let messages = [
-            ShimMessage::State {
-                state: Snapshot {
-                    state: ContainerState::Running,
-                    init_pid: Some(7),
-                },
-            },
-            ShimMessage::Node {
-                event,
-                status: NodeStatus::default(),
-            },
-            ShimMessage::Reply {
-                id: 1,
-                error: Some("no".into()),
-            },
+            ShimMessage::State { state: Snapshot { state: ContainerState::Running, init_pid: Some(7) } },
+            ShimMessage::Node { event, status: NodeStatus::default() },
+            ShimMessage::Reply { id: 1, error: Some("no".into()) },
         ];
         for message in &messages {
             let text = to_line(message);
             assert_eq!(text.iter().filter(|byte| **byte == b'\n').count(), 1);
-            assert_eq!(
-                serde_json::from_slice::<ShimMessage>(&text).unwrap(),
-                *message
-            );
+            assert_eq!(serde_json::from_slice::<ShimMessage>(&text).unwrap(), *message);
         }
         // The format of all versions: a daemon must understand shims started by an earlier one.
-        assert_eq!(
-            to_line(&messages[0]),
-            b"{\"type\":\"state\",\"state\":{\"state\":\"running\",\"init_pid\":7}}\n"
-        );
+        assert_eq!(to_line(&messages[0]), b"{\"type\":\"state\",\"state\":{\"state\":\"running\",\"init_pid\":7}}\n");
         let earlier = r#"{"type":"node","event":{"event":"started","node":"/a","pid":9},"status":{"pid":9,"exit":null,"starts":1}}"#;
         let read: ShimMessage = serde_json::from_str(earlier).unwrap();
         let started = NodeEvent::Started { node: "/a".into() };
         assert!(matches!(read, ShimMessage::Node { event, .. } if event == started));
-        let request = ShimRequest {
-            id: 3,
-            command: Command::SignalNode {
-                node: "/a".into(),
-                signal: 2,
-                last: true,
-            },
-        };
-        assert_eq!(
-            serde_json::from_slice::<ShimRequest>(&to_line(&request)).unwrap(),
-            request
-        );
+        let request = ShimRequest { id: 3, command: Command::SignalNode { node: "/a".into(), signal: 2, last: true } };
+        assert_eq!(serde_json::from_slice::<ShimRequest>(&to_line(&request)).unwrap(), request);
     }
 }

@@ -24,22 +24,14 @@ pub struct Quotas {
 
 impl Default for Quotas {
     fn default() -> Self {
-        Self {
-            scratch: None,
-            inodes: 65_536,
-            log_rate: 1 << 20,
-        }
+        Self { scratch: None, inodes: 65_536, log_rate: 1 << 20 }
     }
 }
 
 impl Quotas {
     /// Returns the quotas of a build, whose output is awaited by a client and which is bounded as a whole.
     pub(crate) fn for_build() -> Self {
-        Self {
-            scratch: None,
-            inodes: BUILD_INODES,
-            log_rate: u64::MAX,
-        }
+        Self { scratch: None, inodes: BUILD_INODES, log_rate: u64::MAX }
     }
 
     /// Returns the bytes of each scratch file system of a container with this memory limit.
@@ -63,12 +55,7 @@ const BURST: u64 = 10;
 
 impl RateLimit {
     pub(crate) fn new(per_second: u64, now: Instant) -> Self {
-        Self {
-            per_second,
-            left: per_second.saturating_mul(BURST),
-            at: now,
-            refusing: false,
-        }
+        Self { per_second, left: per_second.saturating_mul(BURST), at: now, refusing: false }
     }
 
     /// Returns the limit in bytes per second.
@@ -90,11 +77,7 @@ impl RateLimit {
             let most = self.per_second.saturating_mul(BURST);
             self.left = self.left.saturating_add(come).min(most);
         }
-        let left = if self.refusing && self.left < self.per_second {
-            None
-        } else {
-            self.left.checked_sub(bytes)
-        };
+        let left = if self.refusing && self.left < self.per_second { None } else { self.left.checked_sub(bytes) };
         self.refusing = left.is_none();
         self.left = left.unwrap_or(self.left);
         !self.refusing
@@ -139,19 +122,15 @@ mod tests {
         let start = Instant::now();
         let mut rate = RateLimit::new(1000, start);
         // Called far more often than bytes accumulate: fractions of a byte are not lost.
-        let passed = (0..1_000_000_u64)
-            .filter(|micros| rate.admits(1, start + Duration::from_micros(micros * 100)))
-            .count();
+        let passed =
+            (0..1_000_000_u64).filter(|micros| rate.admits(1, start + Duration::from_micros(micros * 100))).count();
         // 100 s at 1000 bytes per second, and the burst.
         assert!((108_000..=110_001).contains(&passed), "{passed}");
     }
 
     #[test]
     fn scratch_is_half_of_the_memory_unless_something_else_is_said() {
-        let said = Quotas {
-            scratch: Some(5),
-            ..Quotas::default()
-        };
+        let said = Quotas { scratch: Some(5), ..Quotas::default() };
         assert_eq!(said.scratch_bytes(Some(100)), 5);
         assert_eq!(Quotas::default().scratch_bytes(Some(100)), 50);
         assert_eq!(Quotas::default().scratch_bytes(None), SCRATCH);

@@ -54,10 +54,7 @@ impl Rootfs<'_> {
     /// namespace and changes its working directory.
     pub fn mount(&self, volumes: &[Mount]) -> Result<StagedRoot, Error> {
         // Copied before changing the namespace, since the originals belong to the old one.
-        let copies = volumes
-            .iter()
-            .map(stage::copy_volume)
-            .collect::<Result<Vec<_>, _>>()?;
+        let copies = volumes.iter().map(stage::copy_volume).collect::<Result<Vec<_>, _>>()?;
         let stage = stage::enter_mount_namespace()?;
         let shift = idmap::create_user_namespace(self.uid_range)?;
         let (lower, root) = (stage.join("lower"), stage.join("root"));
@@ -65,11 +62,7 @@ impl Rootfs<'_> {
             make_directory(path)?;
         }
         // The names are short because all of them together must fit into one page.
-        let all = self
-            .layers
-            .iter()
-            .map(PathBuf::as_path)
-            .chain([self.skeleton]);
+        let all = self.layers.iter().map(PathBuf::as_path).chain([self.skeleton]);
         let mut names = Vec::new();
         for (index, layer) in all.enumerate() {
             let place = lower.join(index.to_string());
@@ -77,24 +70,15 @@ impl Rootfs<'_> {
             stage::attach_shifted(layer, &place, &shift)?;
             names.insert(0, index.to_string());
         }
-        let mut options = format!(
-            "lowerdir={},redirect_dir=nofollow,metacopy=off",
-            names.join(":")
-        );
+        let mut options = format!("lowerdir={},redirect_dir=nofollow,metacopy=off", names.join(":"));
         let mut flags = MsFlags::MS_NODEV;
         match self.upper {
             None => flags |= MsFlags::MS_RDONLY,
             Some(upper) => options += &self.upper_options(upper)?,
         }
         nix::unistd::chdir(&lower).map_err(Error::nix("chdir to the layers"))?;
-        mount(
-            Some("overlay"),
-            &root,
-            Some("overlay"),
-            flags,
-            Some(options.as_str()),
-        )
-        .map_err(|error| Error::file("mount the layers at", &root)(error.into()))?;
+        mount(Some("overlay"), &root, Some("overlay"), flags, Some(options.as_str()))
+            .map_err(|error| Error::file("mount the layers at", &root)(error.into()))?;
         nix::unistd::chdir("/").map_err(Error::nix("chdir to /"))?;
         let volumes = volumes.iter().zip(&copies).enumerate();
         let volumes = volumes.map(|(index, (volume, copy))| {
@@ -102,11 +86,7 @@ impl Rootfs<'_> {
             stage::attach_volume(volume, copy, &place, &shift).map(|()| place)
         });
         let volumes = volumes.collect::<Result<_, _>>()?;
-        Ok(StagedRoot {
-            volumes,
-            root,
-            user_namespace: shift,
-        })
+        Ok(StagedRoot { volumes, root, user_namespace: shift })
     }
 
     fn upper_options(&self, upper: &Path) -> Result<String, Error> {
@@ -115,68 +95,36 @@ impl Rootfs<'_> {
         make_directory(&work)?;
         let base = self.uid_range.0;
         for path in [upper, &work] {
-            std::os::unix::fs::chown(path, Some(base), Some(base))
-                .map_err(Error::file("change the owner of", path))?;
-            fs::set_permissions(path, fs::Permissions::from_mode(0o755))
-                .map_err(Error::file("change", path))?;
+            std::os::unix::fs::chown(path, Some(base), Some(base)).map_err(Error::file("change the owner of", path))?;
+            fs::set_permissions(path, fs::Permissions::from_mode(0o755)).map_err(Error::file("change", path))?;
         }
-        let text = |path: &Path| match path
-            .to_str()
-            .filter(|text| !text.contains([',', ':', '\\']))
-        {
+        let text = |path: &Path| match path.to_str().filter(|text| !text.contains([',', ':', '\\'])) {
             Some(text) => Ok(text.to_owned()),
             None => Err(Error::Malformed {
                 path: path.into(),
-                reason:
-                    "a path with a comma, colon or backslash cannot be an overlay's upper directory"
-                        .into(),
+                reason: "a path with a comma, colon or backslash cannot be an overlay's upper directory".into(),
             }),
         };
         // A build's files are not worth flushing to disk before they become a layer.
-        Ok(format!(
-            ",upperdir={},workdir={},volatile",
-            text(upper)?,
-            text(&work)?
-        ))
+        Ok(format!(",upperdir={},workdir={},volatile", text(upper)?, text(&work)?))
     }
 
     /// Creates directories inside the mounted root that are owned by the compile user; newly created parents are owned
     /// by root.
-    pub fn make_owned_directories(
-        &self,
-        root: &Path,
-        directories: &[PathBuf],
-    ) -> Result<(), Error> {
-        let opened: OwnedFd = fs::File::open(root)
-            .map_err(Error::file("open", root))?
-            .into();
+    pub fn make_owned_directories(&self, root: &Path, directories: &[PathBuf]) -> Result<(), Error> {
+        let opened: OwnedFd = fs::File::open(root).map_err(Error::file("open", root))?.into();
         for directory in directories {
             let mut walked = PathBuf::from("/");
             let mut handle = opened.try_clone().map_err(Error::file("open", root))?;
             for name in directory.components().filter_map(normal_component) {
                 walked.push(name);
-                let made = nix::sys::stat::mkdirat(
-                    &handle,
-                    name,
-                    nix::sys::stat::Mode::from_bits_truncate(0o755),
-                );
-                handle = sys::open_in_root(opened.as_fd(), &walked)
-                    .map_err(Error::file("make inside", &walked))?;
-                let owner = if walked == *directory {
-                    Some(COMPILE_USER)
-                } else {
-                    made.is_ok().then_some(0)
-                };
+                let made = nix::sys::stat::mkdirat(&handle, name, nix::sys::stat::Mode::from_bits_truncate(0o755));
+                handle = sys::open_in_root(opened.as_fd(), &walked).map_err(Error::file("make inside", &walked))?;
+                let owner = if walked == *directory { Some(COMPILE_USER) } else { made.is_ok().then_some(0) };
                 if let Some(owner) = owner {
                     let host = self.uid_range.0 + owner;
-                    nix::unistd::fchown(
-                        &handle,
-                        Some(Uid::from_raw(host)),
-                        Some(Gid::from_raw(host)),
-                    )
-                    .map_err(|error| {
-                        Error::file("change the owner inside of", &walked)(error.into())
-                    })?;
+                    nix::unistd::fchown(&handle, Some(Uid::from_raw(host)), Some(Gid::from_raw(host)))
+                        .map_err(|error| Error::file("change the owner inside of", &walked)(error.into()))?;
                 }
             }
         }

@@ -30,9 +30,6 @@ impl Sandbox for LocalEngine {
     async fn start_sandbox(&self, spec: ContainerSpec) -> Result<SandboxContainer, Error> {
         let servant = self.start_container(spec).await?;
         let uid_offset = servant.uid_range().0;
-        Ok(SandboxContainer {
-            servant,
-            uid_offset,
-        })
+        Ok(SandboxContainer { servant, uid_offset })
     }
 }

@@ -6,8 +6,8 @@
 
 use oci_spec::OciSpecError;
 use oci_spec::runtime::{
-    Arch, LinuxSeccomp, LinuxSeccompAction, LinuxSeccompArg, LinuxSeccompArgBuilder,
-    LinuxSeccompBuilder, LinuxSeccompOperator, LinuxSyscall, LinuxSyscallBuilder,
+    Arch, LinuxSeccomp, LinuxSeccompAction, LinuxSeccompArg, LinuxSeccompArgBuilder, LinuxSeccompBuilder,
+    LinuxSeccompOperator, LinuxSyscall, LinuxSyscallBuilder,
 };
 
 use crate::container::Profile;
@@ -85,10 +85,7 @@ const LOW_WORD: u64 = 0xffff_ffff;
 
 /// Splits groups of names.
 fn split_names(groups: &[&'static str]) -> Vec<&'static str> {
-    groups
-        .iter()
-        .flat_map(|group| group.split_whitespace())
-        .collect()
+    groups.iter().flat_map(|group| group.split_whitespace()).collect()
 }
 
 /// Returns the calls that are refused to all untrusted processes.
@@ -106,31 +103,12 @@ pub fn build_profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
     refused.retain(|name| !allowed.contains(name));
     let mut rules = vec![
         rule(&allowed, LinuxSeccompAction::ScmpActAllow, None, vec![])?,
-        rule(
-            &refused,
-            LinuxSeccompAction::ScmpActErrno,
-            Some(libc::EPERM),
-            vec![],
-        )?,
-        rule(
-            &["clone"],
-            LinuxSeccompAction::ScmpActAllow,
-            None,
-            vec![masked_equal(0, CLONE_NEW, 0)?],
-        )?,
+        rule(&refused, LinuxSeccompAction::ScmpActErrno, Some(libc::EPERM), vec![])?,
+        rule(&["clone"], LinuxSeccompAction::ScmpActAllow, None, vec![masked_equal(0, CLONE_NEW, 0)?])?,
         // Its flags are behind a pointer, which no filter can follow; glibc falls back to clone.
-        rule(
-            &["clone3"],
-            LinuxSeccompAction::ScmpActErrno,
-            Some(libc::ENOSYS),
-            vec![],
-        )?,
+        rule(&["clone3"], LinuxSeccompAction::ScmpActErrno, Some(libc::ENOSYS), vec![])?,
     ];
-    for (name, values) in [
-        ("socket", FAMILIES.as_slice()),
-        ("socketpair", &PAIRED),
-        ("personality", &PERSONALITIES),
-    ] {
+    for (name, values) in [("socket", FAMILIES.as_slice()), ("socketpair", &PAIRED), ("personality", &PERSONALITIES)] {
         for value in values {
             rules.push(rule(
                 &[name],
@@ -150,11 +128,7 @@ pub fn build_profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
 
 /// Allows only this machine's native calls: an i386 or x32 call ends the process.
 fn native_arch() -> Arch {
-    if cfg!(target_arch = "aarch64") {
-        Arch::ScmpArchAarch64
-    } else {
-        Arch::ScmpArchX86_64
-    }
+    if cfg!(target_arch = "aarch64") { Arch::ScmpArchAarch64 } else { Arch::ScmpArchX86_64 }
 }
 
 fn rule(
@@ -200,24 +174,15 @@ mod tests {
             assert_eq!(once.len(), list.len(), "a name is listed twice");
         }
         let refused = split_names(REFUSED);
-        assert!(
-            split_names(ALLOWED)
-                .iter()
-                .all(|name| !refused.contains(name))
-        );
+        assert!(split_names(ALLOWED).iter().all(|name| !refused.contains(name)));
     }
 
     #[test]
     fn every_profile_refuses_namespaces() {
         for kind in [Profile::Servant, Profile::Compile, Profile::Install] {
             let text = serde_json::to_string(&build_profile(kind).unwrap()).unwrap();
-            for name in
-                "unshare setns mount ptrace keyctl bpf io_uring_setup userfaultfd".split(' ')
-            {
-                assert!(
-                    !split_names(ALLOWED).contains(&name) && !BUILDS_TOO.contains(&name),
-                    "{name}"
-                );
+            for name in "unshare setns mount ptrace keyctl bpf io_uring_setup userfaultfd".split(' ') {
+                assert!(!split_names(ALLOWED).contains(&name) && !BUILDS_TOO.contains(&name), "{name}");
                 assert!(text.contains(name), "{name} is refused by name");
             }
         }

@@ -7,11 +7,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
 fn check_result(result: libc::c_long) -> io::Result<libc::c_long> {
-    if result < 0 {
-        Err(io::Error::last_os_error())
-    } else {
-        Ok(result)
-    }
+    if result < 0 { Err(io::Error::last_os_error()) } else { Ok(result) }
 }
 
 fn into_owned_fd(result: libc::c_long) -> io::Result<OwnedFd> {
@@ -20,8 +16,7 @@ fn into_owned_fd(result: libc::c_long) -> io::Result<OwnedFd> {
 }
 
 fn c_path(path: &Path) -> io::Result<CString> {
-    CString::new(path.as_os_str().as_bytes())
-        .map_err(|_| io::Error::from(io::ErrorKind::InvalidInput))
+    CString::new(path.as_os_str().as_bytes()).map_err(|_| io::Error::from(io::ErrorKind::InvalidInput))
 }
 
 /// Opens a pidfd (pidfd_open(2)).
@@ -34,16 +29,7 @@ pub(crate) fn pidfd_open(pid: i32) -> io::Result<OwnedFd> {
 pub(crate) fn pidfd_send_signal(pidfd: BorrowedFd<'_>, signal: i32) -> io::Result<()> {
     let none = std::ptr::null::<libc::siginfo_t>();
     // SAFETY: a null siginfo is allowed.
-    check_result(unsafe {
-        libc::syscall(
-            libc::SYS_pidfd_send_signal,
-            pidfd.as_raw_fd(),
-            signal,
-            none,
-            0,
-        )
-    })
-    .map(drop)
+    check_result(unsafe { libc::syscall(libc::SYS_pidfd_send_signal, pidfd.as_raw_fd(), signal, none, 0) }).map(drop)
 }
 
 /// Closes every descriptor from `first` to `last` (close_range(2)).
@@ -60,18 +46,14 @@ pub(crate) fn clone_mount(path: &Path) -> io::Result<OwnedFd> {
     let path = c_path(path)?;
     let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC;
     // SAFETY: `path` ends in a zero byte and outlives the call.
-    into_owned_fd(unsafe {
-        libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags)
-    })
+    into_owned_fd(unsafe { libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags) })
 }
 
 /// Returns a detached copy of the mount of an open file or directory, from there on (open_tree(2)).
 pub(crate) fn clone_mount_of(opened: BorrowedFd<'_>) -> io::Result<OwnedFd> {
     let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | libc::AT_EMPTY_PATH as u32;
     // SAFETY: an empty path, which refers to the descriptor itself.
-    into_owned_fd(unsafe {
-        libc::syscall(libc::SYS_open_tree, opened.as_raw_fd(), c"".as_ptr(), flags)
-    })
+    into_owned_fd(unsafe { libc::syscall(libc::SYS_open_tree, opened.as_raw_fd(), c"".as_ptr(), flags) })
 }
 
 /// Applies the id mapping of a user namespace to a detached mount and makes it read-only (mount_setattr(2)).
@@ -122,13 +104,7 @@ pub(crate) fn open_in_root(root: BorrowedFd<'_>, path: &Path) -> io::Result<Owne
     how.resolve = libc::RESOLVE_IN_ROOT | libc::RESOLVE_NO_MAGICLINKS;
     // SAFETY: a path that ends in a zero byte and a live structure of the given size.
     into_owned_fd(unsafe {
-        libc::syscall(
-            libc::SYS_openat2,
-            root.as_raw_fd(),
-            path.as_ptr(),
-            &how,
-            size_of::<libc::open_how>(),
-        )
+        libc::syscall(libc::SYS_openat2, root.as_raw_fd(), path.as_ptr(), &how, size_of::<libc::open_how>())
     })
 }
 
@@ -142,13 +118,9 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     lock.l_start = at;
     lock.l_len = 1;
     // SAFETY: a live structure.
-    match check_result(libc::c_long::from(unsafe {
-        libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &lock)
-    })) {
+    match check_result(libc::c_long::from(unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &lock) })) {
         Ok(_) => Ok(true),
-        Err(error) if matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) => {
-            Ok(false)
-        }
+        Err(error) if matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) => Ok(false),
         Err(error) => Err(error),
     }
 }
@@ -169,9 +141,7 @@ mod tests {
     /// Returns the anonymous memory of this process in KiB.
     fn anonymous_memory_kib() -> u64 {
         let status = std::fs::read_to_string("/proc/self/status").expect("/proc");
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("RssAnon:"));
+        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:"));
         let number = line.and_then(|line| line.trim().strip_suffix(" kB"));
         number.expect("RssAnon").trim().parse().expect("a number")
     }

@@ -24,29 +24,18 @@ pub const LOCKS: &str = "/run/cloudroid/uid-ranges";
 
 /// Takes a free range from `base` on, by a lock in the file `path`; returns its first uid, and the lock to keep. Ranges
 /// whose first uid is in `held` are skipped, whatever their locks.
-pub fn lock_free_range(
-    path: &Path,
-    base: u32,
-    held: &BTreeSet<u32>,
-) -> Result<(u32, OwnedFd), Error> {
+pub fn lock_free_range(path: &Path, base: u32, held: &BTreeSet<u32>) -> Result<(u32, OwnedFd), Error> {
     let directory = path.parent().unwrap_or(path);
     fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
     let file: OwnedFd = open(path).map_err(Error::file("open", path))?.into();
     let first = base.div_ceil(RANGE);
-    let end = if base < END {
-        END / RANGE
-    } else {
-        u32::MAX / RANGE
-    };
+    let end = if base < END { END / RANGE } else { u32::MAX / RANGE };
     for range in (first..end).filter(|range| !held.contains(&(range * RANGE))) {
         if sys::lock_byte(file.as_fd(), i64::from(range)).map_err(Error::file("lock", path))? {
             return Ok((range * RANGE, file));
         }
     }
-    Err(Error::NoUidRange {
-        base,
-        ranges: end.saturating_sub(first),
-    })
+    Err(Error::NoUidRange { base, ranges: end.saturating_sub(first) })
 }
 
 /// Returns the first uids of the ranges in the records below `servants`, whether their shims run or not: processes of a
@@ -61,11 +50,7 @@ pub fn claimed_ranges(servants: &Path) -> Result<BTreeSet<u32>, Error> {
     for entry in fs::read_dir(servants).map_err(Error::file("read", servants))? {
         let directory = entry.map_err(Error::file("read", servants))?.path();
         // An unreadable record was just being written: nothing uses those ids yet.
-        let record = |name| {
-            launch::read_record::<UidRangeRecord>(&directory.join(name))
-                .ok()
-                .flatten()
-        };
+        let record = |name| launch::read_record::<UidRangeRecord>(&directory.join(name)).ok().flatten();
         let record = record(launch::RUNTIME).or_else(|| record(launch::SPEC));
         held.extend(record.map(|record| record.uid_range.0));
     }
@@ -74,13 +59,7 @@ pub fn claimed_ranges(servants: &Path) -> Result<BTreeSet<u32>, Error> {
 
 /// Opens the lock file for this user alone: anybody who can open it could hold any range, even by a read lock.
 fn open(path: &Path) -> io::Result<File> {
-    let file = File::options()
-        .create(true)
-        .truncate(false)
-        .write(true)
-        .read(true)
-        .mode(0o600)
-        .open(path)?;
+    let file = File::options().create(true).truncate(false).write(true).read(true).mode(0o600).open(path)?;
     // An earlier version made it readable for all.
     file.set_permissions(fs::Permissions::from_mode(0o600))?;
     Ok(file)
@@ -99,10 +78,7 @@ mod tests {
         let (one, lock) = lock_free_range(&path, base, &nobody).unwrap();
         let (two, _other) = lock_free_range(&path, base, &nobody).unwrap();
         assert_eq!((one, two), (base, base + RANGE));
-        assert!(matches!(
-            lock_free_range(&path, base, &nobody),
-            Err(Error::NoUidRange { ranges: 2, .. })
-        ));
+        assert!(matches!(lock_free_range(&path, base, &nobody), Err(Error::NoUidRange { ranges: 2, .. })));
         drop(lock);
         assert_eq!(lock_free_range(&path, base, &nobody).unwrap().0, base);
     }
@@ -113,10 +89,7 @@ mod tests {
         let path = place.path().join("uid-ranges");
         let servants = place.path().join("servants");
         let base = END - 4 * RANGE;
-        for (index, (id, file)) in [("a", launch::RUNTIME), ("b", launch::SPEC)]
-            .into_iter()
-            .enumerate()
-        {
+        for (index, (id, file)) in [("a", launch::RUNTIME), ("b", launch::SPEC)].into_iter().enumerate() {
             let record = servants.join(id).join(file);
             fs::create_dir_all(record.parent().unwrap()).unwrap();
             let first = base + index as u32 * RANGE;
@@ -126,10 +99,7 @@ mod tests {
         fs::create_dir(servants.join("half-made")).unwrap();
         let held = claimed_ranges(&servants).unwrap();
         assert_eq!(held, BTreeSet::from([base, base + RANGE]));
-        assert_eq!(
-            lock_free_range(&path, base, &held).unwrap().0,
-            base + 2 * RANGE
-        );
+        assert_eq!(lock_free_range(&path, base, &held).unwrap().0, base + 2 * RANGE);
     }
 
     #[test]

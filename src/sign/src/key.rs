@@ -17,9 +17,8 @@ use crate::{Error, wire};
 /// Name of the key type in OpenSSH.
 pub const ALGORITHM: &str = "ssh-ed25519";
 /// Bytes before the 32 bytes of a private key in PKCS #8 (RFC 8410, section 7).
-const PKCS8: [u8; 16] = [
-    0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20,
-];
+const PKCS8: [u8; 16] =
+    [0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20];
 const BEGIN: &str = "-----BEGIN PRIVATE KEY-----";
 const END: &str = "-----END PRIVATE KEY-----";
 
@@ -33,11 +32,7 @@ impl SigningKey {
     pub fn load_or_create(path: &Path) -> Result<SigningKey, Error> {
         let io = |action| {
             let path = path.to_owned();
-            move |source| Error::Io {
-                action,
-                path,
-                source,
-            }
+            move |source| Error::Io { action, path, source }
         };
         match std::fs::read_to_string(path) {
             Ok(text) => Self::from_pem(&text).ok_or_else(|| Error::NoKey(path.to_owned())),
@@ -46,12 +41,8 @@ impl SigningKey {
                 // Written atomically.
                 let half = path.with_extension("half");
                 let _ = std::fs::remove_file(&half);
-                let mut file = OpenOptions::new()
-                    .write(true)
-                    .create_new(true)
-                    .mode(0o600)
-                    .open(&half)
-                    .map_err(io("make"))?;
+                let mut file =
+                    OpenOptions::new().write(true).create_new(true).mode(0o600).open(&half).map_err(io("make"))?;
                 file.write_all(text.as_bytes())
                     .and_then(|()| file.sync_all())
                     .and_then(|()| std::fs::rename(&half, path))
@@ -65,9 +56,7 @@ impl SigningKey {
     /// Generates a new key; returns it with its PEM form.
     pub fn generate() -> Result<(SigningKey, String), Error> {
         let mut seed = [0; 32];
-        SystemRandom::new()
-            .fill(&mut seed)
-            .map_err(|_| Error::NoRandom)?;
+        SystemRandom::new().fill(&mut seed).map_err(|_| Error::NoRandom)?;
         let mut document = PKCS8.to_vec();
         document.extend_from_slice(&seed);
         let text = format!("{BEGIN}\n{}\n{END}\n", STANDARD.encode_to_string(document));
@@ -135,11 +124,7 @@ impl PublicKey {
 
 impl fmt::Display for PublicKey {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "{ALGORITHM} {}",
-            STANDARD.encode_to_string(self.to_blob())
-        )
+        write!(out, "{ALGORITHM} {}", STANDARD.encode_to_string(self.to_blob()))
     }
 }
 
@@ -168,26 +153,14 @@ mod tests {
     fn a_key_is_made_once_and_is_its_owners_alone() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("signing.pem");
-        let made = SigningKey::load_or_create(&path)
-            .expect("made")
-            .public_key();
-        assert_eq!(
-            SigningKey::load_or_create(&path)
-                .expect("read")
-                .public_key(),
-            made
-        );
+        let made = SigningKey::load_or_create(&path).expect("made").public_key();
+        assert_eq!(SigningKey::load_or_create(&path).expect("read").public_key(), made);
         let mode = path.metadata().expect("there").permissions().mode() & 0o7777;
         assert_eq!(mode, 0o600);
         assert_eq!(std::fs::read_dir(place.path()).expect("there").count(), 1);
         std::fs::write(&path, "rubbish").expect("written");
-        let refused = SigningKey::load_or_create(&path)
-            .expect_err("no key")
-            .to_string();
-        assert!(
-            refused.contains("signing.pem holds no ed25519 key"),
-            "{refused}"
-        );
+        let refused = SigningKey::load_or_create(&path).expect_err("no key").to_string();
+        assert!(refused.contains("signing.pem holds no ed25519 key"), "{refused}");
     }
 
     #[test]

@@ -64,10 +64,7 @@ impl SigningKey {
     pub fn sign(&self, namespace: &str, digest: &[u8; 64]) -> String {
         let mut signature = Vec::new();
         wire::write_string(&mut signature, ALGORITHM.as_bytes());
-        wire::write_string(
-            &mut signature,
-            &self.sign_bytes(&signed_message(namespace, digest)),
-        );
+        wire::write_string(&mut signature, &self.sign_bytes(&signed_message(namespace, digest)));
         let mut blob = MAGIC.to_vec();
         blob.extend_from_slice(&VERSION);
         let public = self.public_key().to_blob();
@@ -98,11 +95,7 @@ impl Signature {
         let algorithm = wire::read_string(&mut signature)?;
         let bytes = wire::read_string(&mut signature)?.to_vec();
         let known = hash == HASH && algorithm == ALGORITHM.as_bytes();
-        (known && rest.is_empty() && signature.is_empty()).then_some(Signature {
-            by,
-            namespace,
-            bytes,
-        })
+        (known && rest.is_empty() && signature.is_empty()).then_some(Signature { by, namespace, bytes })
     }
 }
 
@@ -114,10 +107,7 @@ impl PublicKey {
             return Err(Error::OtherKey(signature.by));
         }
         if signature.namespace != namespace {
-            return Err(Error::Namespace {
-                found: signature.namespace,
-                wanted: namespace.to_owned(),
-            });
+            return Err(Error::Namespace { found: signature.namespace, wanted: namespace.to_owned() });
         }
         UnparsedPublicKey::new(&ED25519, self.0)
             .verify(&signed_message(namespace, digest), &signature.bytes)
@@ -146,41 +136,19 @@ mod tests {
         let (key, other) = (key(), key());
         let signature = key.sign(NAMESPACE, &sha512(b"content"));
         let verify = |key: &SigningKey, namespace, content: &[u8], signature: &str| {
-            let verified = key
-                .public_key()
-                .verify(namespace, &sha512(content), signature);
+            let verified = key.public_key().verify(namespace, &sha512(content), signature);
             verified.map_err(|error| error.to_string())
         };
         assert_eq!(verify(&key, NAMESPACE, b"content", &signature), Ok(()));
         assert_eq!(to_armoured_lines(&to_single_line(&signature)), signature);
         let stranger = other.sign(NAMESPACE, &sha512(b"content"));
         for (namespace, content, signature, words) in [
-            (
-                NAMESPACE,
-                &b"contents"[..],
-                &*signature,
-                "does not match the content",
-            ),
+            (NAMESPACE, &b"contents"[..], &*signature, "does not match the content"),
             (NAMESPACE, b"", &signature, "does not match the content"),
-            (
-                "cloudroid-archive",
-                b"content",
-                &signature,
-                "is for \"cloudroid-stub\"",
-            ),
-            (
-                NAMESPACE,
-                b"content",
-                &stranger,
-                "signed with another key, ssh-ed25519 AAAA",
-            ),
+            ("cloudroid-archive", b"content", &signature, "is for \"cloudroid-stub\""),
+            (NAMESPACE, b"content", &stranger, "signed with another key, ssh-ed25519 AAAA"),
             (NAMESPACE, b"content", "", "not an SSH signature"),
-            (
-                NAMESPACE,
-                b"content",
-                &signature[..100],
-                "not an SSH signature",
-            ),
+            (NAMESPACE, b"content", &signature[..100], "not an SSH signature"),
         ] {
             let refused = verify(&key, namespace, content, signature).expect_err(words);
             assert!(refused.contains(words), "{words}: {refused}");
@@ -194,8 +162,7 @@ mod tests {
         let key = key();
         let path = |name: &str| place.path().join(name);
         std::fs::write(path("signers"), key.public_key().allowed_signers_line()).expect("written");
-        std::fs::write(path("signature"), key.sign(NAMESPACE, &sha512(b"content")))
-            .expect("written");
+        std::fs::write(path("signature"), key.sign(NAMESPACE, &sha512(b"content"))).expect("written");
         let verified = |content: &str| {
             std::fs::write(path("content"), content).expect("written");
             let mut command = std::process::Command::new("ssh-keygen");

@@ -48,16 +48,7 @@ fn insert(connection: &Connection, new: &NewAuditRecord<'_>) -> rusqlite::Result
              VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8) RETURNING id",
         )?
         .query_row(
-            params![
-                now() as i64,
-                new.who,
-                new.peer,
-                new.action,
-                new.did,
-                new.object,
-                new.status,
-                new.more
-            ],
+            params![now() as i64, new.who, new.peer, new.action, new.did, new.object, new.status, new.more],
             |row| row.get(0),
         )?;
     if id % 1_000 == 0 {

@@ -56,12 +56,7 @@ struct PendingWrites {
 impl Backlog {
     pub(super) fn new(last_event: i64) -> Backlog {
         Backlog {
-            waiting: Mutex::new(PendingWrites {
-                last_event,
-                writes: VecDeque::new(),
-                dropped: 0,
-                outage: None,
-            }),
+            waiting: Mutex::new(PendingWrites { last_event, writes: VecDeque::new(), dropped: 0, outage: None }),
             begun: Notify::new(),
             last: watch::Sender::new(last_event),
         }
@@ -116,10 +111,7 @@ impl State {
     pub fn outage_message(&self) -> Option<String> {
         let waiting = self.backlog.waiting.lock();
         let (_, why) = waiting.outage.as_ref()?;
-        Some(format!(
-            "the state database {} cannot be written: {why}",
-            self.path
-        ))
+        Some(format!("the state database {} cannot be written: {why}", self.path))
     }
 
     /// Watches the number of the latest event.
@@ -147,8 +139,7 @@ impl State {
             waiting.push(write);
             return self.backlog.begun.notify_one();
         };
-        let outcome =
-            commit_without_waiting(&mut connection, |transaction| apply(transaction, &write));
+        let outcome = commit_without_waiting(&mut connection, |transaction| apply(transaction, &write));
         drop(connection);
         let Err(error) = outcome else { return };
         waiting.push(write);
@@ -164,12 +155,7 @@ impl State {
         let lasting = is_locked(error)
             || matches!(
                 error.sqlite_error_code(),
-                Some(
-                    ErrorCode::DiskFull
-                        | ErrorCode::ReadOnly
-                        | ErrorCode::SystemIoFailure
-                        | ErrorCode::CannotOpen
-                )
+                Some(ErrorCode::DiskFull | ErrorCode::ReadOnly | ErrorCode::SystemIoFailure | ErrorCode::CannotOpen)
             );
         if lasting {
             let mut waiting = self.backlog.waiting.lock();
@@ -202,9 +188,7 @@ impl State {
             return false;
         };
         while let Some(write) = waiting.writes.front() {
-            if let Err(error) =
-                commit_without_waiting(&mut connection, |transaction| apply(transaction, write))
-            {
+            if let Err(error) = commit_without_waiting(&mut connection, |transaction| apply(transaction, write)) {
                 self.begin_outage(&mut waiting, &error);
                 return false;
             }
@@ -223,11 +207,7 @@ impl State {
             now().saturating_sub(since) as f64 / 1000.0
         );
         let event = waiting.new_event(Level::Info, "state-writable", message);
-        if commit_without_waiting(&mut connection, |transaction| {
-            events::insert(transaction, &event)
-        })
-        .is_err()
-        {
+        if commit_without_waiting(&mut connection, |transaction| events::insert(transaction, &event)).is_err() {
             waiting.last_event -= 1;
             return false;
         }
@@ -268,10 +248,9 @@ fn commit_without_waiting<T>(
 fn apply(connection: &Connection, write: &Write) -> rusqlite::Result<()> {
     match write {
         Write::Event(event) => events::insert(connection, event),
-        Write::ServantGone(id) => connection
-            .prepare_cached("DELETE FROM servants WHERE id = ?1")?
-            .execute([id])
-            .map(|_| ()),
+        Write::ServantGone(id) => {
+            connection.prepare_cached("DELETE FROM servants WHERE id = ?1")?.execute([id]).map(|_| ())
+        }
         Write::RobotSeen(robot, time) => connection
             .prepare_cached("UPDATE robots SET last_seen = ?2 WHERE name = ?1")?
             .execute(params![robot, *time as i64])
@@ -281,10 +260,7 @@ fn apply(connection: &Connection, write: &Write) -> rusqlite::Result<()> {
 
 /// Returns whether another connection holds the lock, which it may release at any moment.
 fn is_locked(error: &rusqlite::Error) -> bool {
-    matches!(
-        error.sqlite_error_code(),
-        Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked)
-    )
+    matches!(error.sqlite_error_code(), Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked))
 }
 
 fn describe_error(error: &rusqlite::Error) -> String {

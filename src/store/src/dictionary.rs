@@ -25,20 +25,15 @@ impl State {
         let rows = found.into_iter();
         rows.map(|(id, value, revision, written, texts)| {
             let (measure, aux, limits, spread) = texts;
-            let unreadable = |source| Error::Record {
-                what: format!("entry {id} of the SLA table of {service}"),
-                source,
-            };
+            let unreadable =
+                |source| Error::Record { what: format!("entry {id} of the SLA table of {service}"), source };
             Ok(Row {
                 id,
                 measure: read_measure(&measure).map_err(unreadable)?,
                 value,
                 aux: serde_json::from_str(&aux).map_err(unreadable)?,
                 limits: serde_json::from_str(&limits).map_err(unreadable)?,
-                spread: spread
-                    .map(|spread| serde_json::from_str(&spread))
-                    .transpose()
-                    .map_err(unreadable)?,
+                spread: spread.map(|spread| serde_json::from_str(&spread)).transpose().map_err(unreadable)?,
                 revision,
                 written: written as api::Millis,
             })
@@ -48,12 +43,7 @@ impl State {
 
     /// Writes rows of a service durably, all or none. A row replaces an earlier one with the same measure, value and
     /// auxiliary parameters and takes over its number. `revision` is the revision that they were measured with.
-    pub fn write_dictionary(
-        &self,
-        service: &str,
-        revision: u64,
-        new: &NewRows,
-    ) -> Result<(), Error> {
+    pub fn write_dictionary(&self, service: &str, revision: u64, new: &NewRows) -> Result<(), Error> {
         let mut texts = Vec::new();
         for row in &new.rows {
             let spread = row.spread.as_ref();
@@ -71,16 +61,7 @@ impl State {
                      VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)
                      ON CONFLICT (service, measure, value, aux) DO UPDATE
                      SET limits = ?5, spread = ?6, revision = ?7, written = ?8",
-                    params![
-                        service,
-                        row.measure.name(),
-                        row.value,
-                        aux,
-                        limits,
-                        spread,
-                        revision,
-                        now() as i64
-                    ],
+                    params![service, row.measure.name(), row.value, aux, limits, spread, revision, now() as i64],
                 )?;
             }
             Ok(())
@@ -90,10 +71,7 @@ impl State {
     /// Deletes a row of a service; returns false if it does not exist.
     pub fn remove_from_dictionary(&self, service: &str, id: i64) -> Result<bool, Error> {
         self.write_durably(|connection| {
-            connection.execute(
-                "DELETE FROM dictionary WHERE service = ?1 AND id = ?2",
-                params![service, id],
-            )
+            connection.execute("DELETE FROM dictionary WHERE service = ?1 AND id = ?2", params![service, id])
         })
         .map(|removed| removed == 1)
     }

@@ -48,9 +48,7 @@ impl EventVisibility<'_> {
     fn matches(&self, event: &Event) -> bool {
         let of_service = event.service.as_ref();
         of_service.is_some_and(|service| self.services.contains(service))
-            && self
-                .own_robot
-                .is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
+            && self.own_robot.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
     }
 }
 
@@ -67,11 +65,8 @@ impl EventFilter<'_> {
 
 /// Returns the number of the latest event ever written; 0 before the first.
 pub(super) fn last_event_number(connection: &Connection) -> rusqlite::Result<i64> {
-    connection.query_row(
-        "SELECT COALESCE((SELECT seq FROM sqlite_sequence WHERE name = 'events'), 0)",
-        [],
-        |row| row.get(0),
-    )
+    connection
+        .query_row("SELECT COALESCE((SELECT seq FROM sqlite_sequence WHERE name = 'events'), 0)", [], |row| row.get(0))
 }
 
 /// Writes an event that already has its number.
@@ -92,10 +87,7 @@ pub(super) fn insert(connection: &Connection, event: &Event) -> rusqlite::Result
             event.message
         ])?;
     if event.id % 100 == 0 {
-        connection.execute(
-            "DELETE FROM events WHERE id <= ?1",
-            [event.id - EVENTS_KEPT],
-        )?;
+        connection.execute("DELETE FROM events WHERE id <= ?1", [event.id - EVENTS_KEPT])?;
     }
     Ok(())
 }
@@ -122,12 +114,7 @@ impl State {
     }
 
     /// Returns the latest `limit` matching events after number `since`, oldest first.
-    pub fn filtered_events(
-        &self,
-        filter: EventFilter<'_>,
-        since: i64,
-        limit: u32,
-    ) -> Result<Vec<Event>, Error> {
+    pub fn filtered_events(&self, filter: EventFilter<'_>, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
         // Read before the written events, so that none is missed that is written in between.
         let mut kept = self.backlog.unwritten_events(since);
         kept.retain(|event| filter.matches(event));
@@ -153,19 +140,8 @@ impl State {
         Ok(services)
     }
 
-    fn written_events(
-        &self,
-        filter: EventFilter<'_>,
-        since: i64,
-        limit: u32,
-    ) -> Result<Vec<Event>, Error> {
-        let EventFilter {
-            kind,
-            service,
-            servant,
-            robot,
-            told,
-        } = filter;
+    fn written_events(&self, filter: EventFilter<'_>, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
+        let EventFilter { kind, service, servant, robot, told } = filter;
         let services = told.map(|told| serde_json::Value::from(told.services).to_string());
         let own_robot = told.and_then(|told| told.own_robot);
         self.read_at_length(|connection| {
@@ -179,23 +155,18 @@ impl State {
                       AND (?8 IS NULL OR robot IS NULL OR robot = ?8)
                       ORDER BY id DESC LIMIT ?2) ORDER BY id",
                 )?
-                .query_map(
-                    params![
-                        since, limit, kind, service, servant, robot, services, own_robot
-                    ],
-                    |row| {
-                        Ok(Event {
-                            id: row.get(0)?,
-                            time: row.get::<_, i64>(1)? as Millis,
-                            level: parse_level(&row.get::<_, String>(2)?),
-                            kind: row.get(3)?,
-                            service: row.get(4)?,
-                            servant: row.get(5)?,
-                            robot: row.get(6)?,
-                            message: row.get(7)?,
-                        })
-                    },
-                )?
+                .query_map(params![since, limit, kind, service, servant, robot, services, own_robot], |row| {
+                    Ok(Event {
+                        id: row.get(0)?,
+                        time: row.get::<_, i64>(1)? as Millis,
+                        level: parse_level(&row.get::<_, String>(2)?),
+                        kind: row.get(3)?,
+                        service: row.get(4)?,
+                        servant: row.get(5)?,
+                        robot: row.get(6)?,
+                        message: row.get(7)?,
+                    })
+                })?
                 .collect()
         })
     }
@@ -222,56 +193,23 @@ mod tests {
     use super::*;
 
     fn event_about<'a>(service: Option<&'a str>, robot: Option<&'a str>) -> NewEvent<'a> {
-        NewEvent {
-            service,
-            servant: None,
-            robot,
-        }
+        NewEvent { service, servant: None, robot }
     }
 
     #[test]
     fn whoever_sees_little_is_told_the_newest_of_that_however_much_else_there_is() {
         let home = tempfile::tempdir().expect("a directory");
         let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
-        state.add_event(
-            Level::Info,
-            "k",
-            "mine",
-            &event_about(Some("mine"), Some("r1")),
-        );
-        state.add_event(
-            Level::Info,
-            "k",
-            "of mine",
-            &event_about(Some("mine"), None),
-        );
-        state.add_event(
-            Level::Info,
-            "k",
-            "a friend's",
-            &event_about(Some("mine"), Some("r2")),
-        );
+        state.add_event(Level::Info, "k", "mine", &event_about(Some("mine"), Some("r1")));
+        state.add_event(Level::Info, "k", "of mine", &event_about(Some("mine"), None));
+        state.add_event(Level::Info, "k", "a friend's", &event_about(Some("mine"), Some("r2")));
         for _ in 0..200 {
-            state.add_event(
-                Level::Info,
-                "k",
-                "theirs",
-                &event_about(Some("theirs"), Some("r1")),
-            );
+            state.add_event(Level::Info, "k", "theirs", &event_about(Some("theirs"), Some("r1")));
             state.add_event(Level::Info, "k", "the machine's", &event_about(None, None));
         }
-        assert_eq!(
-            state.services_with_events().expect("readable"),
-            ["mine", "theirs"]
-        );
+        assert_eq!(state.services_with_events().expect("readable"), ["mine", "theirs"]);
         let told = |services: &[String], own_robot, limit| -> Vec<String> {
-            let filter = EventFilter {
-                told: Some(EventVisibility {
-                    services,
-                    own_robot,
-                }),
-                ..EventFilter::default()
-            };
+            let filter = EventFilter { told: Some(EventVisibility { services, own_robot }), ..EventFilter::default() };
             let events = state.filtered_events(filter, 0, limit).expect("readable");
             events.into_iter().map(|event| event.message).collect()
         };
@@ -281,25 +219,11 @@ mod tests {
         assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine"]);
         assert!(told(&[], None, 9).is_empty());
         // The same holds for events that have not been written yet.
-        let locker =
-            Connection::open(home.path().join("cloudroid.db")).expect("another connection");
+        let locker = Connection::open(home.path().join("cloudroid.db")).expect("another connection");
         locker.execute_batch("BEGIN IMMEDIATE").expect("the lock");
-        state.add_event(
-            Level::Info,
-            "k",
-            "kept",
-            &event_about(Some("mine"), Some("r1")),
-        );
-        state.add_event(
-            Level::Info,
-            "k",
-            "kept of others",
-            &event_about(Some("other"), None),
-        );
+        state.add_event(Level::Info, "k", "kept", &event_about(Some("mine"), Some("r1")));
+        state.add_event(Level::Info, "k", "kept of others", &event_about(Some("other"), None));
         assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine", "kept"]);
-        assert_eq!(
-            state.services_with_events().expect("readable"),
-            ["mine", "other", "theirs"]
-        );
+        assert_eq!(state.services_with_events().expect("readable"), ["mine", "other", "theirs"]);
     }
 }

@@ -59,12 +59,7 @@ pub struct SeriesFilter<'a> {
 
 impl State {
     /// Writes samples of one time and one step (in seconds), all or none.
-    pub fn add_samples(
-        &self,
-        step: u32,
-        time: Millis,
-        samples: &[NewSample<'_>],
-    ) -> Result<(), Error> {
+    pub fn add_samples(&self, step: u32, time: Millis, samples: &[NewSample<'_>]) -> Result<(), Error> {
         self.write(|transaction| {
             for sample in samples {
                 let id: i64 = transaction
@@ -73,13 +68,7 @@ impl State {
                          ON CONFLICT (servant) DO UPDATE SET seen = ?5 RETURNING id",
                     )?
                     .query_row(
-                        params![
-                            sample.servant,
-                            sample.service,
-                            sample.robot,
-                            sample.began as i64,
-                            time as i64
-                        ],
+                        params![sample.servant, sample.service, sample.robot, sample.began as i64, time as i64],
                         |row| row.get(0),
                     )?;
                 let figures: Vec<u8> = sample.figures.iter().flat_map(|one| one.to_le_bytes()).collect();
@@ -112,10 +101,8 @@ impl State {
                 [RECORDED],
             )?;
             transaction.execute("DELETE FROM local_periods WHERE ended < ?1", [oldest])?;
-            transaction.execute(
-                "DELETE FROM local_periods WHERE id <= (SELECT MAX(id) FROM local_periods) - ?1",
-                [PERIODS],
-            )?;
+            transaction
+                .execute("DELETE FROM local_periods WHERE id <= (SELECT MAX(id) FROM local_periods) - ?1", [PERIODS])?;
             Ok(())
         })
     }
@@ -127,12 +114,7 @@ impl State {
         from: Millis,
         limit: u32,
     ) -> Result<Vec<RecordedSeries>, Error> {
-        let SeriesFilter {
-            servant,
-            service,
-            robot,
-            told,
-        } = filter;
+        let SeriesFilter { servant, service, robot, told } = filter;
         let services = told.map(|told| serde_json::Value::from(told.services).to_string());
         let own_robot = told.and_then(|told| told.own_robot);
         self.read_at_length(|connection| {
@@ -162,9 +144,7 @@ impl State {
     pub fn services_with_samples(&self) -> Result<Vec<String>, Error> {
         self.read_at_length(|connection| {
             connection
-                .prepare_cached(
-                    "SELECT DISTINCT service FROM recorded WHERE servant <> '' ORDER BY service",
-                )?
+                .prepare_cached("SELECT DISTINCT service FROM recorded WHERE servant <> '' ORDER BY service")?
                 .query_map([], |row| row.get(0))?
                 .collect()
         })
@@ -220,11 +200,7 @@ impl State {
     }
 
     /// Records that a robot's node is served by the cloud again from `ended` on.
-    pub fn end_local_period(
-        &self,
-        (service, robot, node): (&str, &str, &str),
-        ended: Millis,
-    ) -> Result<(), Error> {
+    pub fn end_local_period(&self, (service, robot, node): (&str, &str, &str), ended: Millis) -> Result<(), Error> {
         self.write(|connection| {
             connection
                 .prepare_cached(
@@ -281,13 +257,7 @@ mod tests {
     }
 
     fn sample<'a>(servant: &'a str, figures: &'a [f32]) -> NewSample<'a> {
-        NewSample {
-            servant,
-            service: "adder",
-            robot: "r1",
-            began: 5,
-            figures,
-        }
+        NewSample { servant, service: "adder", robot: "r1", began: 5, figures }
     }
 
     #[test]
@@ -295,62 +265,39 @@ mod tests {
         let (_home, state) = database();
         let samples = [sample("s1", &[1.5, f32::NAN]), sample("s2", &[3.0])];
         state.add_samples(10, 1_000, &samples).expect("written");
-        state
-            .add_samples(10, 11_000, &samples[..1])
-            .expect("written");
-        state
-            .add_samples(60, 60_000, &samples[..1])
-            .expect("written");
-        let found = state
-            .recorded_series(SeriesFilter::default(), 0, 10)
-            .expect("read");
+        state.add_samples(10, 11_000, &samples[..1]).expect("written");
+        state.add_samples(60, 60_000, &samples[..1]).expect("written");
+        let found = state.recorded_series(SeriesFilter::default(), 0, 10).expect("read");
         let seen: Vec<_> = found.iter().map(|one| (&*one.servant, one.seen)).collect();
         assert_eq!(seen, [("s2", 1_000), ("s1", 60_000)]);
         let of = |from, to| state.samples(found[1].id, 10, (from, to), 9).expect("read");
-        let times = |samples: Vec<(Millis, Vec<f32>)>| -> Vec<Millis> {
-            samples.into_iter().map(|(time, _)| time).collect()
-        };
+        let times =
+            |samples: Vec<(Millis, Vec<f32>)>| -> Vec<Millis> { samples.into_iter().map(|(time, _)| time).collect() };
         assert_eq!(times(of(0, 11_000)), [1_000, 11_000]);
         assert_eq!(times(of(1_001, 99_000)), [11_000]);
         let (_, figures) = &of(0, 1_000)[0];
         assert!(figures[0] == 1.5 && figures[1].is_nan(), "{figures:?}");
         // Only the latest ones if there are too many.
-        let newest = state
-            .samples(found[1].id, 10, (0, 99_000), 1)
-            .expect("read");
+        let newest = state.samples(found[1].id, 10, (0, 99_000), 1).expect("read");
         assert_eq!(times(newest), [11_000]);
     }
 
     #[test]
     fn what_is_old_is_forgotten_step_by_step() {
         let (_home, state) = database();
-        state
-            .add_samples(60, 1_000, &[sample("old", &[1.0])])
-            .expect("written");
+        state.add_samples(60, 1_000, &[sample("old", &[1.0])]).expect("written");
         for time in [1_000, 50_000, 90_000] {
             let samples = [sample("s1", &[1.0]), sample("", &[2.0])];
             state.add_samples(10, time, &samples).expect("written");
             state.add_samples(60, time, &samples).expect("written");
         }
-        state
-            .forget_history(&[(10, 60_000), (60, 20_000)])
-            .expect("forgotten");
-        let servants = state
-            .recorded_series(SeriesFilter::default(), 0, 10)
-            .expect("read");
+        state.forget_history(&[(10, 60_000), (60, 20_000)]).expect("forgotten");
+        let servants = state.recorded_series(SeriesFilter::default(), 0, 10).expect("read");
         assert_eq!(servants.len(), 1, "the machine is no servant: {servants:?}");
-        let machine = SeriesFilter {
-            servant: Some(""),
-            ..SeriesFilter::default()
-        };
+        let machine = SeriesFilter { servant: Some(""), ..SeriesFilter::default() };
         let machine = state.recorded_series(machine, 0, 10).expect("read");
         for id in [servants[0].id, machine[0].id] {
-            let count = |step| {
-                state
-                    .samples(id, step, (0, 99_000), 99)
-                    .expect("read")
-                    .len()
-            };
+            let count = |step| state.samples(id, step, (0, 99_000), 99).expect("read").len();
             assert_eq!((count(10), count(60)), (1, 2));
         }
     }
@@ -359,26 +306,13 @@ mod tests {
     fn a_local_period_begins_and_ends_once() {
         let (_home, state) = database();
         let of = ("adder", "r1", "/adder");
-        state
-            .begin_local_period(of, 10, "the link is down")
-            .expect("written");
-        state
-            .begin_local_period(of, 20, "Q has fallen")
-            .expect("written");
+        state.begin_local_period(of, 10, "the link is down").expect("written");
+        state.begin_local_period(of, 20, "Q has fallen").expect("written");
         state.end_local_period(of, 30).expect("written");
         state.end_local_period(of, 40).expect("written");
-        state
-            .begin_local_period(of, 50, "Q has fallen")
-            .expect("written");
-        let periods = |from, to| {
-            state
-                .local_periods("adder", "r1", (from, to))
-                .expect("read")
-        };
-        let told: Vec<_> = periods(0, 99)
-            .iter()
-            .map(|one| (one.began, one.ended))
-            .collect();
+        state.begin_local_period(of, 50, "Q has fallen").expect("written");
+        let periods = |from, to| state.local_periods("adder", "r1", (from, to)).expect("read");
+        let told: Vec<_> = periods(0, 99).iter().map(|one| (one.began, one.ended)).collect();
         assert_eq!(told, [(10, Some(30)), (50, None)]);
         assert_eq!(periods(0, 99)[0].why, "the link is down");
         assert_eq!(periods(31, 49), []);

@@ -46,10 +46,7 @@ impl Journal {
             None => self.state.end_local_period(of, at),
         };
         if let Err(error) = written {
-            tracing::warn!(
-                "the history will not show when {} was served locally: {error}",
-                of.1
-            );
+            tracing::warn!("the history will not show when {} was served locally: {error}", of.1);
         }
     }
 

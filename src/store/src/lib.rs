@@ -125,8 +125,7 @@ pub fn now() -> Millis {
 
 /// Converts a time to milliseconds since 1970.
 pub fn millis(time: SystemTime) -> Millis {
-    time.duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_millis() as Millis)
+    time.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as Millis)
 }
 
 /// Opens all files of a database: SQLite opens the last of them at the first query, and the threads that query later
@@ -145,10 +144,7 @@ impl State {
     /// Opens the database, creating or migrating it as needed.
     pub fn open(path: &Path) -> Result<State, Error> {
         let name = path.display().to_string();
-        let failed = |source| Error::Database {
-            path: name.clone(),
-            source,
-        };
+        let failed = |source| Error::Database { path: name.clone(), source };
         // The database holds token hashes. SQLite gives its auxiliary files the same permissions.
         private::open(path).map_err(|error| failed(open_error(&error)))?;
         let mut connection = Connection::open(path).map_err(failed)?;
@@ -158,9 +154,7 @@ impl State {
                  PRAGMA foreign_keys = ON; PRAGMA temp_store = MEMORY;",
             )
             .map_err(failed)?;
-        connection
-            .busy_handler(Some(wait_for_another))
-            .map_err(failed)?;
+        connection.busy_handler(Some(wait_for_another)).map_err(failed)?;
         migrate(&mut connection, &name)?;
         let last = events::last_event_number(&connection).map_err(failed)?;
         open_files(&connection).map_err(failed)?;
@@ -174,18 +168,12 @@ impl State {
     }
 
     /// Runs `work` in a transaction: if this returns a value, a crash of the daemon does not lose it.
-    fn write<T>(
-        &self,
-        work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
-    ) -> Result<T, Error> {
+    fn write<T>(&self, work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>) -> Result<T, Error> {
         self.with_writer(|connection| commit(connection, work))
     }
 
     /// Runs `work` in a durable transaction: if this returns a value, a power failure does not lose it.
-    fn write_durably<T>(
-        &self,
-        work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
-    ) -> Result<T, Error> {
+    fn write_durably<T>(&self, work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>) -> Result<T, Error> {
         self.with_writer(|connection| {
             connection.pragma_update(None, "synchronous", "FULL")?;
             let outcome = commit(connection, work);
@@ -194,15 +182,9 @@ impl State {
         })
     }
 
-    fn with_writer<T>(
-        &self,
-        work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, Error> {
+    fn with_writer<T>(&self, work: impl FnOnce(&mut Connection) -> rusqlite::Result<T>) -> Result<T, Error> {
         let outcome = {
-            let mut connection = self
-                .connection
-                .try_lock()
-                .unwrap_or_else(|| run_blocking(|| self.connection.lock()));
+            let mut connection = self.connection.try_lock().unwrap_or_else(|| run_blocking(|| self.connection.lock()));
             work(&mut connection)
         };
         outcome.map_err(|source| {
@@ -218,18 +200,12 @@ impl State {
     }
 
     /// Runs a query that may scan thousands of rows, without blocking other tasks of this thread.
-    fn read_at_length<T>(
-        &self,
-        work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
-    ) -> Result<T, Error> {
+    fn read_at_length<T>(&self, work: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, Error> {
         run_blocking(|| self.read(work))
     }
 
     fn database_error(&self, source: rusqlite::Error) -> Error {
-        Error::Database {
-            path: self.path.clone(),
-            source,
-        }
+        Error::Database { path: self.path.clone(), source }
     }
 }
 
@@ -272,36 +248,22 @@ fn run_blocking<T>(wait: impl FnOnce() -> T) -> T {
 }
 
 fn migrate(connection: &mut Connection, path: &str) -> Result<(), Error> {
-    let failed = |source| Error::Database {
-        path: path.to_owned(),
-        source,
-    };
-    let found: usize = connection
-        .query_row("PRAGMA user_version", [], |row| row.get(0))
-        .map_err(failed)?;
+    let failed = |source| Error::Database { path: path.to_owned(), source };
+    let found: usize = connection.query_row("PRAGMA user_version", [], |row| row.get(0)).map_err(failed)?;
     if found > MIGRATIONS.len() {
-        return Err(Error::TooNew {
-            path: path.to_owned(),
-            found,
-            known: MIGRATIONS.len(),
-        });
+        return Err(Error::TooNew { path: path.to_owned(), found, known: MIGRATIONS.len() });
     }
     for (index, step) in MIGRATIONS.iter().enumerate().skip(found) {
         let transaction = connection.transaction().map_err(failed)?;
         transaction.execute_batch(step).map_err(failed)?;
-        transaction
-            .pragma_update(None, "user_version", index + 1)
-            .map_err(failed)?;
+        transaction.pragma_update(None, "user_version", index + 1).map_err(failed)?;
         transaction.commit().map_err(failed)?;
     }
     Ok(())
 }
 
 fn to_json(value: &impl Serialize, what: &str) -> Result<String, Error> {
-    serde_json::to_string(value).map_err(|source| Error::Record {
-        what: what.to_owned(),
-        source,
-    })
+    serde_json::to_string(value).map_err(|source| Error::Record { what: what.to_owned(), source })
 }
 
 #[cfg(test)]

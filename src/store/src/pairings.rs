@@ -74,13 +74,7 @@ fn read_pairing(row: &Row<'_>) -> rusqlite::Result<PairingRecord> {
 
 impl State {
     /// Stores the hash of a new code for a robot; cancels its previous code.
-    pub fn add_pairing_code(
-        &self,
-        robot: &str,
-        hash: &str,
-        scope: &str,
-        expires: u64,
-    ) -> Result<(), Error> {
+    pub fn add_pairing_code(&self, robot: &str, hash: &str, scope: &str, expires: u64) -> Result<(), Error> {
         self.write_durably(|transaction| {
             cancel_code(transaction, robot)?;
             transaction.execute(
@@ -121,12 +115,7 @@ impl State {
 
     /// Consumes a code if it is still valid: pairs its robot with a key, replacing its previous pairing. Returns `None`
     /// if the code is no longer valid.
-    pub fn use_pairing_code(
-        &self,
-        id: i64,
-        key: &str,
-        expires: u64,
-    ) -> Result<Option<PairingRecord>, Error> {
+    pub fn use_pairing_code(&self, id: i64, key: &str, expires: u64) -> Result<Option<PairingRecord>, Error> {
         self.write_durably(|transaction| {
             let used = transaction
                 .prepare_cached(&format!(
@@ -183,13 +172,8 @@ impl State {
 
     /// Records that a robot has connected.
     pub fn record_pairing_use(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.write(|connection| {
-            connection.execute(
-                "UPDATE pairings SET last_used = ?2 WHERE id = ?1",
-                params![id, at],
-            )
-        })
-        .map(|_| ())
+        self.write(|connection| connection.execute("UPDATE pairings SET last_used = ?2 WHERE id = ?1", params![id, at]))
+            .map(|_| ())
     }
 }
 
@@ -202,10 +186,8 @@ fn cancel_code(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Resu
 }
 
 fn revoke_row(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bool> {
-    let changed = connection.execute(
-        "UPDATE pairings SET revoked = ?2 WHERE robot = ?1 AND revoked IS NULL",
-        params![robot, now()],
-    )?;
+    let changed = connection
+        .execute("UPDATE pairings SET revoked = ?2 WHERE robot = ?1 AND revoked IS NULL", params![robot, now()])?;
     Ok(changed > 0)
 }
 

@@ -92,8 +92,7 @@ pub struct NewSession<'a> {
 const MOST_SESSIONS: u32 = 32;
 
 const ACCOUNT: &str = "id, name, password, role, scope, created, last_login, disabled, removed";
-const SESSION: &str =
-    "id, hash, account, name, role, scope, peer, created, last_used, expires, person, groups";
+const SESSION: &str = "id, hash, account, name, role, scope, peer, created, last_used, expires, person, groups";
 
 fn read_account(row: &Row<'_>) -> rusqlite::Result<AccountRecord> {
     Ok(AccountRecord {
@@ -138,13 +137,7 @@ impl State {
     }
 
     /// Creates an account durably; returns false if the name is taken.
-    pub fn add_account(
-        &self,
-        name: &str,
-        password: &str,
-        role: &str,
-        scope: &str,
-    ) -> Result<bool, Error> {
+    pub fn add_account(&self, name: &str, password: &str, role: &str, scope: &str) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute(
                 "INSERT INTO accounts (name, password, role, scope, created) VALUES (?1, ?2, ?3, ?4, ?5)
@@ -183,14 +176,7 @@ impl State {
             transaction.execute(
                 "UPDATE accounts SET password = COALESCE(?2, password), role = COALESCE(?3, role),
                  scope = COALESCE(?4, scope), disabled = CASE WHEN ?5 THEN ?6 ELSE disabled END WHERE id = ?1",
-                params![
-                    id,
-                    edit.password,
-                    role,
-                    scope,
-                    disabled.is_some(),
-                    disabled.flatten()
-                ],
+                params![id, edit.password, role, scope, disabled.is_some(), disabled.flatten()],
             )
         })
     }
@@ -209,10 +195,8 @@ impl State {
     /// Removes an account. A record of it is kept, without its password.
     pub fn remove_account(&self, name: &str) -> Result<bool, Error> {
         self.change_account(name, |transaction, id| {
-            transaction.execute(
-                "UPDATE accounts SET removed = ?2, password = '' WHERE id = ?1",
-                params![id, now() as i64],
-            )
+            transaction
+                .execute("UPDATE accounts SET removed = ?2, password = '' WHERE id = ?1", params![id, now() as i64])
         })
     }
 
@@ -228,11 +212,7 @@ impl State {
 
     /// Creates a session and deletes expired ones. Returns `None` if the account has changed since its password was
     /// checked; `password` is the hash that was checked.
-    pub fn add_session(
-        &self,
-        new: &NewSession<'_>,
-        password: Option<&str>,
-    ) -> Result<Option<SessionRecord>, Error> {
+    pub fn add_session(&self, new: &NewSession<'_>, password: Option<&str>) -> Result<Option<SessionRecord>, Error> {
         let at = now() as i64;
         self.write_durably(|transaction| {
             let good = match new.account {
@@ -276,10 +256,7 @@ impl State {
                 params![new.name, MOST_SESSIONS],
             )?;
             if let Some(id) = new.account {
-                transaction.execute(
-                    "UPDATE accounts SET last_login = ?2 WHERE id = ?1",
-                    params![id, at],
-                )?;
+                transaction.execute("UPDATE accounts SET last_login = ?2 WHERE id = ?1", params![id, at])?;
             }
             Ok(Some(made))
         })
@@ -287,28 +264,19 @@ impl State {
 
     /// Records the use of a session.
     pub fn record_session_use(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.write(|connection| {
-            connection.execute(
-                "UPDATE sessions SET last_used = ?2 WHERE id = ?1",
-                params![id, at],
-            )
-        })
-        .map(|_| ())
+        self.write(|connection| connection.execute("UPDATE sessions SET last_used = ?2 WHERE id = ?1", params![id, at]))
+            .map(|_| ())
     }
 
     /// Ends a session; returns false if it does not exist.
     pub fn end_session(&self, id: i64) -> Result<bool, Error> {
-        self.write_durably(|connection| {
-            connection.execute("DELETE FROM sessions WHERE id = ?1", [id])
-        })
-        .map(|ended| ended > 0)
+        self.write_durably(|connection| connection.execute("DELETE FROM sessions WHERE id = ?1", [id]))
+            .map(|ended| ended > 0)
     }
 
     /// Ends all sessions of a user; returns their number.
     pub fn end_sessions(&self, name: &str) -> Result<usize, Error> {
-        self.write_durably(|connection| {
-            connection.execute("DELETE FROM sessions WHERE name = ?1", [name])
-        })
+        self.write_durably(|connection| connection.execute("DELETE FROM sessions WHERE name = ?1", [name]))
     }
 }
 

@@ -16,13 +16,7 @@ pub fn make_directory(path: &Path) -> io::Result<()> {
 
 /// Opens a file for reading and writing, creating it if needed.
 pub fn open(path: &Path) -> io::Result<File> {
-    let file = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .mode(0o600)
-        .open(path)?;
+    let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
     restrict_to_owner(path)?;
     Ok(file)
 }
@@ -88,13 +82,9 @@ mod tests {
         std::fs::write(path("a/b/program"), "").expect("made");
         std::fs::write(path("outside"), "").expect("made");
         std::os::unix::fs::symlink(path("outside"), path("a/link")).expect("made");
-        for (name, rights) in [
-            ("a", 0o755),
-            ("a/b", 0o711),
-            ("a/b/c", 0o755),
-            ("a/b/program", 0o755),
-            ("outside", 0o644),
-        ] {
+        for (name, rights) in
+            [("a", 0o755), ("a/b", 0o711), ("a/b/c", 0o755), ("a/b/program", 0o755), ("outside", 0o644)]
+        {
             std::fs::set_permissions(path(name), Permissions::from_mode(rights)).expect("set");
         }
         restrict_tree(&path("a"), 2, &|path| path.ends_with("c")).expect("closed");

@@ -23,10 +23,7 @@ impl Readers {
     /// Opens all connections and their files: the threads that query later may not open files.
     pub(super) fn open(path: &Path) -> rusqlite::Result<Readers> {
         let connections = (0..CONNECTIONS).map(|_| open_connection(path).map(Mutex::new));
-        Ok(Readers {
-            connections: connections.collect::<Result<_, _>>()?,
-            next: AtomicUsize::new(0),
-        })
+        Ok(Readers { connections: connections.collect::<Result<_, _>>()?, next: AtomicUsize::new(0) })
     }
 
     /// Acquires a free connection, or waits for one.

@@ -34,9 +34,7 @@ impl State {
     /// Adds a recording and returns its number.
     pub fn add_recording(&self, new: &RecordingRecord) -> Result<u64, Error> {
         let topics = new.topics.as_ref();
-        let topics = topics
-            .map(|topics| to_json(topics, "a recording"))
-            .transpose()?;
+        let topics = topics.map(|topics| to_json(topics, "a recording")).transpose()?;
         self.write(|connection| {
             connection
                 .prepare_cached(
@@ -76,10 +74,8 @@ impl State {
 
     /// Deletes a recording; returns whether it existed.
     pub fn forget_recording(&self, id: u64) -> Result<bool, Error> {
-        self.write(|connection| {
-            connection.execute("DELETE FROM recordings WHERE id = ?1", [id as i64])
-        })
-        .map(|forgotten| forgotten > 0)
+        self.write(|connection| connection.execute("DELETE FROM recordings WHERE id = ?1", [id as i64]))
+            .map(|forgotten| forgotten > 0)
     }
 }
 
@@ -96,9 +92,7 @@ fn read_recording(row: &Row<'_>) -> rusqlite::Result<RecordingRecord> {
         messages: number(7)?,
         bytes: number(8)?,
         // A value that cannot be decoded counts as unknown.
-        topics: row
-            .get::<_, Option<String>>(9)?
-            .and_then(|topics| serde_json::from_str(&topics).ok()),
+        topics: row.get::<_, Option<String>>(9)?.and_then(|topics| serde_json::from_str(&topics).ok()),
     })
 }
 

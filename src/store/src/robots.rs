@@ -13,12 +13,7 @@ pub type Owner = String;
 impl State {
     /// Binds `robot` to `owner` if it is new, or with `claim` also if it has no owner yet; returns the owner that it is
     /// bound to.
-    pub fn claim_robot(
-        &self,
-        robot: &str,
-        owner: Option<&Owner>,
-        claim: bool,
-    ) -> Result<Option<Owner>, Error> {
+    pub fn claim_robot(&self, robot: &str, owner: Option<&Owner>, claim: bool) -> Result<Option<Owner>, Error> {
         // Known robots can connect even while the database cannot be written.
         let known = self.find_robot(robot)?;
         if let Some(known) = known

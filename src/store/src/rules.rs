@@ -18,12 +18,7 @@ pub struct RuleRecord {
 }
 
 fn read_rule(row: &Row<'_>) -> rusqlite::Result<RuleRecord> {
-    Ok(RuleRecord {
-        id: row.get(0)?,
-        who: row.get(1)?,
-        services: row.get(2)?,
-        allow: row.get(3)?,
-    })
+    Ok(RuleRecord { id: row.get(0)?, who: row.get(1)?, services: row.get(2)?, allow: row.get(3)? })
 }
 
 impl State {
@@ -52,9 +47,7 @@ impl State {
     pub fn remove_rule(&self, id: i64) -> Result<Option<RuleRecord>, Error> {
         self.write_durably(|connection| {
             connection
-                .prepare_cached(
-                    "DELETE FROM rules WHERE id = ?1 RETURNING id, who, services, allow",
-                )?
+                .prepare_cached("DELETE FROM rules WHERE id = ?1 RETURNING id, who, services, allow")?
                 .query_row(params![id], read_rule)
                 .optional()
         })

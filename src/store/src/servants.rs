@@ -54,10 +54,7 @@ impl State {
     pub fn set_servant_limits(&self, id: &str, limits: &Limits) -> Result<(), Error> {
         let limits = to_json(limits, id)?;
         self.write(|connection| {
-            connection.execute(
-                "UPDATE servants SET limits = ?2 WHERE id = ?1",
-                [id, limits.as_str()],
-            )
+            connection.execute("UPDATE servants SET limits = ?2 WHERE id = ?1", [id, limits.as_str()])
         })
         .map(|_| ())
     }
@@ -66,10 +63,7 @@ impl State {
     pub fn set_servant_terms(&self, id: &str, terms: &Terms) -> Result<(), Error> {
         let terms = to_json(terms, id)?;
         self.write(|connection| {
-            connection.execute(
-                "UPDATE servants SET terms = ?2 WHERE id = ?1",
-                [id, terms.as_str()],
-            )
+            connection.execute("UPDATE servants SET terms = ?2 WHERE id = ?1", [id, terms.as_str()])
         })
         .map(|_| ())
     }
@@ -83,8 +77,10 @@ impl State {
     pub fn servants(&self) -> Result<Vec<ServantRecord>, Error> {
         self.read(|connection| {
             connection
-                .prepare_cached("SELECT id, service, revision, robot, anonymous, created, limits, terms FROM servants \
-                                 ORDER BY created")?
+                .prepare_cached(
+                    "SELECT id, service, revision, robot, anonymous, created, limits, terms FROM servants \
+                                 ORDER BY created",
+                )?
                 .query_map([], |row| {
                     Ok(ServantRecord {
                         id: row.get(0)?,
@@ -95,9 +91,7 @@ impl State {
                         created: row.get::<_, i64>(5)? as Millis,
                         // If written by a later version, the limits of the push apply.
                         limits: serde_json::from_str(&row.get::<_, String>(6)?).unwrap_or_default(),
-                        terms: row
-                            .get::<_, Option<String>>(7)?
-                            .and_then(|terms| serde_json::from_str(&terms).ok()),
+                        terms: row.get::<_, Option<String>>(7)?.and_then(|terms| serde_json::from_str(&terms).ok()),
                     })
                 })?
                 .collect()

@@ -96,20 +96,11 @@ impl State {
     }
 
     /// Publishes `revision` without making it the current one, unless the service is new.
-    pub fn publish_inactive(
-        &self,
-        revision: &RevisionRecord,
-        inventory: &Inventory,
-    ) -> Result<u64, Error> {
+    pub fn publish_inactive(&self, revision: &RevisionRecord, inventory: &Inventory) -> Result<u64, Error> {
         self.publish_revision(revision, inventory, false)
     }
 
-    fn publish_revision(
-        &self,
-        revision: &RevisionRecord,
-        inventory: &Inventory,
-        current: bool,
-    ) -> Result<u64, Error> {
+    fn publish_revision(&self, revision: &RevisionRecord, inventory: &Inventory, current: bool) -> Result<u64, Error> {
         let flavour = to_json(&revision.flavour, &revision.service)?;
         let inventory = to_json(inventory, &revision.service)?;
         let plan = to_json(&revision.plan, &revision.service)?;
@@ -125,13 +116,7 @@ impl State {
             transaction.execute(
                 "INSERT INTO services (name, package, current, owner) VALUES (?1, ?2, ?3, ?5)
                  ON CONFLICT (name) DO UPDATE SET current = CASE WHEN ?4 THEN ?3 ELSE current END",
-                params![
-                    revision.service,
-                    revision.package,
-                    number,
-                    current,
-                    revision.owner
-                ],
+                params![revision.service, revision.package, number, current, revision.owner],
             )?;
             transaction.execute(
                 "INSERT INTO revisions
@@ -166,12 +151,7 @@ impl State {
     }
 
     /// Makes revision `to` the current one if the current one is `from` or `to`; otherwise returns false.
-    pub fn replace_current_revision(
-        &self,
-        service: &str,
-        from: u64,
-        to: u64,
-    ) -> Result<bool, Error> {
+    pub fn replace_current_revision(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?3 WHERE name = ?1 AND current IN (?2, ?3)
@@ -184,10 +164,8 @@ impl State {
 
     /// Deletes a service and its revisions; returns false if it does not exist.
     pub fn remove_service(&self, name: &str) -> Result<bool, Error> {
-        self.write_durably(|connection| {
-            connection.execute("DELETE FROM services WHERE name = ?1", [name])
-        })
-        .map(|changed| changed == 1)
+        self.write_durably(|connection| connection.execute("DELETE FROM services WHERE name = ?1", [name]))
+            .map(|changed| changed == 1)
     }
 
     /// Returns the names of all services.
@@ -203,13 +181,7 @@ impl State {
     /// Returns the ROS package that a service was first built from.
     pub fn service_package(&self, name: &str) -> Result<Option<String>, Error> {
         self.read(|connection| {
-            connection
-                .query_row(
-                    "SELECT package FROM services WHERE name = ?1",
-                    [name],
-                    |row| row.get(0),
-                )
-                .optional()
+            connection.query_row("SELECT package FROM services WHERE name = ?1", [name], |row| row.get(0)).optional()
         })
     }
 
@@ -239,11 +211,7 @@ impl State {
     }
 
     /// Returns a revision of a service. Revisions are immutable; those in use stay in memory.
-    pub fn revision(
-        &self,
-        service: &str,
-        number: u64,
-    ) -> Result<Option<Arc<RevisionRecord>>, Error> {
+    pub fn revision(&self, service: &str, number: u64) -> Result<Option<Arc<RevisionRecord>>, Error> {
         // There is no such revision: the database cannot represent the number.
         if i64::try_from(number).is_err() {
             return Ok(None);
@@ -295,9 +263,8 @@ impl State {
         let unreadable = |source| unreadable_revision(service, number, source);
         Ok(Some(RevisionRecord {
             // Revisions of earlier versions have no flavour until their image has been inspected.
-            flavour: flavour.map_or(Ok(record.flavour), |flavour| {
-                serde_json::from_str(&flavour).map_err(unreadable)
-            })?,
+            flavour: flavour
+                .map_or(Ok(record.flavour), |flavour| serde_json::from_str(&flavour).map_err(unreadable))?,
             plan: serde_json::from_str(&plan).map_err(unreadable)?,
             interface: serde_json::from_str(&interface).map_err(unreadable)?,
             ..record
@@ -308,18 +275,14 @@ impl State {
     pub fn inventory(&self, service: &str, number: u64) -> Result<Option<Inventory>, Error> {
         let found: Option<Option<String>> = self.read(|connection| {
             connection
-                .prepare_cached(
-                    "SELECT inventory FROM revisions WHERE service = ?1 AND number = ?2",
-                )?
+                .prepare_cached("SELECT inventory FROM revisions WHERE service = ?1 AND number = ?2")?
                 .query_row(params![service, number], |row| row.get(0))
                 .optional()
         })?;
         let Some(text) = found.flatten() else {
             return Ok(None);
         };
-        serde_json::from_str(&text)
-            .map(Some)
-            .map_err(|source| unreadable_revision(service, number, source))
+        serde_json::from_str(&text).map(Some).map_err(|source| unreadable_revision(service, number, source))
     }
 
     /// Records the flavour and inventory of a revision that was published without them.
@@ -343,10 +306,7 @@ impl State {
 
     /// Returns the current revisions whose inventory was not recorded at publication.
     pub fn revisions_without_inventory(&self) -> Result<Vec<RevisionSummary>, Error> {
-        self.query_revisions(
-            "JOIN services s ON s.name = service AND s.current = number WHERE inventory IS NULL",
-            [],
-        )
+        self.query_revisions("JOIN services s ON s.name = service AND s.current = number WHERE inventory IS NULL", [])
     }
 
     /// Returns summaries of all revisions of a service, newest first.
@@ -359,11 +319,7 @@ impl State {
         self.query_revisions("", [])
     }
 
-    fn query_revisions(
-        &self,
-        condition: &str,
-        values: impl rusqlite::Params,
-    ) -> Result<Vec<RevisionSummary>, Error> {
+    fn query_revisions(&self, condition: &str, values: impl rusqlite::Params) -> Result<Vec<RevisionSummary>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!(
@@ -385,8 +341,5 @@ impl State {
 }
 
 fn unreadable_revision(service: &str, number: u64, source: serde_json::Error) -> Error {
-    Error::Record {
-        what: format!("revision {number} of {service}"),
-        source,
-    }
+    Error::Record { what: format!("revision {number} of {service}"), source }
 }

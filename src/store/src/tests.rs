@@ -40,70 +40,32 @@ fn state() -> (tempfile::TempDir, State) {
 #[test]
 fn a_published_revision_is_read_back_after_a_restart() {
     let (directory, state) = state();
-    assert_eq!(
-        state
-            .publish(&revision("opencv_apps", "sha256:1"), &Inventory::default())
-            .expect("published"),
-        1
-    );
+    assert_eq!(state.publish(&revision("opencv_apps", "sha256:1"), &Inventory::default()).expect("published"), 1);
     let mut second = revision("opencv_apps", "sha256:2");
     second.flavour.distribution = "melodic".into();
-    let inventory = Inventory {
-        prefixes: vec!["/usr".into()],
-        ..Inventory::default()
-    };
+    let inventory = Inventory { prefixes: vec!["/usr".into()], ..Inventory::default() };
     assert_eq!(state.publish(&second, &inventory).expect("published"), 2);
     drop(state);
     let state = State::open(&directory.path().join("cloudroid.db")).expect("the same database");
     assert_eq!(state.service_names().expect("readable"), ["opencv_apps"]);
-    assert_eq!(
-        state.inventory("opencv_apps", 2).expect("readable"),
-        Some(inventory)
-    );
-    let current = state
-        .current_revision("opencv_apps")
-        .expect("readable")
-        .expect("there");
-    assert_eq!(
-        *current,
-        RevisionRecord {
-            number: 2,
-            ..second
-        }
-    );
-    let numbers: Vec<u64> = state
-        .revisions("opencv_apps")
-        .expect("readable")
-        .iter()
-        .map(|r| r.number)
-        .collect();
+    assert_eq!(state.inventory("opencv_apps", 2).expect("readable"), Some(inventory));
+    let current = state.current_revision("opencv_apps").expect("readable").expect("there");
+    assert_eq!(*current, RevisionRecord { number: 2, ..second });
+    let numbers: Vec<u64> = state.revisions("opencv_apps").expect("readable").iter().map(|r| r.number).collect();
     assert_eq!(numbers, [2, 1]);
 }
 
 #[test]
 fn rolling_back_needs_a_revision_that_exists() {
     let (_directory, state) = state();
-    state
-        .publish(&revision("a", "sha256:1"), &Inventory::default())
-        .expect("published");
-    state
-        .publish(&revision("a", "sha256:2"), &Inventory::default())
-        .expect("published");
+    state.publish(&revision("a", "sha256:1"), &Inventory::default()).expect("published");
+    state.publish(&revision("a", "sha256:2"), &Inventory::default()).expect("published");
     assert!(state.set_current_revision("a", 1).expect("readable"));
-    assert_eq!(
-        state
-            .current_revision("a")
-            .expect("readable")
-            .expect("there")
-            .image,
-        "sha256:1"
-    );
+    assert_eq!(state.current_revision("a").expect("readable").expect("there").image, "sha256:1");
     assert!(!state.set_current_revision("a", 7).expect("readable"));
     assert!(!state.set_current_revision("b", 1).expect("readable"));
     assert_eq!(
-        state
-            .publish(&revision("a", "sha256:3"), &Inventory::default())
-            .expect("published"),
+        state.publish(&revision("a", "sha256:3"), &Inventory::default()).expect("published"),
         3,
         "numbers go on"
     );
@@ -112,44 +74,26 @@ fn rolling_back_needs_a_revision_that_exists() {
 #[test]
 fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
     let (_directory, state) = state();
-    state
-        .publish(&revision("a", "sha256:1"), &Inventory::default())
-        .expect("published");
+    state.publish(&revision("a", "sha256:1"), &Inventory::default()).expect("published");
     assert!(state.remove_service("a").expect("readable"));
     assert!(!state.remove_service("a").expect("readable"));
     assert!(state.current_revision("a").expect("readable").is_none());
     assert!(state.all_revisions().expect("readable").is_empty());
-    assert_eq!(
-        state
-            .publish(&revision("a", "sha256:1"), &Inventory::default())
-            .expect("published"),
-        2
-    );
+    assert_eq!(state.publish(&revision("a", "sha256:1"), &Inventory::default()).expect("published"), 2);
 }
 
 #[test]
 fn a_robot_stays_with_whom_it_came_first() {
     let (_directory, state) = state();
     let (mine, theirs) = ("m".repeat(64), "t".repeat(64));
-    let owner = |robot: &str, token: Option<&String>, claim| {
-        state.claim_robot(robot, token, claim).expect("readable")
-    };
+    let owner = |robot: &str, token: Option<&String>, claim| state.claim_robot(robot, token, claim).expect("readable");
     assert_eq!(owner("r1", Some(&mine), false), Some(mine.clone()));
     assert_eq!(owner("r1", Some(&theirs), true), Some(mine.clone()));
     assert_eq!(owner("r1", None, false), Some(mine));
     assert_eq!(owner("r2", None, false), None);
-    assert_eq!(
-        owner("r2", Some(&theirs), false),
-        None,
-        "who uses it without a token is not locked out"
-    );
+    assert_eq!(owner("r2", Some(&theirs), false), None, "who uses it without a token is not locked out");
     assert_eq!(owner("r2", Some(&theirs), true), Some(theirs.clone()));
-    assert_eq!(
-        state
-            .release_robots(std::slice::from_ref(&theirs))
-            .expect("readable"),
-        1
-    );
+    assert_eq!(state.release_robots(std::slice::from_ref(&theirs)).expect("readable"), 1);
     assert_eq!(owner("r1", Some(&theirs), false), Some(theirs));
 }
 
@@ -167,34 +111,17 @@ fn servants_are_remembered_until_they_end() {
         terms: None,
     };
     state.add_servant(&record).expect("written");
-    assert_eq!(
-        state.servants().expect("readable"),
-        std::slice::from_ref(&record)
-    );
+    assert_eq!(state.servants().expect("readable"), std::slice::from_ref(&record));
     let terms = api::Terms {
-        stated: [(
-            String::new(),
-            api::Stated::read([("rrt", "100ms"), ("class", "urgent")]).expect("valid"),
-        )]
-        .into(),
+        stated: [(String::new(), api::Stated::read([("rrt", "100ms"), ("class", "urgent")]).expect("valid"))].into(),
         class: Some("urgent".into()),
         priority: 3,
         ..api::Terms::default()
     };
     state.set_servant_terms("a-1", &terms).expect("written");
-    let record = ServantRecord {
-        terms: Some(terms),
-        ..record
-    };
-    assert_eq!(
-        state.servants().expect("readable"),
-        std::slice::from_ref(&record)
-    );
-    let other = ServantRecord {
-        id: "a-2".into(),
-        created: 6,
-        ..record.clone()
-    };
+    let record = ServantRecord { terms: Some(terms), ..record };
+    assert_eq!(state.servants().expect("readable"), std::slice::from_ref(&record));
+    let other = ServantRecord { id: "a-2".into(), created: 6, ..record.clone() };
     state.add_servant(&other).expect("written");
     assert_eq!(state.servants().expect("readable"), [record, other]);
     state.remove_servant("a-2");
@@ -205,16 +132,13 @@ fn servants_are_remembered_until_they_end() {
 #[test]
 fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
     let (_directory, state) = state();
-    state
-        .publish(&revision("a", "sha256:1"), &Default::default())
-        .expect("published");
+    state.publish(&revision("a", "sha256:1"), &Default::default()).expect("published");
     let row = |text: &str| serde_json::from_str::<Row>(text).expect("a row");
     let new = |rows: Vec<Row>, replace| {
         let written = state.write_dictionary("a", 3, &NewRows { rows, replace });
         written.expect("written");
         let rows = state.dictionary("a").expect("readable").into_iter();
-        rows.map(|row| (row.id, row.to_string(), row.limits.cpus, row.revision))
-            .collect::<Vec<_>>()
+        rows.map(|row| (row.id, row.to_string(), row.limits.cpus, row.revision)).collect::<Vec<_>>()
     };
     let wide = row(
         r#"{"measure":"rrt","value":0.1,"aux":{"width":"640"},"limits":{"cpus":2},"spread":{"p50":0.05,"p95":0.1,"requests":9}}"#,
@@ -222,10 +146,7 @@ fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
     let fps = row(r#"{"measure":"fps","value":5,"limits":{"cpus":0.5,"memory":"1G"}}"#);
     assert_eq!(
         new(vec![wide.clone(), fps], false),
-        [
-            (1, "rrt 100ms with aux.width=640".into(), Some(2.0), Some(3)),
-            (2, "fps 5".into(), Some(0.5), Some(3)),
-        ]
+        [(1, "rrt 100ms with aux.width=640".into(), Some(2.0), Some(3)), (2, "fps 5".into(), Some(0.5), Some(3)),]
     );
     let kept = &state.dictionary("a").expect("readable")[0];
     assert_eq!(kept.spread, wide.spread);
@@ -236,15 +157,9 @@ fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
     assert!(state.remove_from_dictionary("a", 2).expect("written"));
     assert!(!state.remove_from_dictionary("a", 2).expect("it is gone"));
     assert!(!state.remove_from_dictionary("b", 1).expect("another's"));
-    let rows = new(
-        vec![row(r#"{"measure":"age","value":1,"limits":{}}"#)],
-        true,
-    );
+    let rows = new(vec![row(r#"{"measure":"age","value":1,"limits":{}}"#)], true);
     assert_eq!(rows[0].1, "age 1s");
-    assert!(
-        rows.len() == 1 && rows[0].0 > 2,
-        "numbers are not given twice: {rows:?}"
-    );
+    assert!(rows.len() == 1 && rows[0].0 > 2, "numbers are not given twice: {rows:?}");
     state.remove_service("a").expect("written");
     assert_eq!(state.dictionary("a").expect("readable"), []);
 }
@@ -253,19 +168,11 @@ fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
 fn the_newest_events_come_oldest_first() {
     let (_directory, state) = state();
     for number in 1..=5 {
-        let about = NewEvent {
-            service: Some("a"),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { service: Some("a"), ..NewEvent::default() };
         state.add_event(Level::Info, "test", &format!("number {number}"), &about);
     }
     let texts = |since, limit| -> Vec<String> {
-        state
-            .events(since, limit)
-            .expect("readable")
-            .into_iter()
-            .map(|event| event.message)
-            .collect()
+        state.events(since, limit).expect("readable").into_iter().map(|event| event.message).collect()
     };
     assert_eq!(texts(0, 2), ["number 4", "number 5"]);
     assert_eq!(texts(4, 10), ["number 5"]);
@@ -284,11 +191,7 @@ fn events_are_told_apart_by_kind_and_by_whom_they_are_about() {
     .into_iter()
     .enumerate()
     {
-        let about = NewEvent {
-            service,
-            servant,
-            robot,
-        };
+        let about = NewEvent { service, servant, robot };
         state.add_event(Level::Info, kind, &number.to_string(), &about);
     }
     let numbers = |filter, limit| -> Vec<String> {
@@ -296,13 +199,7 @@ fn events_are_told_apart_by_kind_and_by_whom_they_are_about() {
         events.into_iter().map(|event| event.message).collect()
     };
     let all = EventFilter::default();
-    let of = |kind, service, servant, robot| EventFilter {
-        kind,
-        service,
-        servant,
-        robot,
-        told: None,
-    };
+    let of = |kind, service, servant, robot| EventFilter { kind, service, servant, robot, told: None };
     for (filter, expected) in [
         (all, &["0", "1", "2", "3", "4"][..]),
         (of(Some("node-hung"), None, None, None), &["0", "1"]),
@@ -334,50 +231,20 @@ fn revisions_of_an_earlier_version_are_kept_and_completed() {
         .expect("written");
     drop(earlier);
     let state = State::open(&path).expect("migrated");
-    let current = state
-        .current_revision("a")
-        .expect("readable")
-        .expect("there");
+    let current = state.current_revision("a").expect("readable").expect("there");
     assert_eq!((current.number, &*current.source), (2, "y"));
     assert_eq!(current.flavour, Flavour::default());
     assert_eq!(state.inventory("a", 2).expect("readable"), None);
     let incomplete = state.revisions_without_inventory().expect("readable");
-    assert_eq!(
-        incomplete
-            .iter()
-            .map(|line| line.number)
-            .collect::<Vec<_>>(),
-        [2],
-        "the current one"
-    );
-    let inventory = Inventory {
-        prefixes: vec!["/usr".into()],
-        ..Inventory::default()
-    };
-    let flavour = Flavour {
-        base: "lab".into(),
-        ..Flavour::default()
-    };
-    state
-        .record_inventory("a", 2, &flavour, &inventory)
-        .expect("written");
-    assert!(
-        state
-            .revisions_without_inventory()
-            .expect("readable")
-            .is_empty()
-    );
+    assert_eq!(incomplete.iter().map(|line| line.number).collect::<Vec<_>>(), [2], "the current one");
+    let inventory = Inventory { prefixes: vec!["/usr".into()], ..Inventory::default() };
+    let flavour = Flavour { base: "lab".into(), ..Flavour::default() };
+    state.record_inventory("a", 2, &flavour, &inventory).expect("written");
+    assert!(state.revisions_without_inventory().expect("readable").is_empty());
     assert_eq!(state.inventory("a", 2).expect("readable"), Some(inventory));
-    let current = state
-        .current_revision("a")
-        .expect("readable")
-        .expect("there");
+    let current = state.current_revision("a").expect("readable").expect("there");
     assert_eq!(current.flavour, flavour);
-    assert_eq!(
-        state.inventory("a", 1).expect("readable"),
-        None,
-        "another's"
-    );
+    assert_eq!(state.inventory("a", 1).expect("readable"), None, "another's");
 }
 
 #[test]
@@ -385,10 +252,7 @@ fn a_later_versions_database_is_left_alone() {
     let (directory, state) = state();
     drop(state);
     let path = directory.path().join("cloudroid.db");
-    Connection::open(&path)
-        .expect("a database")
-        .pragma_update(None, "user_version", 99)
-        .expect("written");
+    Connection::open(&path).expect("a database").pragma_update(None, "user_version", 99).expect("written");
     let refused = State::open(&path).err().expect("too new").to_string();
     assert!(refused.contains("version 99"), "{refused}");
 }
@@ -426,20 +290,9 @@ async fn what_is_told_while_another_has_the_database_is_kept_and_written_later()
     drop(state);
     let again = State::open(&path).expect("the same database");
     assert_eq!(messages(&again), told, "in the database now");
-    let kinds: Vec<String> = again
-        .events(0, 100)
-        .expect("readable")
-        .into_iter()
-        .map(|event| event.kind)
-        .collect();
-    assert_eq!(
-        kinds,
-        ["test", "test", "state-unwritable", "test", "state-writable"]
-    );
-    assert!(
-        told[2].contains("another program has locked it"),
-        "{told:?}"
-    );
+    let kinds: Vec<String> = again.events(0, 100).expect("readable").into_iter().map(|event| event.kind).collect();
+    assert_eq!(kinds, ["test", "test", "state-unwritable", "test", "state-writable"]);
+    assert!(told[2].contains("another program has locked it"), "{told:?}");
 }
 
 #[test]
@@ -458,51 +311,22 @@ fn a_known_robot_comes_in_while_nothing_can_be_written() {
 #[test]
 fn tokens_are_kept_by_their_hashes_and_a_name_is_one_live_tokens() {
     let (directory, state) = state();
-    let new = |name, hash| NewToken {
-        name,
-        hash,
-        role: "robot",
-        scope: "{}",
-        expires: Some(7),
-    };
-    let first = state
-        .add_token(&new("r1", "h1"))
-        .expect("written")
-        .expect("new");
-    assert_eq!(
-        (first.expires, first.revoked, first.last_used),
-        (Some(7), None, None)
-    );
-    assert_eq!(
-        state.add_token(&new("r1", "h2")).expect("written"),
-        None,
-        "the name is taken"
-    );
-    let rotated = state
-        .rotate_token("r1", "h3")
-        .expect("written")
-        .expect("there");
+    let new = |name, hash| NewToken { name, hash, role: "robot", scope: "{}", expires: Some(7) };
+    let first = state.add_token(&new("r1", "h1")).expect("written").expect("new");
+    assert_eq!((first.expires, first.revoked, first.last_used), (Some(7), None, None));
+    assert_eq!(state.add_token(&new("r1", "h2")).expect("written"), None, "the name is taken");
+    let rotated = state.rotate_token("r1", "h3").expect("written").expect("there");
     assert_eq!((rotated.id, &*rotated.hash), (first.id, "h3"));
     state.record_token_use(first.id, 9).expect("written");
     assert!(state.revoke_token("r1").expect("written").is_some());
     assert_eq!(state.revoke_token("r1").expect("written"), None, "once");
-    assert_eq!(
-        state.rotate_token("r1", "h4").expect("written"),
-        None,
-        "revoked for good"
-    );
-    let second = state
-        .add_token(&new("r1", "h5"))
-        .expect("written")
-        .expect("the name is free");
+    assert_eq!(state.rotate_token("r1", "h4").expect("written"), None, "revoked for good");
+    let second = state.add_token(&new("r1", "h5")).expect("written").expect("the name is free");
     assert_ne!(second.id, first.id);
     drop(state);
     let state = State::open(&directory.path().join("cloudroid.db")).expect("the same database");
     let kept = state.tokens().expect("readable");
-    let hashes: Vec<_> = kept
-        .iter()
-        .map(|token| (&*token.hash, token.last_used))
-        .collect();
+    let hashes: Vec<_> = kept.iter().map(|token| (&*token.hash, token.last_used)).collect();
     assert_eq!(hashes, [("h3", Some(9)), ("h5", None)]);
     assert!(kept[0].revoked.is_some() && kept[1].revoked.is_none());
 }
@@ -511,15 +335,9 @@ fn tokens_are_kept_by_their_hashes_and_a_name_is_one_live_tokens() {
 fn a_new_database_grants_robots_and_deployers_what_they_had() {
     let (_directory, state) = state();
     let rules = state.rules().expect("readable");
-    let texts: Vec<_> = rules
-        .iter()
-        .map(|rule| (&*rule.who, &*rule.services, &*rule.allow))
-        .collect();
+    let texts: Vec<_> = rules.iter().map(|rule| (&*rule.who, &*rule.services, &*rule.allow)).collect();
     let all = r#"["*:**"]"#;
-    assert_eq!(
-        texts,
-        [("role:robot", "*", all), ("role:deployer", "*", all)]
-    );
+    assert_eq!(texts, [("role:robot", "*", all), ("role:deployer", "*", all)]);
     assert!(state.remove_rule(rules[0].id).expect("written").is_some());
     assert_eq!(state.remove_rule(rules[0].id).expect("written"), None);
     let added = state.add_rule("r1", "det*", "[]").expect("written");
@@ -537,10 +355,7 @@ fn a_service_is_owned_by_whoever_published_it_first() {
         let number = state.publish(&record, &Inventory::default());
         let revision = state.revision(service, number.expect("published"));
         let owner = revision.expect("readable").expect("there").owner.clone();
-        assert_eq!(
-            state.service_owner(service).expect("readable"),
-            Some(owner.clone())
-        );
+        assert_eq!(state.service_owner(service).expect("readable"), Some(owner.clone()));
         owner
     };
     let alice = Some("alice".to_owned());
@@ -554,13 +369,9 @@ fn a_service_is_owned_by_whoever_published_it_first() {
 fn a_robots_name_can_be_bound_again() {
     let (_directory, state) = state();
     let owner = |name: &str| name.to_owned();
-    state
-        .claim_robot("r1", Some(&owner("a")), true)
-        .expect("written");
+    state.claim_robot("r1", Some(&owner("a")), true).expect("written");
     state.bind_robot("r1", &owner("robot:r1")).expect("written");
-    let found = state
-        .claim_robot("r1", Some(&owner("a")), true)
-        .expect("read");
+    let found = state.claim_robot("r1", Some(&owner("a")), true).expect("read");
     assert_eq!(found, Some(owner("robot:r1")));
 }
 
@@ -587,32 +398,13 @@ fn the_audit_log_is_only_added_to() {
     assert_eq!(objects(2, 100), ["three"]);
     // Not even by a process that has the database open.
     let connection = Connection::open(home.path().join("cloudroid.db")).expect("opened");
-    for statement in [
-        "DELETE FROM audit",
-        "UPDATE audit SET who = 'bob'",
-        "DELETE FROM audit WHERE id = 1",
-    ] {
-        let refused = connection
-            .execute(statement, [])
-            .expect_err(statement)
-            .to_string();
+    for statement in ["DELETE FROM audit", "UPDATE audit SET who = 'bob'", "DELETE FROM audit WHERE id = 1"] {
+        let refused = connection.execute(statement, []).expect_err(statement).to_string();
         assert!(refused.contains("only added to"), "{refused}");
     }
     assert_eq!(objects(0, 100).len(), 3);
     // Beyond a million records the oldest may be deleted.
-    connection
-        .execute(
-            "UPDATE sqlite_sequence SET seq = 1000001 WHERE name = 'audit'",
-            [],
-        )
-        .expect("set");
-    assert_eq!(
-        connection
-            .execute("DELETE FROM audit WHERE id = 1", [])
-            .expect("old"),
-        1
-    );
-    connection
-        .execute("DELETE FROM audit WHERE id = 2", [])
-        .expect_err("not old enough");
+    connection.execute("UPDATE sqlite_sequence SET seq = 1000001 WHERE name = 'audit'", []).expect("set");
+    assert_eq!(connection.execute("DELETE FROM audit WHERE id = 1", []).expect("old"), 1);
+    connection.execute("DELETE FROM audit WHERE id = 2", []).expect_err("not old enough");
 }

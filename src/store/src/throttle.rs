@@ -49,10 +49,7 @@ impl NoticeThrottle {
             self.others += 1;
             return None;
         }
-        let told = RecentNotice {
-            at: now,
-            omitted: 0,
-        };
+        let told = RecentNotice { at: now, omitted: 0 };
         self.told.insert(what.to_owned(), told);
         Some(std::mem::take(&mut self.others))
     }

@@ -77,10 +77,7 @@ impl State {
                     "INSERT INTO tokens (name, hash, role, scope, created, expires) VALUES (?1, ?2, ?3, ?4, ?5, ?6)
                      ON CONFLICT (name) WHERE revoked IS NULL DO NOTHING RETURNING {COLUMNS}"
                 ))?
-                .query_row(
-                    params![new.name, new.hash, new.role, new.scope, now() as i64, new.expires],
-                    read_token,
-                )
+                .query_row(params![new.name, new.hash, new.role, new.scope, now() as i64, new.expires], read_token)
                 .optional()
         })
     }
@@ -111,12 +108,7 @@ impl State {
 
     /// Records the use of a token.
     pub fn record_token_use(&self, id: i64, at: u64) -> Result<(), Error> {
-        self.write(|connection| {
-            connection.execute(
-                "UPDATE tokens SET last_used = ?2 WHERE id = ?1",
-                params![id, at],
-            )
-        })
-        .map(|_| ())
+        self.write(|connection| connection.execute("UPDATE tokens SET last_used = ?2 WHERE id = ?1", params![id, at]))
+            .map(|_| ())
     }
 }

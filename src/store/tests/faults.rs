@@ -90,13 +90,7 @@ fn recording(robot: &str) -> RecordingRecord {
 }
 
 fn token(name: &str) -> NewToken<'_> {
-    NewToken {
-        name,
-        hash: name,
-        role: "viewer",
-        scope: "{}",
-        expires: None,
-    }
+    NewToken { name, hash: name, role: "viewer", scope: "{}", expires: None }
 }
 
 fn session(name: &str) -> NewSession<'_> {
@@ -125,24 +119,17 @@ fn find_rule(state: &State, who: &str) -> Option<i64> {
 
 fn is_paired(state: &State, robot: &str) -> bool {
     let pairings = state.pairings().expect("readable");
-    pairings
-        .iter()
-        .any(|pairing| pairing.robot == robot && pairing.revoked.is_none())
+    pairings.iter().any(|pairing| pairing.robot == robot && pairing.revoked.is_none())
 }
 
 fn find_session(state: &State, name: &str) -> Option<i64> {
     let sessions = state.sessions().expect("readable").into_iter();
-    sessions
-        .filter(|session| session.name == name)
-        .map(|session| session.id)
-        .next()
+    sessions.filter(|session| session.name == name).map(|session| session.id).next()
 }
 
 fn find_recording(state: &State, robot: &str) -> Option<u64> {
     let mut recordings = state.recordings().expect("readable").into_iter();
-    recordings
-        .find(|recording| recording.robot == robot)
-        .map(|recording| recording.id)
+    recordings.find(|recording| recording.robot == robot).map(|recording| recording.id)
 }
 
 fn account(state: &State, name: &str) -> Option<String> {
@@ -230,10 +217,7 @@ const OPERATIONS: &[Operation] = &[
         name: "change an account",
         prepare: |state, name| state.add_account(name, "", "viewer", "{}").map(drop),
         run: |state, name| {
-            let edit = AccountEdit {
-                role_and_scope: Some(("admin", "{}")),
-                ..AccountEdit::default()
-            };
+            let edit = AccountEdit { role_and_scope: Some(("admin", "{}")), ..AccountEdit::default() };
             state.edit_account(name, &edit).map(drop)
         },
         is_done: |state, name| account(state, name).as_deref() == Some("admin"),
@@ -259,11 +243,7 @@ const OPERATIONS: &[Operation] = &[
     Operation {
         name: "sign somebody in whom a provider knows",
         prepare: |_, _| Ok(()),
-        run: |state, name| {
-            state
-                .sign_in_federated_person("issuer", name, name)
-                .map(drop)
-        },
+        run: |state, name| state.sign_in_federated_person("issuer", name, name).map(drop),
         is_done: |state, name| {
             let people = state.federated_people().expect("readable");
             people.iter().any(|person| person.subject == name)
@@ -272,11 +252,7 @@ const OPERATIONS: &[Operation] = &[
     Operation {
         name: "bind a robot that comes",
         prepare: |_, _| Ok(()),
-        run: |state, name| {
-            state
-                .claim_robot(name, Some(&"alice".to_owned()), true)
-                .map(drop)
-        },
+        run: |state, name| state.claim_robot(name, Some(&"alice".to_owned()), true).map(drop),
         is_done: |state, name| {
             let owner = state.claim_robot(name, Some(&"bob".to_owned()), false);
             owner.expect("readable").as_deref() == Some("alice")
@@ -285,11 +261,7 @@ const OPERATIONS: &[Operation] = &[
     Operation {
         name: "publish a service",
         prepare: |_, _| Ok(()),
-        run: |state, name| {
-            state
-                .publish(&revision(name, "alice"), &Inventory::default())
-                .map(drop)
-        },
+        run: |state, name| state.publish(&revision(name, "alice"), &Inventory::default()).map(drop),
         is_done: |state, name| {
             state.service_owner(name).expect("readable") == Some(Some("alice".to_owned()))
                 && state.current_revision(name).expect("readable").is_some()
@@ -297,11 +269,7 @@ const OPERATIONS: &[Operation] = &[
     },
     Operation {
         name: "remove a service",
-        prepare: |state, name| {
-            state
-                .publish(&revision(name, "alice"), &Inventory::default())
-                .map(drop)
-        },
+        prepare: |state, name| state.publish(&revision(name, "alice"), &Inventory::default()).map(drop),
         run: |state, name| state.remove_service(name).map(drop),
         is_done: |state, name| state.current_revision(name).expect("readable").is_none(),
     },
@@ -309,28 +277,13 @@ const OPERATIONS: &[Operation] = &[
         name: "keep samples",
         prepare: |_, _| Ok(()),
         run: |state, name| {
-            let sample = NewSample {
-                servant: name,
-                service: "s",
-                robot: "r",
-                began: 1,
-                figures: &[1.0],
-            };
+            let sample = NewSample { servant: name, service: "s", robot: "r", began: 1, figures: &[1.0] };
             state.add_samples(10, 1, &[sample])
         },
         is_done: |state, name| {
-            let filter = SeriesFilter {
-                servant: Some(name),
-                ..SeriesFilter::default()
-            };
+            let filter = SeriesFilter { servant: Some(name), ..SeriesFilter::default() };
             let recorded = state.recorded_series(filter, 0, 1).expect("readable");
-            recorded.iter().any(|one| {
-                state
-                    .samples(one.id, 10, (0, 9), 9)
-                    .expect("readable")
-                    .len()
-                    == 1
-            })
+            recorded.iter().any(|one| state.samples(one.id, 10, (0, 9), 9).expect("readable").len() == 1)
         },
     },
     Operation {
@@ -357,20 +310,13 @@ const OPERATIONS: &[Operation] = &[
     Operation {
         name: "add to the audit log without waiting for the disk",
         prepare: |_, _| Ok(()),
-        run: |state, name| {
-            state
-                .add_audit_record_without_sync(&new_audit_record(name))
-                .map(drop)
-        },
+        run: |state, name| state.add_audit_record_without_sync(&new_audit_record(name)).map(drop),
         is_done: is_audited,
     },
 ];
 
 fn new_audit_record(object: &str) -> NewAuditRecord<'_> {
-    NewAuditRecord {
-        object,
-        ..NewAuditRecord::default()
-    }
+    NewAuditRecord { object, ..NewAuditRecord::default() }
 }
 
 /// Runs all operations several times while every n-th write fails, and checks them after a restart.
@@ -380,27 +326,18 @@ fn check(one_of: u64) {
     let state = State::open(&path).expect("a database");
     let turns: Vec<_> = (0..3)
         .flat_map(|turn| {
-            OPERATIONS
-                .iter()
-                .enumerate()
-                .map(move |(number, operation)| (format!("n{turn}-{number}"), operation))
+            OPERATIONS.iter().enumerate().map(move |(number, operation)| (format!("n{turn}-{number}"), operation))
         })
         .collect();
     for (name, operation) in &turns {
         (operation.prepare)(&state, name).expect("writable so far");
     }
     FAILING.store(one_of, Ordering::Relaxed);
-    let outcomes: Vec<_> = turns
-        .iter()
-        .map(|(name, operation)| (operation.run)(&state, name))
-        .collect();
+    let outcomes: Vec<_> = turns.iter().map(|(name, operation)| (operation.run)(&state, name)).collect();
     drop(state);
     FAILING.store(0, Ordering::Relaxed);
     let failed = outcomes.iter().filter(|outcome| outcome.is_err()).count();
-    assert!(
-        failed > 0,
-        "no operation noticed that one write of {one_of} failed"
-    );
+    assert!(failed > 0, "no operation noticed that one write of {one_of} failed");
     let state = State::open(&path).expect("the database, undamaged");
     for ((name, operation), outcome) in turns.iter().zip(outcomes) {
         let is_done = (operation.is_done)(&state, name);

@@ -10,12 +10,8 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 use tokio_rustls::rustls::client::WebPkiServerVerifier;
-use tokio_rustls::rustls::client::danger::{
-    HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier,
-};
-use tokio_rustls::rustls::crypto::{
-    CryptoProvider, ring, verify_tls12_signature, verify_tls13_signature,
-};
+use tokio_rustls::rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use tokio_rustls::rustls::crypto::{CryptoProvider, ring, verify_tls12_signature, verify_tls13_signature};
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime};
 use tokio_rustls::rustls::{
@@ -82,11 +78,7 @@ impl Trust {
             None if self.authorities.is_none() => seen,
             None => None,
         };
-        let authorities = self
-            .authorities
-            .as_deref()
-            .map(read_authorities)
-            .transpose()?;
+        let authorities = self.authorities.as_deref().map(read_authorities).transpose()?;
         let verifier = Arc::new(Verifier {
             provider: Arc::clone(&provider),
             expected,
@@ -103,13 +95,11 @@ impl Trust {
             .with_custom_certificate_verifier(Arc::clone(&verifier) as Arc<dyn ServerCertVerifier>);
         let config = match &self.identity {
             None => builder.with_no_client_auth(),
-            Some(own) => builder
-                .with_client_auth_cert(own.chain.clone(), own.key.clone_key())
-                .map_err(io::Error::other)?,
+            Some(own) => {
+                builder.with_client_auth_cert(own.chain.clone(), own.key.clone_key()).map_err(io::Error::other)?
+            }
         };
-        let connected = TlsConnector::from(Arc::new(config))
-            .connect(name, stream)
-            .await;
+        let connected = TlsConnector::from(Arc::new(config)).connect(name, stream).await;
         let outcome = verifier.outcome();
         let stream = connected.map_err(|error| match outcome.refused {
             Some(words) => io::Error::other(words),
@@ -118,11 +108,7 @@ impl Trust {
         if let (Some(first), Some(known)) = (outcome.first, known) {
             let kept = known.remember_first(server, KnownIdentity::Certificate(first))?;
             if kept != KnownIdentity::Certificate(first) {
-                return Err(io::Error::other(describe_mismatch(
-                    first,
-                    kept,
-                    &self.accept,
-                )));
+                return Err(io::Error::other(describe_mismatch(first, kept, &self.accept)));
             }
         }
         let is_new = outcome.by_authority && seen != Some(KnownIdentity::ByAuthority);
@@ -130,10 +116,7 @@ impl Trust {
             // An unwritable home directory is no reason to refuse a server whose certificate an authority has signed.
             let _ = known.remember(server, KnownIdentity::ByAuthority);
         }
-        Ok(TrustedConnection {
-            stream,
-            first: outcome.first,
-        })
+        Ok(TrustedConnection { stream, first: outcome.first })
     }
 }
 
@@ -142,9 +125,7 @@ fn describe_mismatch(shown: Fingerprint, expected: KnownIdentity, accept: &str) 
         KnownIdentity::Certificate(expected) => {
             format!("the known one is {expected}")
         }
-        KnownIdentity::ByAuthority => {
-            "the previous one was signed by an authority, and this one is not".to_owned()
-        }
+        KnownIdentity::ByAuthority => "the previous one was signed by an authority, and this one is not".to_owned(),
     };
     format!(
         "the server presents the certificate {shown}, but {known}: the connection may be intercepted; if its operator \
@@ -155,18 +136,13 @@ fn describe_mismatch(shown: Fingerprint, expected: KnownIdentity, accept: &str) 
 /// Reads the authorities of a PEM file.
 fn read_authorities(path: &Path) -> io::Result<RootCertStore> {
     let unreadable = |error: &dyn std::fmt::Display| {
-        io::Error::other(format!(
-            "ca_file {} holds no certificate: {error}; it should be a PEM file",
-            path.display()
-        ))
+        io::Error::other(format!("ca_file {} holds no certificate: {error}; it should be a PEM file", path.display()))
     };
     let mut trusted = RootCertStore::empty();
     let certificates = CertificateDer::pem_file_iter(path).map_err(|error| unreadable(&error))?;
     for certificate in certificates {
         let certificate = certificate.map_err(|error| unreadable(&error))?;
-        trusted
-            .add(certificate)
-            .map_err(|error| unreadable(&error))?;
+        trusted.add(certificate).map_err(|error| unreadable(&error))?;
     }
     if trusted.is_empty() {
         return Err(unreadable(&"it has no BEGIN CERTIFICATE"));
@@ -204,10 +180,7 @@ struct VerifierOutcome {
 
 impl Verifier {
     fn outcome(&self) -> VerifierOutcome {
-        self.outcome
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone()
+        self.outcome.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     fn record(&self, outcome: VerifierOutcome) {
@@ -222,20 +195,12 @@ impl Verifier {
         ocsp: &[u8],
         now: UnixTime,
     ) -> Result<(), AuthorityRejection> {
-        let roots = self
-            .authorities
-            .clone()
-            .unwrap_or_else(load_system_authorities);
+        let roots = self.authorities.clone().unwrap_or_else(load_system_authorities);
         if roots.is_empty() {
             return Err(AuthorityRejection::NobodyTrusted);
         }
-        let builder = WebPkiServerVerifier::builder_with_provider(
-            Arc::new(roots),
-            Arc::clone(&self.provider),
-        );
-        let verifier = builder
-            .build()
-            .map_err(|error| AuthorityRejection::By(Error::General(error.to_string())))?;
+        let builder = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&self.provider));
+        let verifier = builder.build().map_err(|error| AuthorityRejection::By(Error::General(error.to_string())))?;
         verifier
             .verify_server_cert(certificate, intermediates, name, ocsp, now)
             .map(|_| ())
@@ -262,20 +227,15 @@ impl ServerCertVerifier for Verifier {
         if self.expected == Some(KnownIdentity::Certificate(shown)) {
             return Ok(ServerCertVerified::assertion());
         }
-        let refused = match self.verify_by_authorities(certificate, intermediates, name, ocsp, now)
-        {
+        let refused = match self.verify_by_authorities(certificate, intermediates, name, ocsp, now) {
             Ok(()) => {
-                self.record(VerifierOutcome {
-                    by_authority: true,
-                    ..VerifierOutcome::default()
-                });
+                self.record(VerifierOutcome { by_authority: true, ..VerifierOutcome::default() });
                 return Ok(ServerCertVerified::assertion());
             }
             Err(refused) => refused,
         };
         // For example, the authority's reason tells more if a signed certificate has expired.
-        let about_itself =
-            self.expected != Some(KnownIdentity::ByAuthority) || is_self_signed(certificate);
+        let about_itself = self.expected != Some(KnownIdentity::ByAuthority) || is_self_signed(certificate);
         if let Some(expected) = self.expected.filter(|_| about_itself) {
             self.record(VerifierOutcome {
                 refused: Some(describe_mismatch(shown, expected, &self.accept)),
@@ -284,23 +244,14 @@ impl ServerCertVerifier for Verifier {
             return Err(CertificateError::ApplicationVerificationFailure.into());
         }
         if self.first_use && is_self_signed(certificate) {
-            self.record(VerifierOutcome {
-                first: Some(shown),
-                ..VerifierOutcome::default()
-            });
+            self.record(VerifierOutcome { first: Some(shown), ..VerifierOutcome::default() });
             return Ok(ServerCertVerified::assertion());
         }
         let (words, error) = match refused {
-            AuthorityRejection::NobodyTrusted => (
-                Some(self.advice.to_owned()),
-                CertificateError::UnknownIssuer.into(),
-            ),
+            AuthorityRejection::NobodyTrusted => (Some(self.advice.to_owned()), CertificateError::UnknownIssuer.into()),
             AuthorityRejection::By(error) => (None, error),
         };
-        self.record(VerifierOutcome {
-            refused: words,
-            ..VerifierOutcome::default()
-        });
+        self.record(VerifierOutcome { refused: words, ..VerifierOutcome::default() });
         Err(error)
     }
 
@@ -325,9 +276,7 @@ impl ServerCertVerifier for Verifier {
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.provider
-            .signature_verification_algorithms
-            .supported_schemes()
+        self.provider.signature_verification_algorithms.supported_schemes()
     }
 }
 
@@ -347,10 +296,7 @@ pub fn is_valid_for_host(certificate: &CertificateDer<'_>, authority: &str) -> b
         _ => authority,
     };
     let host = host.trim_matches(['[', ']']);
-    let (Ok(read), Ok(name)) = (
-        webpki::EndEntityCert::try_from(certificate),
-        ServerName::try_from(host),
-    ) else {
+    let (Ok(read), Ok(name)) = (webpki::EndEntityCert::try_from(certificate), ServerName::try_from(host)) else {
         return false;
     };
     read.verify_is_valid_for_subject_name(&name).is_ok()

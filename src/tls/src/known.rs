@@ -56,13 +56,8 @@ impl KnownServers {
 
     /// Returns the current user's file: `cloudroid/known_servers` below `$XDG_CONFIG_HOME`, or below `~/.config`.
     pub fn for_user() -> Option<Self> {
-        let variable = |name| {
-            std::env::var_os(name)
-                .filter(|value| !value.is_empty())
-                .map(PathBuf::from)
-        };
-        let config = variable("XDG_CONFIG_HOME")
-            .or_else(|| variable("HOME").map(|home| home.join(".config")))?;
+        let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+        let config = variable("XDG_CONFIG_HOME").or_else(|| variable("HOME").map(|home| home.join(".config")))?;
         Some(Self(config.join("cloudroid/known_servers")))
     }
 
@@ -74,10 +69,7 @@ impl KnownServers {
     /// Returns the identity remembered for a server, given its host and port.
     pub fn find(&self, server: &str) -> io::Result<Option<KnownIdentity>> {
         let known = self.read()?;
-        Ok(known
-            .into_iter()
-            .find(|(name, _)| name == server)
-            .map(|(_, known)| known))
+        Ok(known.into_iter().find(|(name, _)| name == server).map(|(_, known)| known))
     }
 
     /// Remembers the identity of a server, replacing the previous one.
@@ -143,9 +135,8 @@ impl KnownServers {
             if line.is_empty() || line.starts_with('#') {
                 continue;
             }
-            let read = line
-                .split_once(' ')
-                .and_then(|(server, shown)| Some((server.to_owned(), shown.trim().parse().ok()?)));
+            let read =
+                line.split_once(' ').and_then(|(server, shown)| Some((server.to_owned(), shown.trim().parse().ok()?)));
             let Some(read) = read else {
                 let words = format!(
                     "line {} is not HOST:PORT with a fingerprint or the word \"{AUTHORITY}\"; correct or remove it",
@@ -172,12 +163,7 @@ impl KnownServers {
 
 /// Opens a file that only its owner may read, creating it if necessary.
 fn open_private(path: &Path) -> io::Result<std::fs::File> {
-    OpenOptions::new()
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .mode(0o600)
-        .open(path)
+    OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(path)
 }
 
 fn with_path(path: &Path, error: io::Error) -> io::Error {
@@ -237,20 +223,11 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("known_servers");
         let known = KnownServers::new(path.clone());
-        for text in [
-            "a:1",
-            "a:1 SHA256:00",
-            "a:1 Authority",
-            "# fine\n\na:1\tx",
-            "\u{fffd} ",
-        ] {
+        for text in ["a:1", "a:1 SHA256:00", "a:1 Authority", "# fine\n\na:1\tx", "\u{fffd} "] {
             std::fs::write(&path, text).unwrap();
-            for refused in [
-                known.find("b:1").map(|_| ()),
-                known
-                    .remember_first("b:1", known_certificate('1'))
-                    .map(|_| ()),
-            ] {
+            for refused in
+                [known.find("b:1").map(|_| ()), known.remember_first("b:1", known_certificate('1')).map(|_| ())]
+            {
                 let words = refused.expect_err(text).to_string();
                 assert!(words.contains("known_servers: line"), "{words}");
             }

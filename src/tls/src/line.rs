@@ -31,9 +31,7 @@ pub struct PairingLine {
 
 /// Error for text that is not a pairing line.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "not a pairing line: {0}; copy the whole line that cloudroidctl pair ROBOT prints, between single quotes"
-)]
+#[error("not a pairing line: {0}; copy the whole line that cloudroidctl pair ROBOT prints, between single quotes")]
 pub struct ParsePairingLineError(String);
 
 impl fmt::Display for PairingLine {
@@ -62,12 +60,8 @@ impl FromStr for PairingLine {
         if text.chars().any(|c| !c.is_ascii_graphic()) {
             return Err(no("it contains spaces or control characters"));
         }
-        let rest = text
-            .strip_prefix(SCHEME)
-            .ok_or_else(|| no("it does not begin with cloudroid://"))?;
-        let (server, query) = rest
-            .split_once("/?")
-            .ok_or_else(|| no("it ends after the server's address"))?;
+        let rest = text.strip_prefix(SCHEME).ok_or_else(|| no("it does not begin with cloudroid://"))?;
+        let (server, query) = rest.split_once("/?").ok_or_else(|| no("it ends after the server's address"))?;
         let host = |c: char| c.is_ascii_alphanumeric() || ".-_:[]".contains(c);
         let port = server.rsplit_once(':').map(|(_, port)| port.parse::<u16>());
         if !server.chars().all(host) || !matches!(port, Some(Ok(_))) || server.starts_with(':') {
@@ -78,17 +72,13 @@ impl FromStr for PairingLine {
         for pair in query.split('&') {
             let (name, value) = pair.split_once('=').unwrap_or((pair, ""));
             let Some(at) = NAMES.iter().position(|known| *known == name) else {
-                return Err(ParsePairingLineError(format!(
-                    "this version does not know its parameter {name}"
-                )));
+                return Err(ParsePairingLineError(format!("this version does not know its parameter {name}")));
             };
             if values[at].replace(value).is_some() {
                 return Err(ParsePairingLineError(format!("it has {name} twice")));
             }
         }
-        let value = |at: usize| {
-            values[at].ok_or_else(|| ParsePairingLineError(format!("it lacks {}", NAMES[at])))
-        };
+        let value = |at: usize| values[at].ok_or_else(|| ParsePairingLineError(format!("it lacks {}", NAMES[at])));
         let (robot, fingerprint, key, code) = (value(0)?, value(1)?, value(2)?, value(3)?);
         let named = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
         if robot.is_empty() || robot.len() > 64 || !robot.chars().all(named) {
@@ -96,9 +86,7 @@ impl FromStr for PairingLine {
         }
         let fingerprint = fingerprint
             .parse()
-            .map_err(|error: crate::ParseFingerprintError| {
-                ParsePairingLineError(error.to_string())
-            })?;
+            .map_err(|error: crate::ParseFingerprintError| ParsePairingLineError(error.to_string()))?;
         let encoded = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
         if key.len() != KEY || !key.chars().all(encoded) {
             return Err(no("key is not an ed25519 key"));
@@ -140,10 +128,7 @@ mod tests {
         assert!(!text.contains(['+', '%', '\'', ' ']), "{text}");
         assert_eq!(text.parse(), Ok(line.clone()));
         assert_eq!(format!(" {text}\n").parse(), Ok(line.clone()));
-        let at = PairingLine {
-            server: "[2001:db8::1]:9090".into(),
-            ..line
-        };
+        let at = PairingLine { server: "[2001:db8::1]:9090".into(), ..line };
         assert_eq!(at.to_string().parse(), Ok(at));
     }
 
@@ -175,10 +160,7 @@ mod tests {
             (good[..good.find("&code").unwrap()].into(), "lacks code"),
         ] {
             let refused = text.parse::<PairingLine>().expect_err(&text).to_string();
-            assert!(
-                refused.contains(words) && refused.contains("cloudroidctl pair"),
-                "{text}: {refused}"
-            );
+            assert!(refused.contains(words) && refused.contains("cloudroidctl pair"), "{text}: {refused}");
         }
     }
 }

@@ -25,10 +25,7 @@ impl Server {
             .with_no_client_auth()
             .with_single_cert(vec![certificate.clone()], key.into())
             .unwrap();
-        Self {
-            certificate,
-            config: Arc::new(config),
-        }
+        Self { certificate, config: Arc::new(config) }
     }
 
     /// Creates a server with a self-signed certificate, as the daemon makes them or, with `is_ca`, as openssl does.
@@ -90,24 +87,14 @@ async fn what_signs_itself_is_remembered_and_no_other_is_taken_for_it() {
     for is_ca in [false, true] {
         let place = tempfile::tempdir().unwrap();
         let file = place.path().join("known_servers");
-        let (server, other) = (
-            Server::self_signed("localhost", is_ca),
-            Server::self_signed("localhost", is_ca),
-        );
+        let (server, other) = (Server::self_signed("localhost", is_ca), Server::self_signed("localhost", is_ca));
         let client = trust(Some(&file));
         let shown = server.fingerprint();
-        assert_eq!(
-            server.handshake(&client).await,
-            Ok(Some(shown)),
-            "first seen"
-        );
+        assert_eq!(server.handshake(&client).await, Ok(Some(shown)), "first seen");
         assert_eq!(server.handshake(&client).await, Ok(None), "known");
         let refused = other.handshake(&client).await.expect_err("another");
-        for words in [
-            shown.to_string(),
-            other.fingerprint().to_string(),
-            format!("accept it {}", other.fingerprint()),
-        ] {
+        for words in [shown.to_string(), other.fingerprint().to_string(), format!("accept it {}", other.fingerprint())]
+        {
             assert!(refused.contains(&words), "{words}: {refused}");
         }
         assert_eq!(server.handshake(&client).await, Ok(None), "still known");
@@ -125,10 +112,7 @@ async fn a_fingerprint_that_was_named_is_needed() {
     let file = place.path().join("known_servers");
     // The name does not matter: the fingerprint identifies the holder of the key.
     let server = Server::self_signed("elsewhere", false);
-    let named = |fingerprint| Trust {
-        fingerprint: Some(fingerprint),
-        ..trust(Some(&file))
-    };
+    let named = |fingerprint| Trust { fingerprint: Some(fingerprint), ..trust(Some(&file)) };
     let right = named(server.fingerprint());
     assert_eq!(server.handshake(&right).await, Ok(None));
     let other = Server::self_signed("elsewhere", false);
@@ -139,18 +123,12 @@ async fn a_fingerprint_that_was_named_is_needed() {
 #[tokio::test]
 async fn what_an_authority_has_signed_may_change_but_not_to_what_signs_itself() {
     let place = tempfile::tempdir().unwrap();
-    let (file, pem) = (
-        place.path().join("known_servers"),
-        place.path().join("ca.pem"),
-    );
+    let (file, pem) = (place.path().join("known_servers"), place.path().join("ca.pem"));
     let server = Server::signed_by_authority("localhost", &pem);
     let alone = Server::self_signed("localhost", false);
     let by_chance = trust(Some(&file));
     server.handshake(&by_chance).await.expect_err("whose?");
-    let client = Trust {
-        authorities: Some(pem.clone()),
-        ..by_chance.clone()
-    };
+    let client = Trust { authorities: Some(pem.clone()), ..by_chance.clone() };
     // With the authority's signature it may change, whatever was known before; a self-signed certificate accepted
     // earlier is refused.
     let known = KnownServers::new(file.clone());
@@ -159,39 +137,19 @@ async fn what_an_authority_has_signed_may_change_but_not_to_what_signs_itself() 
     alone.handshake(&client).await.expect_err("signs itself");
     assert_eq!(known.find("localhost:1").unwrap(), Some(accepted));
     assert_eq!(server.handshake(&client).await, Ok(None));
-    assert_eq!(
-        known.find("localhost:1").unwrap(),
-        Some(KnownIdentity::ByAuthority)
-    );
+    assert_eq!(known.find("localhost:1").unwrap(), Some(KnownIdentity::ByAuthority));
     // A self-signed certificate shown later, possibly by a man in the middle, is not a first use.
-    let refused = alone
-        .handshake(&by_chance)
-        .await
-        .expect_err("stands between");
+    let refused = alone.handshake(&by_chance).await.expect_err("stands between");
     assert!(refused.contains("signed by an authority"), "{refused}");
-    assert_eq!(
-        known.find("localhost:1").unwrap(),
-        Some(KnownIdentity::ByAuthority)
-    );
+    assert_eq!(known.find("localhost:1").unwrap(), Some(KnownIdentity::ByAuthority));
     known.remember("localhost:1", accepted).unwrap();
     assert_eq!(alone.handshake(&by_chance).await, Ok(None), "accepted");
     let elsewhere = Server::signed_by_authority("elsewhere", &pem);
-    let refused = elsewhere
-        .handshake(&client)
-        .await
-        .expect_err("another name");
+    let refused = elsewhere.handshake(&client).await.expect_err("another name");
     assert!(refused.contains("not valid for name"), "{refused}");
     // An unwritable home directory is no reason to refuse the server.
-    let unwritable = Trust {
-        known: Some(KnownServers::new("/proc/nowhere/known_servers".into())),
-        ..client
-    };
-    assert_eq!(
-        Server::signed_by_authority("localhost", &pem)
-            .handshake(&unwritable)
-            .await,
-        Ok(None)
-    );
+    let unwritable = Trust { known: Some(KnownServers::new("/proc/nowhere/known_servers".into())), ..client };
+    assert_eq!(Server::signed_by_authority("localhost", &pem).handshake(&unwritable).await, Ok(None));
 }
 
 #[tokio::test]
@@ -212,8 +170,7 @@ async fn what_cannot_be_remembered_is_not_trusted() {
 
 #[test]
 fn a_certificate_speaks_for_its_names_alone() {
-    let params =
-        CertificateParams::new(["cloud.lab", "192.0.2.7", "2001:db8::7"].map(str::to_owned));
+    let params = CertificateParams::new(["cloud.lab", "192.0.2.7", "2001:db8::7"].map(str::to_owned));
     let key = KeyPair::generate().unwrap();
     let certificate = params.unwrap().self_signed(&key).unwrap();
     for (authority, is_spoken_for) in [

@@ -125,46 +125,28 @@ mod tests {
             };
             ((*name).to_owned(), ends)
         };
-        Graph {
-            topics: topics.iter().map(topic).collect(),
-            ..Graph::default()
-        }
+        Graph { topics: topics.iter().map(topic).collect(), ..Graph::default() }
     }
 
     #[test]
     fn what_comes_and_goes_is_told_once_and_by_new_numbers() {
         let mut catalogue = Catalogue::default();
-        let names = |changes: &Changes| -> Vec<String> {
-            changes
-                .topics
-                .iter()
-                .map(|(name, _)| name.clone())
-                .collect()
-        };
+        let names =
+            |changes: &Changes| -> Vec<String> { changes.topics.iter().map(|(name, _)| name.clone()).collect() };
         let all = graph(&[("/a", "/n"), ("/own", "/viewer"), ("/secret", "/n")]);
         let may = |name: &str| name != "/secret";
         let first = catalogue.update(&all, "/viewer", may);
         assert_eq!(names(&first), ["/a"]);
-        assert_eq!(
-            catalogue.update(&all, "/viewer", may),
-            Changes::default(),
-            "it is asked for"
-        );
+        assert_eq!(catalogue.update(&all, "/viewer", may), Changes::default(), "it is asked for");
         let of = Arc::new(WireType::with_name("std_msgs/String"));
-        let id = catalogue
-            .add_topic("/a", Arc::clone(&of))
-            .expect("asked for");
+        let id = catalogue.add_topic("/a", Arc::clone(&of)).expect("asked for");
         assert_eq!(catalogue.add_topic("/a", Arc::clone(&of)), None, "once");
         assert_eq!(catalogue.update(&all, "/viewer", may), Changes::default());
         let gone = catalogue.update(&graph(&[]), "/viewer", may);
         assert_eq!(gone.channels_gone, [id]);
         let again = catalogue.update(&all, "/viewer", may);
         assert_eq!(names(&again), ["/a"]);
-        assert_ne!(
-            catalogue.add_topic("/a", of),
-            Some(id),
-            "a number is given once"
-        );
+        assert_ne!(catalogue.add_topic("/a", of), Some(id), "a number is given once");
         // A topic whose permission was revoked disappears, too.
         let refused = catalogue.update(&all, "/viewer", |_| false);
         assert_eq!(refused.channels_gone.len(), 1);

@@ -16,14 +16,8 @@ impl ViewerFormat {
     /// Returns the encodings of a ROS version.
     pub fn for_version(version: RosVersion) -> Self {
         match version {
-            RosVersion::One => Self {
-                encoding: "ros1",
-                schema: "ros1msg",
-            },
-            RosVersion::Two => Self {
-                encoding: "cdr",
-                schema: "ros2msg",
-            },
+            RosVersion::One => Self { encoding: "ros1", schema: "ros1msg" },
+            RosVersion::Two => Self { encoding: "cdr", schema: "ros2msg" },
         }
     }
 }

@@ -105,12 +105,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> ViewerSocket<S> {
         poll_fn(|cx| self.poll(cx, wanted, before)).await
     }
 
-    fn poll(
-        &mut self,
-        cx: &mut Context<'_>,
-        wanted: bool,
-        before: usize,
-    ) -> Poll<Option<ViewerInput>> {
+    fn poll(&mut self, cx: &mut Context<'_>, wanted: bool, before: usize) -> Poll<Option<ViewerInput>> {
         loop {
             let now = Instant::now();
             if let Poll::Ready(Err(_)) = self.socket.poll_flush(cx) {

@@ -16,11 +16,7 @@ pub async fn get_parameters(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Par
 }
 
 /// Sets a parameter, or deletes it if there is no value.
-pub async fn set_parameter(
-    bus: &dyn Bus,
-    name: &str,
-    value: Option<ParameterValue>,
-) -> Result<(), BusError> {
+pub async fn set_parameter(bus: &dyn Bus, name: &str, value: Option<ParameterValue>) -> Result<(), BusError> {
     let value = value.map(from_parameter_value);
     if bus.version() == RosVersion::One {
         let parameters = bus.parameters()?;
@@ -29,13 +25,8 @@ pub async fn set_parameter(
             None => parameters.delete(name).await,
         };
     }
-    let bad = |reason: &str| BusError::BadParam {
-        key: name.to_owned(),
-        reason: reason.to_owned(),
-    };
-    let (node, own) = name
-        .split_once('.')
-        .ok_or_else(|| bad("give a node and its parameter, such as /see.rate"))?;
+    let bad = |reason: &str| BusError::BadParam { key: name.to_owned(), reason: reason.to_owned() };
+    let (node, own) = name.split_once('.').ok_or_else(|| bad("give a node and its parameter, such as /see.rate"))?;
     let changes = vec![(own.to_owned(), value)];
     let done = bus.node_parameters()?.set(node, changes).await?;
     match done.into_iter().next() {
@@ -46,11 +37,7 @@ pub async fn set_parameter(
 
 async fn get_shared(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
     let parameters = bus.parameters()?;
-    let names = if names.is_empty() {
-        parameters.names().await?
-    } else {
-        names
-    };
+    let names = if names.is_empty() { parameters.names().await? } else { names };
     let mut values = Vec::new();
     for name in names {
         if let Ok(value) = parameters.get(&name).await {
@@ -77,10 +64,7 @@ async fn get_from_nodes(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Paramet
     }
     for name in &names {
         if let Some((node, own)) = name.split_once('.') {
-            wanted
-                .entry(node.to_owned())
-                .or_default()
-                .push(own.to_owned());
+            wanted.entry(node.to_owned()).or_default().push(own.to_owned());
         }
     }
     let mut values = Vec::new();
@@ -90,11 +74,7 @@ async fn get_from_nodes(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Paramet
     Ok(values)
 }
 
-async fn get_from_node(
-    parameters: &dyn NodeParameters,
-    node: &str,
-    names: &[String],
-) -> Vec<Parameter> {
+async fn get_from_node(parameters: &dyn NodeParameters, node: &str, names: &[String]) -> Vec<Parameter> {
     let values = parameters.get(node, names).await.unwrap_or_default();
     let known = names.iter().zip(values);
     let known = known.filter_map(|(name, value)| to_parameter(&format!("{node}.{name}"), &value?));
@@ -105,19 +85,12 @@ async fn get_from_node(
 pub fn to_parameter(name: &str, value: &ParamValue) -> Option<Parameter> {
     let (value, hint) = match value {
         ParamValue::Double(_) => (to_parameter_value(value)?, Some(ParameterType::Float64)),
-        ParamValue::List(all) if is_double_list(all) => (
-            to_parameter_value(value)?,
-            Some(ParameterType::Float64Array),
-        ),
+        ParamValue::List(all) if is_double_list(all) => (to_parameter_value(value)?, Some(ParameterType::Float64Array)),
         // Viewers would take bytes for text.
         ParamValue::Binary(_) => return None,
         other => (to_parameter_value(other)?, None),
     };
-    Some(Parameter {
-        name: name.to_owned(),
-        r#type: hint,
-        value: Some(value),
-    })
+    Some(Parameter { name: name.to_owned(), r#type: hint, value: Some(value) })
 }
 
 fn is_double_list(all: &[ParamValue]) -> bool {
@@ -131,13 +104,9 @@ fn to_parameter_value(value: &ParamValue) -> Option<ParameterValue> {
         ParamValue::Double(value) => ParameterValue::Float64(*value),
         ParamValue::String(value) => ParameterValue::String(value.clone()),
         ParamValue::Binary(_) | ParamValue::Nil => return None,
-        ParamValue::List(all) => {
-            ParameterValue::Array(all.iter().map(to_parameter_value).collect::<Option<_>>()?)
-        }
+        ParamValue::List(all) => ParameterValue::Array(all.iter().map(to_parameter_value).collect::<Option<_>>()?),
         ParamValue::Map(all) => {
-            let one = |(key, value): (&String, &ParamValue)| {
-                Some((key.clone(), to_parameter_value(value)?))
-            };
+            let one = |(key, value): (&String, &ParamValue)| Some((key.clone(), to_parameter_value(value)?));
             ParameterValue::Dict(all.iter().map(one).collect::<Option<_>>()?)
         }
     })
@@ -150,15 +119,10 @@ pub fn from_parameter_value(value: ParameterValue) -> ParamValue {
         ParameterValue::Float64(value) => ParamValue::Double(value),
         ParameterValue::Bool(value) => ParamValue::Bool(value),
         ParameterValue::String(value) => ParamValue::String(value),
-        ParameterValue::Array(all) => {
-            ParamValue::List(all.into_iter().map(from_parameter_value).collect())
-        }
+        ParameterValue::Array(all) => ParamValue::List(all.into_iter().map(from_parameter_value).collect()),
         ParameterValue::Dict(all) => {
             let all = all.into_iter();
-            ParamValue::Map(
-                all.map(|(key, value)| (key, from_parameter_value(value)))
-                    .collect(),
-            )
+            ParamValue::Map(all.map(|(key, value)| (key, from_parameter_value(value))).collect())
         }
     }
 }
@@ -170,10 +134,7 @@ mod tests {
     #[test]
     fn values_come_back_as_they_were() {
         let list = ParamValue::List(vec![ParamValue::Double(1.0), ParamValue::Double(2.5)]);
-        let map = [
-            ("a".to_owned(), list.clone()),
-            ("b".to_owned(), ParamValue::Bool(true)),
-        ];
+        let map = [("a".to_owned(), list.clone()), ("b".to_owned(), ParamValue::Bool(true))];
         for value in [
             ParamValue::Int(3),
             ParamValue::Double(3.0),

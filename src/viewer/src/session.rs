@@ -20,8 +20,7 @@ use foxglove::ws_protocol::server::advertise::Channel;
 use foxglove::ws_protocol::server::advertise_services::Service;
 use foxglove::ws_protocol::server::server_info::Capability;
 use foxglove::ws_protocol::server::{
-    Advertise, AdvertiseServices, ParameterValues, ServerInfo, Status, Unadvertise,
-    UnadvertiseServices,
+    Advertise, AdvertiseServices, ParameterValues, ServerInfo, Status, Unadvertise, UnadvertiseServices,
 };
 use foxglove::ws_protocol::{JsonMessage, ParseError};
 use ros::bus::{Bus, Graph, WireType};
@@ -95,12 +94,7 @@ pub async fn serve<S>(
 {
     let socket = WebSocket::new(io, &read_ahead, LARGEST, LARGEST);
     let mut line = ViewerSocket::new(socket.with_budget(&options.budget, options.unfinished));
-    let ViewedServant {
-        bus,
-        registry,
-        mut ended,
-        held,
-    } = match servant.await {
+    let ViewedServant { bus, registry, mut ended, held } = match servant.await {
         Ok(servant) => servant,
         Err((code, reason)) => return line.close(code, &reason, true).await,
     };
@@ -128,10 +122,7 @@ pub async fn serve<S>(
     };
     session.send_server_info(&options.name);
     let end = loop {
-        session
-            .told
-            .drain(..)
-            .for_each(|frame| line.send_reply(frame));
+        session.told.drain(..).for_each(|frame| line.send_reply(frame));
         // A viewer that does not read is sent no more messages; requests are read until their responses pile up.
         let (is_read, is_given) = (line.should_read(), line.can_send());
         tokio::select! {
@@ -179,9 +170,7 @@ pub async fn serve<S>(
     session.told.drain(..).for_each(|frame| line.send(frame));
     drop((session, held));
     match end {
-        ViewerSessionEnd::Close(code, reason, readable) => {
-            line.close(code, &reason, readable).await
-        }
+        ViewerSessionEnd::Close(code, reason, readable) => line.close(code, &reason, readable).await,
         // The answer to its close frame tells the viewer that everything is published.
         ViewerSessionEnd::Left => line.reply_close().await,
         ViewerSessionEnd::Lost => {}
@@ -255,8 +244,7 @@ impl Session {
     }
 
     fn send_json(&mut self, message: &impl JsonMessage) {
-        self.told
-            .push(ViewerFrame::Text(message.to_string().into()));
+        self.told.push(ViewerFrame::Text(message.to_string().into()));
     }
 
     /// Charges outgoing bytes to the viewer's budget until they are sent.
@@ -276,8 +264,7 @@ impl Session {
         let changes = self.catalogue.update(graph, self.bus.node(), may);
         if !changes.channels_gone.is_empty() {
             let gone = &changes.channels_gone;
-            self.subscriptions
-                .retain(|_, one| !gone.contains(&one.channel));
+            self.subscriptions.retain(|_, one| !gone.contains(&one.channel));
             self.send_json(&Unadvertise::new(gone.iter().copied()));
         }
         if !changes.services_gone.is_empty() {
@@ -343,15 +330,11 @@ impl Session {
                     return;
                 };
                 let (encoding, kind) = (self.format.encoding, self.format.schema);
-                let schema = |name: &str, text: &str| {
-                    Schema::new(name.to_owned(), kind, text.as_bytes().to_vec())
-                };
+                let schema = |name: &str, text: &str| Schema::new(name.to_owned(), kind, text.as_bytes().to_vec());
                 let (request, response) = (&of.request, &of.response);
                 let told = Service::new(id, &service, &of.name)
                     .with_request(encoding, schema(request.name(), request.full_text()))
-                    .and_then(|told| {
-                        told.with_response(encoding, schema(response.name(), response.full_text()))
-                    });
+                    .and_then(|told| told.with_response(encoding, schema(response.name(), response.full_text())));
                 if let Ok(told) = told {
                     self.send_json(&AdvertiseServices::new([told]));
                 }
@@ -371,10 +354,8 @@ impl Session {
     fn drop_revoked(&mut self) {
         let grants = self.granted.grants();
         let may = |operation, name: &str| grants.permits(operation, name);
-        self.subscriptions
-            .retain(|_, one| may(Operation::Subscribe, &one.topic));
-        self.publishers
-            .retain(|_, one| may(Operation::Publish, &one.topic));
+        self.subscriptions.retain(|_, one| may(Operation::Subscribe, &one.topic));
+        self.publishers.retain(|_, one| may(Operation::Publish, &one.topic));
     }
 
     async fn handle_message(&mut self, is_text: bool, message: &[u8]) {
@@ -393,9 +374,7 @@ impl Session {
             }
         }
         let message = if is_text {
-            std::str::from_utf8(message)
-                .map_err(ParseError::from)
-                .and_then(ClientMessage::parse_json)
+            std::str::from_utf8(message).map_err(ParseError::from).and_then(ClientMessage::parse_json)
         } else {
             ClientMessage::parse_binary(message)
         };
@@ -424,17 +403,14 @@ impl Session {
                     self.publishers.remove(&id);
                 }
             }
-            ClientMessage::MessageData(message) => {
-                self.publish(message.channel_id, &message.data).await
-            }
+            ClientMessage::MessageData(message) => self.publish(message.channel_id, &message.data).await,
             ClientMessage::ServiceCallRequest(call) => self.call(call).await,
             ClientMessage::GetParameters(wanted) => {
                 // The same permission as for rosbridge clients.
                 if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/get_param") {
                     return self.send_error(refused.to_string());
                 }
-                self.send_parameters(wanted.parameter_names, wanted.id)
-                    .await;
+                self.send_parameters(wanted.parameter_names, wanted.id).await;
             }
             ClientMessage::SetParameters(wanted) => self.set_parameters(wanted).await,
             ClientMessage::SubscribeConnectionGraph => {

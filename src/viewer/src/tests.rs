@@ -8,8 +8,7 @@ use bridge::ClientGrants;
 use budget::Budget;
 use bytes::Bytes;
 use ros::bus::{
-    Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType,
-    wait_for_connected,
+    Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType, wait_for_connected,
 };
 use ros::schema::Registry;
 use serde_json::{Value, json};
@@ -69,20 +68,11 @@ impl Viewer {
 }
 
 /// Connects a viewer to the system with this budget; also returns the task that serves it.
-fn open_viewer(
-    system: &Arc<MemorySystem>,
-    registry: Arc<Registry>,
-    budget: &Budget,
-) -> (Viewer, JoinHandle<()>) {
+fn open_viewer(system: &Arc<MemorySystem>, registry: Arc<Registry>, budget: &Budget) -> (Viewer, JoinHandle<()>) {
     let (ours, theirs) = tokio::io::duplex(1 << 16);
     let bus: Arc<dyn Bus> = system.join("/cloudroid_inside");
     let (ends, ended) = watch::channel(None);
-    let servant = ViewedServant {
-        bus,
-        registry,
-        ended,
-        held: Box::new(ends),
-    };
+    let servant = ViewedServant { bus, registry, ended, held: Box::new(ends) };
     let options = ViewerOptions {
         name: "lab".to_owned(),
         granted: ClientGrants::fixed(access::Grants::everything()),
@@ -150,14 +140,8 @@ async fn what_would_take_too_much_is_not_read() {
     let budget = Budget::new("viewer x", 16 << 20);
     let (mut viewer, _serving) = open_viewer(&system, Arc::default(), &budget);
     // Deserializing this would copy all the ones once for each enclosing list.
-    let value = format!(
-        "{}{}1{}",
-        "[".repeat(100),
-        "1,".repeat(8000),
-        "]".repeat(100)
-    );
-    let set =
-        format!(r#"{{"op":"setParameters","parameters":[{{"name":"/see.a","value":{value}}}]}}"#);
+    let value = format!("{}{}1{}", "[".repeat(100), "1,".repeat(8000), "]".repeat(100));
+    let set = format!(r#"{{"op":"setParameters","parameters":[{{"name":"/see.a","value":{value}}}]}}"#);
     viewer.send(1, set.as_bytes()).await;
     let status = viewer.next_text("status").await;
     let words = status["message"].as_str().expect("a text");
@@ -167,20 +151,14 @@ async fn what_would_take_too_much_is_not_read() {
 
 #[tokio::test]
 async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
-    let definitions = [
-        ("lab/msg/Seen", "Where[] at\n"),
-        ("lab/msg/Where", "float64 x\n"),
-    ];
+    let definitions = [("lab/msg/Seen", "Where[] at\n"), ("lab/msg/Where", "float64 x\n")];
     let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
     let registry = Registry::with_definitions(RosVersion::Two, &definitions.into()).expect("valid");
     let registry = Arc::new(registry);
     let of = WireType::from_message(&registry.message("lab/msg/Seen").expect("defined"));
     let system = Arc::new(MemorySystem::default());
     let node = system.join("/see");
-    let seen = node
-        .advertise("/seen", of, QosProfile::keep_last(1))
-        .await
-        .expect("advertised");
+    let seen = node.advertise("/seen", of, QosProfile::keep_last(1)).await.expect("advertised");
     let parameters = node.node_parameters().expect("offered");
     let rate = vec![("camera.rate".to_owned(), Some(ParamValue::Double(2.5)))];
     parameters.set("/see", rate).await.expect("set");
@@ -201,9 +179,7 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     let id = channel["id"].clone();
     let wanted = json!({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": id}]});
     viewer.send(1, wanted.to_string().as_bytes()).await;
-    timeout(LONG, wait_for_connected(seen.matched_subscribers(), 1))
-        .await
-        .expect("it subscribes");
+    timeout(LONG, wait_for_connected(seen.matched_subscribers(), 1)).await.expect("it subscribes");
     let message = [0, 1, 0, 0, 0, 0, 0, 0];
     seen.publish(Bytes::copy_from_slice(&message));
     let (opcode, frame) = timeout(LONG, viewer.next_frame()).await.expect("a message");
@@ -215,10 +191,7 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     viewer.send(1, wanted.to_string().as_bytes()).await;
     let told = viewer.next_text("parameterValues").await;
     let rate = &told["parameters"][0];
-    assert_eq!(
-        (&rate["name"], &rate["value"]),
-        (&json!("/see.camera.rate"), &json!(2.5))
-    );
+    assert_eq!((&rate["name"], &rate["value"]), (&json!("/see.camera.rate"), &json!(2.5)));
     let wanted = json!({
         "op": "setParameters", "id": "y", "parameters": [{"name": "/see.camera.rate", "value": 4}],
     });

@@ -38,9 +38,7 @@ impl Header {
             return Ok(None);
         };
         if first & 0x70 != 0 {
-            return Err(WsError::protocol(
-                "reserved bits are set, no extension was agreed upon",
-            ));
+            return Err(WsError::protocol("reserved bits are set, no extension was agreed upon"));
         }
         let opcode = first & 0x0f;
         let last = first & 0x80 != 0;
@@ -57,9 +55,7 @@ impl Header {
         }
         let length = match width {
             0 => u64::from(short),
-            _ => rest[..width]
-                .iter()
-                .fold(0, |sum, &byte| (sum << 8) | u64::from(byte)),
+            _ => rest[..width].iter().fold(0, |sum, &byte| (sum << 8) | u64::from(byte)),
         };
         match opcode {
             CONTINUATION | TEXT | BINARY => {}
@@ -69,23 +65,8 @@ impl Header {
             }
             _ => return Err(WsError::protocol("a reserved opcode is used")),
         }
-        let mask = masked.then(|| {
-            [
-                rest[width],
-                rest[width + 1],
-                rest[width + 2],
-                rest[width + 3],
-            ]
-        });
-        Ok(Some((
-            Header {
-                last,
-                opcode,
-                mask,
-                length,
-            },
-            size,
-        )))
+        let mask = masked.then(|| [rest[width], rest[width + 1], rest[width + 2], rest[width + 3]]);
+        Ok(Some((Header { last, opcode, mask, length }, size)))
     }
 
     /// Appends the header of an unfragmented frame, with its mask if there is one.
@@ -132,25 +113,14 @@ mod tests {
         assert_eq!(header(&[0x81]), None);
         assert_eq!(
             header(&[0x81, 0x85, 1, 2, 3, 4]),
-            Some((
-                Header {
-                    last: true,
-                    opcode: TEXT,
-                    mask: Some([1, 2, 3, 4]),
-                    length: 5
-                },
-                6
-            ))
+            Some((Header { last: true, opcode: TEXT, mask: Some([1, 2, 3, 4]), length: 5 }, 6))
         );
         assert_eq!(header(&[0x81, 0xfe, 1]), None);
         assert_eq!(
             header(&[0x02, 0x7e, 1, 0]).map(|(header, size)| (header.length, header.last, size)),
             Some((256, false, 4))
         );
-        assert_eq!(
-            header(&[0x82, 0x7f, 0, 0, 0, 0, 0, 1, 0, 0]).map(|(header, _)| header.length),
-            Some(65536)
-        );
+        assert_eq!(header(&[0x82, 0x7f, 0, 0, 0, 0, 0, 1, 0, 0]).map(|(header, _)| header.length), Some(65536));
         for length in [0, 125, 126, 65535, 65536] {
             let mut out = bytes::BytesMut::new();
             Header::write(&mut out, BINARY, length, None);
@@ -162,10 +132,7 @@ mod tests {
     #[test]
     fn what_the_protocol_forbids_is_refused() {
         for first in [0xc1, 0x83, 0x09, 0x8b] {
-            assert!(
-                Header::parse(&[first, 0x80, 0, 0, 0, 0]).is_err(),
-                "{first:x}"
-            );
+            assert!(Header::parse(&[first, 0x80, 0, 0, 0, 0]).is_err(), "{first:x}");
         }
         assert!(Header::parse(&[0x89, 0x7e, 0, 126]).is_err());
     }
@@ -174,11 +141,7 @@ mod tests {
     fn masks_come_off_at_every_length() {
         for length in (0..70).chain([127, 128, 200]) {
             let clear: Vec<u8> = (0..length).collect();
-            let mut bytes: Vec<u8> = clear
-                .iter()
-                .enumerate()
-                .map(|(at, byte)| byte ^ [9, 8, 7, 6][at % 4])
-                .collect();
+            let mut bytes: Vec<u8> = clear.iter().enumerate().map(|(at, byte)| byte ^ [9, 8, 7, 6][at % 4]).collect();
             unmask(&mut bytes, [9, 8, 7, 6]);
             assert_eq!(bytes, clear);
         }

@@ -73,17 +73,11 @@ pub enum WsError {
 impl WsError {
     /// Creates the error for a protocol violation (1002).
     pub fn protocol(reason: &str) -> Self {
-        WsError::Refused {
-            code: 1002,
-            reason: reason.to_owned(),
-        }
+        WsError::Refused { code: 1002, reason: reason.to_owned() }
     }
 
     fn too_long(what: &str, length: u64, limit: usize) -> Self {
-        WsError::Refused {
-            code: 1009,
-            reason: format!("a {what} of {length} bytes is over the limit of {limit}"),
-        }
+        WsError::Refused { code: 1009, reason: format!("a {what} of {length} bytes is over the limit of {limit}") }
     }
 }
 
@@ -139,27 +133,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     /// Counts received data against `budget`, from the first byte of a message until the next message is polled for,
     /// and limits the time from a message's first byte to its last to `patience`.
     pub fn with_budget(mut self, budget: &Budget, patience: Duration) -> Self {
-        self.unfinished = Some(ReceiveBudget {
-            permit: budget.permit(),
-            patience,
-            deadline: None,
-            timer: None,
-        });
+        self.unfinished = Some(ReceiveBudget { permit: budget.permit(), patience, deadline: None, timer: None });
         self
     }
 
     /// Creates the client's end; `seed` is a random number for its masks.
-    pub fn client(
-        io: S,
-        read_ahead: &[u8],
-        max_frame: usize,
-        max_message: usize,
-        seed: u64,
-    ) -> Self {
-        Self {
-            masks: Some(MaskGenerator(seed | 1)),
-            ..Self::new(io, read_ahead, max_frame, max_message)
-        }
+    pub fn client(io: S, read_ahead: &[u8], max_frame: usize, max_message: usize, seed: u64) -> Self {
+        Self { masks: Some(MaskGenerator(seed | 1)), ..Self::new(io, read_ahead, max_frame, max_message) }
     }
 
     /// Returns the underlying stream.
@@ -187,8 +167,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 continue;
             }
             self.make_room()?;
-            let Poll::Ready(read) = poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read)
-            else {
+            let Poll::Ready(read) = poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read) else {
                 ready!(self.poll_deadline(cx));
                 return Poll::Ready(Err(self.deadline_error()));
             };
@@ -233,9 +212,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         let patience = unfinished.patience;
         let now = || Instant::now() + patience;
         let deadline = *unfinished.deadline.get_or_insert_with(now);
-        let timer = unfinished
-            .timer
-            .get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
+        let timer = unfinished.timer.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
         // One timer serves all messages: if it was set for an earlier one, it is reset when it fires.
         loop {
             ready!(timer.as_mut().poll(cx));
@@ -247,24 +224,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     fn deadline_error(&self) -> WsError {
-        let patience = self
-            .unfinished
-            .as_ref()
-            .map(|unfinished| unfinished.patience);
+        let patience = self.unfinished.as_ref().map(|unfinished| unfinished.patience);
         WsError::Refused {
             code: 1008,
-            reason: format!(
-                "a message is not complete after {} s",
-                patience.unwrap_or_default().as_secs_f32()
-            ),
+            reason: format!("a message is not complete after {} s", patience.unwrap_or_default().as_secs_f32()),
         }
     }
 
     fn make_room(&mut self) -> Result<(), WsError> {
         let missing = match self.header {
-            Some(header) => {
-                (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len()))
-            }
+            Some(header) => (header.length as usize - self.read.len()).min(READ_AHEAD.max(self.read.len())),
             None => 0,
         };
         let room = missing.max(READ_SIZE / 2);
@@ -284,11 +253,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Ok(())
     }
 
-    fn accept(
-        &mut self,
-        header: Header,
-        mut payload: BytesMut,
-    ) -> Result<Option<WsMessage>, WsError> {
+    fn accept(&mut self, header: Header, mut payload: BytesMut) -> Result<Option<WsMessage>, WsError> {
         if let Some(mask) = header.mask {
             frame::unmask(&mut payload, mask);
         }
@@ -300,9 +265,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
         let (opcode, whole) = match (self.partial.take(), header.opcode) {
             (None, frame::CONTINUATION) => {
-                return Err(WsError::protocol(
-                    "a message begins with a continuation frame",
-                ));
+                return Err(WsError::protocol("a message begins with a continuation frame"));
             }
             (None, opcode) => (opcode, payload),
             (Some((opcode, mut begun)), frame::CONTINUATION) => {
@@ -314,9 +277,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 (opcode, begun)
             }
             (Some(_), _) => {
-                return Err(WsError::protocol(
-                    "a message begins before the last one has ended",
-                ));
+                return Err(WsError::protocol("a message begins before the last one has ended"));
             }
         };
         if !header.last {
@@ -324,18 +285,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             return Ok(None);
         }
         if whole.len() > self.max_message {
-            return Err(WsError::too_long(
-                "message",
-                whole.len() as u64,
-                self.max_message,
-            ));
+            return Err(WsError::too_long("message", whole.len() as u64, self.max_message));
         }
         let whole = whole.freeze();
-        Ok(Some(if opcode == frame::TEXT {
-            WsMessage::Text(whole)
-        } else {
-            WsMessage::Binary(whole)
-        }))
+        Ok(Some(if opcode == frame::TEXT { WsMessage::Text(whole) } else { WsMessage::Binary(whole) }))
     }
 
     /// Returns the number of bytes that are queued and not yet written to the socket.
@@ -393,8 +346,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                 *slice = IoSlice::new(bytes);
                 count += 1;
             }
-            let mut written =
-                ready!(Pin::new(&mut self.io).poll_write_vectored(cx, &slices[..count]))?;
+            let mut written = ready!(Pin::new(&mut self.io).poll_write_vectored(cx, &slices[..count]))?;
             if written == 0 {
                 return Poll::Ready(Err(io::ErrorKind::WriteZero.into()));
             }
@@ -465,9 +417,7 @@ fn parse_close(payload: &[u8]) -> Result<WsMessage, WsError> {
             let code = u16::from_be_bytes([*high, *low]);
             match std::str::from_utf8(reason) {
                 Ok(reason) if is_sendable(code) => Ok(WsMessage::Close(code, reason.to_owned())),
-                _ => Err(WsError::protocol(
-                    "a close frame has no valid code and reason",
-                )),
+                _ => Err(WsError::protocol("a close frame has no valid code and reason")),
             }
         }
         _ => Err(WsError::protocol("a close frame has half a code")),

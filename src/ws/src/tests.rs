@@ -8,10 +8,7 @@ use super::*;
 const LIMIT: usize = 1 << 20;
 
 /// Returns our end and one of tungstenite's.
-async fn pair() -> (
-    WebSocket<tokio::io::DuplexStream>,
-    WebSocketStream<tokio::io::DuplexStream>,
-) {
+async fn pair() -> (WebSocket<tokio::io::DuplexStream>, WebSocketStream<tokio::io::DuplexStream>) {
     let (ours, theirs) = tokio::io::duplex(4096);
     let theirs = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
     (WebSocket::new(ours, b"", LIMIT, LIMIT), theirs)
@@ -28,28 +25,16 @@ async fn messages_of_all_sizes_cross_unchanged_both_ways() {
     let there = async {
         for size in sizes {
             theirs.send(Theirs::binary(vec![7; size])).await.unwrap();
-            theirs
-                .send(Theirs::text("ü".repeat(size / 2)))
-                .await
-                .unwrap();
+            theirs.send(Theirs::text("ü".repeat(size / 2))).await.unwrap();
         }
         for size in sizes {
-            assert_eq!(
-                theirs.next().await.unwrap().unwrap(),
-                Theirs::binary(vec![9; size])
-            );
+            assert_eq!(theirs.next().await.unwrap().unwrap(), Theirs::binary(vec![9; size]));
         }
     };
     let here = async {
         for size in sizes {
-            assert_eq!(
-                next(&mut ours).await.unwrap(),
-                WsMessage::Binary(vec![7; size].into())
-            );
-            assert_eq!(
-                next(&mut ours).await.unwrap(),
-                WsMessage::Text("ü".repeat(size / 2).into())
-            );
+            assert_eq!(next(&mut ours).await.unwrap(), WsMessage::Binary(vec![7; size].into()));
+            assert_eq!(next(&mut ours).await.unwrap(), WsMessage::Text("ü".repeat(size / 2).into()));
         }
         for size in sizes {
             ours.queue(frame::BINARY, vec![9; size].into());
@@ -63,28 +48,14 @@ async fn messages_of_all_sizes_cross_unchanged_both_ways() {
 #[tokio::test]
 async fn control_frames_and_close_cross() {
     let (mut ours, mut theirs) = pair().await;
-    theirs
-        .send(Theirs::Ping(Bytes::from_static(b"p")))
-        .await
-        .unwrap();
-    assert_eq!(
-        next(&mut ours).await.unwrap(),
-        WsMessage::Ping(Bytes::from_static(b"p"))
-    );
+    theirs.send(Theirs::Ping(Bytes::from_static(b"p"))).await.unwrap();
+    assert_eq!(next(&mut ours).await.unwrap(), WsMessage::Ping(Bytes::from_static(b"p")));
     theirs.close(None).await.unwrap();
-    assert_eq!(
-        next(&mut ours).await.unwrap(),
-        WsMessage::Close(1005, String::new())
-    );
+    assert_eq!(next(&mut ours).await.unwrap(), WsMessage::Close(1005, String::new()));
     ours.queue_close(1009, &"ü".repeat(100));
     poll_fn(|cx| ours.poll_flush(cx)).await.unwrap();
-    let Theirs::Close(Some(close)) = theirs.next().await.unwrap().unwrap() else {
-        panic!("not closed")
-    };
-    assert_eq!(
-        (u16::from(close.code), close.reason.chars().count()),
-        (1009, 61)
-    );
+    let Theirs::Close(Some(close)) = theirs.next().await.unwrap().unwrap() else { panic!("not closed") };
+    assert_eq!((u16::from(close.code), close.reason.chars().count()), (1009, 61));
     drop(theirs);
     assert!(matches!(next(&mut ours).await, Err(WsError::Eof)));
 }
@@ -110,63 +81,28 @@ fn masked_frame(first: u8, length: u16) -> Vec<u8> {
 async fn limits_and_rules_are_kept() {
     assert_eq!(
         refusal(&masked_frame(0x81, 1001)).await,
-        (
-            1009,
-            "a frame of 1001 bytes is over the limit of 1000".into()
-        )
+        (1009, "a frame of 1001 bytes is over the limit of 1000".into())
     );
     assert_eq!(
-        refusal(&[
-            0x82, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0
-        ])
-        .await,
-        (
-            1009,
-            format!("a frame of {} bytes is over the limit of 1000", u64::MAX)
-        )
+        refusal(&[0x82, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0, 0, 0, 0]).await,
+        (1009, format!("a frame of {} bytes is over the limit of 1000", u64::MAX))
     );
     let parts = [masked_frame(0x01, 800), masked_frame(0x80, 800)].concat();
-    assert_eq!(
-        refusal(&parts).await,
-        (
-            1009,
-            "a message of 1600 bytes is over the limit of 1500".into()
-        )
-    );
-    assert_eq!(
-        refusal(&[0x81, 0x00]).await,
-        (1002, "a client's frames must be masked".into())
-    );
+    assert_eq!(refusal(&parts).await, (1009, "a message of 1600 bytes is over the limit of 1500".into()));
+    assert_eq!(refusal(&[0x81, 0x00]).await, (1002, "a client's frames must be masked".into()));
     assert_eq!(refusal(&masked_frame(0x80, 1)).await.0, 1002);
-    assert_eq!(
-        refusal(&[masked_frame(0x01, 1), masked_frame(0x01, 1)].concat())
-            .await
-            .0,
-        1002
-    );
+    assert_eq!(refusal(&[masked_frame(0x01, 1), masked_frame(0x01, 1)].concat()).await.0, 1002);
     assert_eq!(refusal(&[0x88, 0x81, 0, 0, 0, 0, 3]).await.0, 1002);
     assert_eq!(refusal(b"\x13\x37\xde\xad\xbe\xef").await.0, 1002);
 }
 
 #[tokio::test]
 async fn parts_make_one_message_with_control_frames_between() {
-    let bytes = [
-        masked_frame(0x01, 2),
-        masked_frame(0x89, 0),
-        masked_frame(0x00, 2),
-        masked_frame(0x80, 2),
-    ]
-    .concat();
+    let bytes = [masked_frame(0x01, 2), masked_frame(0x89, 0), masked_frame(0x00, 2), masked_frame(0x80, 2)].concat();
     let (io, _keep) = tokio::io::duplex(64);
     let mut socket = WebSocket::new(io, &bytes, 1000, 1000);
-    assert_eq!(
-        next(&mut socket).await.unwrap(),
-        WsMessage::Ping(Bytes::new())
-    );
-    assert_eq!(
-        next(&mut socket).await.unwrap(),
-        WsMessage::Text(vec![0; 6].into())
-    );
+    assert_eq!(next(&mut socket).await.unwrap(), WsMessage::Ping(Bytes::new()));
+    assert_eq!(next(&mut socket).await.unwrap(), WsMessage::Text(vec![0; 6].into()));
 }
 
 #[tokio::test]
@@ -193,14 +129,9 @@ async fn what_has_come_of_an_unfinished_message_is_counted() {
     // Five bytes are announced, masked with zeros.
     let frame = [0x82, 0x85, 0, 0, 0, 0, 1, 2, 3, 4, 5];
     for (sent, piece) in [(3, &frame[..3]), (8, &frame[3..8]), (11, &frame[8..])] {
-        tokio::io::AsyncWriteExt::write_all(&mut theirs, piece)
-            .await
-            .unwrap();
+        tokio::io::AsyncWriteExt::write_all(&mut theirs, piece).await.unwrap();
         let polled = poll_fn(|cx| Poll::Ready(ours.poll_next(cx))).await;
-        assert_eq!(
-            (ours.bytes_received(), polled.is_ready()),
-            (sent, sent == 11)
-        );
+        assert_eq!((ours.bytes_received(), polled.is_ready()), (sent, sent == 11));
     }
 }
 
@@ -221,8 +152,7 @@ async fn unfinished_messages_take_no_more_than_their_budget() {
     for _ in 0..20 {
         let (ours, mut theirs) = tokio::io::duplex(64 << 10);
         let limit = 64 << 20;
-        let mut socket =
-            WebSocket::new(ours, b"", limit, limit).with_budget(&budget, Duration::from_secs(3600));
+        let mut socket = WebSocket::new(ours, b"", limit, limit).with_budget(&budget, Duration::from_secs(3600));
         sockets.spawn(async move {
             let sending = async {
                 theirs.write_all(&frame_header(3 << 20, false)).await?;
@@ -253,8 +183,7 @@ async fn a_message_counts_until_the_next_is_asked_for() {
     let budget = Budget::new("client x", 2 << 20);
     let (ours, theirs) = tokio::io::duplex(4096);
     let mut theirs = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
-    let mut ours =
-        WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&budget, Duration::from_secs(60));
+    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&budget, Duration::from_secs(60));
     tokio::spawn(async move {
         for size in [1 << 20, 10, 1 << 20] {
             theirs.send(Theirs::binary(vec![7; size])).await.unwrap();
@@ -275,8 +204,7 @@ async fn a_message_that_stays_unfinished_ends_the_connection() {
     use tokio::io::AsyncWriteExt as _;
     let (ours, mut theirs) = tokio::io::duplex(4096);
     let patience = Duration::from_millis(30);
-    let mut ours =
-        WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&Budget::without_limit(), patience);
+    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&Budget::without_limit(), patience);
     // A whole message, and then idleness for longer than the time limit.
     let mut whole = frame_header(2, true);
     whole.extend(b"ab");
@@ -286,19 +214,13 @@ async fn a_message_that_stays_unfinished_ends_the_connection() {
     assert!(idle.is_err(), "{idle:?}");
     // An unfinished message, one byte at a time.
     let dripping = tokio::spawn(async move {
-        theirs
-            .write_all(&frame_header(100_000, true))
-            .await
-            .unwrap();
+        theirs.write_all(&frame_header(100_000, true)).await.unwrap();
         while theirs.write_all(b"x").await.is_ok() {
             tokio::time::sleep(patience / 3).await;
         }
     });
     let error = next(&mut ours).await.unwrap_err();
-    assert!(
-        matches!(&error, WsError::Refused { code: 1008, reason } if reason.contains("not complete")),
-        "{error}"
-    );
+    assert!(matches!(&error, WsError::Refused { code: 1008, reason } if reason.contains("not complete")), "{error}");
     drop(ours);
     dripping.await.unwrap();
 }

@@ -47,16 +47,8 @@ const PROC: [&str; 22] = [
     "clear_refs",
 ];
 /// Files among them that can be written to change the process.
-const WRITTEN: [&str; 8] = [
-    "mem",
-    "clear_refs",
-    "oom_score_adj",
-    "comm",
-    "coredump_filter",
-    "timerslack_ns",
-    "attr/current",
-    "setgroups",
-];
+const WRITTEN: [&str; 8] =
+    ["mem", "clear_refs", "oom_score_adj", "comm", "coredump_filter", "timerslack_ns", "attr/current", "setgroups"];
 
 /// Number of attempts, and those that succeeded.
 #[derive(Default)]
@@ -113,16 +105,10 @@ fn list_below(directory: &Path, found: &mut Vec<PathBuf>) {
 
 /// Adds all descendants of a process.
 fn add_descendants(pid: i32, found: &mut BTreeSet<i32>) {
-    let tasks = fs::read_dir(format!("/proc/{pid}/task"))
-        .into_iter()
-        .flatten()
-        .flatten();
+    let tasks = fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
     for task in tasks {
         let children = fs::read_to_string(task.path().join("children")).unwrap_or_default();
-        for child in children
-            .split_whitespace()
-            .filter_map(|word| word.parse().ok())
-        {
+        for child in children.split_whitespace().filter_map(|word| word.parse().ok()) {
             if found.insert(child) {
                 add_descendants(child, found);
             }
@@ -138,20 +124,14 @@ fn try_files(tried: &mut LocalAttempts, paths: &[PathBuf]) {
         let read = File::open(path).and_then(|mut file| file.read(&mut bytes));
         tried.expect_refused(|| format!("read {}", shown()), read);
         tried.expect_refused(|| format!("list {}", shown()), fs::read_dir(path));
-        let written = OpenOptions::new()
-            .append(true)
-            .custom_flags(libc::O_NONBLOCK)
-            .open(path);
+        let written = OpenOptions::new().append(true).custom_flags(libc::O_NONBLOCK).open(path);
         tried.expect_refused(|| format!("write {}", shown()), written);
         tried.expect_refused(|| format!("remove {}", shown()), fs::remove_file(path));
         let moved = fs::rename(path, path.with_extension("moved"));
         tried.expect_refused(|| format!("move {}", shown()), moved);
         let opened = fs::set_permissions(path, Permissions::from_mode(0o777));
         tried.expect_refused(|| format!("open up {}", shown()), opened);
-        tried.expect_refused(
-            || format!("link to {}", shown()),
-            fs::hard_link(path, "/tmp/of-another"),
-        );
+        tried.expect_refused(|| format!("link to {}", shown()), fs::hard_link(path, "/tmp/of-another"));
         let made = File::create_new(path.join("planted"));
         tried.expect_refused(|| format!("plant a file in {}", shown()), made);
     }
@@ -179,51 +159,28 @@ fn try_processes(tried: &mut LocalAttempts, pids: &BTreeSet<i32>) {
         }
         for file in WRITTEN {
             let path = format!("/proc/{pid}/{file}");
-            let written = OpenOptions::new()
-                .write(true)
-                .open(&path)
-                .and_then(|mut file| file.write(b"1"));
+            let written = OpenOptions::new().write(true).open(&path).and_then(|mut file| file.write(b"1"));
             tried.expect_refused(|| format!("write {path}"), written);
         }
         let mut word = [0_u8; 8];
-        let here = libc::iovec {
-            iov_base: word.as_mut_ptr().cast(),
-            iov_len: word.len(),
-        };
-        let there = libc::iovec {
-            iov_base: 0x1000 as *mut libc::c_void,
-            iov_len: word.len(),
-        };
-        let limit = libc::rlimit {
-            rlim_cur: 1,
-            rlim_max: 1,
-        };
+        let here = libc::iovec { iov_base: word.as_mut_ptr().cast(), iov_len: word.len() };
+        let there = libc::iovec { iov_base: 0x1000 as *mut libc::c_void, iov_len: word.len() };
+        let limit = libc::rlimit { rlim_cur: 1, rlim_max: 1 };
         // SAFETY: every pointer refers to a local variable, or is null where the call accepts that; the calls would
         // affect another process, and are refused.
         unsafe {
-            tried.expect_call_refused(
-                || format!("attach to {pid}"),
-                libc::ptrace(libc::PTRACE_ATTACH, *pid, 0, 0),
-            );
-            tried.expect_call_refused(
-                || format!("seize {pid}"),
-                libc::ptrace(libc::PTRACE_SEIZE, *pid, 0, 0),
-            );
+            tried.expect_call_refused(|| format!("attach to {pid}"), libc::ptrace(libc::PTRACE_ATTACH, *pid, 0, 0));
+            tried.expect_call_refused(|| format!("seize {pid}"), libc::ptrace(libc::PTRACE_SEIZE, *pid, 0, 0));
             for signal in [0, libc::SIGSTOP, libc::SIGHUP, libc::SIGTERM, libc::SIGKILL] {
-                tried.expect_call_refused(
-                    || format!("signal {signal} to {pid}"),
-                    libc::kill(*pid, signal).into(),
-                );
+                tried.expect_call_refused(|| format!("signal {signal} to {pid}"), libc::kill(*pid, signal).into());
             }
             tried.expect_call_refused(
                 || format!("read memory of {pid}"),
-                libc::process_vm_readv(*pid, &raw const here, 1, &raw const there, 1, 0)
-                    as libc::c_long,
+                libc::process_vm_readv(*pid, &raw const here, 1, &raw const there, 1, 0) as libc::c_long,
             );
             tried.expect_call_refused(
                 || format!("write memory of {pid}"),
-                libc::process_vm_writev(*pid, &raw const here, 1, &raw const there, 1, 0)
-                    as libc::c_long,
+                libc::process_vm_writev(*pid, &raw const here, 1, &raw const there, 1, 0) as libc::c_long,
             );
             let handle = libc::syscall(libc::SYS_pidfd_open, *pid, 0);
             tried.expect_call_refused(
@@ -232,22 +189,12 @@ fn try_processes(tried: &mut LocalAttempts, pids: &BTreeSet<i32>) {
             );
             tried.expect_call_refused(
                 || format!("enter the namespaces of {pid}"),
-                libc::syscall(
-                    libc::SYS_setns,
-                    handle,
-                    libc::CLONE_NEWNS | libc::CLONE_NEWNET,
-                ),
+                libc::syscall(libc::SYS_setns, handle, libc::CLONE_NEWNS | libc::CLONE_NEWNET),
             );
             libc::syscall(libc::SYS_close, handle);
             tried.expect_call_refused(
                 || format!("limit {pid}"),
-                libc::prlimit(
-                    *pid,
-                    libc::RLIMIT_NOFILE,
-                    &raw const limit,
-                    std::ptr::null_mut(),
-                )
-                .into(),
+                libc::prlimit(*pid, libc::RLIMIT_NOFILE, &raw const limit, std::ptr::null_mut()).into(),
             );
             tried.expect_call_refused(
                 || format!("slow {pid} down"),
@@ -285,9 +232,7 @@ fn cgroup_directories(pids: &BTreeSet<i32>) -> anyhow::Result<BTreeSet<PathBuf>>
                 "" => String::new(),
                 controllers => controllers.replace("name=", ""),
             };
-            let directory = Path::new("/sys/fs/cgroup")
-                .join(below)
-                .join(path.trim_start_matches('/'));
+            let directory = Path::new("/sys/fs/cgroup").join(below).join(path.trim_start_matches('/'));
             for file in fs::read_dir(directory).into_iter().flatten().flatten() {
                 found.insert(file.path());
             }
@@ -298,10 +243,7 @@ fn cgroup_directories(pids: &BTreeSet<i32>) -> anyhow::Result<BTreeSet<PathBuf>>
 
 fn try_cgroup_files(tried: &mut LocalAttempts, files: &BTreeSet<PathBuf>) {
     for path in files.iter().filter(|path| path.is_file()) {
-        let written = OpenOptions::new()
-            .write(true)
-            .open(path)
-            .and_then(|mut file| file.write(b"0"));
+        let written = OpenOptions::new().write(true).open(path).and_then(|mut file| file.write(b"0"));
         tried.expect_refused(|| format!("write {}", path.display()), written);
     }
     let directories: BTreeSet<&Path> = files.iter().filter_map(|path| path.parent()).collect();
@@ -316,10 +258,7 @@ fn try_cgroup_files(tried: &mut LocalAttempts, files: &BTreeSet<PathBuf>) {
 fn try_sockets(tried: &mut LocalAttempts, home: &Path) -> anyhow::Result<()> {
     let list = fs::read_to_string("/proc/net/unix")?;
     let home = home.display().to_string();
-    for name in list
-        .lines()
-        .filter_map(|line| line.split_whitespace().nth(7))
-    {
+    for name in list.lines().filter_map(|line| line.split_whitespace().nth(7)) {
         let abstract_name = name
             .strip_prefix('@')
             .filter(|name| name.contains("cloudroid"))
@@ -330,10 +269,7 @@ fn try_sockets(tried: &mut LocalAttempts, home: &Path) -> anyhow::Result<()> {
             None if name.starts_with(&home) => SocketAddr::from_pathname(name)?,
             None => continue,
         };
-        tried.expect_refused(
-            || format!("connect to {name}"),
-            UnixStream::connect_addr(&address),
-        );
+        tried.expect_refused(|| format!("connect to {name}"), UnixStream::connect_addr(&address));
         let sent = UnixDatagram::unbound().and_then(|socket| socket.send_to_addr(b"x", &address));
         tried.expect_refused(|| format!("send to {name}"), sent);
     }
@@ -342,14 +278,10 @@ fn try_sockets(tried: &mut LocalAttempts, home: &Path) -> anyhow::Result<()> {
 
 pub fn another_account_of_this_machine_reaches_nothing() -> Verdict {
     // A directory that other users can enter, so that only the daemon's own protection matters.
-    let place = tempfile::Builder::new()
-        .prefix("cloudroid-account-")
-        .tempdir()?;
+    let place = tempfile::Builder::new().prefix("cloudroid-account-").tempdir()?;
     fs::set_permissions(place.path(), Permissions::from_mode(0o755))?;
     let home = place.path().join("home");
-    let daemon = DaemonSetup::new(&home)
-        .config("tokens = [\"open sesame\"]\n")
-        .start()?;
+    let daemon = DaemonSetup::new(&home).config("tokens = [\"open sesame\"]\n").start()?;
     let alice = create_token(&daemon, &["alice", "--role", "deployer", "--service", "*"])?;
     push_adder(&daemon, &alice, &[])?.expect_success()?;
     let mut robot = daemon.robot(&format!("adder_py?robot=r1&token={alice}"))?;
@@ -371,20 +303,13 @@ fn try_everything(daemon: &Daemon, home: &Path, secret: &str) -> anyhow::Result<
     // These files belong to the story.
     paths.retain(|path| !path.ends_with("daemon.log") && !path.ends_with("test-config.toml"));
     for needed in ["cloudroid.db", "run/daemon.sock", "layers", "images"] {
-        ensure!(
-            paths.contains(&home.join(needed)),
-            "{needed} is not in {paths:#?}"
-        );
+        ensure!(paths.contains(&home.join(needed)), "{needed} is not in {paths:#?}");
     }
     let mut pids = BTreeSet::from([daemon.pid()]);
     add_descendants(daemon.pid(), &mut pids);
     for servant in daemon.servants_of("adder_py")? {
         let inside = servant["pids"].as_array().context("pids")?;
-        pids.extend(
-            inside
-                .iter()
-                .filter_map(|pid| i32::try_from(pid.as_i64()?).ok()),
-        );
+        pids.extend(inside.iter().filter_map(|pid| i32::try_from(pid.as_i64()?).ok()));
     }
     ensure!(pids.len() > 2, "{pids:?}");
     let groups = cgroup_directories(&pids)?;
@@ -398,10 +323,7 @@ fn try_everything(daemon: &Daemon, home: &Path, secret: &str) -> anyhow::Result<
         for (pid, line) in pids.iter().flat_map(|pid| lines.map(|line| (pid, line))) {
             let text = fs::read_to_string(format!("/proc/{pid}/{line}")).unwrap_or_default();
             let holds = text.contains(secret) || text.contains("open sesame");
-            tried.expect_refused(
-                || format!("find a token in {line} of {pid}"),
-                if holds { Ok(()) } else { Err(()) },
-            );
+            tried.expect_refused(|| format!("find a token in {line} of {pid}"), if holds { Ok(()) } else { Err(()) });
         }
         try_sockets(&mut tried, home)?;
         // Over loopback the user has no special rights.
@@ -416,16 +338,10 @@ fn try_everything(daemon: &Daemon, home: &Path, secret: &str) -> anyhow::Result<
             ("GET", "/stubs/adder_py.tar.gz"),
         ] {
             let (status, _) = daemon.request(method, path, &[])?;
-            tried.expect_refused(
-                || format!("{method} {path}: {status}"),
-                if status == 401 { Err(()) } else { Ok(()) },
-            );
+            tried.expect_refused(|| format!("{method} {path}: {status}"), if status == 401 { Err(()) } else { Ok(()) });
         }
         // It cannot take the daemon's place either.
-        for again in [
-            &*daemon.address,
-            &daemon.address.replace("127.0.0.1", "0.0.0.0"),
-        ] {
+        for again in [&*daemon.address, &daemon.address.replace("127.0.0.1", "0.0.0.0")] {
             tried.expect_refused(|| format!("listen at {again}"), TcpListener::bind(again));
         }
         Ok(tried)

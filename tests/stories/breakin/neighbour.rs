@@ -37,15 +37,10 @@ impl NeighbourNetwork {
         };
         let there = format!("ct{id}");
         let (name, end) = (network.name.as_str(), network.end.as_str());
-        let (own, theirs) = (
-            format!("{}/30", network.address),
-            format!("198.51.100.{}/30", low + 2),
-        );
+        let (own, theirs) = (format!("{}/30", network.address), format!("198.51.100.{}/30", low + 2));
         for words in [
             &["netns", "add", name][..],
-            &[
-                "link", "add", end, "type", "veth", "peer", "name", &there, "netns", name,
-            ],
+            &["link", "add", end, "type", "veth", "peer", "name", &there, "netns", name],
             &["addr", "add", &own, "dev", end],
             &["link", "set", end, "up"],
             &["-n", name, "addr", "add", &theirs, "dev", &there],
@@ -58,10 +53,7 @@ impl NeighbourNetwork {
 
     /// Runs a program in the namespace.
     fn run(&self, program: &Path, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
-        run(tell_patience(&mut Command::new("ip"))
-            .args(["netns", "exec", &self.name])
-            .arg(program)
-            .args(arguments))
+        run(tell_patience(&mut Command::new("ip")).args(["netns", "exec", &self.name]).arg(program).args(arguments))
     }
 }
 
@@ -88,52 +80,31 @@ done
 
 /// Pairs robot rover2; returns its certificate and key, and forged ones, by name.
 fn make_certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
-    let made = daemon
-        .deployer()
-        .run_json(&["pair", "rover2", "--services", "none_*"])?;
+    let made = daemon.deployer().run_json(&["pair", "rover2", "--services", "none_*"])?;
     let line = made["line"].as_str().context("a line")?;
     let own = place.join("own");
     run(Command::new(binaries::path("stubs/x86_64/cloudroid-stub"))
         .args(["pair", line])
         .env("CLOUDROID_IDENTITY", &own))?
     .expect_success()?;
-    let kept = std::fs::read_dir(own.join("paired"))?
-        .next()
-        .context("a pairing")??;
+    let kept = std::fs::read_dir(own.join("paired"))?.next().context("a pairing")??;
     let text = std::fs::read_to_string(kept.path())?.replace("\\n", "\n");
     let begin = text.find("-----BEGIN").context("a certificate")?;
     let end = text.find("-----END CERTIFICATE-----").context("its end")?;
-    std::fs::write(
-        place.join("robot.pem"),
-        format!("{}-----END CERTIFICATE-----\n", &text[begin..end]),
-    )?;
+    std::fs::write(place.join("robot.pem"), format!("{}-----END CERTIFICATE-----\n", &text[begin..end]))?;
     std::fs::copy(own.join("robot.key"), place.join("robot.key"))?;
     // The other authority has the same name as the daemon's.
     let issuer = run(Command::new("openssl")
         .args(["x509", "-noout", "-issuer", "-nameopt", "compat", "-in"])
         .arg(place.join("robot.pem")))?
     .expect_success()?;
-    let authority = issuer
-        .stdout
-        .trim()
-        .trim_start_matches("issuer=")
-        .trim()
-        .to_owned();
+    let authority = issuer.stdout.trim().trim_start_matches("issuer=").trim().to_owned();
     run(Command::new("sh")
         .args(["-euc", CERTIFICATES])
-        .env(
-            "AUTHORITY",
-            if authority.starts_with('/') {
-                authority
-            } else {
-                "/CN=authority".to_owned()
-            },
-        )
+        .env("AUTHORITY", if authority.starts_with('/') { authority } else { "/CN=authority".to_owned() })
         .current_dir(place))?
     .expect_success()?;
-    let pair = |certificate: &str, key: &str| -> [PathBuf; 2] {
-        [place.join(certificate), place.join(key)]
-    };
+    let pair = |certificate: &str, key: &str| -> [PathBuf; 2] { [place.join(certificate), place.join(key)] };
     Ok(json!({
         "that signs itself": pair("self.pem", "self.key"),
         "of another authority": pair("ca-other.pem", "ca-other.key"),
@@ -208,29 +179,17 @@ pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
     let daemon = world()
         .setup("breakin-neighbour")
         .listen(&format!("{}:0", network.address))
-        .config(
-            "tokens = [\"open sesame\"]\n[tls]\nserve = \"tls\"\n[portal]\nhandshake = \"5s\"\n",
-        )
+        .config("tokens = [\"open sesame\"]\n[tls]\nserve = \"tls\"\n[portal]\nhandshake = \"5s\"\n")
         .start()?;
     create_token(&daemon, &["chief", "--role", "admin"])?;
-    people::run_account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?
-        .expect_success()?;
+    people::run_account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?.expect_success()?;
     let place = world().directory("neighbour")?;
     let certificates = make_certificates(&daemon, place.path())?;
     let before = server_state(&daemon)?;
     let (host, port) = daemon.address.rsplit_once(':').context("a port")?;
     let routes: Vec<_> = read_routes()?
         .into_iter()
-        .map(|(method, path)| {
-            (
-                if method == "ANY" {
-                    "GET".to_owned()
-                } else {
-                    method
-                },
-                path,
-            )
-        })
+        .map(|(method, path)| (if method == "ANY" { "GET".to_owned() } else { method }, path))
         .collect();
     let asked = json!({
         "host": host,
@@ -240,19 +199,11 @@ pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
         "certificates": certificates,
     });
     let script = binaries::checkout().join("tests/stories/breakin/neighbour.py");
-    let told = network
-        .run(
-            &binaries::python(),
-            &[path_str(&script), &asked.to_string()],
-        )?
-        .expect_success()?;
+    let told = network.run(&binaries::python(), &[path_str(&script), &asked.to_string()])?.expect_success()?;
     let mut tried = 0;
     for line in told.stdout.lines() {
         let one: Value = serde_json::from_str(line).with_context(|| line.to_owned())?;
-        let (name, came) = (
-            one["name"].as_str().unwrap_or_default(),
-            one["came"].as_str().unwrap_or_default(),
-        );
+        let (name, came) = (one["name"].as_str().unwrap_or_default(), one["came"].as_str().unwrap_or_default());
         let open = OPEN.contains(&(name, came));
         ensure!(open || is_allowed_outcome(name, came), "{name}: {came}");
         tried += 1;
@@ -260,10 +211,7 @@ pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
     ensure!(server_state(&daemon)? == before, "{before:#}");
     // There is no other listening socket.
     let doors = listening_addresses(daemon.pid())?;
-    ensure!(
-        doors.len() == 1 && doors.iter().all(|door| door.starts_with("tcp ")),
-        "{doors:?}"
-    );
+    ensure!(doors.len() == 1 && doors.iter().all(|door| door.starts_with("tcp ")), "{doors:?}");
     println!("{tried} attempts");
     ensure!(tried > 180, "{tried}: {}", told.output());
     Ok(())

@@ -57,10 +57,9 @@ impl HostileSite {
         };
         // As the portal sets it; the browser sends it to all ports of a host.
         let cookie = match path {
-            "/page" if head.contains(FIRST) => format!(
-                "Set-Cookie: {}; Path=/; HttpOnly; SameSite=Strict\r\n",
-                self.cookie
-            ),
+            "/page" if head.contains(FIRST) => {
+                format!("Set-Cookie: {}; Path=/; HttpOnly; SameSite=Strict\r\n", self.cookie)
+            }
             _ => String::new(),
         };
         write!(
@@ -79,10 +78,7 @@ impl HostileSite {
         let head = head.replace("Connection: keep-alive", "Connection: close");
         portal.write_all(head.as_bytes())?;
         portal.write_all(body)?;
-        let (mut from, mut to) = (
-            PatientStream::new(portal.try_clone()?)?,
-            stream.try_clone()?,
-        );
+        let (mut from, mut to) = (PatientStream::new(portal.try_clone()?)?, stream.try_clone()?);
         let back = std::thread::spawn(move || {
             let _ = std::io::copy(&mut from, &mut to);
             let _ = to.shutdown(Shutdown::Both);
@@ -101,10 +97,7 @@ fn try_from_pages(daemon: &Daemon, cookie: &str) -> anyhow::Result<Vec<Value>> {
     let port = listener.local_addr()?.port();
     let (sender, said) = mpsc::channel();
     let (_, own) = daemon.address.rsplit_once(':').context("a port")?;
-    let sites: Vec<String> = SITES
-        .iter()
-        .map(|name| format!("http://{name}:{port}"))
-        .collect();
+    let sites: Vec<String> = SITES.iter().map(|name| format!("http://{name}:{port}")).collect();
     let site = Arc::new(HostileSite {
         portal: daemon.address.clone(),
         cookie: cookie.to_owned(),
@@ -150,16 +143,12 @@ pub fn a_page_of_another_site_reaches_nothing_in_a_real_browser() -> Verdict {
     drop(open);
     // With a user who is signed in.
     let daemon = world().setup("breakin-page").start()?;
-    people::run_account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?
-        .expect_success()?;
+    people::run_account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?.expect_success()?;
     let alice = people::SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
     let before = server_state(&daemon)?;
     tried += count_failed("signed in", &try_from_pages(&daemon, &alice.cookie)?)?;
     ensure!(server_state(&daemon)? == before, "{before:#}");
-    ensure!(
-        alice.request("GET", "/api/v1/tokens")?.0 == 200,
-        "she is signed in still"
-    );
+    ensure!(alice.request("GET", "/api/v1/tokens")?.0 == 200, "she is signed in still");
     println!("{tried} attempts");
     ensure!(tried > 1000, "{tried}");
     Ok(())

@@ -14,8 +14,7 @@ const NOWHERE: &[u16] = &[400, 403, 404, 405, 414];
 
 /// Administration, which is for admins only.
 pub fn administration_attempts<'a>() -> Vec<RequestAttempt<'a>> {
-    let new =
-        |role: &str| json!({"name": "mallory", "role": role, "services": ["*"], "robot": "r1"});
+    let new = |role: &str| json!({"name": "mallory", "role": role, "services": ["*"], "robot": "r1"});
     let person = json!({"name": "mallory", "password": "long enough a password", "role": "admin"});
     let rule = |who: &str| json!({"who": who, "services": "*", "allow": ["*:/**"]});
     let mut attempts: Vec<_> = ["admin", "operator", "deployer", "robot", "viewer"]
@@ -37,23 +36,10 @@ pub fn administration_attempts<'a>() -> Vec<RequestAttempt<'a>> {
         RequestAttempt::new("DELETE", "/api/v1/tokens/over", NO),
         RequestAttempt::new("DELETE", "/api/v1/tokens/nobody", NO),
     ]);
-    for name in [
-        "chief", "olga", "alice", "rover", "eve", "over", "nobody", "*",
-    ] {
-        attempts.push(RequestAttempt::new(
-            "POST",
-            format!("/api/v1/tokens/{name}/rotate"),
-            NO,
-        ));
+    for name in ["chief", "olga", "alice", "rover", "eve", "over", "nobody", "*"] {
+        attempts.push(RequestAttempt::new("POST", format!("/api/v1/tokens/{name}/rotate"), NO));
     }
-    for path in [
-        "tokens",
-        "accounts",
-        "sessions",
-        "policy",
-        "audit",
-        "audit?follow=true",
-    ] {
+    for path in ["tokens", "accounts", "sessions", "policy", "audit", "audit?follow=true"] {
         attempts.push(RequestAttempt::new("GET", format!("/api/v1/{path}"), NO));
         attempts.push(RequestAttempt::new("HEAD", format!("/api/v1/{path}"), NO));
     }
@@ -73,11 +59,7 @@ fn operation_attempts<'a>() -> Vec<RequestAttempt<'a>> {
         RequestAttempt::new("DELETE", "/api/v1/servants?service=", NO),
         RequestAttempt::new("DELETE", "/api/v1/servants?service=*", NO),
         RequestAttempt::new("DELETE", "/api/v1/servants?service=vault", NO),
-        RequestAttempt::new(
-            "DELETE",
-            "/api/v1/servants?service=adder_py&service=vault",
-            &[400, 403],
-        ),
+        RequestAttempt::new("DELETE", "/api/v1/servants?service=adder_py&service=vault", &[400, 403]),
         // Only through TLS, and by the robot that shows its certificate.
         RequestAttempt::new("POST", "/api/v1/renew", &[400]).body(json!({"request": "x"})),
         RequestAttempt::new("POST", "/api/v1/pair", &[400])
@@ -115,27 +97,16 @@ fn change_attempts<'a>(service: &str, servant: &str) -> Vec<RequestAttempt<'a>> 
 fn push_attempt<'a>(options: serde_json::Value, status: &'a [u16]) -> RequestAttempt<'a> {
     let mut options = options;
     options["nodes"] = json!(["x"]);
-    let text: String = options
-        .to_string()
-        .bytes()
-        .map(|byte| format!("%{byte:02x}"))
-        .collect();
+    let text: String = options.to_string().bytes().map(|byte| format!("%{byte:02x}")).collect();
     RequestAttempt::new("POST", format!("/api/v1/push?options={text}"), status)
 }
 
 /// Information about a service for those who may see it.
 fn read_attempts<'a>(service: &str, image: &str, servant: &str) -> Vec<RequestAttempt<'a>> {
-    let mut attempts: Vec<_> = [
-        "",
-        "/interface",
-        "/fit",
-        "/rollout",
-        "/sla",
-        "/sla/explain?rrt=1s",
-    ]
-    .into_iter()
-    .map(|path| RequestAttempt::new("GET", format!("/api/v1/services/{service}{path}"), NO))
-    .collect();
+    let mut attempts: Vec<_> = ["", "/interface", "/fit", "/rollout", "/sla", "/sla/explain?rrt=1s"]
+        .into_iter()
+        .map(|path| RequestAttempt::new("GET", format!("/api/v1/services/{service}{path}"), NO))
+        .collect();
     for path in [
         format!("/v2/{service}/tags/list"),
         format!("/v2/{service}/manifests/latest"),
@@ -156,16 +127,8 @@ fn read_attempts<'a>(service: &str, image: &str, servant: &str) -> Vec<RequestAt
         attempts.push(RequestAttempt::new("GET", path, NO));
     }
     // A blob of another service's image, requested through the own one.
-    attempts.push(RequestAttempt::new(
-        "GET",
-        format!("/v2/adder_py/manifests/{image}"),
-        &[404],
-    ));
-    attempts.push(RequestAttempt::new(
-        "GET",
-        format!("/v2/adder_py/blobs/{image}"),
-        &[404],
-    ));
+    attempts.push(RequestAttempt::new("GET", format!("/v2/adder_py/manifests/{image}"), &[404]));
+    attempts.push(RequestAttempt::new("GET", format!("/v2/adder_py/blobs/{image}"), &[404]));
     attempts
 }
 
@@ -243,35 +206,16 @@ fn path_attempts<'a>() -> Vec<RequestAttempt<'a>> {
 fn method_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     const REFUSED: &[u16] = &[400, 403, 404, 405];
     let mut attempts = Vec::new();
-    for method in [
-        "OPTIONS", "TRACE", "PUT", "PATCH", "PROPFIND", "DELETE ", "delete", "GETX",
-    ] {
-        attempts.push(RequestAttempt::new(
-            method.trim(),
-            "/api/v1/tokens",
-            REFUSED,
-        ));
-        attempts.push(RequestAttempt::new(
-            method.trim(),
-            "/api/v1/services/vault",
-            REFUSED,
-        ));
+    for method in ["OPTIONS", "TRACE", "PUT", "PATCH", "PROPFIND", "DELETE ", "delete", "GETX"] {
+        attempts.push(RequestAttempt::new(method.trim(), "/api/v1/tokens", REFUSED));
+        attempts.push(RequestAttempt::new(method.trim(), "/api/v1/services/vault", REFUSED));
     }
-    for header in [
-        "X-HTTP-Method-Override",
-        "X-HTTP-Method",
-        "X-Method-Override",
-    ] {
-        attempts.push(
-            RequestAttempt::new("POST", "/api/v1/services/vault", REFUSED).header(header, "DELETE"),
-        );
-        attempts
-            .push(RequestAttempt::new("GET", "/api/v1/policy/1", REFUSED).header(header, "DELETE"));
+    for header in ["X-HTTP-Method-Override", "X-HTTP-Method", "X-Method-Override"] {
+        attempts.push(RequestAttempt::new("POST", "/api/v1/services/vault", REFUSED).header(header, "DELETE"));
+        attempts.push(RequestAttempt::new("GET", "/api/v1/policy/1", REFUSED).header(header, "DELETE"));
     }
     for header in ["X-Original-URL", "X-Rewrite-URL", "X-Forwarded-Uri"] {
-        attempts.push(
-            RequestAttempt::new("GET", "/nowhere/at/all", REFUSED).header(header, "/api/v1/tokens"),
-        );
+        attempts.push(RequestAttempt::new("GET", "/nowhere/at/all", REFUSED).header(header, "/api/v1/tokens"));
     }
     for (header, value) in [
         ("X-Forwarded-For", "127.0.0.1"),
@@ -287,24 +231,9 @@ fn method_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     ] {
         attempts.push(RequestAttempt::new("GET", "/api/v1/tokens", REFUSED).header(header, value));
     }
-    for query in [
-        "_method=DELETE",
-        "method=DELETE",
-        "role=admin",
-        "robot=r9",
-        "as=chief",
-        "user=root",
-    ] {
-        attempts.push(RequestAttempt::new(
-            "POST",
-            format!("/api/v1/services/vault?{query}"),
-            REFUSED,
-        ));
-        attempts.push(RequestAttempt::new(
-            "GET",
-            format!("/api/v1/tokens?{query}"),
-            REFUSED,
-        ));
+    for query in ["_method=DELETE", "method=DELETE", "role=admin", "robot=r9", "as=chief", "user=root"] {
+        attempts.push(RequestAttempt::new("POST", format!("/api/v1/services/vault?{query}"), REFUSED));
+        attempts.push(RequestAttempt::new("GET", format!("/api/v1/tokens?{query}"), REFUSED));
     }
     attempts
 }
@@ -359,21 +288,10 @@ fn publish_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     }
     // Errors during the push are reported in the last line of the response.
     for base in ["../../etc", "/etc/shadow"] {
-        attempts.push(push_attempt(
-            json!({"name": "adder_new", "base": base}),
-            &[200],
-        ));
+        attempts.push(push_attempt(json!({"name": "adder_new", "base": base}), &[200]));
     }
-    attempts.push(RequestAttempt::new(
-        "POST",
-        "/api/v1/push?options=%7B",
-        &[400],
-    ));
-    attempts.push(RequestAttempt::new(
-        "POST",
-        "/api/v1/push?options=%7B%22name%22%3A1%7D",
-        &[400],
-    ));
+    attempts.push(RequestAttempt::new("POST", "/api/v1/push?options=%7B", &[400]));
+    attempts.push(RequestAttempt::new("POST", "/api/v1/push?options=%7B%22name%22%3A1%7D", &[400]));
     attempts
 }
 
@@ -414,15 +332,9 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
     let tokens = &scene.tokens;
     let [r1, r2, r9] = &scene.servants;
     let kept = [r9.as_str(), scene.image.as_str()];
-    let fail = |who: &str, token: &str, kept: &[&str], attempts| {
-        scene.all_fail(who, Some(token), kept, attempts)
-    };
+    let fail = |who: &str, token: &str, kept: &[&str], attempts| scene.all_fail(who, Some(token), kept, attempts);
     // Principals who may not see vault.
-    for (who, token) in [
-        ("a robot", &tokens.rover),
-        ("a viewer", &tokens.eve),
-        ("a deployer", &tokens.alice),
-    ] {
+    for (who, token) in [("a robot", &tokens.rover), ("a viewer", &tokens.eve), ("a deployer", &tokens.alice)] {
         fail(who, token, &kept, read_attempts("vault", &scene.image, r9))?;
         fail(who, token, &kept, path_attempts())?;
         fail(who, token, &kept, change_attempts("vault", r9))?;
@@ -450,8 +362,8 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
     fail("a deployer", &tokens.alice, &kept, publish_attempts())?;
     // A robot sees only its own servant, although it may use the other's service as well.
     let beside = [r2.as_str()];
-    let others = ["", "/logs", "/inside"]
-        .map(|path| RequestAttempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
+    let others =
+        ["", "/logs", "/inside"].map(|path| RequestAttempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
     fail("a robot", &tokens.rover, &beside, others.into())?;
     fail(
         "a robot",
@@ -470,17 +382,9 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
         ],
     )?;
     for (who, token) in [("a robot", &tokens.rover), ("a viewer", &tokens.eve)] {
-        let lists = [
-            "services",
-            "servants",
-            "events?limit=1000",
-            "events?service=vault",
-            "back-offs",
-        ];
-        let mut lists: Vec<_> = lists
-            .into_iter()
-            .map(|path| RequestAttempt::new("GET", format!("/api/v1/{path}"), &[200]))
-            .collect();
+        let lists = ["services", "servants", "events?limit=1000", "events?service=vault", "back-offs"];
+        let mut lists: Vec<_> =
+            lists.into_iter().map(|path| RequestAttempt::new("GET", format!("/api/v1/{path}"), &[200])).collect();
         lists.push(RequestAttempt::new("GET", "/stubs", &[200]));
         lists.push(RequestAttempt::new("GET", "/v2/_catalog", &[200]));
         fail(who, token, &["vault", r9], lists)?;

@@ -63,13 +63,7 @@ pub struct RequestAttempt<'a> {
 
 impl<'a> RequestAttempt<'a> {
     pub fn new(method: &'a str, path: impl Into<String>, status: &'a [u16]) -> Self {
-        RequestAttempt {
-            method,
-            path: path.into(),
-            headers: Vec::new(),
-            body: String::new(),
-            status,
-        }
+        RequestAttempt { method, path: path.into(), headers: Vec::new(), body: String::new(), status }
     }
 
     pub fn body(mut self, body: impl ToString) -> Self {
@@ -103,19 +97,13 @@ fn without_volatile(list: &Value, keys: &[&str]) -> Value {
 /// access control.
 pub fn server_state(daemon: &Daemon) -> anyhow::Result<Value> {
     let mut services = Vec::new();
-    for service in daemon
-        .api("/api/v1/services")?
-        .as_array()
-        .context("a list")?
-    {
+    for service in daemon.api("/api/v1/services")?.as_array().context("a list")? {
         let name = service["name"].as_str().context("a name")?;
         let detail = daemon.api(&format!("/api/v1/services/{name}"))?;
         let rows = daemon.api(&format!("/api/v1/services/{name}/sla"))?;
         services.push(json!([name, detail["revisions"], rows]));
     }
-    let all = |path: &str, keys: &[&str]| {
-        Ok::<_, anyhow::Error>(without_volatile(&daemon.api(path)?, keys))
-    };
+    let all = |path: &str, keys: &[&str]| Ok::<_, anyhow::Error>(without_volatile(&daemon.api(path)?, keys));
     Ok(json!({
         "services": services,
         "servants": all("/api/v1/servants", &["id", "service", "robot", "limits"])?,
@@ -131,19 +119,9 @@ impl BreakinScene {
         let daemon = world().setup(name).start()?;
         let made = |words: &[&str]| create_token(&daemon, words);
         let robot = |name: &str, robot: &str, services: &str| {
-            made(&[
-                name,
-                "--role",
-                "robot",
-                "--robot",
-                robot,
-                "--service",
-                services,
-            ])
+            made(&[name, "--role", "robot", "--robot", robot, "--service", services])
         };
-        let scoped = |name: &str, role: &str, services: &str| {
-            made(&[name, "--role", role, "--service", services])
-        };
+        let scoped = |name: &str, role: &str, services: &str| made(&[name, "--role", role, "--service", services]);
         let tokens = SceneTokens {
             admin: made(&["chief", "--role", "admin"])?,
             operator: made(&["olga", "--role", "operator"])?,
@@ -158,27 +136,15 @@ impl BreakinScene {
         };
         let keeper = robot("keeper", "r9", "vault")?;
         let deployer = daemon.deployer();
-        for typed in [
-            &["token", "revoke", "over"][..],
-            &["policy", "allow", "narrow", "subscribe:/rosout"],
-        ] {
+        for typed in [&["token", "revoke", "over"][..], &["policy", "allow", "narrow", "subscribe:/rosout"]] {
             deployer.run(typed)?.expect_success()?;
         }
         push_adder(&daemon, &tokens.alice, &[])?.expect_success()?;
         let vault = [&["--name", "vault"], TELLER.arguments].concat();
         deployer.push(TELLER.name, &vault)?.expect_success()?;
-        people::run_account(
-            &daemon,
-            &["create", "carol", "--role", "operator"],
-            people::PASSWORD,
-        )?
-        .expect_success()?;
+        people::run_account(&daemon, &["create", "carol", "--role", "operator"], people::PASSWORD)?.expect_success()?;
         let mut at_work = Vec::new();
-        for (service, token) in [
-            ("adder_py", &tokens.rover),
-            ("adder_py", &tokens.other),
-            ("vault", &keeper),
-        ] {
+        for (service, token) in [("adder_py", &tokens.rover), ("adder_py", &tokens.other), ("vault", &keeper)] {
             let mut robot = daemon.robot(&format!("{service}?token={token}"))?;
             robot.call("/rosapi/get_time", json!({}))?;
             at_work.push(robot);
@@ -187,23 +153,10 @@ impl BreakinScene {
             let servant = daemon.servant_of(service, robot)?;
             Ok::<_, anyhow::Error>(servant["id"].as_str().context("an id")?.to_owned())
         };
-        let servants = [
-            servant("adder_py", "r1")?,
-            servant("adder_py", "r2")?,
-            servant("vault", "r9")?,
-        ];
+        let servants = [servant("adder_py", "r1")?, servant("adder_py", "r2")?, servant("vault", "r9")?];
         let vault = daemon.api("/api/v1/services/vault")?;
-        let image = vault["revisions"][0]["image"]
-            .as_str()
-            .context("an image")?;
-        Ok(BreakinScene {
-            image: image.to_owned(),
-            daemon,
-            tokens,
-            servants,
-            at_work,
-            tried: Cell::new(0),
-        })
+        let image = vault["revisions"][0]["image"].as_str().context("an image")?;
+        Ok(BreakinScene { image: image.to_owned(), daemon, tokens, servants, at_work, tried: Cell::new(0) })
     }
 
     /// Returns the number of attempts so far.
@@ -227,34 +180,22 @@ impl BreakinScene {
         let before = server_state(&self.daemon)?;
         let mut since = Vec::new();
         for attempt in attempts {
-            let mut headers: Vec<(&str, &str)> = attempt
-                .headers
-                .iter()
-                .map(|(name, value)| (*name, value.as_str()))
-                .collect();
+            let mut headers: Vec<(&str, &str)> =
+                attempt.headers.iter().map(|(name, value)| (*name, value.as_str())).collect();
             let bearer = token.map(|token| format!("Bearer {token}"));
             if let Some(bearer) = &bearer {
                 headers.insert(0, ("Authorization", bearer));
             }
-            let what = format!(
-                "{who}: {} {} {:?}",
-                attempt.method, attempt.path, attempt.headers
-            );
+            let what = format!("{who}: {} {} {:?}", attempt.method, attempt.path, attempt.headers);
             let (status, head, body) = self
                 .daemon
                 .request_with_body(attempt.method, &attempt.path, &headers, &attempt.body)
                 .with_context(|| what.clone())?;
-            ensure!(
-                attempt.status.contains(&status),
-                "{what} was answered with {status}: {body}"
-            );
+            ensure!(attempt.status.contains(&status), "{what} was answered with {status}: {body}");
             for secret in SECRETS.iter().chain(kept) {
                 // The refusal may repeat the request.
                 let told = (head.clone() + &body).replace(&attempt.path, "");
-                ensure!(
-                    attempt.path.contains(secret) || !told.contains(secret),
-                    "{what} was told {secret}: {body}"
-                );
+                ensure!(attempt.path.contains(secret) || !told.contains(secret), "{what} was told {secret}: {body}");
             }
             since.push(what);
             // Reading the state takes longer than an attempt.
@@ -269,10 +210,7 @@ impl BreakinScene {
     /// Fails if the state differs from that before these attempts.
     fn expect_unchanged(&self, before: &Value, since: &mut Vec<String>) -> anyhow::Result<()> {
         let after = server_state(&self.daemon)?;
-        ensure!(
-            after == *before,
-            "one of {since:#?} changed {before:#} into {after:#}"
-        );
+        ensure!(after == *before, "one of {since:#?} changed {before:#} into {after:#}");
         since.clear();
         Ok(())
     }

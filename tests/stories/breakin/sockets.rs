@@ -15,12 +15,7 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
     let tokens = &scene.tokens;
     let before = server_state(&scene.daemon)?;
     let bearer = |token: &str| vec![("Authorization", format!("Bearer {token}"))];
-    let offer = |token: &str| {
-        (
-            "Sec-WebSocket-Protocol",
-            format!("rosbridge, bearer.{token}"),
-        )
-    };
+    let offer = |token: &str| ("Sec-WebSocket-Protocol", format!("rosbridge, bearer.{token}"));
     let mut attempts: Vec<(HandshakeCredentials<'_>, &[u16])> = Vec::new();
     let rover = &tokens.rover;
     for path in [
@@ -53,29 +48,14 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
     }
     // Two tokens at once: the one shown in the more secure way counts, with its own rights only.
     for (path, headers) in [
-        (
-            format!("adder_py?robot=r2&token={}", tokens.other),
-            bearer(rover),
-        ),
-        (
-            format!("adder_py?robot=r2&token={rover}&token={}", tokens.other),
-            vec![],
-        ),
+        (format!("adder_py?robot=r2&token={}", tokens.other), bearer(rover)),
+        (format!("adder_py?robot=r2&token={rover}&token={}", tokens.other), vec![]),
         (format!("vault?token={}", tokens.admin), bearer(rover)),
-        (
-            format!("vault?robot=r1&token={}", tokens.admin),
-            vec![offer(rover)],
-        ),
+        (format!("vault?robot=r1&token={}", tokens.admin), vec![offer(rover)]),
+        ("vault".to_owned(), [bearer(rover), vec![offer(&tokens.admin)]].concat()),
         (
             "vault".to_owned(),
-            [bearer(rover), vec![offer(&tokens.admin)]].concat(),
-        ),
-        (
-            "vault".to_owned(),
-            vec![(
-                "Sec-WebSocket-Protocol",
-                format!("rosbridge, bearer.{rover}, bearer.{}", tokens.admin),
-            )],
+            vec![("Sec-WebSocket-Protocol", format!("rosbridge, bearer.{rover}, bearer.{}", tokens.admin))],
         ),
     ] {
         attempts.push(((path, headers), &[400, 403]));
@@ -83,12 +63,7 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
     // Principals who may view may not connect; those who may publish are no robots of other services, and cannot take
     // another robot's name.
     for token in [&tokens.eve, &tokens.oscar] {
-        for path in [
-            "adder_py",
-            "adder_py?robot=r1",
-            "adder_py?robot=new",
-            "vault?robot=new",
-        ] {
+        for path in ["adder_py", "adder_py?robot=r1", "adder_py?robot=new", "vault?robot=new"] {
             attempts.push(((path.to_owned(), bearer(token)), &[403]));
         }
     }
@@ -126,10 +101,7 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
             format!("foxglove/{servant}/"),
             format!("foxglove/%2e%2e/{servant}"),
         ] {
-            let door = [
-                format!("api/v1/servants/{servant}/inside"),
-                format!("foxglove/{servant}"),
-            ];
+            let door = [format!("api/v1/servants/{servant}/inside"), format!("foxglove/{servant}")];
             let plain = door.contains(&path);
             let status = if plain { status } else { &[400, 401, 403, 404] };
             attempts.push(((path, headers.clone()), status));
@@ -150,17 +122,11 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
         attempts.push(((path.to_owned(), headers), status));
     }
     for ((path, headers), status) in attempts {
-        let headers: Vec<(&str, &str)> = headers
-            .iter()
-            .map(|(name, value)| (*name, value.as_str()))
-            .collect();
+        let headers: Vec<(&str, &str)> = headers.iter().map(|(name, value)| (*name, value.as_str())).collect();
         let url = scene.daemon.url(&path);
         match Robot::try_connect_with_headers(&url, &headers) {
             Ok(_) => bail!("{path} {headers:?} was let in"),
-            Err(refusal) => ensure!(
-                status.contains(&refusal.status),
-                "{path} {headers:?}: {refusal}"
-            ),
+            Err(refusal) => ensure!(status.contains(&refusal.status), "{path} {headers:?}: {refusal}"),
         }
         scene.count_attempt();
     }
@@ -187,15 +153,12 @@ pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
 /// A robot that may only subscribe to `/rosout`, and tries the other operations with other names and in other forms.
 pub fn nobody_uses_what_it_is_not_granted(scene: &BreakinScene) -> Verdict {
     let tokens = &scene.tokens;
-    let mut robot = scene
-        .daemon
-        .robot(&format!("adder_py?token={}", tokens.narrow))?;
+    let mut robot = scene.daemon.robot(&format!("adder_py?token={}", tokens.narrow))?;
     // It has authenticated already; authenticating again as an admin changes nothing.
     for who in [&tokens.admin, &tokens.other, &tokens.narrow] {
         robot.send(json!({"op": "auth", "mac": who}))?;
     }
-    let call =
-        |service: &str| json!({"op": "call_service", "service": service, "args": {"a": 1, "b": 2}});
+    let call = |service: &str| json!({"op": "call_service", "service": service, "args": {"a": 1, "b": 2}});
     let fragment = |message: &Value, num: usize, total: usize, data: &str| {
         json!({"op": "fragment",
         "id": message["id"], "num": num, "total": total, "data": data})
@@ -252,43 +215,19 @@ pub fn nobody_uses_what_it_is_not_granted(scene: &BreakinScene) -> Verdict {
     for (operation, names) in [
         ("publish", json!({"topic": "/rosout", "msg": {"msg": "x"}})),
         ("publish", json!({"topic": "rosout", "msg": {}})),
-        (
-            "publish",
-            json!({"topic": "/clock", "type": "rosgraph_msgs/Clock", "msg": {}}),
-        ),
-        (
-            "advertise",
-            json!({"topic": "/tf", "type": "tf2_msgs/TFMessage"}),
-        ),
-        (
-            "advertise",
-            json!({"topic": "/rosout", "type": "rosgraph_msgs/Log"}),
-        ),
+        ("publish", json!({"topic": "/clock", "type": "rosgraph_msgs/Clock", "msg": {}})),
+        ("advertise", json!({"topic": "/tf", "type": "tf2_msgs/TFMessage"})),
+        ("advertise", json!({"topic": "/rosout", "type": "rosgraph_msgs/Log"})),
         ("subscribe", json!({"topic": "/tf"})),
         ("subscribe", json!({"topic": "/rosout/../tf"})),
         ("subscribe", json!({"topic": "/rosout_agg"})),
         ("subscribe", json!({"topic": "/**"})),
         ("subscribe", json!({"topic": "*"})),
-        (
-            "advertise_service",
-            json!({"service": "/add_two", "type": "adder_py/AddTwo"}),
-        ),
-        (
-            "advertise_service",
-            json!({"service": "/rosout", "type": "std_srvs/Trigger"}),
-        ),
-        (
-            "advertise_action",
-            json!({"action": "/rosout", "type": "actionlib/Test"}),
-        ),
-        (
-            "send_action_goal",
-            json!({"action": "/rosout", "action_type": "actionlib/Test", "args": {"goal": 1}}),
-        ),
-        (
-            "service_response",
-            json!({"service": "/add_two", "id": "n1", "values": {"sum": 9}, "result": true}),
-        ),
+        ("advertise_service", json!({"service": "/add_two", "type": "adder_py/AddTwo"})),
+        ("advertise_service", json!({"service": "/rosout", "type": "std_srvs/Trigger"})),
+        ("advertise_action", json!({"action": "/rosout", "type": "actionlib/Test"})),
+        ("send_action_goal", json!({"action": "/rosout", "action_type": "actionlib/Test", "args": {"goal": 1}})),
+        ("service_response", json!({"service": "/add_two", "id": "n1", "values": {"sum": 9}, "result": true})),
         ("Call_Service", json!({"service": "/add_two"})),
         ("call_service\u{0}", json!({"service": "/add_two"})),
     ] {
@@ -300,36 +239,22 @@ pub fn nobody_uses_what_it_is_not_granted(scene: &BreakinScene) -> Verdict {
     }
     // Answers are in order: an operation that was not refused before this answer was not executed either.
     robot.send(json!({"op": "call_service", "service": "/rosapi/get_time", "id": "last"}))?;
-    let done = |said: &Value| {
-        said["op"] == "service_response" && said["result"] == true && said["id"] != "last"
-    };
+    let done = |said: &Value| said["op"] == "service_response" && said["result"] == true && said["id"] != "last";
     robot.wait_for("the last answer", |said| said["id"] == "last")?;
-    ensure!(
-        robot.has_not_heard(done)?,
-        "something was done that is not granted"
-    );
+    ensure!(robot.has_not_heard(done)?, "something was done that is not granted");
     // Queries do not reveal more than it may use.
     for (asked, arguments) in [
         ("/rosapi/services", json!({})),
         ("/rosapi/topics", json!({})),
         ("/rosapi/nodes", json!({})),
         ("/rosapi/service_type", json!({"service": "/add_two"})),
-        (
-            "/rosapi/service_providers",
-            json!({"service": "adder_py/AddTwo"}),
-        ),
-        (
-            "/rosapi/services_for_type",
-            json!({"type": "adder_py/AddTwo"}),
-        ),
+        ("/rosapi/service_providers", json!({"service": "adder_py/AddTwo"})),
+        ("/rosapi/services_for_type", json!({"type": "adder_py/AddTwo"})),
         ("/rosapi/node_details", json!({"node": "/adder"})),
         ("/rosapi/get_param_names", json!({})),
     ] {
         let told = robot.call(asked, arguments)?;
-        ensure!(
-            !told["values"].to_string().contains("add_two"),
-            "{asked}: {told}"
-        );
+        ensure!(!told["values"].to_string().contains("add_two"), "{asked}: {told}");
         scene.count_attempt();
     }
     Ok(())

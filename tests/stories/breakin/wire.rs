@@ -19,10 +19,7 @@ struct RawRequest {
 }
 
 fn raw_request(text: impl Into<Vec<u8>>, status: &'static [u16]) -> RawRequest {
-    RawRequest {
-        bytes: text.into(),
-        status,
-    }
+    RawRequest { bytes: text.into(), status }
 }
 
 /// A request that would revoke a token.
@@ -120,21 +117,19 @@ fn header_requests() -> Vec<RawRequest> {
     .collect();
     all.push(header(format!("X-Long: {}", "x".repeat(500_000))));
     all.push(header("X-Many: x\r\n".repeat(5_000).trim_end().to_owned()));
-    all.push(header(format!(
-        "Authorization: Bearer {}",
-        "x".repeat(60_000)
-    )));
+    all.push(header(format!("Authorization: Bearer {}", "x".repeat(60_000))));
     all.push(header(format!("Cookie: {}", "cloudroid=x; ".repeat(2_000))));
     all.push(raw_request(
-        [&b"DELETE /api/v1/tokens/chief HTTP/1.1\r\nHost: localhost\r\nX: \xff\xfe\r\nAuthorization: \
-            Bearer \xff\r\n"[..], CLOSE.as_bytes()].concat(),
+        [
+            &b"DELETE /api/v1/tokens/chief HTTP/1.1\r\nHost: localhost\r\nX: \xff\xfe\r\nAuthorization: \
+            Bearer \xff\r\n"[..],
+            CLOSE.as_bytes(),
+        ]
+        .concat(),
         NO,
     ));
     // Unusual line endings.
-    all.push(raw_request(
-        "DELETE /api/v1/tokens/chief HTTP/1.1\nHost: localhost\nConnection: close\n\n",
-        NO,
-    ));
+    all.push(raw_request("DELETE /api/v1/tokens/chief HTTP/1.1\nHost: localhost\nConnection: close\n\n", NO));
     all
 }
 
@@ -145,12 +140,7 @@ fn smuggling_requests() -> Vec<RawRequest> {
     let hidden = format!("{REVOKE}{CLOSE}");
     let length = hidden.len();
     let mut all = Vec::new();
-    for first in [
-        "POST /healthz",
-        "GET /healthz",
-        "GET /",
-        "POST /api/v1/session",
-    ] {
+    for first in ["POST /healthz", "GET /healthz", "GET /", "POST /api/v1/session"] {
         let line = format!("{first} HTTP/1.1\r\nHost: localhost\r\n");
         for framing in [
             "Transfer-Encoding: chunked\r\nContent-Length: 5\r\n",
@@ -161,10 +151,7 @@ fn smuggling_requests() -> Vec<RawRequest> {
             "Transfer-Encoding : chunked\r\n",
             "Transfer-Encoding:\u{b}chunked\r\n",
         ] {
-            all.push(raw_request(
-                format!("{line}{framing}\r\n0\r\n\r\n{hidden}"),
-                NO,
-            ));
+            all.push(raw_request(format!("{line}{framing}\r\n0\r\n\r\n{hidden}"), NO));
         }
         for lengths in [
             format!("Content-Length: 0\r\nContent-Length: {length}\r\n"),
@@ -177,23 +164,13 @@ fn smuggling_requests() -> Vec<RawRequest> {
         ] {
             all.push(raw_request(format!("{line}{lengths}\r\n{hidden}"), NO));
         }
-        for chunk in [
-            "0;x=\"\r\n\r\n",
-            "00000000000000000000\r\n\r\n",
-            "-1\r\n\r\n",
-            "fffffffffffffffff\r\n",
-            "1\r\nxx",
-        ] {
-            all.push(raw_request(
-                format!("{line}Transfer-Encoding: chunked\r\n\r\n{chunk}{hidden}"),
-                NO,
-            ));
+        for chunk in
+            ["0;x=\"\r\n\r\n", "00000000000000000000\r\n\r\n", "-1\r\n\r\n", "fffffffffffffffff\r\n", "1\r\nxx"]
+        {
+            all.push(raw_request(format!("{line}Transfer-Encoding: chunked\r\n\r\n{chunk}{hidden}"), NO));
         }
         // The next request on the same connection is authenticated as well.
-        all.push(raw_request(
-            format!("{line}Content-Length: 0\r\n\r\n{hidden}"),
-            NO,
-        ));
+        all.push(raw_request(format!("{line}Content-Length: 0\r\n\r\n{hidden}"), NO));
     }
     all
 }
@@ -201,9 +178,7 @@ fn smuggling_requests() -> Vec<RawRequest> {
 pub fn nothing_is_smuggled_past_who_asks() -> Verdict {
     let daemon = world()
         .setup("breakin-wire")
-        .config(&format!(
-            "tokens = [{TOKEN:?}]\n[portal]\nhandshake = \"2s\"\n"
-        ))
+        .config(&format!("tokens = [{TOKEN:?}]\n[portal]\nhandshake = \"2s\"\n"))
         .start()?;
     let chief = create_token(&daemon, &["chief", "--role", "admin"])?;
     let before = server_state(&daemon)?;
@@ -212,13 +187,9 @@ pub fn nothing_is_smuggled_past_who_asks() -> Verdict {
     for sent in all {
         let shown = String::from_utf8_lossy(&sent.bytes);
         let shown: String = shown.chars().take(200).collect();
-        let heard =
-            exchange_with(&daemon.address, &sent.bytes).with_context(|| format!("{shown:?}"))?;
+        let heard = exchange_with(&daemon.address, &sent.bytes).with_context(|| format!("{shown:?}"))?;
         for status in statuses(&heard) {
-            ensure!(
-                sent.status.contains(&status),
-                "{shown:?} was answered with {status}: {heard}"
-            );
+            ensure!(sent.status.contains(&status), "{shown:?} was answered with {status}: {heard}");
         }
         ensure!(!heard.contains("chief"), "{shown:?}: {heard}");
         tried += 1;

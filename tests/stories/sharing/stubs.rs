@@ -11,8 +11,7 @@ use anyhow::{Context, ensure};
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use ros::bus::{
-    ActionClient, Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, RosVersion,
-    Subscription,
+    ActionClient, Bus, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, RosVersion, Subscription,
 };
 use ros::codec::{from_json, to_json};
 use ros::schema::{MessageType, Registry};
@@ -74,17 +73,7 @@ impl StubbedRobot {
         let all = |graph: &Graph| registrations_in(sharer.ros, graph, node).len() >= 6;
         site.wait_for_graph(&app, "what the node serves", all)
             .with_context(|| format!("the stub said:\n{}", stub.output()))?;
-        Ok(StubbedRobot {
-            sharer,
-            registry: sharer.registry()?,
-            name,
-            node,
-            work,
-            count,
-            site,
-            app,
-            stub,
-        })
+        Ok(StubbedRobot { sharer, registry: sharer.registry()?, name, node, work, count, site, app, stub })
     }
 
     /// Returns the registrations that the original's node would have.
@@ -100,9 +89,7 @@ impl StubbedRobot {
                 format!("subscribes {count}/goal [sharer_cpp/CountActionGoal]"),
             ],
             RosVersion::Two => [
-                format!(
-                    "publishes {count}/_action/feedback [sharer_msgs/action/Count_FeedbackMessage]"
-                ),
+                format!("publishes {count}/_action/feedback [sharer_msgs/action/Count_FeedbackMessage]"),
                 format!("publishes {count}/_action/status [action_msgs/msg/GoalStatusArray]"),
                 format!("serves {work} [sharer_msgs/srv/Work]"),
                 format!("serves {count}/_action/send_goal [sharer_msgs/action/Count_SendGoal]"),
@@ -159,9 +146,7 @@ impl StubbedRobot {
         let (told, events) = mpsc::unbounded_channel();
         let _runtime = self.site.runtime.enter();
         let client = self.app.action_client(self.count, &of)?;
-        self.site
-            .runtime
-            .block_on(client.wait_for_server(patience()))?;
+        self.site.runtime.block_on(client.wait_for_server(patience()))?;
         client.send_goal(id, goal, Arc::new(GoalEndListener(told)));
         Ok(CountGoal { client, events })
     }
@@ -210,28 +195,15 @@ fn registrations_in(ros: RosVersion, graph: &Graph, node: &str) -> BTreeSet<Stri
     publishes.chain(subscribes).chain(serves).collect()
 }
 
-pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
-    ros: RosVersion,
-) -> Verdict {
+pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(ros: RosVersion) -> Verdict {
     let sharer = SharerNode::for_ros(ros);
     let daemon = sharer.start_daemon("sharing-stubs", "", &["--min", "2", "--max", "2"])?;
     let (front, other): (&[&str], &[&str]) = match ros {
-        RosVersion::One => (
-            &["__ns:=/front", "__name:=hands"],
-            &["work:=/plan", "count:=tally", "_speed:=3"],
-        ),
+        RosVersion::One => (&["__ns:=/front", "__name:=hands"], &["work:=/plan", "count:=tally", "_speed:=3"]),
         RosVersion::Two => (
             &["--ros-args", "-r", "__ns:=/front", "-r", "__node:=hands"],
             // The deployer has set its speed. An action of ROS 2 cannot be remapped.
-            &[
-                "--ros-args",
-                "-r",
-                "work:=/plan",
-                "-r",
-                "count:=tally",
-                "-p",
-                "speed:=3.0",
-            ],
+            &["--ros-args", "-r", "work:=/plan", "-r", "count:=tally", "-p", "speed:=3.0"],
         ),
     };
     let tally = match ros {
@@ -240,21 +212,13 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
     };
     let linked = |name, argv: &[&str], names| StubbedRobot::new(&daemon, sharer, name, argv, names);
     let mut plain = linked("plain", &[], ["/sharer", "/work", "/count"])?;
-    let front = linked(
-        "front",
-        front,
-        ["/front/hands", "/front/work", "/front/count"],
-    )?;
+    let front = linked("front", front, ["/front/hands", "/front/work", "/front/count"])?;
     let other = linked("other", other, ["/sharer", "/plan", tally])?;
     // The names and types of the original.
     for robot in [&plain, &front, &other] {
         let graph = robot.app.graph().borrow().clone();
         let found = registrations_in(ros, &graph, robot.node);
-        ensure!(
-            found == robot.expected_registrations(),
-            "{}: {found:#?}",
-            robot.name
-        );
+        ensure!(found == robot.expected_registrations(), "{}: {found:#?}", robot.name);
     }
     // Settings that would change the node for all robots are ignored, with a warning.
     other.stub.wait_for_output("is ignored")?;
@@ -267,9 +231,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
         let mut feedback = robot.subscribe_to_feedback()?;
         let mut goals = [&plain, &front].map(|robot| robot.send_count_goal("mine", 5));
         for (robot, goal) in [&plain, &front].into_iter().zip(&mut goals) {
-            let goal = goal
-                .as_mut()
-                .map_err(|error| anyhow::anyhow!("{error:#}"))?;
+            let goal = goal.as_mut().map_err(|error| anyhow::anyhow!("{error:#}"))?;
             let end = robot.wait_for_end(goal)?;
             let result = json!({"who": robot.name, "all": [1, 2, 3, 4, 5]});
             ensure!(end == (GoalOutcome::Succeeded, result), "{end:?}");
@@ -313,9 +275,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
             })
         })
         .collect();
-    sharer.wait_for_group(&daemon, "answers of both", |group| {
-        group["answered"].as_u64() > Some(20)
-    })?;
+    sharer.wait_for_group(&daemon, "answers of both", |group| group["answered"].as_u64() > Some(20))?;
     kill_shim(&daemon, &victim)?;
     sharer.wait_for_group(&daemon, "another in its place", |group| {
         ready_count(group) == 2 && !group["servants"].to_string().contains(&victim)
@@ -326,10 +286,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
             let refused = plain.site.runtime.block_on(long)?;
             let words = refused.err().map(|error| error.to_string());
             let words = words.context("a lost call was answered")?;
-            ensure!(
-                words.contains(&victim) && words.contains("--idempotent"),
-                "{words}"
-            );
+            ensure!(words.contains(&victim) && words.contains("--idempotent"), "{words}");
         }
         // A service of ROS 2 cannot report a failure; the robot's log does.
         RosVersion::Two => {
@@ -339,9 +296,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
         }
     }
     for robot in working {
-        let (robot, answered) = robot
-            .join()
-            .map_err(|_| anyhow::anyhow!("a robot panicked"))??;
+        let (robot, answered) = robot.join().map_err(|_| anyhow::anyhow!("a robot panicked"))??;
         ensure!(answered > 0, "{} was never answered", robot.name);
     }
     let still = plain.call_work("still", 0.0)?;
@@ -350,19 +305,11 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
     // The signal with which launchers end nodes.
     plain.stub.signal(Signal::SIGINT)?;
     let status = plain.stub.wait_for_exit()?;
-    ensure!(
-        status.code() == Some(0),
-        "{status}: {}",
-        plain.stub.output()
-    );
+    ensure!(status.code() == Some(0), "{status}: {}", plain.stub.output());
     plain
         .site
-        .wait_for_graph(&plain.app, "an empty graph", |graph| {
-            registrations_in(ros, graph, plain.node).is_empty()
-        })?;
-    sharer.wait_for_group(&daemon, "two servants still", |group| {
-        ready_count(group) == 2
-    })?;
+        .wait_for_graph(&plain.app, "an empty graph", |graph| registrations_in(ros, graph, plain.node).is_empty())?;
+    sharer.wait_for_group(&daemon, "two servants still", |group| ready_count(group) == 2)?;
     Ok(())
 }
 
@@ -392,12 +339,7 @@ pub fn an_application_of_rclpy_shares_one_servant_with_another_robot() -> Verdic
     let linked = StubbedRobot::new(&daemon, sharer, "linked", &[], names)?;
     // The only servant executes a goal of another robot.
     let mut two = sharer.connect(&daemon, "two")?;
-    send_goal(
-        &mut two,
-        sharer,
-        "long",
-        json!({"who": "two", "to": 100_000}),
-    )?;
+    send_goal(&mut two, sharer, "long", json!({"who": "two", "to": 100_000}))?;
     two.wait_for("feedback", |value| value["op"] == "action_feedback")?;
     let told = run_application(&linked, &daemon, "waiting")?;
     // It is accepted and waits, as its status says, and can be cancelled meanwhile.

@@ -2,8 +2,8 @@
 
 use async_trait::async_trait;
 use ros::bus::{
-    BusError, FailureReason, NodeParameters, ParamChange, ParamValue, ParameterDescription,
-    ParameterEvent, ParameterEvents, ParameterKind, ParameterNames,
+    BusError, FailureReason, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvent,
+    ParameterEvents, ParameterKind, ParameterNames,
 };
 use tokio::sync::mpsc;
 
@@ -39,9 +39,7 @@ fn fitting(held: &ParamValue, given: ParamValue) -> Result<ParamValue, FailureRe
     match (held, given) {
         // This conversion is lossless.
         (ParamValue::Double(_), ParamValue::Int(given)) => Ok(ParamValue::Double(given as f64)),
-        (held, given) if std::mem::discriminant(held) == std::mem::discriminant(&given) => {
-            Ok(given)
-        }
+        (held, given) if std::mem::discriminant(held) == std::mem::discriminant(&given) => Ok(given),
         _ => Err(FailureReason::new("it is of another kind")),
     }
 }
@@ -61,21 +59,14 @@ impl NodeParameters for MemoryBus {
         Ok(names.iter().map(|name| held.get(name).cloned()).collect())
     }
 
-    async fn set(
-        &self,
-        node: &str,
-        changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), FailureReason>>, BusError> {
+    async fn set(&self, node: &str, changes: Vec<ParamChange>) -> Result<Vec<Result<(), FailureReason>>, BusError> {
         self.system.change(|state| {
             if !state.nodes.contains(node) {
                 return Err(self.absent(node));
             }
             let held = state.parameters.entry(node.to_owned()).or_default();
             let mut done = Vec::new();
-            let mut event = ParameterEvent {
-                node: node.to_owned(),
-                ..ParameterEvent::default()
-            };
+            let mut event = ParameterEvent { node: node.to_owned(), ..ParameterEvent::default() };
             for (name, value) in changes {
                 let value = match (held.get(&name), value) {
                     (Some(before), Some(given)) => fitting(before, given).map(Some),
@@ -98,34 +89,18 @@ impl NodeParameters for MemoryBus {
         })
     }
 
-    async fn set_atomically(
-        &self,
-        _node: &str,
-        _changes: Vec<ParamChange>,
-    ) -> Result<(), BusError> {
+    async fn set_atomically(&self, _node: &str, _changes: Vec<ParamChange>) -> Result<(), BusError> {
         Err(BusError::NotOffered("changes of several parameters"))
     }
 
-    async fn list(
-        &self,
-        node: &str,
-        _prefixes: &[String],
-        _depth: u64,
-    ) -> Result<ParameterNames, BusError> {
+    async fn list(&self, node: &str, _prefixes: &[String], _depth: u64) -> Result<ParameterNames, BusError> {
         let state = self.system.state.lock();
         let held = state.parameters.get(node);
         let held = held.ok_or_else(|| self.absent(node))?;
-        Ok(ParameterNames {
-            names: held.keys().cloned().collect(),
-            prefixes: Vec::new(),
-        })
+        Ok(ParameterNames { names: held.keys().cloned().collect(), prefixes: Vec::new() })
     }
 
-    async fn describe(
-        &self,
-        node: &str,
-        names: &[String],
-    ) -> Result<Vec<Option<ParameterDescription>>, BusError> {
+    async fn describe(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParameterDescription>>, BusError> {
         let values = self.get(node, names).await?;
         let described = names.iter().zip(values).map(|(name, value)| {
             value.map(|value| ParameterDescription {

@@ -36,13 +36,8 @@ pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
     let listener = TcpListener::bind(OUT)?;
     let mut robot = daemon()?.robot("granted?robot=given")?;
     check_grants(&mut robot, &listener)?;
-    daemon()?
-        .deployer()
-        .run(&["stop", "--service", "granted"])?
-        .expect_success()?;
-    let place = Path::new(MODELS)
-        .parent()
-        .context("a directory of its own")?;
+    daemon()?.deployer().run(&["stop", "--service", "granted"])?.expect_success()?;
+    let place = Path::new(MODELS).parent().context("a directory of its own")?;
     std::fs::remove_dir_all(place)?;
     Ok(())
 }

@@ -15,9 +15,7 @@ use crate::machine::{HOME, SERVANTS, daemon, run_program};
 fn all_is_well() -> Verdict {
     let daemon = daemon()?;
     for part in ["servants", "build"] {
-        let left: Vec<_> = std::fs::read_dir(Path::new(HOME).join(part))?
-            .flatten()
-            .collect();
+        let left: Vec<_> = std::fs::read_dir(Path::new(HOME).join(part))?.flatten().collect();
         ensure!(left.is_empty(), "{part}: {left:?}");
     }
     ensure!(daemon.deployer().run_json(&["servants"])? == json!([]));
@@ -26,28 +24,15 @@ fn all_is_well() -> Verdict {
         let left: Vec<_> = kinds.filter(|entry| entry.file_name() != "shims").collect();
         ensure!(left.is_empty(), "cgroups: {left:?}");
     }
-    ensure!(
-        !run_program("cat", &["/proc/self/mountinfo"])?.contains("overlay"),
-        "an overlay is mounted"
-    );
+    ensure!(!run_program("cat", &["/proc/self/mountinfo"])?.contains("overlay"), "an overlay is mounted");
     let services = daemon.deployer().run_json(&["services"])?;
-    let names: Vec<&str> = services
-        .as_array()
-        .context("services")?
-        .iter()
-        .filter_map(|service| service["name"].as_str())
-        .collect();
-    ensure!(
-        names == ["adder_py", "burglar_cpp", "granted", "greeter_cpp", "small"],
-        "{names:?}"
-    );
+    let names: Vec<&str> =
+        services.as_array().context("services")?.iter().filter_map(|service| service["name"].as_str()).collect();
+    ensure!(names == ["adder_py", "burglar_cpp", "granted", "greeter_cpp", "small"], "{names:?}");
     let mut robot = daemon.robot("greeter_cpp?robot=after")?;
     ensure!(robot.call("/greeter/count", json!({"reset": false}))?["result"] == true);
     robot.leave()?;
-    daemon
-        .deployer()
-        .run(&["stop", "--all"])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--all"])?.expect_success()?;
     Ok(())
 }
 
@@ -90,9 +75,7 @@ pub mod in_the_middle_of_a_start {
 
     pub fn before() -> Verdict {
         let daemon = daemon()?;
-        let _ready = daemon
-            .robot("greeter_cpp?robot=ready")?
-            .call("/greeter/count", json!({}))?;
+        let _ready = daemon.robot("greeter_cpp?robot=ready")?.call("/greeter/count", json!({}))?;
         let url = daemon.url("burglar_cpp?robot=starting");
         std::thread::spawn(move || support::robot::Robot::connect(&url));
         let servants = Path::new(HOME).join("servants");
@@ -117,21 +100,9 @@ pub mod in_the_middle_of_a_push {
 
     pub fn before() -> Verdict {
         daemon()?;
-        let _push = spawn(
-            "cloudroidctl",
-            &[
-                "push",
-                "/stage/greeter_cpp",
-                "--name",
-                "halved",
-                "--node",
-                "greeter",
-            ],
-        )?;
+        let _push = spawn("cloudroidctl", &["push", "/stage/greeter_cpp", "--name", "halved", "--node", "greeter"])?;
         let build = Path::new(HOME).join("build");
-        wait_until_seen("a build", || {
-            std::fs::read_dir(&build).is_ok_and(|mut entries| entries.next().is_some())
-        })
+        wait_until_seen("a build", || std::fs::read_dir(&build).is_ok_and(|mut entries| entries.next().is_some()))
     }
 
     pub fn after() -> Verdict {
@@ -148,10 +119,7 @@ pub mod in_the_middle_of_a_database_write {
         let daemon = daemon()?;
         let mut robot = daemon.robot("greeter_cpp?robot=written")?;
         robot.call("/greeter/count", json!({}))?;
-        let id = daemon.servant_of("greeter_cpp", "written")?["id"]
-            .as_str()
-            .context("an id")?
-            .to_owned();
+        let id = daemon.servant_of("greeter_cpp", "written")?["id"].as_str().context("an id")?.to_owned();
         let wal = Path::new(HOME).join("cloudroid.db-wal");
         // Once its pages are in the database, the file is overwritten from its beginning and does not grow.
         let written = || {

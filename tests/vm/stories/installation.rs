@@ -24,10 +24,7 @@ pub fn installs() -> Verdict {
     let text = std::fs::read_to_string(configuration)?;
     ensure!(text.contains("#: warm_pool = 8"), "{text}");
     let text = text.replace("#: warm_pool = 8", "warm_pool = 0");
-    let text = text.replace(
-        "[allow]\n",
-        &format!("[allow]\n{}\n", confinement::allow_config()),
-    );
+    let text = text.replace("[allow]\n", &format!("[allow]\n{}\n", confinement::allow_config()));
     std::fs::write(configuration, text)?;
     run_program("systemctl", &["restart", "cloudroid"])?;
     ensure!(property("cloudroid.service", "Type")? == "notify");
@@ -36,10 +33,7 @@ pub fn installs() -> Verdict {
     let daemon = daemon()?;
     let status = daemon.deployer().run_json(&["status"])?;
     ensure!(status["pid"] == main_pid()?, "{status:#}");
-    ensure!(
-        status["isolation"]["cgroup_version"] == 2 && status["isolation"]["missing"] == json!([]),
-        "{status:#}"
-    );
+    ensure!(status["isolation"]["cgroup_version"] == 2 && status["isolation"]["missing"] == json!([]), "{status:#}");
     let doctor = daemon.deployer().run_json(&["doctor"])?;
     for check in doctor["checks"].as_array().context("checks")? {
         ensure!(check["status"] != "missing", "{check:#}");
@@ -50,18 +44,10 @@ pub fn installs() -> Verdict {
 /// Removes the package: every servant is ended, and only the state is left.
 pub fn removes() -> Verdict {
     let daemon = daemon()?;
-    let _robot = daemon
-        .robot("greeter_cpp?robot=last")?
-        .call("/greeter/count", json!({}))?;
+    let _robot = daemon.robot("greeter_cpp?robot=last")?.call("/greeter/count", json!({}))?;
     let id = daemon.servant_of("greeter_cpp", "last")?["id"].clone();
     // As a build would leave them, for the next story.
-    run_program(
-        "sh",
-        &[
-            "-c",
-            &format!("mkdir {BUILT} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT}"),
-        ],
-    )?;
+    run_program("sh", &["-c", &format!("mkdir {BUILT} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT}")])?;
     let log = run_program("dpkg", &["--purge", "cloudroid"])?;
     nothing_but_the_state_is_left(id.as_str().context("an id")?).context(log)
 }
@@ -75,16 +61,10 @@ pub fn installs_and_removes_without_a_package() -> Verdict {
     let said = run_program(&script("install"), &[BUILT, "", "/usr/local"])?;
     ensure!(said.contains("installed and running"), "{said}");
     ensure!(property("cloudroid.service", "ActiveState")? == "active");
-    ensure!(
-        property("cloudroid.service", "FragmentPath")?.starts_with("/usr/local/"),
-        "another unit runs"
-    );
+    ensure!(property("cloudroid.service", "FragmentPath")?.starts_with("/usr/local/"), "another unit runs");
     // The programs and the command that stories call are now in another directory.
     let asks = |arguments: &[&str]| -> anyhow::Result<serde_json::Value> {
-        let told = run_program(
-            "/usr/local/bin/cloudroidctl",
-            &[&["--format", "json"], arguments].concat(),
-        )?;
+        let told = run_program("/usr/local/bin/cloudroidctl", &[&["--format", "json"], arguments].concat())?;
         Ok(serde_json::from_str(&told)?)
     };
     let status = asks(&["status", "--wait"])?;
@@ -105,23 +85,8 @@ fn nothing_but_the_state_is_left(id: &str) -> Verdict {
         let command = procfs::command_line(pid).unwrap_or_default();
         ensure!(!command.contains("cloudroid"), "{pid}: {command}");
     }
-    ensure!(
-        leftovers::cgroups(&[id.to_owned()]).is_empty(),
-        "cgroups of servants are left"
-    );
-    let found = run_program(
-        "find",
-        &[
-            "/etc",
-            "/usr",
-            "/var",
-            "/run",
-            "/lib/",
-            "-xdev",
-            "-name",
-            "*cloudroid*",
-        ],
-    )?;
+    ensure!(leftovers::cgroups(&[id.to_owned()]).is_empty(), "cgroups of servants are left");
+    let found = run_program("find", &["/etc", "/usr", "/var", "/run", "/lib/", "-xdev", "-name", "*cloudroid*"])?;
     let left: Vec<&str> = found
         .lines()
         .filter(|path| {
@@ -132,9 +97,6 @@ fn nothing_but_the_state_is_left(id: &str) -> Verdict {
         })
         .collect();
     ensure!(left.is_empty(), "{left:#?}");
-    ensure!(
-        Path::new(HOME).join("cloudroid.db").exists(),
-        "the state is gone"
-    );
+    ensure!(Path::new(HOME).join("cloudroid.db").exists(), "the state is gone");
     Ok(())
 }

@@ -30,10 +30,7 @@ pub fn limits_are_in_the_kernels_own_files() -> Verdict {
     let id = servant["id"].as_str().context("an id")?;
     ensure!(servant["cgroup_version"] == 2, "{servant:#}");
     ensure!(read_control_file(id, "cpu.max")? == "50000 100000");
-    ensure!(
-        read_control_file(id, "cpu.weight")? == "500",
-        "as much as is promised"
-    );
+    ensure!(read_control_file(id, "cpu.weight")? == "500", "as much as is promised");
     ensure!(read_control_file(id, "memory.max")? == (96 << 20).to_string());
     ensure!(read_control_file(id, "memory.swap.max")? == "0");
     ensure!(read_control_file(id, "memory.oom.group")? == "1");
@@ -89,9 +86,7 @@ pub fn cores_are_shared_out_as_asked() -> Verdict {
     let id = servant_id(&daemon, "burglar_cpp", "burner")?;
     let used = || -> anyhow::Result<f64> {
         let stat = read_control_file(&id, "cpu.stat")?;
-        let usage = stat
-            .lines()
-            .find_map(|line| line.strip_prefix("usage_usec "));
+        let usage = stat.lines().find_map(|line| line.strip_prefix("usage_usec "));
         Ok(usage.context("usage_usec")?.parse::<f64>()? / 1e6)
     };
     let mut told = Vec::new();
@@ -107,33 +102,17 @@ pub fn cores_are_shared_out_as_asked() -> Verdict {
         let spent = ended.1 - began.1;
         let least = spent / (ended.2 - began.0).as_secs_f64();
         let most = spent / (ended.0 - began.2).as_secs_f64();
-        told.push(format!(
-            "{:.0} % asked, {:.1} % got",
-            cores * 100.0,
-            least * 100.0
-        ));
+        told.push(format!("{:.0} % asked, {:.1} % got", cores * 100.0, least * 100.0));
         let allowed = 0.02 + cores * 0.1;
-        ensure!(
-            least <= cores + allowed && most >= cores - allowed,
-            "{told:?}"
-        );
+        ensure!(least <= cores + allowed && most >= cores - allowed, "{told:?}");
     }
     println!("        {}", told.join("; "));
     let servant = daemon.servant_of("burglar_cpp", "burner")?;
-    ensure!(
-        servant["usage"]["throttled_usec"].as_u64() > Some(100_000),
-        "{servant:#}"
-    );
-    ensure!(
-        servant["usage"]["pressure"]["cpu"].as_f64() > Some(1.0),
-        "{servant:#}"
-    );
+    ensure!(servant["usage"]["throttled_usec"].as_u64() > Some(100_000), "{servant:#}");
+    ensure!(servant["usage"]["pressure"]["cpu"].as_f64() > Some(1.0), "{servant:#}");
     let (_, metrics) = daemon.get("/metrics")?;
     for name in ["throttled_seconds_total", "pressure_ratio"] {
-        ensure!(
-            metrics.contains(&format!("cloudroid_servant_{name}{{servant=\"{id}\"")),
-            "{metrics}"
-        );
+        ensure!(metrics.contains(&format!("cloudroid_servant_{name}{{servant=\"{id}\"")), "{metrics}");
     }
     try_attempt(&mut robot, "rest", "")?;
     Ok(())
@@ -175,18 +154,9 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     }
     // The host may have been busier during the measurement alone.
     let alone = alone.min(with);
-    ensure!(
-        without > alone * 1.5,
-        "the neighbours are not greedy: {without} against {alone}"
-    );
-    ensure!(
-        with - alone <= (without - alone) / 3.0,
-        "{with} against {alone} and {without}"
-    );
-    daemon
-        .deployer()
-        .run(&["stop", "--service", "burglar_cpp"])?
-        .expect_success()?;
+    ensure!(without > alone * 1.5, "the neighbours are not greedy: {without} against {alone}");
+    ensure!(with - alone <= (without - alone) / 3.0, "{with} against {alone} and {without}");
+    daemon.deployer().run(&["stop", "--service", "burglar_cpp"])?.expect_success()?;
     Ok(())
 }
 
@@ -194,20 +164,13 @@ pub fn who_takes_too_much_memory_is_told_so() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=hungry")?;
     robot.send(json!({"op": "set_level", "level": "warning"}))?;
-    robot.send(json!({"op": "call_service", "service": "/burglar/try", "args": {"what": "take", "argument": "400"}}))?;
+    robot
+        .send(json!({"op": "call_service", "service": "/burglar/try", "args": {"what": "take", "argument": "400"}}))?;
     let status = robot.wait_for_status("memory")?;
-    ensure!(
-        status["msg"]
-            .as_str()
-            .is_some_and(|text| text.contains("96M")),
-        "the limit is named: {status}"
-    );
+    ensure!(status["msg"].as_str().is_some_and(|text| text.contains("96M")), "the limit is named: {status}");
     let events = daemon.deployer().run_json(&["events"])?;
     let told = events.as_array().context("events")?.iter().any(|event| {
-        event["kind"] == "out-of-memory"
-            && event["message"]
-                .as_str()
-                .is_some_and(|text| text.contains("96M"))
+        event["kind"] == "out-of-memory" && event["message"].as_str().is_some_and(|text| text.contains("96M"))
     });
     ensure!(told, "{events:#}");
     Ok(())
@@ -224,18 +187,10 @@ pub fn a_fork_bomb_ends_when_its_servant_does() -> Verdict {
     while read_control_file(&id, "pids.current")?.parse::<u64>()? < 95 && !deadline.is_over() {
         std::thread::yield_now();
     }
-    ensure!(
-        read_control_file(&id, "pids.current")?.parse::<u64>()? <= 100,
-        "the limit holds"
-    );
+    ensure!(read_control_file(&id, "pids.current")?.parse::<u64>()? <= 100, "the limit holds");
     // Other servants are not affected.
-    daemon
-        .robot("greeter_cpp?robot=calm")?
-        .call("/greeter/count", json!({}))?;
+    daemon.robot("greeter_cpp?robot=calm")?.call("/greeter/count", json!({}))?;
     daemon.deployer().run(&["stop", &id])?.expect_success()?;
-    ensure!(
-        !Path::new(SERVANTS).join(&id).exists(),
-        "its cgroup is gone"
-    );
+    ensure!(!Path::new(SERVANTS).join(&id).exists(), "its cgroup is gone");
     Ok(())
 }

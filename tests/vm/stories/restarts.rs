@@ -47,16 +47,12 @@ fn greet_across(robot: &str, end: fn() -> Verdict) -> Verdict {
     // Latched before, and still known to the node.
     after.subscribe("/greeter/greeting")?;
     let latched: Value = after.next_message_on("/greeter/greeting")?;
-    ensure!(
-        latched["count"].as_u64() >= counted,
-        "{latched} after {counted:?}"
-    );
+    ensure!(latched["count"].as_u64() >= counted, "{latched} after {counted:?}");
     greet(&mut after)?;
     ensure!(count(&mut after)? > counted, "the node has counted on");
     let same = second.servant_of("greeter_cpp", robot)?;
     ensure!(
-        (&same["id"], &same["pids"], &same["enforced"])
-            == (&servant["id"], &servant["pids"], &servant["enforced"]),
+        (&same["id"], &same["pids"], &same["enforced"]) == (&servant["id"], &servant["pids"], &servant["enforced"]),
         "{servant:#} became {same:#}"
     );
     Ok(())
@@ -64,28 +60,18 @@ fn greet_across(robot: &str, end: fn() -> Verdict) -> Verdict {
 
 pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Verdict {
     greet_across("killed", || {
-        run_program(
-            "systemctl",
-            &["kill", "--kill-whom=main", "-s", "KILL", "cloudroid"],
-        )
-        .map(|_| ())
+        run_program("systemctl", &["kill", "--kill-whom=main", "-s", "KILL", "cloudroid"]).map(|_| ())
     })
 }
 
 pub fn a_restart_loses_nothing() -> Verdict {
-    greet_across("restarted", || {
-        run_program("systemctl", &["restart", "cloudroid"]).map(|_| ())
-    })
+    greet_across("restarted", || run_program("systemctl", &["restart", "cloudroid"]).map(|_| ()))
 }
 
 /// Returns the first user id of a servant on the host, from the kernel.
 fn user_id(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     let servant = daemon.servant_of("greeter_cpp", robot)?;
-    let pid = servant["pids"]
-        .as_array()
-        .and_then(|pids| pids.first())
-        .and_then(Value::as_i64)
-        .context("a process")?;
+    let pid = servant["pids"].as_array().and_then(|pids| pids.first()).and_then(Value::as_i64).context("a process")?;
     let map = std::fs::read_to_string(format!("/proc/{pid}/uid_map"))?;
     let first = map.split_whitespace().nth(1).context("a user id")?;
     Ok(first.to_owned())

@@ -54,16 +54,12 @@ fn write_rows(daemon: &Daemon) -> anyhow::Result<(f64, f64)> {
     let slow = fast * 4.0;
     for (value, cpus) in [(fast, "1"), (slow, "0.25")] {
         let value = format!("{value:.3}");
-        let written = daemon.deployer().run_json(&[
-            "sla", "set", SERVICE, "--rrt", &value, "--cpus", cpus, "--memory", "64M",
-        ])?;
+        let written =
+            daemon.deployer().run_json(&["sla", "set", SERVICE, "--rrt", &value, "--cpus", cpus, "--memory", "64M"])?;
         ensure!(written.as_array().is_some(), "{written:#}");
     }
     let servant = servant_id(daemon, "alone")?;
-    daemon
-        .deployer()
-        .run(&["stop", &servant])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", &servant])?.expect_success()?;
     Ok((fast, slow))
 }
 
@@ -71,10 +67,7 @@ fn remove_rows(daemon: &Daemon) -> Verdict {
     let rows = daemon.deployer().run_json(&["sla", "list", SERVICE])?;
     for row in rows.as_array().context("rows")? {
         let number = row["id"].to_string();
-        daemon
-            .deployer()
-            .run(&["sla", "rm", SERVICE, &number])?
-            .expect_success()?;
+        daemon.deployer().run(&["sla", "rm", SERVICE, &number])?.expect_success()?;
     }
     Ok(())
 }
@@ -100,18 +93,9 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
     for robot in [&mut swift, &mut patient] {
         try_attempt(robot, "rest", "")?;
     }
-    let (swifts, patients) = (
-        servant_id(&daemon, "swift")?,
-        servant_id(&daemon, "patient")?,
-    );
-    let at_first = (
-        read_control_file(&swifts, "cpu.max")?,
-        read_control_file(&patients, "cpu.max")?,
-    );
-    println!(
-        "        cpu.max of swift: {}; of patient: {}",
-        at_first.0, at_first.1
-    );
+    let (swifts, patients) = (servant_id(&daemon, "swift")?, servant_id(&daemon, "patient")?);
+    let at_first = (read_control_file(&swifts, "cpu.max")?, read_control_file(&patients, "cpu.max")?);
+    println!("        cpu.max of swift: {}; of patient: {}", at_first.0, at_first.1);
     // On a slow machine the controller may have raised them by now.
     let (of_swift, of_patient) = (quota(&swifts)?, quota(&patients)?);
     ensure!(
@@ -161,16 +145,10 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
     for neighbour in &mut neighbours {
         try_attempt(neighbour, "rest", "")?;
     }
-    daemon
-        .deployer()
-        .run(&["stop", "--service", SERVICE])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", "--service", SERVICE])?.expect_success()?;
     remove_rows(&daemon)?;
     // The number of requests in time depends on the host as well; that limits make the difference does not.
-    ensure!(
-        share(with) >= share(without) + 30.0,
-        "the row's limits change nothing"
-    );
+    ensure!(share(with) >= share(without) + 30.0, "the row's limits change nothing");
     Ok(())
 }
 
@@ -196,10 +174,7 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     let times: anyhow::Result<Vec<f64>> = (0..7).map(|_| little(&mut alone)).collect();
     let took = median(times?);
     let servant = servant_id(&daemon, "alone")?;
-    daemon
-        .deployer()
-        .run(&["stop", &servant])?
-        .expect_success()?;
+    daemon.deployer().run(&["stop", &servant])?.expect_success()?;
     let mut plain = daemon.robot(&format!("{SERVICE}?robot=plain"))?;
     try_attempt(&mut plain, "rest", "1")?;
     let unmoved = quota(&servant_id(&daemon, "plain")?)?;
@@ -208,18 +183,10 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     let near = format!("{SERVICE}?robot=near&cpus=0.25&max_rrt={accepts}");
     let mut near = daemon.robot(&near)?;
     let mut owner = daemon.robot(&format!("{SERVICE}?robot=owner&cpus=0.25"))?;
-    for (robot, what) in [
-        (&mut near, "rest"),
-        (&mut owner, "burn"),
-        (&mut plain, "burn"),
-    ] {
+    for (robot, what) in [(&mut near, "rest"), (&mut owner, "burn"), (&mut plain, "burn")] {
         try_attempt(robot, what, "1")?;
     }
-    let ids = [
-        servant_id(&daemon, "near")?,
-        servant_id(&daemon, "owner")?,
-        servant_id(&daemon, "plain")?,
-    ];
+    let ids = [servant_id(&daemon, "near")?, servant_id(&daemon, "owner")?, servant_id(&daemon, "plain")?];
     let quotas = || -> anyhow::Result<Vec<u64>> { ids.iter().map(|id| quota(id)).collect() };
     // The promises of two of them, and the limit of the third without the controller.
     let at_first = vec![25_000, 25_000, unmoved];
@@ -236,22 +203,13 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
         let now = quotas()?;
         promises_hold(&now)?;
         let moved = now[0] > at_first[0] && now[2] < at_first[2];
-        Ok(if moved {
-            Ok(())
-        } else {
-            Err(format!("{now:?}"))
-        })
+        Ok(if moved { Ok(()) } else { Err(format!("{now:?}")) })
     })?;
     let events = daemon.api("/api/v1/events?limit=1000")?;
     let told = events.as_array().context("events")?.iter();
     let mut told = told.filter(|event| event["kind"] == "cores-moved");
     let reason = told.find(|event| event["robot"] == "near");
-    println!(
-        "        {}",
-        reason.context("an event of it")?["message"]
-            .as_str()
-            .unwrap_or_default()
-    );
+    println!("        {}", reason.context("an event of it")?["message"].as_str().unwrap_or_default());
     let shown = servant_field(&daemon, "near", "response")?;
     ensure!(shown["requests"].as_u64() > Some(0), "{shown}");
     // The robot makes no more requests and gives back what it had gained.
@@ -265,11 +223,7 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
         last = support::wait_until("less, until it is what it was promised", || {
             let now = quotas()?;
             promises_hold(&now)?;
-            Ok(if now == last {
-                Err(format!("{now:?}"))
-            } else {
-                Ok(now)
-            })
+            Ok(if now == last { Err(format!("{now:?}")) } else { Ok(now) })
         })?;
     }
     ensure!(last == at_first, "it does not come to rest: {seen:?}");
@@ -277,11 +231,7 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     for robot in [&mut owner, &mut plain] {
         try_attempt(robot, "rest", "")?;
     }
-    daemon
-        .deployer()
-        .run(&["stop", "--service", SERVICE])?
-        .expect_success()
-        .map(|_| ())
+    daemon.deployer().run(&["stop", "--service", SERVICE])?.expect_success().map(|_| ())
 }
 
 /// Returns a field of a robot's servant.

@@ -57,9 +57,7 @@ fn connections_per_second(address: &str, path: &str) -> Result<f64> {
     };
     let counts = std::thread::scope(|scope| {
         let all: Vec<_> = (0..THREADS).map(|_| scope.spawn(come)).collect();
-        all.into_iter()
-            .map(join_thread)
-            .collect::<Result<Vec<u32>>>()
+        all.into_iter().map(join_thread).collect::<Result<Vec<u32>>>()
     })?;
     Ok(f64::from(counts.iter().sum::<u32>()) / began.elapsed().as_secs_f64())
 }

@@ -29,20 +29,13 @@ pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     report
         .figure(title, "", answered as f64)
         .require(Target::AtLeast(IDLE as f64))
-        .note(format!(
-            "after {time:?}; {:.0} kB of the daemon's memory for each",
-            grown * 1e3 / IDLE as f64
-        ));
+        .note(format!("after {time:?}; {:.0} kB of the daemon's memory for each", grown * 1e3 / IDLE as f64));
     let title = format!("a call beside {IDLE} idle WebSockets, p99");
     report
         .figure(title, "ms", quantile(&beside, 0.99))
         .relative_to("without them", quantile(&alone, 0.99))
         .require(Target::RatioAtMost(2.0))
-        .note(format!(
-            "p50 {:.2} ms beside {:.2} ms",
-            quantile(&beside, 0.5),
-            quantile(&alone, 0.5)
-        ));
+        .note(format!("p50 {:.2} ms beside {:.2} ms", quantile(&beside, 0.5), quantile(&alone, 0.5)));
     Ok(())
 }
 

@@ -51,31 +51,18 @@ pub(super) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
     }
     let before = Resources::read(daemon.pid())?.resident;
     let for_readers = publish_and_call(daemon)?;
-    let PublishingSample {
-        messages,
-        times,
-        most,
-    } = for_readers;
+    let PublishingSample { messages, times, most } = for_readers;
     let title = format!("memory of the daemon with {READERS} clients that never read");
     report
         .figure(title, "MB", most)
         .relative_to("before they were there", before)
         .require(Target::AtMost((before + OVERHEAD * CLIENT).round()))
-        .note(format!(
-            "resident; {messages} messages of {MESSAGE} bytes were published"
-        ));
+        .note(format!("resident; {messages} messages of {MESSAGE} bytes were published"));
     let title = format!("a call beside {READERS} clients that never read, p99");
     report
         .figure(title, "ms", quantile(&times, 0.99))
-        .relative_to(
-            "while the same is published for nobody",
-            quantile(&for_nobody.times, 0.99),
-        )
-        .note(format!(
-            "p50 {:.2} ms beside {:.2} ms",
-            quantile(&times, 0.5),
-            quantile(&for_nobody.times, 0.5)
-        ));
+        .relative_to("while the same is published for nobody", quantile(&for_nobody.times, 0.99))
+        .note(format!("p50 {:.2} ms beside {:.2} ms", quantile(&times, 0.5), quantile(&for_nobody.times, 0.5)));
     Ok(())
 }
 
@@ -84,8 +71,7 @@ fn publish_and_call(daemon: &Daemon) -> Result<PublishingSample> {
     let mut publisher = daemon.robot(&greeters::robot_path(UNREAD))?;
     publisher.send(json!({"op": "advertise", "topic": "/unread", "type": "std_msgs/String"}))?;
     publisher.call("/rosapi/get_time", json!({}))?;
-    let message =
-        json!({"op": "publish", "topic": "/unread", "msg": {"data": "x".repeat(MESSAGE)}});
+    let message = json!({"op": "publish", "topic": "/unread", "msg": {"data": "x".repeat(MESSAGE)}});
     let mut robot = daemon.robot(&greeters::robot_path("polite"))?;
     greeters::greeting_count(&mut robot)?;
     let (began, mut times, mut most) = (Instant::now(), Vec::new(), 0.0_f64);
@@ -112,9 +98,5 @@ fn publish_and_call(daemon: &Daemon) -> Result<PublishingSample> {
         }
         join_thread(publishing)
     })?;
-    Ok(PublishingSample {
-        messages,
-        times,
-        most,
-    })
+    Ok(PublishingSample { messages, times, most })
 }

@@ -55,11 +55,7 @@ pub(super) struct MixedLoad<'a> {
 
 impl<'a> MixedLoad<'a> {
     pub(super) fn new(daemon: &'a Daemon) -> Self {
-        Self {
-            daemon,
-            over: AtomicBool::new(false),
-            tally: Mutex::default(),
-        }
+        Self { daemon, over: AtomicBool::new(false), tally: Mutex::default() }
     }
 
     /// Starts all robots, each on a thread of its own; they work until [`MixedLoad::end`].
@@ -91,9 +87,7 @@ impl<'a> MixedLoad<'a> {
 
     /// Returns the results.
     pub(super) fn into_tally(self) -> Result<Tally> {
-        self.tally
-            .into_inner()
-            .map_err(|_| anyhow!("a robot panicked"))
+        self.tally.into_inner().map_err(|_| anyhow!("a robot panicked"))
     }
 
     fn record(&self, note: impl FnOnce(&mut Tally)) {
@@ -148,9 +142,7 @@ impl<'a> MixedLoad<'a> {
     /// Calls the service, publishes a name, sets a parameter and queries topics.
     fn run_caller(&self, robot: &str) {
         let begin = |robot: &mut Robot| {
-            robot.send(
-                json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}),
-            )
+            robot.send(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))
         };
         self.repeat_connected(robot, begin, |robot| {
             let made = Instant::now();
@@ -161,10 +153,7 @@ impl<'a> MixedLoad<'a> {
             let set = json!({"name": "/kept", "value": "[1, 2]"});
             let set = robot.call("/rosapi/set_param", set)?;
             let topics = robot.call("/rosapi/topics", json!({}))?;
-            ensure!(
-                set["result"] == true && topics["result"] == true,
-                "{set} {topics}"
-            );
+            ensure!(set["result"] == true && topics["result"] == true, "{set} {topics}");
             Ok(())
         });
     }
@@ -175,8 +164,7 @@ impl<'a> MixedLoad<'a> {
             robot.send(json!({"op": "advertise", "topic": "/talk", "type": "std_msgs/String"}))?;
             robot.subscribe("/talk")
         };
-        let message =
-            json!({"op": "publish", "topic": "/talk", "msg": {"data": "x".repeat(MESSAGE)}});
+        let message = json!({"op": "publish", "topic": "/talk", "msg": {"data": "x".repeat(MESSAGE)}});
         self.repeat_connected(robot, begin, |robot| {
             let is_it = |heard: &serde_json::Value| heard["topic"] == "/talk";
             robot.send_until(&message, "its own words", is_it)?;
@@ -214,15 +202,11 @@ impl<'a> MixedLoad<'a> {
             let argv = twin.argv(&format!("link{number}"), &[]);
             let robot = format!("soaked-{number}");
             let stub = twin.stub(&site, (&self.daemon.address, &robot), "", &argv)?;
-            support::wait_until("a link", || {
-                Ok(ask(number).map_err(|error| format!("{error:#}")))
-            })
-            .with_context(|| stub.output())?;
+            support::wait_until("a link", || Ok(ask(number).map_err(|error| format!("{error:#}"))))
+                .with_context(|| stub.output())?;
             stubs.push(stub);
         }
-        self.repeat("robots with stubs", PACE, || {
-            (0..LINKED).try_for_each(|number| ask(number).map(drop))
-        });
+        self.repeat("robots with stubs", PACE, || (0..LINKED).try_for_each(|number| ask(number).map(drop)));
         Ok(())
     }
 

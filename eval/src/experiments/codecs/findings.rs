@@ -35,11 +35,7 @@ fn compare_with_published(what: &StreamSpec, saved: f64) -> String {
     } else {
         format!("{less:.1} percentage points less than")
     };
-    let lossless = if what.setting.is_lossy() {
-        ""
-    } else {
-        " and loses nothing"
-    };
+    let lossless = if what.setting.is_lossy() { "" } else { " and loses nothing" };
     format!(
         "{}: codec {} saves {saved:.1} % of the bytes{lossless}: {beside} the publication's row \u{201c}{row}\u{201d} \
          ({published} %).",
@@ -103,14 +99,8 @@ fn larger_than_deflate(kind: Kind, alone: &OfflineResult) -> Option<String> {
             ours.bytes[1],
             published.codec,
             published.bytes[1],
-            ratio(Some(
-                ours.bytes[1] as f64 / published.bytes[1].max(1) as f64
-            )),
-            if larger {
-                " by ours: worse than hoped"
-            } else {
-                " by ours"
-            }
+            ratio(Some(ours.bytes[1] as f64 / published.bytes[1].max(1) as f64)),
+            if larger { " by ours: worse than hoped" } else { " by ours" }
         )
     })
 }

@@ -59,8 +59,7 @@ pub(super) fn measure(sources: &StreamSources, what: &StreamSpec) -> Result<Rece
     let mut reader = ::recording::RecordingReader::open(&file)?;
     let mut received = ReceivedPictures::default();
     while let Some(played) = reader.next_message()? {
-        let number =
-            read_header(&played.message).and_then(|header| header.stamp.0.checked_sub(FIRST));
+        let number = read_header(&played.message).and_then(|header| header.stamp.0.checked_sub(FIRST));
         let Some(number) = number.map(|number| number as usize) else {
             continue;
         };
@@ -70,10 +69,7 @@ pub(super) fn measure(sources: &StreamSources, what: &StreamSpec) -> Result<Rece
             received.add(&sent.request.bytes, &played.message)?;
         }
     }
-    ensure!(
-        received.exact + received.psnr.len() > 0,
-        "no picture was recorded in the servant"
-    );
+    ensure!(received.exact + received.psnr.len() > 0, "no picture was recorded in the servant");
     Ok(received)
 }
 
@@ -119,11 +115,7 @@ fn start_recording(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Ch
         // With any other output, it does not record.
         let _ = child.kill();
         child.wait()?;
-        ensure!(
-            !over.load(Ordering::Relaxed),
-            "the servant could not be recorded: {}",
-            line.trim()
-        );
+        ensure!(!over.load(Ordering::Relaxed), "the servant could not be recorded: {}", line.trim());
         std::thread::sleep(AGAIN);
     }
 }

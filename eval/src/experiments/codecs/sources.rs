@@ -21,14 +21,7 @@ use crate::stream::{self, StreamHeader};
 use crate::trace::MapGrid;
 
 /// Colour photographs of Debian's opencv-doc.
-const PHOTOGRAPHS: [&str; 6] = [
-    "aloeL.jpg",
-    "baboon.jpg",
-    "board.jpg",
-    "fruits.jpg",
-    "home.jpg",
-    "building.jpg",
-];
+const PHOTOGRAPHS: [&str; 6] = ["aloeL.jpg", "baboon.jpg", "board.jpg", "fruits.jpg", "home.jpg", "building.jpg"];
 const PLACE: &str = "/usr/share/doc/opencv-doc/examples/data";
 const SIZE: (u32, u32) = (640, 480);
 /// Number of scans of the drive from which the map is built, and the interval between them.
@@ -80,18 +73,12 @@ impl StreamSources<'_> {
             Kind::Video | Kind::Pictures => {
                 stream::write(&path, &StreamHeader::for_pictures(ROUNDS), &photographs()?)?;
             }
-            Kind::Map => stream::write(
-                &path,
-                &StreamHeader::for_maps(ROUNDS),
-                &[serialize_grid(&self.source_map()?)?],
-            )?,
+            Kind::Map => {
+                stream::write(&path, &StreamHeader::for_maps(ROUNDS), &[serialize_grid(&self.source_map()?)?])?
+            }
             Kind::LargeMap => {
                 let large = centre_in_grid(&self.source_map()?, LARGE)?;
-                stream::write(
-                    &path,
-                    &StreamHeader::for_maps(ROUNDS),
-                    &[serialize_grid(&large)?],
-                )?;
+                stream::write(&path, &StreamHeader::for_maps(ROUNDS), &[serialize_grid(&large)?])?;
             }
         }
         Ok(path)
@@ -99,14 +86,12 @@ impl StreamSources<'_> {
 
     /// Returns the map that laser_slam builds from the recorded drive.
     fn source_map(&self) -> Result<MapGrid> {
-        let map = self
-            .cells
-            .measure("codecs source map", &(CLASS, SCANS), || {
-                let (at, robot) = (ExecutionSite::Outsourced, (CLASS, NetworkProfile::Lan));
-                let adapt = |plan: &mut RobotPlan| (plan.most, plan.every) = SCANS;
-                let (trace, _) = self.workshop.run(&LASER_SLAM, at, robot, adapt)?;
-                trace.map.context("laser_slam published no map")
-            })?;
+        let map = self.cells.measure("codecs source map", &(CLASS, SCANS), || {
+            let (at, robot) = (ExecutionSite::Outsourced, (CLASS, NetworkProfile::Lan));
+            let adapt = |plan: &mut RobotPlan| (plan.most, plan.every) = SCANS;
+            let (trace, _) = self.workshop.run(&LASER_SLAM, at, robot, adapt)?;
+            trace.map.context("laser_slam published no map")
+        })?;
         match map {
             CachedResult::Done(map) => Ok(map),
             CachedResult::Missing(why) => anyhow::bail!("there is no map to be sent: {why}"),
@@ -120,16 +105,9 @@ impl StreamSources<'_> {
         let recording = Recording::read(&path)?;
         let steps = recording.steps(kind.topic());
         let tried = if kind.is_map() { 1 } else { TRIED };
-        let messages: Vec<&Bytes> = steps
-            .iter()
-            .take(tried)
-            .map(|step| &step.request.bytes)
-            .collect();
-        let (schema, made) = if kind.is_map() {
-            (Schema::OccupancyGrid, Codec::Grid)
-        } else {
-            (Schema::Image, Codec::Image)
-        };
+        let messages: Vec<&Bytes> = steps.iter().take(tried).map(|step| &step.request.bytes).collect();
+        let (schema, made) =
+            if kind.is_map() { (Schema::OccupancyGrid, Codec::Grid) } else { (Schema::Image, Codec::Image) };
         let codecs = [Codec::Deflate(6), Codec::Zlib(6), made];
         let one = |codec: &Codec| {
             let mut encoder = Encoder::new(schema);
@@ -140,11 +118,7 @@ impl StreamSources<'_> {
                 bytes[0] += message.len() as u64;
                 bytes[1] += frame.len() as u64;
             }
-            CodecOutput {
-                codec: codec.to_string(),
-                ours: *codec == made,
-                bytes,
-            }
+            CodecOutput { codec: codec.to_string(), ours: *codec == made, bytes }
         };
         Ok(OfflineResult {
             codecs: codecs.iter().map(one).collect(),
@@ -160,11 +134,7 @@ impl StreamSources<'_> {
 fn photographs() -> Result<Vec<Bytes>> {
     let read = |name: &&str| {
         let path = Path::new(PLACE).join(name);
-        ensure!(
-            path.exists(),
-            "{} is missing; it comes with Debian's opencv-doc: make deps",
-            path.display()
-        );
+        ensure!(path.exists(), "{} is missing; it comes with Debian's opencv-doc: make deps", path.display());
         let mut command = Command::new("ffmpeg");
         command
             .args(["-v", "error", "-i"])
@@ -195,18 +165,13 @@ fn known_share(cells: &[u8]) -> f64 {
 fn serialize_grid(grid: &MapGrid) -> Result<Bytes> {
     let mut bytes = Vec::with_capacity(grid.cells.len() + 100);
     let words = |bytes: &mut Vec<u8>, words: &[u32]| {
-        words
-            .iter()
-            .for_each(|word| bytes.extend(word.to_le_bytes()));
+        words.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
     };
     words(&mut bytes, &[1, 1, 0, 3]);
     bytes.extend(b"map");
     words(&mut bytes, &[0, 0]);
     bytes.extend((grid.resolution as f32).to_le_bytes());
-    words(
-        &mut bytes,
-        &[u32::try_from(grid.width)?, u32::try_from(grid.height)?],
-    );
+    words(&mut bytes, &[u32::try_from(grid.width)?, u32::try_from(grid.height)?]);
     let [x, y] = grid.origin;
     for number in [x, y, 0.0, 0.0, 0.0, 0.0, 1.0] {
         bytes.extend(number.to_le_bytes());
@@ -245,13 +210,7 @@ mod tests {
     use super::*;
 
     fn small_grid() -> MapGrid {
-        MapGrid {
-            width: 2,
-            height: 1,
-            resolution: 0.5,
-            origin: [1.0, 2.0],
-            cells: vec![0, 100],
-        }
+        MapGrid { width: 2, height: 1, resolution: 0.5, origin: [1.0, 2.0], cells: vec![0, 100] }
     }
 
     #[test]

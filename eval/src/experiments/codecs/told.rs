@@ -18,7 +18,8 @@ const SMALLER: f64 = 0.9;
 pub fn section(runs: &CodecRuns) -> Result<Section> {
     let mut section = Section::new(8, "codecs", "Bytes that codecs save");
     section.published = "Table I of the publication: video by libav saves 75.4 %, images by deflate 96.1 %, grid maps \
-        by zlib 99.9 %; how much libav loses is not published.".to_owned();
+        by zlib 99.9 %; how much libav loses is not published."
+        .to_owned();
     section.differs = differences();
     if runs.quick {
         let left_out = "A quick evaluation sends the video alone, over the LAN: make eval ONLY=8 has photographs, \
@@ -34,11 +35,7 @@ pub fn section(runs: &CodecRuns) -> Result<Section> {
     }
     let mut kinds: Vec<Kind> = lan_streams(runs).map(|(what, _)| what.kind).collect();
     kinds.dedup();
-    bars.extend(
-        kinds
-            .iter()
-            .map(|kind| bar(*kind, "published", kind.published_saving().1)),
-    );
+    bars.extend(kinds.iter().map(|kind| bar(*kind, "published", kind.published_saving().1)));
     section.add_drawing(
         "codecs-saved",
         "Share of the bytes on the cable that each codec saves over the LAN, beside the published one",
@@ -59,12 +56,7 @@ pub fn section(runs: &CodecRuns) -> Result<Section> {
     section.add_drawing(
         "codecs-response",
         "Response time of one picture of the video by codec and network: median, 5 % and 95 %",
-        plots::bars(
-            "From picture to receipt",
-            "response time (ms)",
-            &responses,
-            true,
-        )?,
+        plots::bars("From picture to receipt", "response time (ms)", &responses, true)?,
     );
     section.findings = findings(runs);
     add_missing(&mut section, runs);
@@ -74,7 +66,8 @@ pub fn section(runs: &CodecRuns) -> Result<Section> {
 fn differences() -> Vec<String> {
     vec![
         "Bytes are those of packets on the robot's cable, with the heads of TCP, IP and WebSocket; what is sent \
-         without a codec is the base of each saving.".to_owned(),
+         without a codec is the base of each saving."
+            .to_owned(),
         format!(
             "A robot of the class {} sends one message after the other's receipt; the node in the servant answers with \
              the header alone. The first messages are not counted: by then the link has measured itself and chosen.",
@@ -88,17 +81,18 @@ fn differences() -> Vec<String> {
         ),
         "The publication's video, image and map are not published: the video is vtest.avi of Debian's opencv-doc, \
          images are photographs of the same package, scaled to 640x480, bgr8, the map is what laser_slam makes of a \
-         recorded drive, alone and in the middle of 4000 x 4000 cells, as gmapping publishes it.".to_owned(),
+         recorded drive, alone and in the middle of 4000 x 4000 cells, as gmapping publishes it."
+            .to_owned(),
         "What deflate and zlib, which lose nothing, make of the same messages in one process is in the last table, \
-         beside what they saved in the publication.".to_owned(),
+         beside what they saved in the publication."
+            .to_owned(),
         "Photographs and the large map are sent over the LAN alone; no codec but those of stub.toml can be had on the \
-         cable.".to_owned(),
+         cable."
+            .to_owned(),
     ]
 }
 
-pub(super) fn measured_streams(
-    runs: &CodecRuns,
-) -> impl Iterator<Item = (&StreamSpec, &StreamResult)> {
+pub(super) fn measured_streams(runs: &CodecRuns) -> impl Iterator<Item = (&StreamSpec, &StreamResult)> {
     let streams = runs.streams.iter();
     let done = streams.filter_map(|(what, sent)| Some((what, sent.value()?)));
     // Streams whose codec is not built in do not count as measured.
@@ -126,28 +120,17 @@ fn saving_where_encoded(runs: &CodecRuns, what: &StreamSpec, sent: &StreamResult
 }
 
 /// Number of messages that took clearly fewer bytes than without a codec.
-pub(super) fn count_encoded(
-    runs: &CodecRuns,
-    what: &StreamSpec,
-    sent: &StreamResult,
-) -> Option<usize> {
+pub(super) fn count_encoded(runs: &CodecRuns, what: &StreamSpec, sent: &StreamResult) -> Option<usize> {
     let (_, base) = find_base(runs, what).filter(|_| what.setting != Setting::None)?;
     let whole = base.carried?[0];
-    let smaller = sent
-        .each
-        .iter()
-        .filter(|bytes| (**bytes as f64) < SMALLER * whole);
+    let smaller = sent.each.iter().filter(|bytes| (**bytes as f64) < SMALLER * whole);
     Some(smaller.count())
 }
 
 /// Returns the stream of the same kind on the same network without a codec.
-pub(super) fn find_base<'a>(
-    runs: &'a CodecRuns,
-    what: &StreamSpec,
-) -> Option<(&'a StreamSpec, &'a StreamResult)> {
-    measured_streams(runs).find(|(base, _)| {
-        base.setting == Setting::None && base.kind == what.kind && base.network == what.network
-    })
+pub(super) fn find_base<'a>(runs: &'a CodecRuns, what: &StreamSpec) -> Option<(&'a StreamSpec, &'a StreamResult)> {
+    measured_streams(runs)
+        .find(|(base, _)| base.setting == Setting::None && base.kind == what.kind && base.network == what.network)
 }
 
 /// Formats a value that is a percentage already.
@@ -175,17 +158,11 @@ fn savings_table(runs: &CodecRuns) -> Table {
             what.setting.name().to_owned(),
             row.to_owned(),
             format_percent(Some(published)),
-            if base {
-                "the base".to_owned()
-            } else {
-                format_percent(saving(runs, what, sent))
-            },
+            if base { "the base".to_owned() } else { format_percent(saving(runs, what, sent)) },
             format_percent(saving_where_encoded(runs, what, sent)),
             format_bytes(sent.carried.map(|ways| ways[0])),
             format_bytes(sent.carried.map(|ways| ways[1])),
-            or_dash(count_encoded(runs, what, sent), |encoded| {
-                format!("{encoded} of {}", sent.each.len())
-            }),
+            or_dash(count_encoded(runs, what, sent), |encoded| format!("{encoded} of {}", sent.each.len())),
             noise,
             changed,
         ]);
@@ -207,10 +184,7 @@ fn noise_cells(runs: &CodecRuns, what: &StreamSpec) -> (String, String) {
     let (median, least) = (quantile(&received.psnr, 0.5), quantile(&received.psnr, 0.0));
     let both = median.zip(least);
     let noise = both.map(|(median, least)| format!("{median:.1} ({least:.1})"));
-    (
-        noise.unwrap_or_else(|| "lossless".to_owned()),
-        format!("{changed} of {all}"),
-    )
+    (noise.unwrap_or_else(|| "lossless".to_owned()), format!("{changed} of {all}"))
 }
 
 fn times_table(runs: &CodecRuns) -> Table {
@@ -233,9 +207,7 @@ fn times_table(runs: &CodecRuns) -> Table {
                 Setting::None => "the base".to_owned(),
                 _ => format_percent(saving(runs, what, sent)),
             },
-            or_dash(count_encoded(runs, what, sent), |encoded| {
-                format!("{encoded} of {}", sent.each.len())
-            }),
+            or_dash(count_encoded(runs, what, sent), |encoded| format!("{encoded} of {}", sent.each.len())),
         ]);
     }
     table
@@ -263,26 +235,17 @@ fn offline_table(runs: &CodecRuns) -> Table {
 }
 
 fn bar(kind: Kind, name: &str, value: f64) -> Bar {
-    Bar {
-        group: kind.name().to_owned(),
-        name: name.to_owned(),
-        value,
-        spread: None,
-    }
+    Bar { group: kind.name().to_owned(), name: name.to_owned(), value, spread: None }
 }
 
 fn add_missing(section: &mut Section, runs: &CodecRuns) {
     let mut add = |what: String, why: &str, next: &str| {
-        section
-            .missing
-            .push(MissingMeasurement::new(what, why, next));
+        section.missing.push(MissingMeasurement::new(what, why, next));
     };
     for (what, sent) in &runs.streams {
         match sent {
             CachedResult::Missing(why) => add(stream_title(what), why, AGAIN),
-            CachedResult::Done(StreamResult {
-                warning: Some(why), ..
-            }) => add(
+            CachedResult::Done(StreamResult { warning: Some(why), .. }) => add(
                 stream_title(what),
                 why,
                 "build cloudroidd and cloudroid-stub with the feature video (docs/codecs.md)",
@@ -297,11 +260,7 @@ fn add_missing(section: &mut Section, runs: &CodecRuns) {
     }
     for (what, received) in &runs.received {
         if let CachedResult::Missing(why) = received {
-            add(
-                format!("{}: signal to noise", stream_title(what)),
-                why,
-                AGAIN,
-            );
+            add(format!("{}: signal to noise", stream_title(what)), why, AGAIN);
         }
     }
     for (kind, alone) in &runs.alone {
@@ -324,10 +283,7 @@ mod tests {
             kind: Kind::Video,
             setting,
             network: NetworkProfile::Lan,
-            length: StreamLength {
-                settle: 1,
-                counted: 2,
-            },
+            length: StreamLength { settle: 1, counted: 2 },
         }
     }
 
@@ -341,19 +297,13 @@ mod tests {
     }
 
     fn test_runs() -> CodecRuns {
-        let received = ReceivedPictures {
-            psnr: vec![36.0, 38.0],
-            exact: 1,
-        };
+        let received = ReceivedPictures { psnr: vec![36.0, 38.0], exact: 1 };
         let made = |codec: &str, bytes: u64| CodecOutput {
             codec: codec.to_owned(),
             ours: codec == "image",
             bytes: [200, bytes],
         };
-        let alone = OfflineResult {
-            codecs: vec![made("deflate", 150), made("image", 160)],
-            known: None,
-        };
+        let alone = OfflineResult { codecs: vec![made("deflate", 150), made("image", 160)], known: None };
         CodecRuns {
             streams: vec![
                 (spec(Setting::None), measured_stream(1000.0, 0.08)),
@@ -373,10 +323,7 @@ mod tests {
         assert_eq!(rows[0][4], "the base");
         assert_eq!(rows[1][3..5], ["75.4 %", "50.0 %"].map(str::to_owned));
         assert_eq!(rows[2][4..6], ["95.0 %", "95.0 %"].map(str::to_owned));
-        assert_eq!(
-            rows[2][8..],
-            ["1 of 2", "37.0 (36.0)", "2 of 3"].map(str::to_owned)
-        );
+        assert_eq!(rows[2][8..], ["1 of 2", "37.0 (36.0)", "2 of 3"].map(str::to_owned));
         assert_eq!(section.tables[2].rows[0][4], "25.00 %");
         let told = section.findings.join(" ");
         assert_tells(
@@ -384,10 +331,7 @@ mod tests {
             "saves 50.0 % of the bytes and loses nothing: 25.4 percentage points less than the \
             publication's row \u{201c}video, libav\u{201d} (75.4 %).",
         );
-        assert_tells(
-            &told,
-            "saves 95.0 % of the bytes: at least as many as the publication's",
-        );
+        assert_tells(&told, "saves 95.0 % of the bytes: at least as many as the publication's");
         assert_tells(&told, "takes longer with the codec (90.0 ms)");
         assert_tells(&told, "1 of 2 messages took nine tenths");
         assert_tells(

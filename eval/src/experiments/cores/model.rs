@@ -5,12 +5,7 @@ use crate::statistics::{RrtModel, mean};
 use crate::trace::Trace;
 
 /// Names of [`ResponseParts`], in their order.
-pub const NAMES: [&str; 4] = [
-    "acquisition",
-    "computation",
-    "rendering",
-    "transport and waiting",
-];
+pub const NAMES: [&str; 4] = ["acquisition", "computation", "rendering", "transport and waiting"];
 /// Index of the algorithm itself.
 const COMPUTATION: usize = 1;
 /// If a part's number of useful cores is at least this fraction of the greatest measured limit, no limit of parallelism
@@ -23,10 +18,7 @@ pub type ResponseParts = [f64; 4];
 
 /// Returns the parts of a run; `None` if the package did not report durations.
 pub fn mean_parts(trace: &Trace) -> Option<ResponseParts> {
-    let both = trace
-        .requests
-        .iter()
-        .filter_map(|one| Some((one.response?, one.phases?)));
+    let both = trace.requests.iter().filter_map(|one| Some((one.response?, one.phases?)));
     let all: Vec<ResponseParts> = both
         .map(|(response, phases)| {
             let told = [phases.acquisition, phases.computation, phases.rendering];
@@ -61,11 +53,7 @@ impl Model {
             RrtModel::fit(&points.collect::<Vec<_>>())
         };
         let most = runs.iter().map(|run| run.0).fold(0.0, f64::max);
-        Some(Self {
-            parts: [of(0)?, of(1)?, of(2)?, of(3)?],
-            most,
-            threads,
-        })
+        Some(Self { parts: [of(0)?, of(1)?, of(2)?, of(3)?], most, threads })
     }
 
     /// Predicts the mean response time with `cores` cores, in seconds. More cores than were measured give no further
@@ -82,8 +70,7 @@ impl Model {
         if self.threads < 2 || cores <= computation.parallel {
             return self.predict_cautious(cores);
         }
-        self.predict_cautious(cores) - computation.work / computation.parallel
-            + computation.work / cores
+        self.predict_cautious(cores) - computation.work / computation.parallel + computation.work / cores
     }
 
     /// Returns whether more cores stopped helping below the greatest measured number.
@@ -103,29 +90,19 @@ mod tests {
 
     /// 1 ms and 2 core seconds of computation that `parallel` cores share, 50 ms of transport.
     fn runs(parallel: f64) -> Vec<(f64, ResponseParts)> {
-        [0.25, 0.5, 1.0, 2.0]
-            .map(|cores: f64| (cores, [0.001, 2.0 / cores.min(parallel), 0.0, 0.05]))
-            .to_vec()
+        [0.25, 0.5, 1.0, 2.0].map(|cores: f64| (cores, [0.001, 2.0 / cores.min(parallel), 0.0, 0.05])).to_vec()
     }
 
     #[test]
     fn what_is_left_is_transport() {
         let request = |response, computation| RequestSample {
             response: Some(response),
-            phases: Some(ComputationPhases {
-                acquisition: 0.01,
-                computation,
-                rendering: 0.02,
-            }),
+            phases: Some(ComputationPhases { acquisition: 0.01, computation, rendering: 0.02 }),
             ..RequestSample::default()
         };
         let mut trace = Trace::default();
         assert_eq!(mean_parts(&trace), None);
-        trace.requests = vec![
-            request(0.5, 0.4),
-            request(0.7, 0.6),
-            RequestSample::default(),
-        ];
+        trace.requests = vec![request(0.5, 0.4), request(0.7, 0.6), RequestSample::default()];
         let found = mean_parts(&trace).expect("two are known");
         for (one, other) in found.into_iter().zip([0.01, 0.5, 0.02, 0.07]) {
             assert_near(one, other);

@@ -23,22 +23,15 @@ const GAINED: f64 = 1.05;
 
 /// Creates the section of the report.
 pub fn section(studies: &[ProgramStudy]) -> Result<Section> {
-    let mut section = Section::new(
-        2,
-        "cores",
-        "What more cores would give: a model, and its error at points that were held back",
-    );
+    let mut section =
+        Section::new(2, "cores", "What more cores would give: a model, and its error at points that were held back");
     section.published = format!(
         "Fig. 5 of the publication: outsourced to a cloud of many cores, packages answered up to {PUBLISHED} times as \
          fast as on a Raspberry Pi."
     );
     section.differs = differences();
     let found: Vec<ProgramFit> = studies.iter().map(ProgramFit::from_study).collect();
-    section.tables = vec![
-        measured_table(&found),
-        models_table(&found),
-        predictions_table(&found),
-    ];
+    section.tables = vec![measured_table(&found), models_table(&found), predictions_table(&found)];
     for one in &found {
         add_findings(&mut section, one);
         add_missing(&mut section, one);
@@ -105,18 +98,13 @@ fn measured_table(found: &[ProgramFit]) -> Table {
             let (Some(run), Some((_, parts, of))) = (measured.value(), point) else {
                 continue;
             };
-            let (whole, model) = (
-                total_time(*parts),
-                one.model.map(|model| model.predict_cautious(*cores)),
-            );
+            let (whole, model) = (total_time(*parts), one.model.map(|model| model.predict_cautious(*cores)));
             let mut row = vec![
                 one.name().to_owned(),
                 digits(run.enforced),
                 of.name().to_owned(),
                 run.trace.answered_count().to_string(),
-                or_dash(run.trace.bytes_per_request(1), |ways| {
-                    format!("{:.0}", ways[0] + ways[1])
-                }),
+                or_dash(run.trace.bytes_per_request(1), |ways| format!("{:.0}", ways[0] + ways[1])),
             ];
             row.extend(parts.map(|part| milliseconds(Some(part))));
             row.extend([Some(whole), model].map(milliseconds));
@@ -137,11 +125,7 @@ fn models_table(found: &[ProgramFit]) -> Table {
         "program | part | overhead (ms) | work (core ms) | parallel (cores)",
     );
     for one in found {
-        for (name, part) in one
-            .model
-            .iter()
-            .flat_map(|model| NAMES.iter().zip(model.parts))
-        {
+        for (name, part) in one.model.iter().flat_map(|model| NAMES.iter().zip(model.parts)) {
             table.push([
                 one.name().to_owned(),
                 (*name).to_owned(),
@@ -168,11 +152,7 @@ fn predictions_table(found: &[ProgramFit]) -> Table {
             let times = |predicted: f64| ratio(one.native.map(|native| native / predicted));
             table.push([
                 one.name().to_owned(),
-                if cores.is_finite() {
-                    cores.to_string()
-                } else {
-                    "without end".to_owned()
-                },
+                if cores.is_finite() { cores.to_string() } else { "without end".to_owned() },
                 milliseconds(one.native),
                 milliseconds(Some(cautious)),
                 times(cautious),
@@ -205,10 +185,7 @@ fn add_findings(section: &mut Section, one: &ProgramFit) {
         }
     }
     let Some(native) = one.native else { return };
-    let (cautious, bound) = (
-        model.predict_cautious(32.0),
-        model.predict_bound(f64::INFINITY),
-    );
+    let (cautious, bound) = (model.predict_cautious(32.0), model.predict_bound(f64::INFINITY));
     let reached = if native / cautious >= PUBLISHED {
         "which reaches the published factor"
     } else if native / bound >= PUBLISHED {
@@ -227,17 +204,10 @@ fn add_findings(section: &mut Section, one: &ProgramFit) {
 /// Reports the error of the model between the limits to which it was fitted.
 fn inside_finding(one: &ProgramFit) -> Option<String> {
     let pairs = one.pairs(LimitUse::Inside, Model::predict_cautious);
-    let relative: Vec<(f64, f64)> = pairs
-        .iter()
-        .map(|(predicted, measured)| (predicted / measured, 1.0))
-        .collect();
+    let relative: Vec<(f64, f64)> = pairs.iter().map(|(predicted, measured)| (predicted / measured, 1.0)).collect();
     let error = root_mean_square_error(&relative)?;
     let worst = relative.iter().map(|pair| (pair.0 - 1.0).abs());
-    let why = if error > POOR {
-        changing_work_finding(one).unwrap_or_default()
-    } else {
-        String::new()
-    };
+    let why = if error > POOR { changing_work_finding(one).unwrap_or_default() } else { String::new() };
     let limits = match pairs.len() {
         1 => "the limit that was held back".to_owned(),
         many => format!("the {many} limits that were held back"),
@@ -274,27 +244,19 @@ fn changing_work_finding(one: &ProgramFit) -> Option<String> {
 
 /// Reports the errors of both predictions at the limit above the fitted ones.
 fn beyond_finding(one: &ProgramFit, model: &Model) -> Option<String> {
-    let cores = one
-        .points
-        .iter()
-        .find(|point| point.2 == LimitUse::Beyond)?
-        .0;
+    let cores = one.points.iter().find(|point| point.2 == LimitUse::Beyond)?.0;
     let error = |predict: fn(&Model, f64) -> f64| {
         let (predicted, measured) = *one.pairs(LimitUse::Beyond, predict).first()?;
         Some(signed_percent(predicted / measured - 1.0))
     };
-    let bound = (model.threads > 1)
-        .then(|| error(Model::predict_bound))
-        .flatten();
+    let bound = (model.threads > 1).then(|| error(Model::predict_bound)).flatten();
     Some(format!(
         "{}: beyond the fitted range, at {} cores where it goes to {}, the cautious prediction's error is {}{}.",
         one.name(),
         digits(cores),
         digits(model.most),
         error(Model::predict_cautious)?,
-        bound
-            .map(|bound| format!(", that of the bound {bound}"))
-            .unwrap_or_default()
+        bound.map(|bound| format!(", that of the bound {bound}")).unwrap_or_default()
     ))
 }
 
@@ -302,8 +264,7 @@ fn beyond_finding(one: &ProgramFit, model: &Model) -> Option<String> {
 fn limit_finding(one: &ProgramFit, model: &Model) -> String {
     let end = digits(model.parts[1].parallel);
     let beyond = one.points.iter().find(|point| point.2 == LimitUse::Beyond);
-    let further =
-        beyond.and_then(|point| Some((point.0, computation(one, model.most)? / point.1[1])));
+    let further = beyond.and_then(|point| Some((point.0, computation(one, model.most)? / point.1[1])));
     match (model.has_end(), model.threads) {
         (false, _) => match further {
             Some((cores, faster)) if faster < GAINED => format!(
@@ -362,10 +323,7 @@ mod tests {
         Trace {
             requests: vec![RequestSample {
                 response: Some(computation + 0.05),
-                phases: Some(ComputationPhases {
-                    computation,
-                    ..ComputationPhases::default()
-                }),
+                phases: Some(ComputationPhases { computation, ..ComputationPhases::default() }),
                 ..RequestSample::default()
             }],
             ..Trace::default()
@@ -375,21 +333,14 @@ mod tests {
     /// A tenth of a core second, divided among up to `parallel` cores; 50 ms of transport; 450 ms natively.
     fn study(subject: Subject, parallel: f64) -> ProgramStudy {
         let run = |cores: &f64| {
-            let reading = CoreLimitRun {
-                enforced: *cores,
-                trace: trace(0.1 / cores.min(parallel)),
-                cost: RunCost::default(),
-            };
+            let reading =
+                CoreLimitRun { enforced: *cores, trace: trace(0.1 / cores.min(parallel)), cost: RunCost::default() };
             (*cores, CachedResult::Done(reading))
         };
         ProgramStudy {
             subject,
             native: CachedResult::Done(trace(0.4)),
-            runs: [subject.fitted, subject.held_back]
-                .concat()
-                .iter()
-                .map(run)
-                .collect(),
+            runs: [subject.fitted, subject.held_back].concat().iter().map(run).collect(),
         }
     }
 
@@ -402,10 +353,7 @@ mod tests {
             "3 limits that were held back inside the fitted range the model's error is 0.0 %",
         );
         // 50 + 100 / 1.5 ms are predicted, 50 + 100 / 1.75 ms were measured.
-        assert_tells(
-            &section.findings[1],
-            "error is +8.9 %, that of the bound +0.0 %",
-        );
+        assert_tells(&section.findings[1], "error is +8.9 %, that of the bound +0.0 %");
         assert!(section.findings[2].contains("1.50 times as fast with 2 threads"));
         let four = &section.tables[2].rows[0];
         // 450 ms divided by 50 + 100 / 1.5, and by 50 + 100 / 4.
@@ -419,10 +367,7 @@ mod tests {
     fn cores_that_gave_nothing_where_they_were_held_back_are_told() {
         let section = section(&[study(SUBJECTS[2], 1.5)]).expect("it is drawn");
         let told = &section.findings[2];
-        assert_tells(
-            told,
-            "with 1.75 cores, which were held back, it computes only 1.00 times as fast as with 1.50",
-        );
+        assert_tells(told, "with 1.75 cores, which were held back, it computes only 1.00 times as fast as with 1.50");
     }
 
     #[test]
@@ -436,19 +381,13 @@ mod tests {
         }
         let section = section(&[study]).expect("it is drawn");
         let told = &section.findings[0];
-        assert_tells(
-            told,
-            "computation is 175 core ms at 0.25 cores and 100 core ms at 1.00",
-        );
+        assert_tells(told, "computation is 175 core ms at 0.25 cores and 100 core ms at 1.00");
     }
 
     #[test]
     fn a_program_of_one_thread_gains_nothing() {
         let section = section(&[study(SUBJECTS[1], 1.0)]).expect("it is drawn");
-        assert_tells(
-            &section.findings[2],
-            "more than 1.00 cores are not expected",
-        );
+        assert_tells(&section.findings[2], "more than 1.00 cores are not expected");
         assert_eq!(section.tables[2].rows[0][4], section.tables[2].rows[3][6]);
     }
 
@@ -460,11 +399,7 @@ mod tests {
         }
         study.native = CachedResult::Missing("no cgroups".to_owned());
         let section = section(&[study]).expect("it is drawn");
-        let missing: Vec<&str> = section
-            .missing
-            .iter()
-            .map(|one| one.what.as_str())
-            .collect();
+        let missing: Vec<&str> = section.missing.iter().map(|one| one.what.as_str()).collect();
         assert_eq!(missing.len(), 4, "{missing:?}");
         assert!(section.tables[2].rows.is_empty());
     }

@@ -3,8 +3,7 @@
 use anyhow::Result;
 
 use super::{
-    CLASS, FailoverRun, FailoverRuns, FailoverSetUp, HERTZ, Q, TIMES, count_late, is_late,
-    replay_satisfaction,
+    CLASS, FailoverRun, FailoverRuns, FailoverSetUp, HERTZ, Q, TIMES, count_late, is_late, replay_satisfaction,
 };
 use crate::place::NetworkProfile;
 use crate::plots::{self, Series, TimelineData};
@@ -15,12 +14,8 @@ use crate::trace::{RequestSample, Trace};
 use crate::words::{digits, milliseconds, or_dash, percent};
 
 /// Classes of points in the plot.
-const CLASSES: [&str; 4] = [
-    "answered by the cloud",
-    "answered by the local original",
-    "later than T_max",
-    "never answered (at the top)",
-];
+const CLASSES: [&str; 4] =
+    ["answered by the cloud", "answered by the local original", "later than T_max", "never answered (at the top)"];
 
 /// Creates the section of the report.
 pub fn section(runs: &FailoverRuns) -> Result<Section> {
@@ -47,18 +42,13 @@ pub fn section(runs: &FailoverRuns) -> Result<Section> {
         let data = timeline_data(runs, run);
         section.add_drawing(
             format!("failover-{}", name.replace([' ', ','], "-")),
-            format!(
-                "{name}: response time of each request, and Q{}",
-                whose_q(run.set_up)
-            ),
+            format!("{name}: response time of each request, and Q{}", whose_q(run.set_up)),
             plots::timeline(&title, "request", "response time (s)", &data)?,
         );
     }
     section.tables.push(table);
     let seen: Vec<Series> = measured_requests(runs)
-        .map(|(set_up, requests)| {
-            Series::new(set_up.name(), number_values(replay_satisfaction(requests)))
-        })
+        .map(|(set_up, requests)| Series::new(set_up.name(), number_values(replay_satisfaction(requests))))
         .collect();
     section.add_drawing(
         "failover-satisfaction",
@@ -70,22 +60,10 @@ pub fn section(runs: &FailoverRuns) -> Result<Section> {
 }
 
 fn differences(runs: &FailoverRuns) -> Vec<String> {
-    let bad: Vec<String> = runs
-        .course
-        .bad
-        .iter()
-        .map(|(from, to)| format!("{from}-{to}"))
-        .collect();
+    let bad: Vec<String> = runs.course.bad.iter().map(|(from, to)| format!("{from}-{to}")).collect();
     let alone = measured_requests(runs).find(|(set_up, _)| *set_up == FailoverSetUp::Local);
-    let alone = alone.and_then(|(_, requests)| {
-        quantile(
-            &requests
-                .iter()
-                .filter_map(|one| one.response)
-                .collect::<Vec<f64>>(),
-            0.5,
-        )
-    });
+    let alone = alone
+        .and_then(|(_, requests)| quantile(&requests.iter().filter_map(|one| one.response).collect::<Vec<f64>>(), 0.5));
     let alone = alone.map(|median| {
         format!(
             ", where alone it needs {} ms of the {} ms from request to request (median)",
@@ -128,21 +106,7 @@ fn new_table() -> Table {
          mean response of those answered (ms) | median of those answered (ms) | mean Q of the robot | \
          least Q of the robot | mean Q of the cloud | original asked, left, started, stopped",
     )
-    .row([
-        "published (Fig. 7)",
-        "130",
-        "–",
-        "drawn only",
-        "–",
-        "–",
-        "drawn only",
-        "–",
-        "–",
-        "–",
-        "–",
-        "–",
-        "–",
-    ])
+    .row(["published (Fig. 7)", "130", "–", "drawn only", "–", "–", "drawn only", "–", "–", "–", "–", "–", "–"])
 }
 
 fn add_row(table: &mut Table, runs: &FailoverRuns, set_up: FailoverSetUp, trace: &Trace) {
@@ -152,10 +116,7 @@ fn add_row(table: &mut Table, runs: &FailoverRuns, set_up: FailoverSetUp, trace:
     let seen = replay_satisfaction(requests);
     let own: Vec<f64> = requests.iter().filter_map(|one| one.satisfaction).collect();
     let number = |value: Option<f64>| or_dash(value, digits);
-    let onsets: Vec<String> = count_late(&runs.course, requests)
-        .iter()
-        .map(usize::to_string)
-        .collect();
+    let onsets: Vec<String> = count_late(&runs.course, requests).iter().map(usize::to_string).collect();
     table.push([
         set_up.name().to_owned(),
         requests.len().to_string(),
@@ -170,9 +131,7 @@ fn add_row(table: &mut Table, runs: &FailoverRuns, set_up: FailoverSetUp, trace:
         number(seen.iter().copied().reduce(f64::min)),
         number(mean(&own)),
         match set_up {
-            FailoverSetUp::Stub | FailoverSetUp::Cold => {
-                trace.handovers.map(|one| one.to_string()).join(", ")
-            }
+            FailoverSetUp::Stub | FailoverSetUp::Cold => trace.handovers.map(|one| one.to_string()).join(", "),
             FailoverSetUp::Cloud | FailoverSetUp::Local => "–".to_owned(),
         },
     ]);
@@ -195,12 +154,8 @@ fn whose_q(set_up: FailoverSetUp) -> &'static str {
     }
 }
 
-fn measured_requests(
-    runs: &FailoverRuns,
-) -> impl Iterator<Item = (FailoverSetUp, &[RequestSample])> {
-    runs.runs
-        .iter()
-        .filter_map(|run| Some((run.set_up, &run.measured.value()?.0.requests[..])))
+fn measured_requests(runs: &FailoverRuns) -> impl Iterator<Item = (FailoverSetUp, &[RequestSample])> {
+    runs.runs.iter().filter_map(|run| Some((run.set_up, &run.measured.value()?.0.requests[..])))
 }
 
 fn number_values(values: impl IntoIterator<Item = f64>) -> Vec<(f64, f64)> {
@@ -209,10 +164,7 @@ fn number_values(values: impl IntoIterator<Item = f64>) -> Vec<(f64, f64)> {
 }
 
 fn timeline_data(runs: &FailoverRuns, run: &FailoverRun) -> TimelineData {
-    let requests = run
-        .measured
-        .value()
-        .map_or(&[][..], |done| &done.0.requests);
+    let requests = run.measured.value().map_or(&[][..], |done| &done.0.requests);
     let answered = requests.iter().filter_map(|request| request.response);
     // The time for which answers were awaited after the last request.
     let top = answered.fold(runs.course.stragglers, f64::max);
@@ -224,21 +176,12 @@ fn timeline_data(runs: &FailoverRuns, run: &FailoverRun) -> TimelineData {
         };
         (f64::from(number), request.response.unwrap_or(top), class)
     };
-    let own =
-        |(number, request): (u32, &RequestSample)| Some((f64::from(number), request.satisfaction?));
+    let own = |(number, request): (u32, &RequestSample)| Some((f64::from(number), request.satisfaction?));
     TimelineData {
         points: (1..).zip(requests).map(point).collect(),
         classes: CLASSES.map(str::to_owned).to_vec(),
-        bad: runs
-            .course
-            .bad
-            .iter()
-            .map(|(first, last)| (*first as f64 - 0.5, *last as f64 + 0.5))
-            .collect(),
-        levels: vec![
-            (TIMES.0, "T_desire".to_owned()),
-            (TIMES.1, "T_max".to_owned()),
-        ],
+        bad: runs.course.bad.iter().map(|(first, last)| (*first as f64 - 0.5, *last as f64 + 0.5)).collect(),
+        levels: vec![(TIMES.0, "T_desire".to_owned()), (TIMES.1, "T_max".to_owned())],
         q: match run.set_up {
             FailoverSetUp::Local => number_values(replay_satisfaction(requests)),
             _ => (1..).zip(requests).filter_map(own).collect(),
@@ -259,11 +202,7 @@ fn findings(runs: &FailoverRuns) -> Vec<String> {
         ));
     }
     for run in &runs.runs {
-        if run
-            .measured
-            .value()
-            .is_some_and(|(trace, _)| trace.late_before)
-        {
+        if run.measured.value().is_some_and(|(trace, _)| trace.late_before) {
             findings.push(format!(
                 "{}: answers were late already before the first request that counts: the machine was busy, or the \
                  package is too slow for this rate.",
@@ -271,23 +210,20 @@ fn findings(runs: &FailoverRuns) -> Vec<String> {
             ));
         }
     }
-    if let (Some((_, stub)), Some((_, cloud))) = (of(FailoverSetUp::Stub), of(FailoverSetUp::Cloud))
-    {
+    if let (Some((_, stub)), Some((_, cloud))) = (of(FailoverSetUp::Stub), of(FailoverSetUp::Cloud)) {
         let both = share_in_time(stub).zip(share_in_time(cloud));
         if both.is_some_and(|(stub, cloud)| stub <= cloud) {
-            findings.push("The stub with a local original is in time no more often than the cloud alone: the local \
-                original did not help, or the network was not bad enough.".to_owned());
+            findings.push(
+                "The stub with a local original is in time no more often than the cloud alone: the local \
+                original did not help, or the network was not bad enough."
+                    .to_owned(),
+            );
         }
     }
-    if let (Some((_, stub)), Some((_, local))) = (of(FailoverSetUp::Stub), of(FailoverSetUp::Local))
-    {
+    if let (Some((_, stub)), Some((_, local))) = (of(FailoverSetUp::Stub), of(FailoverSetUp::Local)) {
         if let Some((stub, local)) = share_in_time(stub).zip(share_in_time(local)) {
             if stub < local {
-                findings.push(lateness_reason(
-                    runs,
-                    of(FailoverSetUp::Stub),
-                    100.0 * (local - stub),
-                ));
+                findings.push(lateness_reason(runs, of(FailoverSetUp::Stub), 100.0 * (local - stub)));
             }
         }
     }
@@ -295,11 +231,7 @@ fn findings(runs: &FailoverRuns) -> Vec<String> {
 }
 
 /// Explains why more requests are late through the stub than on the robot, by `more` percentage points.
-fn lateness_reason(
-    runs: &FailoverRuns,
-    stub: Option<(FailoverSetUp, &[RequestSample])>,
-    more: f64,
-) -> String {
+fn lateness_reason(runs: &FailoverRuns, stub: Option<(FailoverSetUp, &[RequestSample])>, more: f64) -> String {
     let requests = stub.map_or(&[][..], |(_, requests)| requests);
     let all = requests.iter().filter(|request| is_late(request)).count();
     let noticing: usize = count_late(&runs.course, requests).iter().sum();
@@ -334,54 +266,27 @@ mod tests {
             satisfaction: Some(8.0),
             ..RequestSample::default()
         };
-        let trace = Trace {
-            requests: responses.iter().map(one).collect(),
-            ..Trace::default()
-        };
-        FailoverRun {
-            set_up,
-            measured: CachedResult::Done((trace, RunCost::default())),
-        }
+        let trace = Trace { requests: responses.iter().map(one).collect(), ..Trace::default() };
+        FailoverRun { set_up, measured: CachedResult::Done((trace, RunCost::default())) }
     }
 
     fn test_runs(runs: Vec<FailoverRun>) -> FailoverRuns {
-        FailoverRuns {
-            course: FaultSchedule {
-                requests: 4,
-                bad: vec![(2, 3)],
-                stragglers: 1.0,
-            },
-            runs,
-        }
+        FailoverRuns { course: FaultSchedule { requests: 4, bad: vec![(2, 3)], stragglers: 1.0 }, runs }
     }
 
     #[test]
     fn the_table_counts_what_was_late_and_what_was_lost() {
         let runs = test_runs(vec![
-            test_run(
-                FailoverSetUp::Stub,
-                &[Some(0.2), Some(0.9), Some(0.3), Some(0.2)],
-                true,
-            ),
-            test_run(
-                FailoverSetUp::Cloud,
-                &[Some(0.2), None, None, Some(0.3)],
-                false,
-            ),
+            test_run(FailoverSetUp::Stub, &[Some(0.2), Some(0.9), Some(0.3), Some(0.2)], true),
+            test_run(FailoverSetUp::Cloud, &[Some(0.2), None, None, Some(0.3)], false),
         ]);
         let section = section(&runs).expect("a section");
         let [published, stub, cloud] = &section.tables[0].rows[..] else {
             panic!("{:?}", section.tables[0].rows);
         };
         assert_eq!(published[1], "130");
-        assert_eq!(
-            stub[2..7],
-            ["75.0 %", "1", "0", "0", "4"].map(str::to_owned)
-        );
-        assert_eq!(
-            cloud[2..7],
-            ["50.0 %", "2", "2", "0", "0"].map(str::to_owned)
-        );
+        assert_eq!(stub[2..7], ["75.0 %", "1", "0", "0", "4"].map(str::to_owned));
+        assert_eq!(cloud[2..7], ["50.0 %", "2", "2", "0", "0"].map(str::to_owned));
         assert_eq!(cloud[7], "250");
         // 15 + 2, at most 16; halved twice; plus 2: 16, 8, 4, 6.
         assert_eq!(cloud[9..12], ["8.50", "4.00", "8.00"].map(str::to_owned));

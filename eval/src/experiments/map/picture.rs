@@ -28,10 +28,7 @@ pub fn draw_maps(maps: &[&MapGrid]) -> Result<Vec<u8>> {
     let whole_height = rows * (height + 2 * MARGIN + THICK);
     let mut pixels = vec![BACKGROUND; whole_width * whole_height];
     for (at, map) in maps.iter().enumerate() {
-        let (left, top) = (
-            (at % columns) * (width + MARGIN),
-            (at / columns) * (height + 2 * MARGIN + THICK),
-        );
+        let (left, top) = ((at % columns) * (width + MARGIN), (at / columns) * (height + 2 * MARGIN + THICK));
         for row in 0..height {
             for column in 0..width {
                 let x = from[0] + (column as f64 + 0.5) * side;
@@ -57,9 +54,7 @@ fn known_bounds(maps: &[&MapGrid]) -> Option<([f64; 2], [f64; 2])> {
                 continue;
             }
             let index = [at % map.width, at / map.width];
-            let corner = |axis: usize, of: usize| {
-                map.origin[axis] + (index[axis] + of) as f64 * map.resolution
-            };
+            let corner = |axis: usize, of: usize| map.origin[axis] + (index[axis] + of) as f64 * map.resolution;
             let (from, to) = found.get_or_insert(([f64::MAX; 2], [f64::MIN; 2]));
             for axis in 0..2 {
                 from[axis] = from[axis].min(corner(axis, 0));
@@ -103,22 +98,14 @@ mod tests {
 
     fn decode_drawing(all: &[&MapGrid]) -> (usize, usize, Vec<u8>) {
         let file = draw_maps(all).expect("a picture");
-        let mut reader = png::Decoder::new(std::io::Cursor::new(file))
-            .read_info()
-            .expect("a PNG");
+        let mut reader = png::Decoder::new(std::io::Cursor::new(file)).read_info().expect("a PNG");
         let mut pixels = vec![0; reader.output_buffer_size().expect("a size")];
         let frame = reader.next_frame(&mut pixels).expect("pixels");
         (frame.width as usize, frame.height as usize, pixels)
     }
 
     fn map(origin: [f64; 2]) -> MapGrid {
-        MapGrid {
-            width: 3,
-            height: 3,
-            resolution: 1.0,
-            origin,
-            cells: vec![-1, -1, -1, -1, 0, 100, -1, 100, -1],
-        }
+        MapGrid { width: 3, height: 3, resolution: 1.0, origin, cells: vec![-1, -1, -1, -1, 0, 100, -1, 100, -1] }
     }
 
     #[test]

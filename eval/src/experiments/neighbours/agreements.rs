@@ -62,25 +62,15 @@ impl RobotOutcome {
 /// Results of all runs.
 pub(super) struct AgreementRuns(Vec<(AgreementPlan, CachedResult<Vec<RobotOutcome>>)>);
 
-pub(super) fn measure(
-    cells: &RunCache,
-    yard: &mut CrowdDaemon,
-    quick: bool,
-) -> Result<AgreementRuns> {
+pub(super) fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<AgreementRuns> {
     let robots: &[usize] = if quick { &[4] } else { &[2, 3, 4, 5, 6, 7, 8] };
     // Once a second the controller examines the requests of the last ten seconds.
     let (settles, lasts) = if quick { (1.0, 1.5) } else { (12.0, 9.0) };
     let mut runs = Vec::new();
     for controller in BOTH {
         for robots in robots.iter().copied() {
-            let plan = AgreementPlan {
-                controller,
-                robots,
-                settles,
-                lasts,
-                work: LONG.milliseconds,
-                cores: crowd::cores(),
-            };
+            let plan =
+                AgreementPlan { controller, robots, settles, lasts, work: LONG.milliseconds, cores: crowd::cores() };
             let name = format!("agreements {robots} controller {}", controller.name());
             let measured = cells.measure(&name, &plan, || {
                 let daemon = yard.without_servants(controller)?;
@@ -103,18 +93,13 @@ fn agreement_terms(robots: usize, cores: f64, work: f64) -> (f64, f64, f64) {
 }
 
 fn run_robots(daemon: &Daemon, plan: &AgreementPlan) -> Result<Vec<RobotOutcome>> {
-    let (part, eager, patient) =
-        agreement_terms(plan.robots, plan.cores, f64::from(plan.work) / 1e3);
+    let (part, eager, patient) = agreement_terms(plan.robots, plan.cores, f64::from(plan.work) / 1e3);
     // All start together: a robot measured while another's servant is still starting would have that servant's cores,
     // or lack them.
     let ready = Barrier::new(plan.robots);
     let one = |number: usize| -> Result<RobotOutcome> {
         let is_eager = number % 2 == 0;
-        let (accepts, pause) = if is_eager {
-            (eager, 0.0)
-        } else {
-            (patient, SELDOM)
-        };
+        let (accepts, pause) = if is_eager { (eager, 0.0) } else { (patient, SELDOM) };
         let states = format!("&cpus={part:.3}&max_rrt={:.0}ms", accepts * 1e3);
         let joined = crowd::join(daemon, LONG, &format!("r{number}"), &states);
         let joined = joined.and_then(|mut robot| crowd::time_call(&mut robot).map(|_| robot));
@@ -123,19 +108,11 @@ fn run_robots(daemon: &Daemon, plan: &AgreementPlan) -> Result<Vec<RobotOutcome>
         let mut robot = joined?;
         let from = Instant::now() + Duration::from_secs_f64(plan.settles);
         let to = from + Duration::from_secs_f64(plan.lasts);
-        Ok(RobotOutcome {
-            accepts,
-            eager: is_eager,
-            times: crowd::time_calls(&mut robot, (from, to), || pause)?,
-        })
+        Ok(RobotOutcome { accepts, eager: is_eager, times: crowd::time_calls(&mut robot, (from, to), || pause)? })
     };
     std::thread::scope(|scope| {
-        let all: Vec<_> = (0..plan.robots)
-            .map(|number| scope.spawn(move || one(number)))
-            .collect();
-        let joined = all
-            .into_iter()
-            .map(|robot| robot.join().ok().context("a robot's thread broke")?);
+        let all: Vec<_> = (0..plan.robots).map(|number| scope.spawn(move || one(number))).collect();
+        let joined = all.into_iter().map(|robot| robot.join().ok().context("a robot's thread broke")?);
         joined.collect()
     })
 }
@@ -167,9 +144,7 @@ pub(super) fn add_to_section(runs: &AgreementRuns, section: &mut Section) -> Res
                 let share = had.and_then(RobotOutcome::share_in_time);
                 or_dash(share, |share| format!("{:.0}", share * 100.0))
             };
-            let long = |had: Option<&RobotOutcome>| {
-                milliseconds(had.and_then(|had| quantile(&had.times, 0.95)))
-            };
+            let long = |had: Option<&RobotOutcome>| milliseconds(had.and_then(|had| quantile(&had.times, 0.95)));
             table.push([
                 format!("{} of {robots}", number + 1),
                 if had.eager { "at once" } else { "seldom" }.to_owned(),
@@ -191,11 +166,7 @@ pub(super) fn add_to_section(runs: &AgreementRuns, section: &mut Section) -> Res
         }
     }
     for (plan, measured) in &runs.0 {
-        let what = format!(
-            "{} robots with mixed agreements, controller {}",
-            plan.robots,
-            plan.controller.name()
-        );
+        let what = format!("{} robots with mixed agreements, controller {}", plan.robots, plan.controller.name());
         measured.require(section, what, AGAIN);
     }
     section.tables.push(table);
@@ -229,21 +200,13 @@ impl AgreementRuns {
         let (mut counts, mut of) = ([0; 2], 0);
         let mut eager: [Vec<f64>; 2] = Default::default();
         for robots in self.fleet_sizes() {
-            let [Some(off), Some(on)] = BOTH.map(|controller| self.find_run(controller, robots))
-            else {
+            let [Some(off), Some(on)] = BOTH.map(|controller| self.find_run(controller, robots)) else {
                 continue;
             };
-            counts = [
-                counts[0] + count_in_time(off),
-                counts[1] + count_in_time(on),
-            ];
+            counts = [counts[0] + count_in_time(off), counts[1] + count_in_time(on)];
             of += robots;
             for (shares, all) in eager.iter_mut().zip([off, on]) {
-                shares.extend(
-                    all.iter()
-                        .filter(|had| had.eager)
-                        .filter_map(RobotOutcome::share_in_time),
-                );
+                shares.extend(all.iter().filter(|had| had.eager).filter_map(RobotOutcome::share_in_time));
             }
         }
         if of == 0 {
@@ -267,7 +230,8 @@ impl AgreementRuns {
                     ": the controller won no robot here, which is worse than hoped.".to_owned(),
                 std::cmp::Ordering::Less =>
                     ", which is worse than hoped: robots lost what they had while cores were moved to \
-                     others.".to_owned(),
+                     others."
+                        .to_owned(),
             }
         ));
         if let [Some(off), Some(on)] = eager.map(|shares| mean(&shares)) {
@@ -288,22 +252,11 @@ mod tests {
     use crate::words::assert_tells;
 
     fn outcome(accepts: f64, times: &[f64]) -> RobotOutcome {
-        RobotOutcome {
-            accepts,
-            eager: true,
-            times: times.to_vec(),
-        }
+        RobotOutcome { accepts, eager: true, times: times.to_vec() }
     }
 
     fn test_runs(off: Vec<RobotOutcome>, on: Vec<RobotOutcome>) -> AgreementRuns {
-        let plan = |controller| AgreementPlan {
-            controller,
-            robots: 2,
-            settles: 1.0,
-            lasts: 1.0,
-            work: 50,
-            cores: 2.0,
-        };
+        let plan = |controller| AgreementPlan { controller, robots: 2, settles: 1.0, lasts: 1.0, work: 50, cores: 2.0 };
         AgreementRuns(vec![
             (plan(Controller::Off), CachedResult::Done(off)),
             (plan(Controller::On), CachedResult::Done(on)),
@@ -312,10 +265,7 @@ mod tests {
 
     #[test]
     fn shares_are_of_what_was_asked() {
-        assert_eq!(
-            outcome(0.1, &[0.05, 0.1, 0.2, 0.3]).share_in_time(),
-            Some(0.5)
-        );
+        assert_eq!(outcome(0.1, &[0.05, 0.1, 0.2, 0.3]).share_in_time(), Some(0.5));
         assert_eq!(outcome(0.1, &[]).share_in_time(), None);
         assert!(!outcome(0.1, &[]).is_in_time() && outcome(0.1, &[0.1]).is_in_time());
     }
@@ -334,29 +284,18 @@ mod tests {
     fn the_controllers_gain_is_counted() {
         let (good, bad) = (outcome(0.1, &[0.05]), outcome(0.1, &[0.3]));
         let mut section = Section::new(9, "a", "b");
-        let gained = test_runs(
-            vec![good.clone(), bad.clone()],
-            vec![good.clone(), good.clone()],
-        );
+        let gained = test_runs(vec![good.clone(), bad.clone()], vec![good.clone(), good.clone()]);
         add_to_section(&gained, &mut section).expect("it is told");
         let found = &section.findings[0];
-        assert!(
-            found.contains("1 were served") && found.contains("2.0 times as many"),
-            "{found}"
-        );
+        assert!(found.contains("1 were served") && found.contains("2.0 times as many"), "{found}");
         assert_eq!(section.tables[0].rows[1][3..5], ["0", "100"]);
         assert!(
-            section.findings[1].contains("50 % were in time")
-                && section.findings[1].contains("100 % with"),
+            section.findings[1].contains("50 % were in time") && section.findings[1].contains("100 % with"),
             "{:?}",
             section.findings
         );
         let mut section = Section::new(9, "a", "b");
-        add_to_section(
-            &test_runs(vec![good.clone(), good], vec![bad.clone(), bad]),
-            &mut section,
-        )
-        .expect("it is told");
+        add_to_section(&test_runs(vec![good.clone(), good], vec![bad.clone(), bad]), &mut section).expect("it is told");
         assert_tells(&section.findings[0], "worse than hoped");
     }
 }

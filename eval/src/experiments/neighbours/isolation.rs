@@ -71,24 +71,14 @@ pub(super) struct IsolationPoint {
 /// Results of all points.
 pub(super) struct IsolationRuns(Vec<(IsolationPlan, CachedResult<IsolationPoint>)>);
 
-pub(super) fn measure(
-    cells: &RunCache,
-    yard: &mut CrowdDaemon,
-    quick: bool,
-) -> Result<IsolationRuns> {
+pub(super) fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<IsolationRuns> {
     let neighbours: &[usize] = if quick { &[0, 2] } else { &[0, 1, 2, 4, 8] };
     let (settles, lasts) = if quick { (0.3, 1.2) } else { (1.5, 7.0) };
     let mut points = Vec::new();
     for policy in IsolationPolicy::ALL {
         for neighbours in neighbours.iter().copied() {
-            let plan = IsolationPlan {
-                policy,
-                neighbours,
-                settles,
-                lasts,
-                work: SHORT.milliseconds,
-                cores: crowd::cores(),
-            };
+            let plan =
+                IsolationPlan { policy, neighbours, settles, lasts, work: SHORT.milliseconds, cores: crowd::cores() };
             let name = format!("neighbours {} {neighbours}", policy.name());
             let measured = cells.measure(&name, &plan, || {
                 let daemon = yard.without_servants(Controller::Off)?;
@@ -136,10 +126,7 @@ fn measure_point(daemon: &Daemon, plan: &IsolationPlan) -> Result<IsolationPoint
     let (before, begun) = (crowd::usage(daemon, ENDLESS)?, Instant::now());
     let times = crowd::time_calls(&mut measured, lasts(plan.lasts), || PAUSE)?;
     let used = crowd::usage(daemon, ENDLESS)?.0 - before.0;
-    Ok(IsolationPoint {
-        times,
-        neighbours_cores: used / begun.elapsed().as_secs_f64(),
-    })
+    Ok(IsolationPoint { times, neighbours_cores: used / begun.elapsed().as_secs_f64() })
 }
 
 pub(super) fn add_to_section(runs: &IsolationRuns, section: &mut Section) -> Result<()> {
@@ -177,20 +164,11 @@ pub(super) fn add_to_section(runs: &IsolationRuns, section: &mut Section) -> Res
         }
     }
     section.tables.push(table);
-    for (id, fraction, name) in [
-        ("neighbours-median", 0.5, "median"),
-        ("neighbours-95", 0.95, "95 %"),
-    ] {
-        let series = IsolationPolicy::ALL
-            .map(|policy| Series::new(policy.name(), runs.quantile_line(policy, fraction)));
+    for (id, fraction, name) in [("neighbours-median", 0.5, "median"), ("neighbours-95", 0.95, "95 %")] {
+        let series =
+            IsolationPolicy::ALL.map(|policy| Series::new(policy.name(), runs.quantile_line(policy, fraction)));
         let caption = format!("Response time of a robot beside greedy neighbours, {name}");
-        let drawing = plots::lines(
-            &caption,
-            "greedy neighbours",
-            "response time (ms)",
-            &series,
-            false,
-        )?;
+        let drawing = plots::lines(&caption, "greedy neighbours", "response time (ms)", &series, false)?;
         section.add_drawing(id, caption, drawing);
     }
     runs.add_findings(section);
@@ -238,19 +216,10 @@ impl IsolationRuns {
             }
         }
         if !parts.is_empty() {
-            section.findings.push(format!(
-                "Beside {most} greedy neighbours, {}.",
-                parts.join("; ")
-            ));
+            section.findings.push(format!("Beside {most} greedy neighbours, {}.", parts.join("; ")));
         }
-        let used = |policy| {
-            self.find_point(policy, most)
-                .map(|beside| beside.neighbours_cores)
-        };
-        if let (Some(limits), Some(weights)) = (
-            used(IsolationPolicy::Limits),
-            used(IsolationPolicy::Weights),
-        ) {
+        let used = |policy| self.find_point(policy, most).map(|beside| beside.neighbours_cores);
+        if let (Some(limits), Some(weights)) = (used(IsolationPolicy::Limits), used(IsolationPolicy::Weights)) {
             let idle = if weights > limits {
                 "; what the robot does not use is left idle with limits"
             } else {
@@ -262,12 +231,9 @@ impl IsolationRuns {
                 digits(weights)
             ));
         }
-        let alone: Vec<f64> = IsolationPolicy::ALL
-            .iter()
-            .filter_map(|policy| mean(&self.find_point(*policy, 0)?.times))
-            .collect();
-        let spread = alone.iter().copied().fold(0.0, f64::max)
-            / alone.iter().copied().fold(f64::INFINITY, f64::min);
+        let alone: Vec<f64> =
+            IsolationPolicy::ALL.iter().filter_map(|policy| mean(&self.find_point(*policy, 0)?.times)).collect();
+        let spread = alone.iter().copied().fold(0.0, f64::max) / alone.iter().copied().fold(f64::INFINITY, f64::min);
         if spread > ALIKE {
             section.findings.push(format!(
                 "Alone, the three policies should be equal, and differ by {:.0} %: the machine did something else \
@@ -277,8 +243,8 @@ impl IsolationRuns {
             ));
             return;
         }
-        let [Some(limits), Some(weights)] = [IsolationPolicy::Limits, IsolationPolicy::Weights]
-            .map(|policy| self.slowdown(policy, most, 0.95))
+        let [Some(limits), Some(weights)] =
+            [IsolationPolicy::Limits, IsolationPolicy::Weights].map(|policy| self.slowdown(policy, most, 0.95))
         else {
             return;
         };
@@ -307,23 +273,10 @@ mod tests {
 
     fn test_runs(limits: [f64; 2], weights: [f64; 2], none: [f64; 2]) -> IsolationRuns {
         let mut points = Vec::new();
-        for (policy, times) in IsolationPolicy::ALL
-            .into_iter()
-            .zip([limits, weights, none])
-        {
+        for (policy, times) in IsolationPolicy::ALL.into_iter().zip([limits, weights, none]) {
             for (neighbours, time) in [0, 8].into_iter().zip(times) {
-                let plan = IsolationPlan {
-                    policy,
-                    neighbours,
-                    settles: 1.0,
-                    lasts: 1.0,
-                    work: 8,
-                    cores: 2.0,
-                };
-                let beside = IsolationPoint {
-                    times: vec![time; 3],
-                    neighbours_cores: 1.5,
-                };
+                let plan = IsolationPlan { policy, neighbours, settles: 1.0, lasts: 1.0, work: 8, cores: 2.0 };
+                let beside = IsolationPoint { times: vec![time; 3], neighbours_cores: 1.5 };
                 points.push((plan, CachedResult::Done(beside)));
             }
         }
@@ -342,11 +295,7 @@ mod tests {
              median is 2.0 times that alone, the 95 % value 2.0 times; none: the median is 5.0 times that alone, the \
              95 % value 5.0 times."
         );
-        assert!(
-            section.findings[2].starts_with("By their 95 % values, limits protect"),
-            "{:?}",
-            section.findings
-        );
+        assert!(section.findings[2].starts_with("By their 95 % values, limits protect"), "{:?}", section.findings);
         assert_eq!(section.tables[0].rows[5][3..6], ["50.0", "50.0", "5.0"]);
         assert_eq!(section.figures.len(), 2);
     }
@@ -375,10 +324,6 @@ mod tests {
         let mut section = Section::new(9, "a", "b");
         add_to_section(&measured, &mut section).expect("it is told");
         assert_eq!(section.missing[0].what, "8 neighbours, limits");
-        assert!(
-            !section.findings[0].contains("limits:"),
-            "{:?}",
-            section.findings
-        );
+        assert!(!section.findings[0].contains("limits:"), "{:?}", section.findings);
     }
 }

@@ -11,16 +11,14 @@ use crate::words::milliseconds;
 
 /// Creates the section of experiment 5.
 pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
-    let mut section = Section::new(
-        5,
-        "jitter",
-        "How much response times differ from request to request",
-    );
-    section.published =
-        "Fig. 6 of the publication: jitter of response times, native and outsourced.".to_owned();
-    section.differs = vec!["The network itself has no jitter here (LAN, WAN): what is shown is that of the packages, \
+    let mut section = Section::new(5, "jitter", "How much response times differ from request to request");
+    section.published = "Fig. 6 of the publication: jitter of response times, native and outsourced.".to_owned();
+    section.differs = vec![
+        "The network itself has no jitter here (LAN, WAN): what is shown is that of the packages, \
         the portal and this machine's scheduler. A robot that has a quarter of a core is stopped by the kernel for \
-        most of each tenth of a second, which is jitter, too.".to_owned()];
+        most of each tenth of a second, which is jitter, too."
+            .to_owned(),
+    ];
     let mut table = Table::new(
         "Response times, milliseconds",
         "package | robot | where | standard deviation | of the mean | 5 % | median | 95 % | 99 %",
@@ -31,9 +29,8 @@ pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
         };
         let responses = trace.responses();
         let deviation = standard_deviation(&responses);
-        let share = deviation
-            .zip(mean(&responses))
-            .map(|(deviation, mean)| format!("{:.0} %", 100.0 * deviation / mean));
+        let share =
+            deviation.zip(mean(&responses)).map(|(deviation, mean)| format!("{:.0} %", 100.0 * deviation / mean));
         let at = |share| milliseconds(quantile(&responses, share));
         table.push([
             run.example.name.to_owned(),
@@ -72,12 +69,7 @@ pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
 
 /// Compares the variation natively and outsourced: by the standard deviations and, where that of the outsourced run is
 /// not smaller, by the range of nine in ten requests.
-fn steadiness_finding(
-    run: &OutsourcingRun,
-    network: NetworkProfile,
-    native: &[f64],
-    here: &[f64],
-) -> Option<String> {
+fn steadiness_finding(run: &OutsourcingRun, network: NetworkProfile, native: &[f64], here: &[f64]) -> Option<String> {
     let [on_robot, outsourced] = [native, here].map(standard_deviation);
     let (on_robot, outsourced) = on_robot.zip(outsourced)?;
     let most = |all: &[f64]| Some(quantile(all, 0.95)? - quantile(all, 0.05)?);
@@ -122,10 +114,7 @@ mod tests {
             panic!("{:?}", section.findings);
         };
         assert_tells(lan, "LAN: response times differ less");
-        assert_tells(
-            wan,
-            "response times differ more outsourced (standard deviation 566 ms) than",
-        );
+        assert_tells(wan, "response times differ more outsourced (standard deviation 566 ms) than");
         assert!(wan.ends_with("(141 ms): worse than hoped."), "{wan}");
     }
 

@@ -13,23 +13,20 @@ use crate::words::milliseconds;
 /// Creates the section of experiment 4.
 pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
     let mut section = Section::new(4, "phases", "Where the time of one frame goes");
-    section.published =
-        "Table II of the publication: SLAMBench's phases (acquisition, computation, rendering) of \
+    section.published = "Table II of the publication: SLAMBench's phases (acquisition, computation, rendering) of \
         KinectFusion, native and outsourced."
-            .to_owned();
+        .to_owned();
     section.differs = vec![
         "The phases are those of laser_slam, as it tells them itself; what is left of the response time is transport: \
-         serialization, the network, the portal and waiting.".to_owned(),
+         serialization, the network, the portal and waiting."
+            .to_owned(),
     ];
     let mut table = Table::new(
         "Mean of all frames, milliseconds",
         "robot | where | acquisition | computation | rendering | transport and waiting | response time",
     );
     let mut bars = Vec::new();
-    for run in runs
-        .iter()
-        .filter(|run| run.example.name == LASER_SLAM.name)
-    {
+    for run in runs.iter().filter(|run| run.example.name == LASER_SLAM.name) {
         let Some((trace, _)) = run.measured.value() else {
             continue;
         };
@@ -45,14 +42,8 @@ pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
             });
             continue;
         }
-        let of = |part: fn(&ComputationPhases) -> f64| {
-            mean(&told.iter().map(part).collect::<Vec<f64>>())
-        };
-        let parts = [
-            of(|one| one.acquisition),
-            of(|one| one.computation),
-            of(|one| one.rendering),
-        ];
+        let of = |part: fn(&ComputationPhases) -> f64| mean(&told.iter().map(part).collect::<Vec<f64>>());
+        let parts = [of(|one| one.acquisition), of(|one| one.computation), of(|one| one.rendering)];
         let own: f64 = parts.iter().flatten().sum();
         let whole = mean(&responses);
         let rest = whole.map(|whole| whole - own);
@@ -64,9 +55,8 @@ pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
                  %."
             ));
         }
-        for (name, part) in ["acquisition", "computation", "rendering", "transport"]
-            .into_iter()
-            .zip(parts.into_iter().chain([rest]))
+        for (name, part) in
+            ["acquisition", "computation", "rendering", "transport"].into_iter().zip(parts.into_iter().chain([rest]))
         {
             bars.push(Bar {
                 group: group.clone(),
@@ -76,11 +66,7 @@ pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
             });
         }
         let cells = parts.into_iter().chain([rest, whole]).map(milliseconds);
-        table.push(
-            [run.class.name().to_owned(), run.set_up.name().to_owned()]
-                .into_iter()
-                .chain(cells),
-        );
+        table.push([run.class.name().to_owned(), run.set_up.name().to_owned()].into_iter().chain(cells));
     }
     section.tables.push(table);
     section.add_drawing(
@@ -88,13 +74,7 @@ pub fn phases(runs: &[OutsourcingRun]) -> Result<Section> {
         "Parts of one frame's response time",
         plots::bars("laser_slam", "time (ms)", &bars, false)?,
     );
-    add_missing(
-        &mut section,
-        &runs
-            .iter()
-            .filter(|run| run.example.name == LASER_SLAM.name)
-            .collect::<Vec<_>>(),
-    );
+    add_missing(&mut section, &runs.iter().filter(|run| run.example.name == LASER_SLAM.name).collect::<Vec<_>>());
     Ok(section)
 }
 
@@ -106,11 +86,7 @@ mod tests {
 
     #[test]
     fn what_phases_do_not_tell_is_transport() {
-        let section =
-            phases(&[test_run(OutsourcingSetUp::Native, &[1.0, 1.0])]).expect("a section");
-        assert_eq!(
-            section.tables[0].rows[0][2..],
-            ["100", "500", "200", "200", "1000"].map(str::to_owned)
-        );
+        let section = phases(&[test_run(OutsourcingSetUp::Native, &[1.0, 1.0])]).expect("a section");
+        assert_eq!(section.tables[0].rows[0][2..], ["100", "500", "200", "200", "1000"].map(str::to_owned));
     }
 }

@@ -15,22 +15,14 @@ const PUBLISHED: u32 = 25;
 
 /// Creates the section of experiment 2.
 pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
-    let mut section = Section::new(
-        2,
-        "outsourcing",
-        "Native and outsourced, on two kinds of robots",
-    );
+    let mut section = Section::new(2, "outsourcing", "Native and outsourced, on two kinds of robots");
     section.published = "Fig. 5 of the publication: response times per request and accumulated times of RGBD-SLAM, \
         RTAB-Map and SSD on a \
         Raspberry Pi and on an ultrabook, native and outsourced: outsourced they were up to 25 times as fast."
         .to_owned();
     section.differs = differences();
-    let network = runs
-        .iter()
-        .find_map(|run| Some(&run.measured.value()?.1.network));
-    section
-        .differs
-        .extend(network.map(|network| format!("Packets are delayed by {network}.")));
+    let network = runs.iter().find_map(|run| Some(&run.measured.value()?.1.network));
+    section.differs.extend(network.map(|network| format!("Packets are delayed by {network}.")));
     let mut table = Table::new(
         "Response times, from publishing a request to its answer (milliseconds), one request after the other",
         "package | robot | where | requests | answered | median | 95 % | accumulated (s) | \
@@ -45,8 +37,7 @@ pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
         let native = find_run(runs, run.example.name, run.class, OutsourcingSetUp::Native);
         let native = native.map(|(trace, _)| trace.responses());
         let median = quantile(&responses, 0.5);
-        let times =
-            |of: &dyn Fn(&[f64]) -> Option<f64>| Some(of(native.as_ref()?)? / of(&responses)?);
+        let times = |of: &dyn Fn(&[f64]) -> Option<f64>| Some(of(native.as_ref()?)? / of(&responses)?);
         let faster = times(&|all| quantile(all, 0.5));
         let by_means = times(&|all| mean(all));
         table.push([
@@ -62,12 +53,9 @@ pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
             ratio(by_means),
             published_factor(run.set_up),
             format!("{:.1}", cost.robot_cpu),
-            or_dash(trace.bytes_per_request(1), |ways| {
-                format!("{:.0}", ways[0] + ways[1])
-            }),
+            or_dash(trace.bytes_per_request(1), |ways| format!("{:.0}", ways[0] + ways[1])),
         ]);
-        if let (Some(both), OutsourcingSetUp::Behind(network)) = (faster.zip(by_means), run.set_up)
-        {
+        if let (Some(both), OutsourcingSetUp::Behind(network)) = (faster.zip(by_means), run.set_up) {
             section.findings.push(finding(run, network, both));
         }
         let lost = trace.requests.len() - trace.answered_count();
@@ -97,24 +85,12 @@ pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
         section.add_drawing(
             format!("outsourcing-{}", example.name),
             format!("{title}: response time of each request"),
-            plots::lines(
-                &title,
-                "request",
-                "response time (s)",
-                &series(numbered_responses),
-                true,
-            )?,
+            plots::lines(&title, "request", "response time (s)", &series(numbered_responses), true)?,
         );
         section.add_drawing(
             format!("outsourcing-{}-accumulated", example.name),
             format!("{title}: accumulated response times"),
-            plots::lines(
-                &title,
-                "request",
-                "accumulated response times (s)",
-                &series(accumulate),
-                false,
-            )?,
+            plots::lines(&title, "request", "accumulated response times (s)", &series(accumulate), false)?,
         );
     }
     add_missing(&mut section, runs);
@@ -172,9 +148,7 @@ fn finding(run: &OutsourcingRun, network: NetworkProfile, (medians, means): (f64
 
 fn numbered_responses(trace: &Trace) -> Vec<(f64, f64)> {
     let known = (1..).zip(&trace.requests);
-    let point = |(number, one): (u32, &crate::trace::RequestSample)| {
-        Some((f64::from(number), one.response?))
-    };
+    let point = |(number, one): (u32, &crate::trace::RequestSample)| Some((f64::from(number), one.response?));
     known.filter_map(point).collect()
 }
 
@@ -197,21 +171,11 @@ mod tests {
     fn how_much_faster_is_by_the_medians() {
         let runs = [
             test_run(OutsourcingSetUp::Native, &[0.3, 0.4, 0.5]),
-            test_run(
-                OutsourcingSetUp::Behind(NetworkProfile::Lan),
-                &[0.1, 0.1, 0.9],
-            ),
-            test_run(
-                OutsourcingSetUp::Behind(NetworkProfile::Wan),
-                &[0.8, 0.8, 0.8],
-            ),
+            test_run(OutsourcingSetUp::Behind(NetworkProfile::Lan), &[0.1, 0.1, 0.9]),
+            test_run(OutsourcingSetUp::Behind(NetworkProfile::Wan), &[0.8, 0.8, 0.8]),
         ];
         let section = response_times(&runs).expect("a section");
-        let faster: Vec<&str> = section.tables[0]
-            .rows
-            .iter()
-            .map(|row| row[8].as_str())
-            .collect();
+        let faster: Vec<&str> = section.tables[0].rows.iter().map(|row| row[8].as_str()).collect();
         assert_eq!(faster, ["1.0", "4.0", "0.50"]);
         assert_eq!(section.tables[0].rows[1][9], "1.1");
         assert_eq!(section.tables[0].rows[1][10], "up to 25");

@@ -42,8 +42,7 @@ impl CoreUsage {
 impl TimeCounters {
     pub(super) fn read(daemon: &Daemon) -> Result<Self> {
         let machine = std::fs::read_to_string("/proc/stat").context("/proc/stat")?;
-        let of_process =
-            |process: Process| -> Result<f64> { Ok(process.total_processor_time()?.as_secs_f64()) };
+        let of_process = |process: Process| -> Result<f64> { Ok(process.total_processor_time()?.as_secs_f64()) };
         Ok(Self {
             machine: parse_machine_time(&machine).context("/proc/stat")?,
             daemon: of_process(Process::from_pid(daemon.pid()))?,
@@ -66,10 +65,7 @@ impl TimeCounters {
 /// Parses the non-idle core seconds of `/proc/stat`. Guest time is included in user time.
 fn parse_machine_time(text: &str) -> Option<f64> {
     let line = text.lines().find_map(|line| line.strip_prefix("cpu "))?;
-    let ticks: Vec<f64> = line
-        .split_whitespace()
-        .map(|word| word.parse().ok())
-        .collect::<Option<_>>()?;
+    let ticks: Vec<f64> = line.split_whitespace().map(|word| word.parse().ok()).collect::<Option<_>>()?;
     // user, nice, system, idle, iowait, irq, softirq, steal
     let used = [0, 1, 2, 5, 6].map(|index| ticks.get(index).copied().unwrap_or(0.0));
     (ticks.len() >= 4).then(|| used.iter().sum::<f64>() / TICKS)

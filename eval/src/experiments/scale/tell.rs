@@ -86,11 +86,7 @@ pub fn section(runs: &ScaleRuns) -> Result<Section> {
         let next = "make eval ONLY=10 tries it again";
         if let Some(point) = measured.require(&mut section, what, next) {
             let held_back = index % 2 == 1;
-            told.push(ReportedPoint {
-                plan,
-                point,
-                held_back,
-            });
+            told.push(ReportedPoint { plan, point, held_back });
         }
     }
     if told.is_empty() {
@@ -132,25 +128,12 @@ fn add_starts(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
         "Start of a servant, until it has answered a first call (s)",
         "figure | published | here | servants started",
     );
-    for (name, value) in [
-        ("median", median(&times)),
-        ("slowest", quantile(&times, 1.0)),
-    ] {
-        table.push([
-            name.to_owned(),
-            "over 5".to_owned(),
-            or_dash(value, digits),
-            times.len().to_string(),
-        ]);
+    for (name, value) in [("median", median(&times)), ("slowest", quantile(&times, 1.0))] {
+        table.push([name.to_owned(), "over 5".to_owned(), or_dash(value, digits), times.len().to_string()]);
     }
     section.tables.push(table);
     let caption = "Start of the next servant";
-    let series = [Series::new(
-        "",
-        all.iter()
-            .map(|(number, time)| (*number as f64, *time))
-            .collect(),
-    )];
+    let series = [Series::new("", all.iter().map(|(number, time)| (*number as f64, *time)).collect())];
     let drawing = plots::points(caption, "servants on the node", "start (s)", &series, false)?;
     section.add_drawing("scale-starts", caption, drawing);
     let tenth = (times.len() / 10).max(1);
@@ -158,10 +141,7 @@ fn add_starts(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
         1 => "one".to_owned(),
         many => format!("{many}, median"),
     };
-    let (first, last) = (
-        median(&times[..tenth]),
-        median(&times[times.len() - tenth..]),
-    );
+    let (first, last) = (median(&times[..tenth]), median(&times[times.len() - tenth..]));
     if let (Some(first), Some(last)) = (first, last) {
         section.findings.push(format!(
             "A new servant has answered its robot's first call after {} ms on an empty node (the first {which}) and \
@@ -182,9 +162,7 @@ fn add_points(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Se
     );
     for one in told {
         let predicted = node.map(|node| node.predict(one.plan.robots as u64).response);
-        let error = predicted
-            .zip(one.mean_response())
-            .map(|(predicted, mean)| predicted / mean - 1.0);
+        let error = predicted.zip(one.mean_response()).map(|(predicted, mean)| predicted / mean - 1.0);
         table.push([
             one.plan.robots.to_string(),
             if one.held_back { "held back" } else { "fitted" }.to_owned(),
@@ -219,9 +197,7 @@ fn add_costs(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
     }
     section.tables.push(table);
     let line = |name: &str, bytes: fn(&ScalePoint) -> f64| {
-        let points = told
-            .iter()
-            .map(|one| (one.robots(), bytes(one.point) / MEGA));
+        let points = told.iter().map(|one| (one.robots(), bytes(one.point) / MEGA));
         Series::new(name, points.collect())
     };
     let caption = "Memory of all robots together";
@@ -238,9 +214,7 @@ fn add_costs(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
 fn add_bend(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Section) {
     let times: Vec<Option<f64>> = told.iter().map(|one| median(&one.point.times)).collect();
     let Some(alone) = times[0] else { return };
-    let bent = times
-        .iter()
-        .position(|time| time.is_some_and(|time| time >= BENT * alone));
+    let bent = times.iter().position(|time| time.is_some_and(|time| time >= BENT * alone));
     let at = &told[bent.unwrap_or(told.len() - 1)];
     let memory = 1.0 - at.point.left.0 / at.point.left.1;
     let state = format!(
@@ -248,9 +222,9 @@ fn add_bend(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Sect
         at.busy_share() * 100.0,
         memory * 100.0
     );
-    let knee = node.map(NodeModel::knee).map(|knee| {
-        format!(" By the model robots begin to wait for one another at {knee:.0} robots.")
-    });
+    let knee = node
+        .map(NodeModel::knee)
+        .map(|knee| format!(" By the model robots begin to wait for one another at {knee:.0} robots."));
     let knee = knee.unwrap_or_default();
     let last = &told[told.len() - 1];
     let room = format!(
@@ -293,10 +267,7 @@ fn add_bend(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Sect
 
 /// Adds a remark if the machine was not quiet.
 fn add_disturbance(told: &[ReportedPoint], section: &mut Section) {
-    let most = told
-        .iter()
-        .map(ReportedPoint::other_share)
-        .fold(0.0, f64::max);
+    let most = told.iter().map(ReportedPoint::other_share).fold(0.0, f64::max);
     if most >= OTHERS {
         section.findings.push(format!(
             "Other programs used up to {:.0} % of the cores' time meanwhile: response times, the memory that the \

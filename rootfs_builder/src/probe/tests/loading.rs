@@ -8,12 +8,7 @@ use super::memory_container::{DEFINITIONS, MemoryContainer};
 use super::*;
 
 fn component(plugin: &str, name: &str) -> Component {
-    Component {
-        package: "talk".to_owned(),
-        plugin: plugin.to_owned(),
-        name: name.to_owned(),
-        ..Component::default()
-    }
+    Component { package: "talk".to_owned(), plugin: plugin.to_owned(), name: name.to_owned(), ..Component::default() }
 }
 
 async fn run_probe(
@@ -32,14 +27,7 @@ async fn run_probe(
         ..ProbeOptions::new(vec!["/box".into()], "/looker")
     };
     let bus: Arc<dyn Bus> = system.join("/looker");
-    probe(
-        &bus,
-        &registry,
-        &definitions,
-        &options,
-        std::future::pending(),
-    )
-    .await
+    probe(&bus, &registry, &definitions, &options, std::future::pending()).await
 }
 
 const LONG: Duration = Duration::from_secs(60);
@@ -48,8 +36,7 @@ const LONG: Duration = Duration::from_secs(60);
 async fn a_container_loads_its_nodes_before_they_are_looked_at() {
     let system = Arc::default();
     let container = MemoryContainer::start(&system, "/box").await;
-    let parameter =
-        json!({"name": "gains", "value": {"type": 8, "double_array_value": [0.5, "Infinity"]}});
+    let parameter = json!({"name": "gains", "value": {"type": 8, "double_array_value": [0.5, "Infinity"]}});
     let first = Component {
         namespace: "/front".to_owned(),
         remap_rules: vec!["chatter:=/said".to_owned()],
@@ -79,14 +66,9 @@ async fn a_container_loads_its_nodes_before_they_are_looked_at() {
 async fn what_is_not_loaded_is_told_with_the_containers_words() {
     let system = Arc::default();
     let container = MemoryContainer::start(&system, "/box").await;
-    let components = vec![
-        component("talk::Talker", "see"),
-        component("talk::Walker", "go"),
-        component("talk::Talker", "late"),
-    ];
-    let error = run_probe(&system, components, LONG)
-        .await
-        .expect_err("refused");
+    let components =
+        vec![component("talk::Talker", "see"), component("talk::Walker", "go"), component("talk::Talker", "late")];
+    let error = run_probe(&system, components, LONG).await.expect_err("refused");
     assert_eq!(
         error.to_string(),
         "the component container /box does not load /go (talk::Walker of package talk): Failed to find class with the \
@@ -101,9 +83,7 @@ async fn a_node_that_loads_nothing_is_told_with_how_long_was_waited() {
     let _node = system.join("/box");
     let components = vec![component("talk::Talker", "see")];
     let patience = Duration::from_millis(200);
-    let error = run_probe(&system, components, patience)
-        .await
-        .expect_err("late");
+    let error = run_probe(&system, components, patience).await.expect_err("late");
     let words = error.to_string();
     assert!(
         words.contains("/see (talk::Talker of package talk): it did not serve /box/_container/load_node within 200ms"),

@@ -16,15 +16,9 @@ const DEFINITIONS: [(&str, &str); 8] = [
     ("lab/msg/Seen", "Where[] at\n"),
     ("lab/msg/Where", "float64 x\n"),
     ("lab/srv/Look", "---\nWhere at\n"),
-    (
-        "lab/action/Turn",
-        "Where to\n---\nbool done\n---\nfloat64 left\n",
-    ),
+    ("lab/action/Turn", "Where to\n---\nbool done\n---\nfloat64 left\n"),
     ("lifecycle_msgs/msg/State", "uint8 id\nstring label\n"),
-    (
-        "lifecycle_msgs/srv/ChangeState",
-        "Transition transition\n---\nbool success\n",
-    ),
+    ("lifecycle_msgs/srv/ChangeState", "Transition transition\n---\nbool success\n"),
     ("lifecycle_msgs/srv/GetState", "---\nState current_state\n"),
 ];
 
@@ -42,11 +36,7 @@ impl Ros2System {
         let definitions = all.map(|(key, text)| (key.to_owned(), text.to_owned()));
         let definitions: BTreeMap<String, String> = definitions.collect();
         let registry = Registry::with_definitions(RosVersion::Two, &definitions).expect("valid");
-        Self {
-            definitions,
-            registry: Arc::new(registry),
-            system: Arc::default(),
-        }
+        Self { definitions, registry: Arc::new(registry), system: Arc::default() }
     }
 
     fn wire(&self, name: &str) -> WireType {
@@ -77,9 +67,7 @@ struct Zeros;
 #[async_trait::async_trait]
 impl ServiceHandler for Zeros {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
-        Ok(Bytes::from_static(&[
-            0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-        ]))
+        Ok(Bytes::from_static(&[0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]))
     }
 }
 
@@ -88,44 +76,20 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     let two = Ros2System::new();
     let node = two.system.join_demanding("/see");
     let seen = two.wire("lab/msg/Seen");
-    let weak = QosProfile {
-        reliability: OnBus::BestEffort,
-        ..QosProfile::keep_last(1)
-    };
-    let _out = node
-        .advertise("/seen", seen.clone(), weak)
-        .await
-        .expect("a topic");
+    let weak = QosProfile { reliability: OnBus::BestEffort, ..QosProfile::keep_last(1) };
+    let _out = node.advertise("/seen", seen.clone(), weak).await.expect("a topic");
     let latched = QosProfile::keep_last(1).latching(true);
     let string = two.wire("std_msgs/msg/String");
-    let mut input = node
-        .subscribe("/map", string.clone(), latched)
-        .await
-        .expect("a topic");
-    let _map = node
-        .advertise("/state", string.clone(), latched)
-        .await
-        .expect("a topic");
-    let _log = node
-        .advertise("/parameter_events", string, latched)
-        .await
-        .expect("a topic");
+    let mut input = node.subscribe("/map", string.clone(), latched).await.expect("a topic");
+    let _map = node.advertise("/state", string.clone(), latched).await.expect("a topic");
+    let _log = node.advertise("/parameter_events", string, latched).await.expect("a topic");
     let zeros = || Arc::new(Zeros);
-    let _look = node
-        .serve("/look", two.service("lab/srv/Look"), zeros())
-        .await
-        .expect("served");
-    let _own = node
-        .serve("/see/get_parameters", two.service("lab/srv/Look"), zeros())
-        .await;
+    let _look = node.serve("/look", two.service("lab/srv/Look"), zeros()).await.expect("served");
+    let _own = node.serve("/see/get_parameters", two.service("lab/srv/Look"), zeros()).await;
     let _needs = node.seek("/where", two.service("lab/srv/Look"));
     let turn = two.registry.action("lab/action/Turn").expect("defined");
     let _turns = node.action_client("/turn", &turn).expect("a client");
-    let set = [
-        ("rate", 2.5.into()),
-        ("use_sim_time", false.into()),
-        ("camera.id", "x".into()),
-    ];
+    let set = [("rate", 2.5.into()), ("use_sim_time", false.into()), ("camera.id", "x".into())];
     let parameters = node.node_parameters().expect("offered");
     let set = set.map(|(name, value): (&str, Value)| {
         let value: ParamValue = serde_json::from_value(value).expect("a value");
@@ -142,10 +106,7 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     let names: Vec<&str> = interface.topics.iter().map(|it| it.name.as_str()).collect();
     assert_eq!(names, ["/map", "/seen", "/state"]);
     let qos = topic("/seen").qos.expect("told");
-    assert_eq!(
-        (qos.reliability, qos.durability),
-        (Reliability::BestEffort, Durability::Volatile)
-    );
+    assert_eq!((qos.reliability, qos.durability), (Reliability::BestEffort, Durability::Volatile));
     assert!(!topic("/seen").latched && topic("/state").latched);
     assert_eq!(topic("/seen").type_name, "lab/msg/Seen");
     assert_eq!(topic("/seen").md5, seen.digest.to_string());
@@ -153,46 +114,20 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     assert_eq!(asked.durability, Durability::TransientLocal);
     // It requests a latched message and got it.
     assert!(input.messages.try_recv().is_some(), "{:?}", found.warnings);
-    let services: Vec<&str> = interface
-        .services
-        .iter()
-        .map(|it| it.name.as_str())
-        .collect();
+    let services: Vec<&str> = interface.services.iter().map(|it| it.name.as_str()).collect();
     assert_eq!(services, ["/look"]);
     assert!(interface.services[0].md5.starts_with("RIHS01_"));
-    let needs: Vec<_> = interface
-        .needs
-        .iter()
-        .map(|need| (&*need.name, need.nodes.len()))
-        .collect();
+    let needs: Vec<_> = interface.needs.iter().map(|need| (&*need.name, need.nodes.len())).collect();
     assert_eq!(needs, [("/turn", 1), ("/where", 1)]);
-    let shown: Vec<_> = interface
-        .parameters
-        .iter()
-        .map(|it| (&*it.name, it.own_name(), it.value.clone()))
-        .collect();
+    let shown: Vec<_> = interface.parameters.iter().map(|it| (&*it.name, it.own_name(), it.value.clone())).collect();
     assert_eq!(
         shown,
-        [
-            ("/see/camera.id", Some("camera.id"), Some(json!("x"))),
-            ("/see/rate", Some("rate"), Some(json!(2.5))),
-        ]
+        [("/see/camera.id", Some("camera.id"), Some(json!("x"))), ("/see/rate", Some("rate"), Some(json!(2.5))),]
     );
     let said = interface.parameters[1].descriptor.as_ref().expect("told");
-    assert_eq!(
-        (&*said.kind, &*said.description),
-        ("double", "rate of /see")
-    );
+    assert_eq!((&*said.kind, &*said.description), ("double", "rate of /see"));
     let keys: Vec<&str> = interface.definitions.keys().map(String::as_str).collect();
-    assert_eq!(
-        keys,
-        [
-            "lab/msg/Seen",
-            "lab/msg/Where",
-            "lab/srv/Look",
-            "std_msgs/msg/String"
-        ]
-    );
+    assert_eq!(keys, ["lab/msg/Seen", "lab/msg/Where", "lab/srv/Look", "std_msgs/msg/String"]);
 }
 
 /// A lifecycle node as in rclcpp: configured, then activated, which starts its work; `refuses` is the transition that
@@ -220,16 +155,8 @@ impl Stages {
         }
         self.state.store(state + 1, Ordering::SeqCst);
         if label == "activate" {
-            let of = WireType::from_message(
-                &self
-                    .registry
-                    .message("std_msgs/msg/String")
-                    .expect("defined"),
-            );
-            let publisher = self
-                .node
-                .advertise("/driven", of, QosProfile::keep_last(1))
-                .await;
+            let of = WireType::from_message(&self.registry.message("std_msgs/msg/String").expect("defined"));
+            let publisher = self.node.advertise("/driven", of, QosProfile::keep_last(1)).await;
             *self.working.lock() = Some(publisher.expect("advertised"));
         }
         true
@@ -253,23 +180,13 @@ impl ServiceHandler for Stage {
         };
         let mut bytes = Vec::new();
         let text = answer.to_string();
-        from_json(
-            &of.response,
-            text.as_bytes(),
-            &mut bytes,
-            &FillOptions::default(),
-        )
-        .expect("fits");
+        from_json(&of.response, text.as_bytes(), &mut bytes, &FillOptions::default()).expect("fits");
         Ok(bytes.into())
     }
 }
 
 /// Starts a lifecycle node in this state; the returned guard keeps its services alive.
-async fn start_lifecycle_node(
-    two: &Ros2System,
-    refuses: &'static str,
-    state: u8,
-) -> (Arc<Stages>, impl Sized) {
+async fn start_lifecycle_node(two: &Ros2System, refuses: &'static str, state: u8) -> (Arc<Stages>, impl Sized) {
     let node = two.system.join("/drive");
     let stages = Arc::new(Stages {
         registry: Arc::clone(&two.registry),
@@ -279,10 +196,9 @@ async fn start_lifecycle_node(
         working: Mutex::default(),
     });
     let mut served = Vec::new();
-    for (service, of) in [
-        ("/drive/change_state", "lifecycle_msgs/srv/ChangeState"),
-        ("/drive/get_state", "lifecycle_msgs/srv/GetState"),
-    ] {
+    for (service, of) in
+        [("/drive/change_state", "lifecycle_msgs/srv/ChangeState"), ("/drive/get_state", "lifecycle_msgs/srv/GetState")]
+    {
         let handler = Arc::new(Stage(Arc::clone(&stages), of));
         let serving = node.serve(service, two.service(of), handler).await;
         served.push(serving.expect("served"));
@@ -305,22 +221,12 @@ async fn a_node_with_a_lifecycle_is_activated_and_its_services_are_its_lifecycle
 #[tokio::test]
 async fn a_node_that_does_not_activate_is_named_with_the_transition() {
     for (refuses, words) in [
-        (
-            "configure",
-            "/drive does not configure: /drive did not configure, and is unconfigured now",
-        ),
-        (
-            "activate",
-            "/drive does not activate: /drive did not activate, and is inactive now",
-        ),
+        ("configure", "/drive does not configure: /drive did not configure, and is unconfigured now"),
+        ("activate", "/drive does not activate: /drive did not activate, and is inactive now"),
     ] {
         let two = Ros2System::new();
         let (_stages, _served) = start_lifecycle_node(&two, refuses, 1).await;
-        let error = two
-            .run_probe(&["/drive"])
-            .await
-            .expect_err("refused")
-            .to_string();
+        let error = two.run_probe(&["/drive"]).await.expect_err("refused").to_string();
         assert!(error.contains(words), "{error}");
     }
 }
@@ -330,10 +236,7 @@ async fn a_node_that_somebody_drives_is_left_to_it() {
     let two = Ros2System::new();
     let (stages, _served) = start_lifecycle_node(&two, "", 1).await;
     let manager = two.system.join("/manager");
-    let _drives = manager.seek(
-        "/drive/change_state",
-        two.service("lifecycle_msgs/srv/ChangeState"),
-    );
+    let _drives = manager.seek("/drive/change_state", two.service("lifecycle_msgs/srv/ChangeState"));
     let found = two.run_probe(&["/drive"]).await.expect("found");
     assert_eq!(stages.state()["current_state"]["label"], "unconfigured");
     assert_eq!(found.interface.lifecycle, ["/drive"]);
@@ -342,10 +245,7 @@ async fn a_node_that_somebody_drives_is_left_to_it() {
     let (stages, _served) = start_lifecycle_node(&two, "", 2).await;
     let found = two.run_probe(&["/drive"]).await.expect("found");
     assert_eq!(stages.state()["current_state"]["label"], "inactive");
-    let told = found
-        .warnings
-        .iter()
-        .any(|it| it.contains("/drive was inactive"));
+    let told = found.warnings.iter().any(|it| it.contains("/drive was inactive"));
     assert!(told, "{:?}", found.warnings);
 }
 
@@ -364,15 +264,9 @@ async fn actions_bring_the_definitions_that_their_parts_refer_to() {
     let two = Ros2System::new();
     let node = two.system.join("/see");
     let turn = two.registry.action("lab/action/Turn").expect("defined");
-    let _served = node
-        .serve_action("/turn", &turn, Arc::new(Nothing))
-        .expect("served");
+    let _served = node.serve_action("/turn", &turn, Arc::new(Nothing)).expect("served");
     let interface = two.run_probe(&["/see"]).await.expect("found").interface;
-    let actions: Vec<_> = interface
-        .actions
-        .iter()
-        .map(|it| (&*it.name, &*it.type_name))
-        .collect();
+    let actions: Vec<_> = interface.actions.iter().map(|it| (&*it.name, &*it.type_name)).collect();
     assert_eq!(actions, [("/turn", "lab/action/Turn")]);
     let keys: Vec<&str> = interface.definitions.keys().map(String::as_str).collect();
     assert_eq!(keys, ["lab/action/Turn", "lab/msg/Where"]);

@@ -59,11 +59,7 @@ impl Measure {
 
     /// Returns whether `value` is at least as good as `than`.
     pub fn reaches(self, value: f64, than: f64) -> bool {
-        if self.is_less_better() {
-            value <= than
-        } else {
-            value >= than
-        }
+        if self.is_less_better() { value <= than } else { value >= than }
     }
 
     /// Formats a value with its unit, as it is written after the measure's key.
@@ -159,11 +155,7 @@ impl Sla {
     pub fn goals(&self) -> Vec<Goal> {
         let goals = self.values().into_iter().filter_map(|(measure, pair)| {
             let (desire, bound) = complete(pair)?;
-            Some(Goal {
-                measure,
-                desire,
-                bound,
-            })
+            Some(Goal { measure, desire, bound })
         });
         goals.collect()
     }
@@ -175,11 +167,7 @@ impl Sla {
             if let (Some(desire), Some(bound)) = (desire, bound)
                 && !measure.reaches(desire, bound)
             {
-                let reason = UnstatableReason::WorseThanBound {
-                    measure,
-                    desire,
-                    bound,
-                };
+                let reason = UnstatableReason::WorseThanBound { measure, desire, bound };
                 return Err(Unstatable::new(key, reason));
             }
             // Spans are checked where they are made.
@@ -196,29 +184,10 @@ impl Sla {
 
     /// Returns the stricter of both, measure by measure.
     pub fn stricter(self, other: Sla) -> Sla {
-        let (rrt, max_rrt) = stricter(
-            (self.rrt, self.max_rrt),
-            (other.rrt, other.max_rrt),
-            Span::min,
-        );
-        let (fps, min_fps) = stricter(
-            (self.fps, self.min_fps),
-            (other.fps, other.min_fps),
-            f64::max,
-        );
-        let (age, max_age) = stricter(
-            (self.age, self.max_age),
-            (other.age, other.max_age),
-            Span::min,
-        );
-        Sla {
-            rrt,
-            max_rrt,
-            fps,
-            min_fps,
-            age,
-            max_age,
-        }
+        let (rrt, max_rrt) = stricter((self.rrt, self.max_rrt), (other.rrt, other.max_rrt), Span::min);
+        let (fps, min_fps) = stricter((self.fps, self.min_fps), (other.fps, other.min_fps), f64::max);
+        let (age, max_age) = stricter((self.age, self.max_age), (other.age, other.max_age), Span::min);
+        Sla { rrt, max_rrt, fps, min_fps, age, max_age }
     }
 }
 
@@ -243,19 +212,13 @@ fn stricter<T: Copy>(one: Pair<T>, other: Pair<T>, better: fn(T, T) -> T) -> Pai
 pub(super) fn describe_contradiction(measure: &Measure, desire: &f64, bound: &f64) -> String {
     let [_, bound_key] = measure.row().keys;
     let [desire, bound] = [desire, bound].map(|value| measure.format_value(*value));
-    let (relation, correct, otherwise) = if measure.is_less_better() {
-        ("greater", "lower", "raise")
-    } else {
-        ("less", "raise", "lower")
-    };
-    format!(
-        "({desire}) is {relation} than {bound_key} ({bound}); {correct} it, or {otherwise} {bound_key}"
-    )
+    let (relation, correct, otherwise) =
+        if measure.is_less_better() { ("greater", "lower", "raise") } else { ("less", "raise", "lower") };
+    format!("({desire}) is {relation} than {bound_key} ({bound}); {correct} it, or {otherwise} {bound_key}")
 }
 
 /// Parses a rate in frames per second.
 pub(super) fn parse_rate(text: &str) -> Result<f64, ParseRateError> {
     let rate = text.parse().ok();
-    rate.filter(|rate| *rate > 0.0 && *rate <= MOST_FPS)
-        .ok_or_else(|| ParseRateError(text.to_owned()))
+    rate.filter(|rate| *rate > 0.0 && *rate <= MOST_FPS).ok_or_else(|| ParseRateError(text.to_owned()))
 }

@@ -25,15 +25,9 @@ fn all_that_can_be_stated_is_read() {
     .expect("valid");
     assert_eq!(stated.sla.rrt, Span::from_millis(100));
     assert_eq!(stated.sla.max_rrt, Span::from_millis(300));
-    assert_eq!(
-        (stated.sla.fps, stated.sla.min_fps),
-        (Some(10.0), Some(5.0))
-    );
+    assert_eq!((stated.sla.fps, stated.sla.min_fps), (Some(10.0), Some(5.0)));
     assert_eq!(stated.class.as_deref(), Some("interactive"));
-    assert_eq!(
-        (stated.cpus, stated.memory),
-        (Some(1.5), Some(Size(1 << 30)))
-    );
+    assert_eq!((stated.cpus, stated.memory), (Some(1.5), Some(Size(1 << 30))));
     assert_eq!(stated.aux["width"], "640");
     assert_eq!(
         stated.to_string(),
@@ -48,11 +42,7 @@ fn all_that_can_be_stated_is_read() {
 #[test]
 fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
     for (key, value, words) in [
-        (
-            "rrt",
-            "soon",
-            &["rrt = \"soon\" is not a time", "300ms"][..],
-        ),
+        ("rrt", "soon", &["rrt = \"soon\" is not a time", "300ms"][..]),
         ("rrt", "", &["rrt = \"\" is not a time"]),
         ("max_rrt", "-1", &["max_rrt = \"-1\""]),
         ("max_rrt", "5 min", &["max_rrt", "seconds"]),
@@ -64,19 +54,11 @@ fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
         ("cpus", "many", &["cpus = \"many\"", "such as 1.5"]),
         ("cpus", "0", &["cpus = \"0\"", "between 0.01 and 4096"]),
         ("cpus", "inf", &["cpus = \"inf\""]),
-        (
-            "memory",
-            "lots",
-            &["memory = \"lots\" is not a size", "512M"],
-        ),
+        ("memory", "lots", &["memory = \"lots\" is not a size", "512M"]),
         ("memory", "1K", &["memory = 1K is too little", "4M"]),
         ("aux.", "1", &["aux.", "write aux.KEY=VALUE"]),
         ("aux.a b", "1", &["aux.a b is not an auxiliary parameter"]),
-        (
-            "aux.width",
-            "",
-            &["aux.width has no value", "aux.width=640"],
-        ),
+        ("aux.width", "", &["aux.width has no value", "aux.width=640"]),
         ("aux.width", "\u{7}", &["aux.width has no value"]),
         // Misspelled keys.
         ("max-rrt", "1", &["max-rrt is not a key; write max_rrt"]),
@@ -93,18 +75,9 @@ fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
         }
     }
     for (query, words) in [
-        (
-            [("rrt", "300ms"), ("max_rrt", "100ms")],
-            "rrt (300ms) is greater than max_rrt (100ms); lower it",
-        ),
-        (
-            [("fps", "5"), ("min_fps", "10")],
-            "fps (5) is less than min_fps (10); raise it",
-        ),
-        (
-            [("max_age", "1"), ("age", "2")],
-            "age (2s) is greater than max_age (1s); lower it",
-        ),
+        ([("rrt", "300ms"), ("max_rrt", "100ms")], "rrt (300ms) is greater than max_rrt (100ms); lower it"),
+        ([("fps", "5"), ("min_fps", "10")], "fps (5) is less than min_fps (10); raise it"),
+        ([("max_age", "1"), ("age", "2")], "age (2s) is greater than max_age (1s); lower it"),
         ([("rrt", "1"), ("rrt", "1")], "rrt is given twice"),
         ([("aux.a", "1"), ("aux.a", "2")], "aux.a is given twice"),
     ] {
@@ -120,11 +93,7 @@ fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
 fn every_key_is_read_and_documented() {
     let document = include_str!("../../../../docs/robots.md");
     for key in &KEYS {
-        assert!(
-            document.contains(&format!("`{}`", key.name)),
-            "{}",
-            key.name
-        );
+        assert!(document.contains(&format!("`{}`", key.name)), "{}", key.name);
         let refused = read(&[(key.name, "")]).expect_err(key.name);
         assert_eq!(refused.key, key.name);
     }
@@ -137,16 +106,9 @@ fn every_key_is_read_and_documented() {
 #[test]
 fn a_goal_has_a_desire_and_a_bound() {
     let goals = |query: &[(&str, &str)]| read(query).expect("valid").sla.goals();
-    let goal = |measure, desire, bound| Goal {
-        measure,
-        desire,
-        bound,
-    };
+    let goal = |measure, desire, bound| Goal { measure, desire, bound };
     assert_eq!(goals(&[]), []);
-    assert_eq!(
-        goals(&[("rrt", "0.1"), ("max_rrt", "0.3")]),
-        [goal(Measure::Rrt, 0.1, 0.3)]
-    );
+    assert_eq!(goals(&[("rrt", "0.1"), ("max_rrt", "0.3")]), [goal(Measure::Rrt, 0.1, 0.3)]);
     assert_eq!(
         goals(&[("max_rrt", "0.3"), ("fps", "4")]),
         [goal(Measure::Rrt, 0.3, 0.3), goal(Measure::Fps, 4.0, 4.0)]
@@ -182,8 +144,7 @@ fn several_of_one_robot_get_what_the_strictest_needs() {
 }
 
 fn any_stated() -> impl Strategy<Value = Stated> {
-    let span =
-        || proptest::option::of((1u64..86_400_000_000_000).prop_map(|nanos| nanos as f64 / 1e9));
+    let span = || proptest::option::of((1u64..86_400_000_000_000).prop_map(|nanos| nanos as f64 / 1e9));
     // Exactly representable in binary: serde_json may parse other values with an error in the last digit.
     let eighths = |most: u32| (1..most).prop_map(|n| f64::from(n) / 8.0);
     let rate = || proptest::option::of(eighths(8_000_000));
@@ -195,30 +156,22 @@ fn any_stated() -> impl Strategy<Value = Stated> {
         proptest::option::of((4u64 << 20)..(1 << 50)),
         aux,
     )
-        .prop_map(
-            |((rrt, max_rrt, fps, min_fps, age, max_age), class, cpus, memory, aux)| {
-                let span = |seconds: Option<f64>| seconds.and_then(Span::from_seconds);
-                // A desired value is at least as strict as its bound.
-                let within = |desire: Option<f64>, bound: Option<f64>| {
-                    desire.map(|desire| bound.map_or(desire, |bound| bound.min(desire)))
-                };
-                let sla = Sla {
-                    rrt: span(within(rrt, max_rrt)),
-                    max_rrt: span(max_rrt),
-                    fps: fps.map(|fps| min_fps.map_or(fps, |min| fps.max(min))),
-                    min_fps,
-                    age: span(within(age, max_age)),
-                    max_age: span(max_age),
-                };
-                Stated {
-                    sla,
-                    class,
-                    cpus,
-                    memory: memory.map(Size),
-                    aux,
-                }
-            },
-        )
+        .prop_map(|((rrt, max_rrt, fps, min_fps, age, max_age), class, cpus, memory, aux)| {
+            let span = |seconds: Option<f64>| seconds.and_then(Span::from_seconds);
+            // A desired value is at least as strict as its bound.
+            let within = |desire: Option<f64>, bound: Option<f64>| {
+                desire.map(|desire| bound.map_or(desire, |bound| bound.min(desire)))
+            };
+            let sla = Sla {
+                rrt: span(within(rrt, max_rrt)),
+                max_rrt: span(max_rrt),
+                fps: fps.map(|fps| min_fps.map_or(fps, |min| fps.max(min))),
+                min_fps,
+                age: span(within(age, max_age)),
+                max_age: span(max_age),
+            };
+            Stated { sla, class, cpus, memory: memory.map(Size), aux }
+        })
 }
 
 proptest! {

@@ -27,10 +27,7 @@ pub(super) enum ClientActionError {
     #[error(transparent)]
     NotGranted(#[from] NotGrantedError),
     #[error("action {action}: {source}")]
-    Definition {
-        action: String,
-        source: DefinitionError,
-    },
+    Definition { action: String, source: DefinitionError },
     #[error(transparent)]
     Begin(#[from] BeginCallError),
     /// The goal, feedback or result is not a message of its type.
@@ -57,19 +54,14 @@ pub(super) enum ClientActionError {
 
 impl Actions {
     /// Removes the served actions whose names match.
-    pub(super) fn take_served(
-        &mut self,
-        chosen: impl Fn(&str) -> bool,
-    ) -> Vec<(String, Arc<ActionServer>)> {
+    pub(super) fn take_served(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Arc<ActionServer>)> {
         remove_matching(&mut self.served, chosen)
     }
 
     /// Returns the goals in progress of actions whose names match: the server's id and the action.
     pub(super) fn goals_of_actions(&self, chosen: impl Fn(&str) -> bool) -> Vec<(String, String)> {
         let goals = self.goals.iter().filter(|(_, goal)| chosen(&goal.action));
-        goals
-            .map(|(goal_id, goal)| (goal_id.clone(), goal.action.clone()))
-            .collect()
+        goals.map(|(goal_id, goal)| (goal_id.clone(), goal.action.clone())).collect()
     }
 
     /// Returns the server's id of the goal with the client's `id`.
@@ -81,11 +73,7 @@ impl Actions {
 }
 
 impl BridgeClient {
-    fn action_def(
-        &self,
-        action: &str,
-        type_name: &str,
-    ) -> Result<Arc<ActionDef>, ClientActionError> {
+    fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, ClientActionError> {
         let name = lookup_name(self.version(), type_name);
         let registry = &self.shared.registry;
         let def = registry.action(&name);

@@ -89,17 +89,11 @@ struct ServiceCall {
 
 impl ServiceCall {
     fn reply(&self) -> ReplyTarget {
-        ReplyTarget {
-            id: self.id.clone(),
-            format: payload_format(self.compression),
-        }
+        ReplyTarget { id: self.id.clone(), format: payload_format(self.compression) }
     }
 
     fn args(&self) -> Option<Payload<'_>> {
-        self.args.as_ref().map(|(format, bytes)| Payload {
-            format: *format,
-            bytes,
-        })
+        self.args.as_ref().map(|(format, bytes)| Payload { format: *format, bytes })
     }
 }
 
@@ -116,13 +110,8 @@ impl BridgeClient {
             written: op.service.clone().into_owned(),
             said: op.type_name.map(Cow::into_owned),
             id: reply.id.clone(),
-            args: op
-                .args
-                .map(|args| (args.format, Bytes::copy_from_slice(args.bytes))),
-            timeout: op
-                .timeout
-                .filter(|timeout| !timeout.is_zero())
-                .unwrap_or(self.shared.options.call_timeout),
+            args: op.args.map(|args| (args.format, Bytes::copy_from_slice(args.bytes))),
+            timeout: op.timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(self.shared.options.call_timeout),
             compression,
             fragment_size: op.fragment_size,
         };
@@ -134,10 +123,7 @@ impl BridgeClient {
             Ok(found) => found,
             Err(error) => return self.answer_call_failed(&call, &error),
         };
-        let call = ServiceCall {
-            service: service.into_owned(),
-            ..call
-        };
+        let call = ServiceCall { service: service.into_owned(), ..call };
         let client = self.clone();
         let mut call = Box::pin(async move {
             let _guard = guard;
@@ -151,11 +137,7 @@ impl BridgeClient {
             }
         });
         // The request is sent at once; the task that waits for the answer is spawned while the node handles it.
-        if call
-            .as_mut()
-            .poll(&mut Context::from_waker(Waker::noop()))
-            .is_pending()
-        {
+        if call.as_mut().poll(&mut Context::from_waker(Waker::noop())).is_pending() {
             tokio::spawn(call);
         }
     }
@@ -164,21 +146,14 @@ impl BridgeClient {
         self.wait_own_service(&call.service).await;
         let bus = &self.shared.bus;
         let server = bus.graph().borrow().services.get(&call.service).cloned();
-        let own = server
-            .is_none()
-            .then(|| own::find_own_service(&call.service))
-            .flatten();
+        let own = server.is_none().then(|| own::find_own_service(&call.service)).flatten();
         if !own.as_ref().is_some_and(|own| own.is_filtered()) {
             self.client_grants().check(Operation::Call, &call.service)?;
         }
         if let Some(own) = own {
             return self.call_own_service(call, &*own).await;
         }
-        let service_type = self
-            .shared
-            .service_types
-            .find(self.shared.bus.as_ref(), &call.service)
-            .await?;
+        let service_type = self.shared.service_types.find(self.shared.bus.as_ref(), &call.service).await?;
         let def = self.find_definition(call, &service_type);
         if let Ok(def) = &def {
             self.warn_surplus_args(&call.reply(), "call_service", &def.request, call.args());
@@ -209,29 +184,16 @@ impl BridgeClient {
             (Err(error), _) => return Err(error),
         };
         let of = def.as_ref().map(|def| &*def.request);
-        self.shared
-            .inputs
-            .for_input(&call.service, of)
-            .record(&request);
+        self.shared.inputs.for_input(&call.service, of).record(&request);
         let asked = Instant::now();
-        let response = self
-            .shared
-            .bus
-            .call(&call.service, request, call.timeout)
-            .await;
+        let response = self.shared.bus.call(&call.service, request, call.timeout).await;
         // Services of the robot's own clients say nothing about the servant.
         if server.is_none_or(|server| server != bus.node()) {
             let took = response.is_ok().then(|| asked.elapsed());
             self.shared.options.called.record(took);
         }
         let response = response.inspect_err(|error| {
-            if matches!(
-                error,
-                BusError::CallFailed {
-                    fate: CallFate::Answered,
-                    ..
-                }
-            ) {
+            if matches!(error, BusError::CallFailed { fate: CallFate::Answered, .. }) {
                 self.shared.metrics.calls_denied.add(1);
             }
         })?;
@@ -261,15 +223,8 @@ impl BridgeClient {
 
     /// Returns the mismatch if the client gives another type than the service has. As in rosbridge_suite, a call whose
     /// arguments fit is made anyway.
-    fn declared_type_mismatch(
-        &self,
-        call: &ServiceCall,
-        theirs: &str,
-    ) -> Option<DeclaredTypeError> {
-        let said = call
-            .said
-            .as_deref()
-            .filter(|said| !is_same_type(said, theirs))?;
+    fn declared_type_mismatch(&self, call: &ServiceCall, theirs: &str) -> Option<DeclaredTypeError> {
+        let said = call.said.as_deref().filter(|said| !is_same_type(said, theirs))?;
         Some(DeclaredTypeError::new(
             format!("service {}", call.service),
             theirs,
@@ -289,12 +244,7 @@ impl BridgeClient {
     /// Waits until everything this client has advertised is registered in ROS, so that its own operations appear to it
     /// in order. Waits only briefly; a failed registration is reported by a status message.
     async fn wait_registered(&self) {
-        let topics: Vec<String> = self
-            .topic_publishers
-            .lock()
-            .topics()
-            .map(str::to_owned)
-            .collect();
+        let topics: Vec<String> = self.topic_publishers.lock().topics().map(str::to_owned).collect();
         let services: Vec<String> = self.services.lock().names().map(str::to_owned).collect();
         let mut graph = self.shared.bus.graph();
         let known = graph.wait_for(|graph| {
@@ -302,10 +252,7 @@ impl BridgeClient {
                 let nodes = graph.topics.get(topic);
                 nodes.is_some_and(|nodes| !nodes.publishers.is_empty())
             };
-            topics.iter().all(published)
-                && services
-                    .iter()
-                    .all(|name| graph.services.contains_key(name))
+            topics.iter().all(published) && services.iter().all(|name| graph.services.contains_key(name))
         });
         let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
     }
@@ -324,20 +271,13 @@ impl BridgeClient {
         let mut held = self.budget.permit();
         held.count(JsonWeight::estimate(&args).bytes + COPIES * args.len())?;
         let grants = self.client_grants().grants();
-        let caller = Caller {
-            grants: &grants,
-            budget: &self.budget,
-        };
+        let caller = Caller { grants: &grants, budget: &self.budget };
         let values = own.answer(&self.shared, &args, &caller).await?;
         self.own_service_frame(call, &def, &values)
     }
 
     /// Returns the arguments of a call that the bridge answers, as a JSON object.
-    fn own_service_args(
-        &self,
-        call: &ServiceCall,
-        def: &ServiceDef,
-    ) -> Result<Bytes, ServiceCallError> {
+    fn own_service_args(&self, call: &ServiceCall, def: &ServiceDef) -> Result<Bytes, ServiceCallError> {
         match (call.args(), &call.args) {
             (None, _) => Ok(Bytes::from_static(b"{}")),
             (Some(args), Some((Format::Json, bytes)))
@@ -367,10 +307,7 @@ impl BridgeClient {
                 Ok(())
             });
         }
-        let values = Payload {
-            format: Format::Json,
-            bytes: values,
-        };
+        let values = Payload { format: Format::Json, bytes: values };
         let response = decode_args(&def.response, Some(values), Compression::None)?;
         Ok(self.response_frame(call, Some(def), &response)?)
     }
@@ -392,9 +329,7 @@ impl BridgeClient {
             writer.end();
             return Ok(EncodedFrame::new(format, out));
         };
-        answer_frame(call, format, |out| {
-            self.print_payload(&def.response, response, format, out)
-        })
+        answer_frame(call, format, |out| self.print_payload(&def.response, response, format, out))
     }
 
     /// Appends a serialized message as a payload of the format.
@@ -410,10 +345,7 @@ impl BridgeClient {
             max_bytes: self.shared.options.max_encoded,
             ..JsonOptions::default()
         };
-        let cbor = CborOptions {
-            max_bytes: self.shared.options.max_encoded,
-            ..CborOptions::default()
-        };
+        let cbor = CborOptions { max_bytes: self.shared.options.max_encoded, ..CborOptions::default() };
         let printed = match format {
             Format::Json => codec::to_json(message_type, bytes, out, &json),
             Format::Cbor => codec::to_cbor(message_type, bytes, out, &cbor),

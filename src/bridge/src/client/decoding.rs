@@ -40,16 +40,11 @@ pub(super) fn decode(
         let raw = read_raw(payload)?;
         codec::validate(message_type, &raw).map_err(Box::new)?;
         return Ok(match (&raw, source) {
-            (Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => {
-                source.slice_ref(slice)
-            }
+            (Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => source.slice_ref(slice),
             _ => Bytes::from(raw.into_owned()),
         });
     }
-    let options = FillOptions {
-        now: Some(Time::now()),
-        ..FillOptions::default()
-    };
+    let options = FillOptions { now: Some(Time::now()), ..FillOptions::default() };
     // Base64 shrinks by a quarter; everything else of relevance by more.
     let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
     let decoded = match payload.format {
@@ -68,24 +63,14 @@ pub(super) fn decode_args(
     compression: Compression,
 ) -> Result<Bytes, PayloadError> {
     match args {
-        None if compression == Compression::CborRaw && !message_type.fields().is_empty() => {
-            Err(PayloadError::NoArgs)
-        }
+        None if compression == Compression::CborRaw && !message_type.fields().is_empty() => Err(PayloadError::NoArgs),
         None => decode(message_type, Payload::json("{}"), Compression::None, None),
         Some(list) if list.is_list() && compression != Compression::CborRaw => {
             let fields = message_type.fields();
             let named = list
                 .to_named_object(fields.iter().map(|field| field.name.as_str()))
                 .ok_or(PayloadError::TooManyArgs)?;
-            decode(
-                message_type,
-                Payload {
-                    format: list.format,
-                    bytes: &named,
-                },
-                compression,
-                None,
-            )
+            decode(message_type, Payload { format: list.format, bytes: &named }, compression, None)
         }
         Some(args) => decode(message_type, args, compression, None),
     }

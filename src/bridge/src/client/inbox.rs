@@ -33,11 +33,7 @@ pub(crate) struct Inbox {
 impl Inbox {
     pub(crate) fn new(shared: &BridgeShared, budget: &Budget) -> Self {
         let limits = shared.options.fragments;
-        Self {
-            fragments: Fragments::new(limits),
-            pictures: Fragments::new(limits),
-            permit: budget.permit(),
-        }
+        Self { fragments: Fragments::new(limits), pictures: Fragments::new(limits), permit: budget.permit() }
     }
 
     /// Counts the client's incomplete messages in its budget.

@@ -14,9 +14,7 @@ use super::{BridgeClient, ReplyTarget, remove_matching};
 use crate::NotGrantedError;
 use crate::client_state::{AdvertisedTopic, TopicPublishers, Untyped};
 use crate::lacking::DefinitionError;
-use crate::names::{
-    DeclaredTypeError, ResolveNameError, digest_word, is_same_type, lookup_name, ros_type_name,
-};
+use crate::names::{DeclaredTypeError, ResolveNameError, digest_word, is_same_type, lookup_name, ros_type_name};
 use crate::quality::{PublisherOffer, publication_offer};
 use crate::tf;
 use crate::topic_publisher::{PublisherEvents, TopicPublisher};
@@ -36,10 +34,7 @@ pub(super) enum PublishError {
     #[error(transparent)]
     OtherType(#[from] DeclaredTypeError),
     #[error("topic {topic}: {source}")]
-    Definition {
-        topic: String,
-        source: DefinitionError,
-    },
+    Definition { topic: String, source: DefinitionError },
     /// The client gives the digest of another definition.
     #[error(
         "type {name} has {word} {ours} here and {theirs} there; use the definition that /rosapi/message_details shows"
@@ -58,9 +53,7 @@ pub(super) enum PublishError {
     #[error("topic {0} does not exist; advertise it with its type first")]
     NoTopic(String),
     /// The type is still being looked up, and the messages that wait for it have this many bytes.
-    #[error(
-        "topic {topic} has no known type yet, and {waiting} bytes wait for one already; advertise it first"
-    )]
+    #[error("topic {topic} has no known type yet, and {waiting} bytes wait for one already; advertise it first")]
     TooManyUntypedBytes { topic: String, waiting: usize },
     /// The type is still being looked up, and too many messages wait for it.
     #[error("topic {0} has no known type yet; advertise it first")]
@@ -120,23 +113,13 @@ impl PublisherEvents for AdvertiseNotifier {
 }
 
 impl BridgeClient {
-    pub(super) fn advertise(
-        self: &Arc<Self>,
-        op: &Advertise<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), PublishError> {
+    pub(super) fn advertise(self: &Arc<Self>, op: &Advertise<'_>, reply: &ReplyTarget) -> Result<(), PublishError> {
         let topic = self.resolve(&op.topic)?;
         self.client_grants().check(Operation::Publish, &topic)?;
-        let message_type = self
-            .publishable_type(&topic, &op.type_name)
-            .inspect_err(|_| {
-                self.mark_reported(&topic);
-            })?;
-        if let Some(digest) = op
-            .md5sum
-            .as_deref()
-            .filter(|digest| *digest != "*" && *digest != message_type.digest())
-        {
+        let message_type = self.publishable_type(&topic, &op.type_name).inspect_err(|_| {
+            self.mark_reported(&topic);
+        })?;
+        if let Some(digest) = op.md5sum.as_deref().filter(|digest| *digest != "*" && *digest != message_type.digest()) {
             return Err(PublishError::OtherDefinition {
                 name: message_type.name().to_owned(),
                 word: digest_word(self.version()),
@@ -151,11 +134,7 @@ impl BridgeClient {
         Ok(())
     }
 
-    pub(super) fn unadvertise(
-        &self,
-        op: &Unadvertise<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), ResolveNameError> {
+    pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &ReplyTarget) -> Result<(), ResolveNameError> {
         let topic = self.resolve(&op.topic)?;
         let mut topic_publishers = self.topic_publishers.lock();
         topic_publishers.told.remove(&*topic);
@@ -175,44 +154,27 @@ impl BridgeClient {
         drop(topic_publishers);
         match (&gone, warning) {
             (_, Some(warning)) => self.warn(reply, &format!("unadvertise: {warning} {topic}")),
-            (Some(_), None) => self.info(
-                reply,
-                &format!("unadvertise: {topic} is no longer advertised"),
-            ),
-            (None, None) => self.info(
-                reply,
-                &format!("unadvertise: {topic} stays advertised, under another id"),
-            ),
+            (Some(_), None) => self.info(reply, &format!("unadvertise: {topic} is no longer advertised")),
+            (None, None) => self.info(reply, &format!("unadvertise: {topic} stays advertised, under another id")),
         }
         Ok(())
     }
 
     /// Returns the type of this name, if the topic may be published with it.
-    fn publishable_type(
-        &self,
-        topic: &str,
-        type_name: &str,
-    ) -> Result<Arc<MessageType>, PublishError> {
+    fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, PublishError> {
         let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
-        let theirs = graph
-            .topics
-            .get(topic)
-            .map(|nodes| nodes.type_name.as_str());
-        let other =
-            |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
+        let theirs = graph.topics.get(topic).map(|nodes| nodes.type_name.as_str());
+        let other = |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
         if let Some(theirs) = theirs.filter(other) {
             let name = ros_type_name(version, type_name, "msg");
             let topic = format!("topic {topic}");
             return Err(DeclaredTypeError::new(topic, theirs, &name).into());
         }
-        self.shared
-            .registry
-            .message(&lookup_name(version, type_name))
-            .map_err(|error| PublishError::Definition {
-                topic: topic.to_owned(),
-                source: DefinitionError::new(version, error),
-            })
+        self.shared.registry.message(&lookup_name(version, type_name)).map_err(|error| PublishError::Definition {
+            topic: topic.to_owned(),
+            source: DefinitionError::new(version, error),
+        })
     }
 
     /// Marks that the client is told why nothing can be published on a topic; returns whether it was told before.
@@ -228,11 +190,7 @@ impl BridgeClient {
     /// Returns the reason why a message cannot be published, but only for the first such message of its topic: hundreds
     /// of them may follow.
     fn report_once(&self, topic: &str, reason: PublishError) -> Result<(), PublishError> {
-        if self.mark_reported(topic) {
-            Ok(())
-        } else {
-            Err(reason)
-        }
+        if self.mark_reported(topic) { Ok(()) } else { Err(reason) }
     }
 
     fn open_publisher(
@@ -258,9 +216,7 @@ impl BridgeClient {
                 known: known.topic_publisher.message_type.name().to_owned(),
             });
         }
-        let is_new = known
-            .as_ref()
-            .is_none_or(|known| id.as_ref().is_some_and(|id| !known.ids.contains(id)));
+        let is_new = known.as_ref().is_none_or(|known| id.as_ref().is_some_and(|id| !known.ids.contains(id)));
         if is_new && count >= limit {
             return Err(PublishError::TooMany(limit));
         }
@@ -274,20 +230,13 @@ impl BridgeClient {
         }
         ids.extend(id);
         topic_publishers.told.remove(topic);
-        let notified = Arc::new(AdvertiseNotifier {
-            client: Arc::downgrade(self),
-            topic: topic.to_owned(),
-            reply: reply.clone(),
-        });
+        let notified =
+            Arc::new(AdvertiseNotifier { client: Arc::downgrade(self), topic: topic.to_owned(), reply: reply.clone() });
         if topic == tf::GOAL_TOPIC {
             self.shared.republisher.listen_for_goals(&self.shared);
         }
-        let topic_publisher =
-            TopicPublisher::open(&self.shared, topic, message_type, offer, notified);
-        let opened = AdvertisedTopic {
-            topic_publisher: topic_publisher.clone(),
-            ids,
-        };
+        let topic_publisher = TopicPublisher::open(&self.shared, topic, message_type, offer, notified);
+        let opened = AdvertisedTopic { topic_publisher: topic_publisher.clone(), ids };
         let replaced = topic_publishers.open.insert(topic.to_owned(), opened);
         drop(topic_publishers);
         drop(replaced);
@@ -301,12 +250,7 @@ impl BridgeClient {
         source: Option<&Bytes>,
     ) -> Result<(), PublishError> {
         let topic = self.resolve(&op.topic)?;
-        let known = self
-            .topic_publishers
-            .lock()
-            .open
-            .get(&*topic)
-            .map(|known| known.topic_publisher.clone());
+        let known = self.topic_publishers.lock().open.get(&*topic).map(|known| known.topic_publisher.clone());
         let topic_publisher = match known {
             Some(topic_publisher) => topic_publisher,
             None => match self
@@ -323,16 +267,8 @@ impl BridgeClient {
                 Err(reason) => return self.report_once(&topic, reason),
             },
         };
-        let bytes = decode(
-            &topic_publisher.message_type,
-            op.msg,
-            op.compression,
-            source,
-        )
-        .map_err(|source| PublishError::Payload {
-            topic: topic.to_string(),
-            source,
-        })?;
+        let bytes = decode(&topic_publisher.message_type, op.msg, op.compression, source)
+            .map_err(|source| PublishError::Payload { topic: topic.to_string(), source })?;
         topic_publisher.publish(bytes);
         if op.compression != Compression::CborRaw && self.wants_level(StatusLevel::Warning) {
             self.warn_defaulted_fields(&topic, &topic_publisher.message_type, op.msg, reply);
@@ -341,36 +277,20 @@ impl BridgeClient {
     }
 
     /// Warns about missing fields of the message; except a header, which clients may leave to the server.
-    fn warn_defaulted_fields(
-        &self,
-        topic: &str,
-        message_type: &MessageType,
-        msg: Payload<'_>,
-        reply: &ReplyTarget,
-    ) {
+    fn warn_defaulted_fields(&self, topic: &str, message_type: &MessageType, msg: Payload<'_>, reply: &ReplyTarget) {
         let Some(given) = msg.keys() else { return };
         let headers = usize::from(message_type.has_header());
         let fields = message_type.fields().iter().map(|field| &field.name);
-        let missing: Vec<_> = fields
-            .skip(headers)
-            .filter(|name| !given.contains(name))
-            .map(|name| format!("{name:?}"))
-            .collect();
+        let missing: Vec<_> =
+            fields.skip(headers).filter(|name| !given.contains(name)).map(|name| format!("{name:?}")).collect();
         if !missing.is_empty() {
             let missing = missing.join(", ");
-            self.warn(
-                reply,
-                &format!("publish: topic {topic}: using defaults for {missing}"),
-            );
+            self.warn(reply, &format!("publish: topic {topic}: using defaults for {missing}"));
         }
     }
 
     /// Returns the type for publishing without advertising: the given one, or the topic's.
-    fn publish_type(
-        &self,
-        topic: &str,
-        op: &Publish<'_>,
-    ) -> Result<Option<Arc<MessageType>>, PublishError> {
+    fn publish_type(&self, topic: &str, op: &Publish<'_>) -> Result<Option<Arc<MessageType>>, PublishError> {
         if let Some(name) = &op.type_name {
             return self.publishable_type(topic, name).map(Some);
         }
@@ -387,12 +307,7 @@ impl BridgeClient {
     }
 
     /// Keeps a message until the nodes have announced the type of the topic.
-    fn defer_publish(
-        self: &Arc<Self>,
-        topic: &str,
-        op: &Publish<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), PublishError> {
+    fn defer_publish(self: &Arc<Self>, topic: &str, op: &Publish<'_>, reply: &ReplyTarget) -> Result<(), PublishError> {
         let waiting = Untyped {
             format: op.msg.format,
             payload: Bytes::copy_from_slice(op.msg.bytes),
@@ -401,17 +316,9 @@ impl BridgeClient {
             reply: reply.clone(),
         };
         let mut topic_publishers = self.topic_publishers.lock();
-        let held: usize = topic_publishers
-            .untyped
-            .values()
-            .flatten()
-            .map(|other| other.payload.len())
-            .sum();
+        let held: usize = topic_publishers.untyped.values().flatten().map(|other| other.payload.len()).sum();
         if held > 0 && held + waiting.payload.len() > MAX_UNTYPED_BYTES {
-            return Err(PublishError::TooManyUntypedBytes {
-                topic: topic.to_owned(),
-                waiting: held,
-            });
+            return Err(PublishError::TooManyUntypedBytes { topic: topic.to_owned(), waiting: held });
         }
         if let Some(others) = topic_publishers.untyped.get_mut(topic) {
             if others.len() >= MAX_UNTYPED {
@@ -420,9 +327,7 @@ impl BridgeClient {
             others.push(waiting);
             return Ok(());
         }
-        topic_publishers
-            .untyped
-            .insert(topic.to_owned(), vec![waiting]);
+        topic_publishers.untyped.insert(topic.to_owned(), vec![waiting]);
         drop(topic_publishers);
         let (client, topic) = (self.clone(), topic.to_owned());
         tokio::spawn(async move {
@@ -430,12 +335,7 @@ impl BridgeClient {
                 () = client.wait_ended() => return,
                 asked = client.shared.bus.topic_type(&topic) => asked,
             };
-            let waiting = client
-                .topic_publishers
-                .lock()
-                .untyped
-                .remove(&topic)
-                .unwrap_or_default();
+            let waiting = client.topic_publishers.lock().untyped.remove(&topic).unwrap_or_default();
             let report = |message: &Untyped, error: &PublishError| {
                 if !client.mark_reported(&topic) {
                     client.error(&message.reply, &format!("publish: topic {topic}: {error}"));
@@ -468,18 +368,9 @@ impl BridgeClient {
         message_type: Arc<MessageType>,
         message: &Untyped,
     ) -> Result<(), PublishError> {
-        let topic_publisher =
-            self.open_publisher(topic, message_type, message.offer, &message.reply, false)?;
-        let payload = Payload {
-            format: message.format,
-            bytes: &message.payload,
-        };
-        let bytes = decode(
-            &topic_publisher.message_type,
-            payload,
-            message.compression,
-            None,
-        );
+        let topic_publisher = self.open_publisher(topic, message_type, message.offer, &message.reply, false)?;
+        let payload = Payload { format: message.format, bytes: &message.payload };
+        let bytes = decode(&topic_publisher.message_type, payload, message.compression, None);
         topic_publisher.publish(bytes.map_err(PublishError::UntypedPayload)?);
         Ok(())
     }

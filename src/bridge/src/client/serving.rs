@@ -28,10 +28,7 @@ pub(super) enum ServingError {
     #[error(transparent)]
     NotGranted(#[from] NotGrantedError),
     #[error("service {service}: {source}")]
-    Definition {
-        service: String,
-        source: DefinitionError,
-    },
+    Definition { service: String, source: DefinitionError },
     #[error("this client serves {0} services already; unadvertise one")]
     TooMany(usize),
     #[error("field \"id\" is missing, the id of the call is expected")]
@@ -42,11 +39,7 @@ pub(super) enum ServingError {
     NoCall { service: String, id: String },
     /// The call with this id is one of another service.
     #[error("the call with id {id:?} is one of {called}, not of {service}")]
-    OtherService {
-        id: String,
-        called: String,
-        service: String,
-    },
+    OtherService { id: String, called: String, service: String },
     /// The values are not those of the type.
     #[error(transparent)]
     Payload(#[from] PayloadError),
@@ -86,28 +79,16 @@ struct CallHandler {
 #[async_trait]
 impl ServiceHandler for CallHandler {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, FailureReason> {
-        let gone =
-            || FailureReason::new(format!("the client that serves {} is gone", self.service));
+        let gone = || FailureReason::new(format!("the client that serves {} is gone", self.service));
         let client = self.client.upgrade().ok_or_else(gone)?;
         client.shared.metrics.calls_served.add(1);
-        let id = format!(
-            "service_request:{}:{}",
-            self.service,
-            client.shared.next_number()
-        );
+        let id = format!("service_request:{}:{}", self.service, client.shared.next_number());
         let frame = self.frame(&client, &id, &request);
         let frame = frame.map_err(|error| FailureReason::new(error.to_string()))?;
         let (answer, answered) = oneshot::channel();
-        let request = PendingCall {
-            service: self.service.clone(),
-            def: self.def.clone(),
-            answer,
-        };
+        let request = PendingCall { service: self.service.clone(), def: self.def.clone(), answer };
         client.services.lock().requests.insert(id.clone(), request);
-        let _forget = ForgetOnDrop {
-            client: self.client.clone(),
-            id,
-        };
+        let _forget = ForgetOnDrop { client: self.client.clone(), id };
         let timeout = client.shared.options.call_timeout;
         client.send_as(frame, self.compression, None);
         drop(client);
@@ -123,12 +104,7 @@ impl ServiceHandler for CallHandler {
 }
 
 impl CallHandler {
-    fn frame(
-        &self,
-        client: &BridgeClient,
-        id: &str,
-        request: &Bytes,
-    ) -> Result<EncodedFrame, Box<CodecError>> {
+    fn frame(&self, client: &BridgeClient, id: &str, request: &Bytes) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + request.len());
         let mut writer = Writer::op(&mut out, format, "call_service", Some(&Id::from(id)));
@@ -138,9 +114,7 @@ impl CallHandler {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, request);
         } else {
-            writer.value("args", |out| {
-                client.print_payload(&self.def.request, request, format, out)
-            })?;
+            writer.value("args", |out| client.print_payload(&self.def.request, request, format, out))?;
         }
         writer.end();
         Ok(EncodedFrame::new(format, out))
@@ -169,14 +143,9 @@ impl BridgeClient {
     ) -> Result<(), ServingError> {
         let service = self.resolve(&op.service)?.into_owned();
         self.client_grants().check(Operation::Advertise, &service)?;
-        let def = self
-            .shared
-            .registry
-            .service(&lookup_name(self.version(), &op.type_name))
-            .map_err(|error| ServingError::Definition {
-                service: service.clone(),
-                source: DefinitionError::new(self.version(), error),
-            })?;
+        let def = self.shared.registry.service(&lookup_name(self.version(), &op.type_name)).map_err(|error| {
+            ServingError::Definition { service: service.clone(), source: DefinitionError::new(self.version(), error) }
+        })?;
         let limit = self.shared.options.max_advertisements;
         let number = self.shared.next_number();
         let stop = CancellationToken::new();
@@ -185,20 +154,11 @@ impl BridgeClient {
             return Err(ServingError::TooMany(limit));
         }
         let (now_registered, registered) = watch::channel(false);
-        let served = ServedService {
-            number,
-            registered,
-            _stop: stop.clone().drop_guard(),
-        };
+        let served = ServedService { number, registered, _stop: stop.clone().drop_guard() };
         let earlier = services.served.insert(service.clone(), served);
         drop(services);
         if earlier.is_some() {
-            self.warn(
-                reply,
-                &format!(
-                    "advertise_service: {service} was advertised before, the new one replaces it"
-                ),
-            );
+            self.warn(reply, &format!("advertise_service: {service} was advertised before, the new one replaces it"));
         }
         drop(earlier);
         self.warn_of_takeover(&service, reply);
@@ -215,19 +175,11 @@ impl BridgeClient {
             let service_type = ServiceType::from_service(&def);
             // An earlier handler of this client is released at once; another client's is not.
             let patience = std::time::Duration::from_secs(1);
-            let entered =
-                tokio::time::timeout(patience, shared.registrations.acquire(&service)).await;
+            let entered = tokio::time::timeout(patience, shared.registrations.acquire(&service)).await;
             let Ok(registration) = entered else {
                 if let Some(client) = client.upgrade() {
-                    client
-                        .services
-                        .lock()
-                        .served
-                        .retain(|_, other| other.number != number);
-                    client.error(
-                        &reply,
-                        &format!("advertise_service: another client serves {service} already"),
-                    );
+                    client.services.lock().served.retain(|_, other| other.number != number);
+                    client.error(&reply, &format!("advertise_service: another client serves {service} already"));
                 }
                 return;
             };
@@ -245,11 +197,7 @@ impl BridgeClient {
                 }
                 Err(error) => {
                     if let Some(client) = client.upgrade() {
-                        client
-                            .services
-                            .lock()
-                            .served
-                            .retain(|_, other| other.number != number);
+                        client.services.lock().served.retain(|_, other| other.number != number);
                         client.error(&reply, &format!("advertise_service: {error}"));
                     }
                 }
@@ -267,12 +215,7 @@ impl BridgeClient {
         if let Some(node) = graph.services.get(service)
             && node != bus.node()
         {
-            self.warn(
-                reply,
-                &format!(
-                    "advertise_service: {service} was served by {node}, this client replaces it"
-                ),
-            );
+            self.warn(reply, &format!("advertise_service: {service} was served by {node}, this client replaces it"));
         }
     }
 
@@ -290,10 +233,7 @@ impl BridgeClient {
             .filter(|(_, request)| *request.service == *service)
             .map(|(id, _)| id.clone())
             .collect();
-        let unanswered: Vec<_> = unanswered
-            .iter()
-            .filter_map(|id| services.requests.remove(id))
-            .collect();
+        let unanswered: Vec<_> = unanswered.iter().filter_map(|id| services.requests.remove(id)).collect();
         drop(services);
         for request in unanswered {
             let reason = format!("{service} was unadvertised before it answered");
@@ -301,14 +241,8 @@ impl BridgeClient {
             let _ = request.answer.send(Err(FailureReason::new(reason)));
         }
         match gone {
-            Some(_) => self.info(
-                reply,
-                &format!("unadvertise_service: {service} is no longer advertised"),
-            ),
-            None => self.warn(
-                reply,
-                &format!("unadvertise_service: this client does not advertise {service}"),
-            ),
+            Some(_) => self.info(reply, &format!("unadvertise_service: {service} is no longer advertised")),
+            None => self.warn(reply, &format!("unadvertise_service: this client does not advertise {service}")),
         }
         Ok(())
     }
@@ -350,14 +284,9 @@ impl BridgeClient {
         drop(services);
         // A failure has a reason as text. Clients of the first rosbridge return failure with values: then the caller
         // gets the values.
-        let has_values = op
-            .values
-            .is_some_and(|values| values.is_object() || values.is_list());
+        let has_values = op.values.is_some_and(|values| values.is_object() || values.is_list());
         if !op.result && !has_values {
-            let reason = op
-                .values
-                .and_then(|values| values.text())
-                .unwrap_or_default();
+            let reason = op.values.and_then(|values| values.text()).unwrap_or_default();
             let reason = if reason.is_empty() {
                 format!("service {service} failed without a reason")
             } else {

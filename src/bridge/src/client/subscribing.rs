@@ -30,24 +30,13 @@ pub(super) enum SubscribeError {
     #[error(transparent)]
     OtherType(#[from] DeclaredTypeError),
     #[error("topic {topic}: {source}")]
-    Definition {
-        topic: String,
-        source: DefinitionError,
-    },
-    #[error(
-        "topic {0} does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing topics"
-    )]
+    Definition { topic: String, source: DefinitionError },
+    #[error("topic {0} does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing topics")]
     NoTopic(String),
     #[error("this client has {0} subscriptions already; unsubscribe from one")]
     TooMany(usize),
-    #[error(
-        "this client subscribes to {topic} as {earlier}, not {wanted}; unsubscribe from it first"
-    )]
-    TwoTypes {
-        topic: String,
-        earlier: String,
-        wanted: String,
-    },
+    #[error("this client subscribes to {topic} as {earlier}, not {wanted}; unsubscribe from it first")]
+    TwoTypes { topic: String, earlier: String, wanted: String },
 }
 
 impl TopicSubscription {
@@ -97,11 +86,7 @@ impl Listener for TopicListener {
 }
 
 impl BridgeClient {
-    pub(super) fn subscribe(
-        self: &Arc<Self>,
-        op: Subscribe<'_>,
-        reply: &ReplyTarget,
-    ) -> Result<(), SubscribeError> {
+    pub(super) fn subscribe(self: &Arc<Self>, op: Subscribe<'_>, reply: &ReplyTarget) -> Result<(), SubscribeError> {
         let name = self.resolve(&op.topic)?;
         self.client_grants().check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
@@ -119,13 +104,8 @@ impl BridgeClient {
             .map(|name| ros_type_name(self.version(), name, "msg").into_owned());
         let limit = self.shared.options.max_subscriptions;
         let mut subscribed = self.subscriptions.lock();
-        let all: usize = subscribed
-            .values()
-            .map(|known| known.subscriptions.len())
-            .sum();
-        let is_new = subscribed
-            .get(&*op.topic)
-            .is_none_or(|known| !known.subscriptions.contains_key(&reply.id));
+        let all: usize = subscribed.values().map(|known| known.subscriptions.len()).sum();
+        let is_new = subscribed.get(&*op.topic).is_none_or(|known| !known.subscriptions.contains_key(&reply.id));
         if is_new && all >= limit {
             return Err(SubscribeError::TooMany(limit));
         }
@@ -179,17 +159,11 @@ impl BridgeClient {
     }
 
     /// Returns the type that the client may expect, if it is known; fails if the client expects another.
-    fn expected_type(
-        &self,
-        topic: &str,
-        op: &Subscribe<'_>,
-    ) -> Result<Option<Arc<MessageType>>, SubscribeError> {
+    fn expected_type(&self, topic: &str, op: &Subscribe<'_>) -> Result<Option<Arc<MessageType>>, SubscribeError> {
         let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
         let nodes = graph.topics.get(topic);
-        let actual = nodes
-            .map(|nodes| nodes.type_name.as_str())
-            .filter(|name| !name.is_empty() && *name != "*");
+        let actual = nodes.map(|nodes| nodes.type_name.as_str()).filter(|name| !name.is_empty() && *name != "*");
         let local = self.shared.local_type(topic);
         let actual = actual.or(local.as_deref());
         let wanted = op.type_name.as_deref().filter(|name| *name != "*");
@@ -242,13 +216,7 @@ impl BridgeClient {
         let mut subscribed = self.subscriptions.lock();
         let Some(known) = subscribed.get_mut(&*op.topic) else {
             drop(subscribed);
-            self.warn(
-                reply,
-                &format!(
-                    "unsubscribe: this client has no subscription to {}",
-                    op.topic
-                ),
-            );
+            self.warn(reply, &format!("unsubscribe: this client has no subscription to {}", op.topic));
             return;
         };
         let gone = match &reply.id {
@@ -256,10 +224,7 @@ impl BridgeClient {
             id => {
                 known.asked.remove(id);
                 if known.subscriptions.remove(id).is_none() {
-                    self.warn(
-                        reply,
-                        &format!("unsubscribe: no subscription to {} has this id", op.topic),
-                    );
+                    self.warn(reply, &format!("unsubscribe: no subscription to {} has this id", op.topic));
                 }
                 known.subscriptions.is_empty()
             }
@@ -273,9 +238,6 @@ impl BridgeClient {
         } else {
             self.apply_options(known);
         }
-        self.info(
-            reply,
-            &format!("unsubscribe: unsubscribed from {}", op.topic),
-        );
+        self.info(reply, &format!("unsubscribe: unsubscribed from {}", op.topic));
     }
 }

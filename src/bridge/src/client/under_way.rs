@@ -34,33 +34,21 @@ pub(super) struct InFlightGuard {
 impl Drop for InFlightGuard {
     fn drop(&mut self) {
         self.client.under_way.fetch_sub(1, Ordering::Relaxed);
-        self.client
-            .under_way_bytes
-            .fetch_sub(self.bytes, Ordering::Relaxed);
+        self.client.under_way_bytes.fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 
 impl BridgeClient {
     /// Counts a call or goal with these arguments as in progress until the guard is dropped.
-    pub(super) fn begin_call(
-        self: &Arc<Self>,
-        args: Option<Payload<'_>>,
-    ) -> Result<InFlightGuard, BeginCallError> {
+    pub(super) fn begin_call(self: &Arc<Self>, args: Option<Payload<'_>>) -> Result<InFlightGuard, BeginCallError> {
         let options = &self.shared.options;
         let limit = options.max_calls;
         let bytes = args.map_or(0, |args| args.bytes.len());
         let before = self.under_way.fetch_add(1, Ordering::Relaxed);
         let bytes_before = self.under_way_bytes.fetch_add(bytes, Ordering::Relaxed);
-        let mut guard = InFlightGuard {
-            client: self.clone(),
-            bytes,
-            _permit: None,
-        };
+        let mut guard = InFlightGuard { client: self.clone(), bytes, _permit: None };
         if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
-            return Err(BeginCallError::TooManyBytes {
-                bytes,
-                limit: options.max_call_bytes,
-            });
+            return Err(BeginCallError::TooManyBytes { bytes, limit: options.max_call_bytes });
         }
         if before >= limit {
             return Err(BeginCallError::TooManyCalls(limit));

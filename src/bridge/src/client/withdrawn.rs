@@ -15,8 +15,7 @@ impl BridgeClient {
         }
         for (operation, name) in self.remove_ungranted(&grants) {
             let operation = operation.name();
-            let text =
-                format!("{operation}:{name} is no longer granted to this client and was ended");
+            let text = format!("{operation}:{name} is no longer granted to this client and was ended");
             self.send_status(StatusLevel::Error, None, Format::Json, &text);
         }
     }
@@ -34,48 +33,31 @@ impl BridgeClient {
             })
             .cloned()
             .collect();
-        let gone: Vec<_> = written
-            .iter()
-            .filter_map(|topic| subscriptions.remove(topic))
-            .collect();
+        let gone: Vec<_> = written.iter().filter_map(|topic| subscriptions.remove(topic)).collect();
         drop(subscriptions);
         for known in &gone {
             self.outbox.remove_topic(known.key());
         }
         drop(gone);
-        told.extend(
-            written
-                .iter()
-                .map(|topic| (Operation::Subscribe, topic.to_string())),
-        );
+        told.extend(written.iter().map(|topic| (Operation::Subscribe, topic.to_string())));
 
         let mut publishers = self.topic_publishers.lock();
         let gone = publishers.take(|topic| lacks(Operation::Publish, topic));
         drop(publishers);
-        told.extend(
-            gone.iter()
-                .map(|(topic, _)| (Operation::Publish, topic.clone())),
-        );
+        told.extend(gone.iter().map(|(topic, _)| (Operation::Publish, topic.clone())));
         drop(gone);
 
         let mut services = self.services.lock();
         let gone = services.take(|service| lacks(Operation::Advertise, service));
         drop(services);
-        told.extend(
-            gone.iter()
-                .map(|(service, _)| (Operation::Advertise, service.clone())),
-        );
+        told.extend(gone.iter().map(|(service, _)| (Operation::Advertise, service.clone())));
         drop(gone);
 
         let mut actions = self.actions.lock();
         let served = actions.take_served(|action| lacks(Operation::Advertise, action));
         let goals = actions.goals_of_actions(|action| lacks(Operation::Call, action));
         drop(actions);
-        told.extend(
-            served
-                .iter()
-                .map(|(action, _)| (Operation::Advertise, action.clone())),
-        );
+        told.extend(served.iter().map(|(action, _)| (Operation::Advertise, action.clone())));
         drop(served);
         for (goal_id, action) in goals {
             // Fails if it has ended meanwhile.

@@ -18,11 +18,7 @@ use crate::sample::{EncodedFrame, SampleError, TopicSample};
 
 impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
     /// Moves queued frames into the socket. Ready when none is left, pending when the socket accepts no more.
-    pub(super) fn write(
-        &mut self,
-        cx: &mut Context<'_>,
-        now: Instant,
-    ) -> Poll<Result<(), StopReason>> {
+    pub(super) fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), StopReason>> {
         loop {
             while self.socket.bytes_queued() < SOCKET_FULL && self.moved < MOVED {
                 let next = self.next_frame(now).map_err(|full| StopReason::Close {
@@ -42,10 +38,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
             if self.socket.bytes_queued() == 0 {
                 return Poll::Ready(Ok(()));
             }
-            ready!(self.socket.poll_flush(cx)).map_err(|error| StopReason::Lost {
-                reason: error.to_string(),
-                heard_all: false,
-            })?;
+            ready!(self.socket.poll_flush(cx))
+                .map_err(|error| StopReason::Lost { reason: error.to_string(), heard_all: false })?;
         }
     }
 
@@ -58,9 +52,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
         loop {
             let next = if self.cuts.is_full() {
                 // A control message that would be fragmented as well waits in its queue, which is bounded.
-                let whole = |control: &ControlMessage| {
-                    !Fragmenter::is_long(&control.frame, control.fragment_size)
-                };
+                let whole = |control: &ControlMessage| !Fragmenter::is_long(&control.frame, control.fragment_size);
                 let control = self.client.outbox.next_control_if(whole);
                 control.map(Outgoing::Control)
             } else {
@@ -70,22 +62,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
                 None => return self.next_fragment(),
                 Some(Outgoing::Control(control)) => {
                     self.retain_answer(&control, now);
-                    let cut = self
-                        .cuts
-                        .add_if_long(&control.frame, control.fragment_size, None);
+                    let cut = self.cuts.add_if_long(&control.frame, control.fragment_size, None);
                     (!cut).then_some(control.frame)
                 }
-                Some(Outgoing::Sample {
-                    key,
-                    sample,
-                    topic,
-                    compression,
-                    fragment_size,
-                }) => {
+                Some(Outgoing::Sample { key, sample, topic, compression, fragment_size }) => {
                     let frame = self.encode(key, &sample, &topic, compression, now);
-                    let cut = frame.as_ref().is_some_and(|frame| {
-                        self.cuts.add_if_long(frame, fragment_size, Some(key))
-                    });
+                    let cut =
+                        frame.as_ref().is_some_and(|frame| self.cuts.add_if_long(frame, fragment_size, Some(key)));
                     if cut {
                         self.client.outbox.hold_topic(self.number, key);
                     }
@@ -127,11 +110,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
             // The bytes are shared with other clients; for as long as this client does not read them they count in its
             // budget.
             let held = if frame.is_big() {
-                self.client
-                    .budget
-                    .without_parents()
-                    .take(frame.bytes.len())
-                    .map(Some)
+                self.client.budget.without_parents().take(frame.bytes.len()).map(Some)
             } else {
                 Ok(None)
             };
@@ -145,8 +124,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
             Err(reason) => {
                 if self.client.outbox.should_report(key, now) {
                     let text = format!("subscribe: topic {topic}: {reason}");
-                    self.client
-                        .send_status(StatusLevel::Error, None, Format::Json, &text);
+                    self.client.send_status(StatusLevel::Error, None, Format::Json, &text);
                 }
                 None
             }

@@ -58,19 +58,13 @@ const TEXTS: &[(&str, &str)] = &[
     ("HasParam", "string name\n---\nbool exists\n"),
     ("Interfaces", "---\nstring[] interfaces\n"),
     ("MessageDetails", DETAILS),
-    (
-        "NodeDetails",
-        "string node\n---\nstring[] subscribing\nstring[] publishing\nstring[] services\n",
-    ),
+    ("NodeDetails", "string node\n---\nstring[] subscribing\nstring[] publishing\nstring[] services\n"),
     ("Nodes", "---\nstring[] nodes\n"),
     ("Publishers", "string topic\n---\nstring[] publishers\n"),
     ("SearchParam", "string name\n---\nstring global_name\n"),
     ("ServiceHost", "string service\n---\nstring host\n"),
     ("ServiceNode", "string service\n---\nstring node\n"),
-    (
-        "ServiceProviders",
-        "string service\n---\nstring[] providers\n",
-    ),
+    ("ServiceProviders", "string service\n---\nstring[] providers\n"),
     ("ServiceRequestDetails", DETAILS),
     ("ServiceResponseDetails", DETAILS),
     ("ServiceType", "string service\n---\nstring type\n"),
@@ -79,20 +73,14 @@ const TEXTS: &[(&str, &str)] = &[
     ("Subscribers", "string topic\n---\nstring[] subscribers\n"),
     ("TopicType", "string topic\n---\nstring type\n"),
     ("Topics", "---\nstring[] topics\nstring[] types\n"),
-    (
-        "TopicsAndRawTypes",
-        "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text\n",
-    ),
+    ("TopicsAndRawTypes", "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text\n"),
     ("TopicsForType", "string type\n---\nstring[] topics\n"),
 ];
 
 /// Services of ROS 1 only.
 const OF_ONE: &[(&str, &str)] = &[
     ("DeleteParam", "string name\n---\n"),
-    (
-        "GetParam",
-        "string name\nstring default\n---\nstring value\n",
-    ),
+    ("GetParam", "string name\nstring default\n---\nstring value\n"),
     ("GetTime", "---\ntime time\n"),
     ("SetParam", "string name\nstring value\n---\n"),
 ];
@@ -100,19 +88,10 @@ const OF_ONE: &[(&str, &str)] = &[
 /// Services of ROS 2 only. Later versions of rosapi have dropped the default of a parameter, and return instead whether
 /// it exists.
 const OF_TWO: &[(&str, &str)] = &[
-    (
-        "DeleteParam",
-        "string name\n---\nbool successful\nstring reason\n",
-    ),
-    (
-        "GetParam",
-        "string name\nstring default_value\n---\nstring value\nbool successful\nstring reason\n",
-    ),
+    ("DeleteParam", "string name\n---\nbool successful\nstring reason\n"),
+    ("GetParam", "string name\nstring default_value\n---\nstring value\nbool successful\nstring reason\n"),
     ("GetTime", "---\nbuiltin_interfaces/Time time\n"),
-    (
-        "SetParam",
-        "string name\nstring value\n---\nbool successful\nstring reason\n",
-    ),
+    ("SetParam", "string name\nstring value\n---\nbool successful\nstring reason\n"),
 ];
 
 /// Returns the package of rosapi's types.
@@ -170,18 +149,9 @@ mod tests {
             }
         }
         // As in rosbridge_suite's generated code.
-        assert_eq!(
-            registry(RosVersion::One)
-                .service("rosapi/Topics")
-                .unwrap()
-                .md5,
-            "d966d98fc333fa1f3135af765eac1ba8"
-        );
+        assert_eq!(registry(RosVersion::One).service("rosapi/Topics").unwrap().md5, "d966d98fc333fa1f3135af765eac1ba8");
         let two = registry(RosVersion::Two).service("rosapi_msgs/GetTime");
         let response = two.unwrap().response.clone();
-        assert_eq!(
-            response.fields()[0].type_name,
-            "builtin_interfaces/msg/Time"
-        );
+        assert_eq!(response.fields()[0].type_name, "builtin_interfaces/msg/Time");
     }
 }

@@ -79,11 +79,7 @@ fn add_tf_action(version: RosVersion, graph: &mut Graph) {
     for (topic, type_name, published) in tf::TOPICS {
         let nodes = graph.topics.entry(topic.to_owned()).or_default();
         nodes.type_name = type_name.to_owned();
-        let end = if published {
-            &mut nodes.publishers
-        } else {
-            &mut nodes.subscribers
-        };
+        let end = if published { &mut nodes.publishers } else { &mut nodes.subscribers };
         end.push(NODE.to_owned());
     }
 }
@@ -94,20 +90,11 @@ pub(super) fn filter_by_grants(mut graph: Graph, grants: &Grants) -> Graph {
         return graph;
     }
     graph.topics.retain(|topic, _| grants.permits_any(topic));
-    graph
-        .services
-        .retain(|service, _| grants.permits_any(service));
+    graph.services.retain(|service, _| grants.permits_any(service));
     graph.actions.retain(|action, _| grants.permits_any(action));
-    let ends = graph
-        .topics
-        .values()
-        .flat_map(|nodes| nodes.publishers.iter().chain(&nodes.subscribers));
+    let ends = graph.topics.values().flat_map(|nodes| nodes.publishers.iter().chain(&nodes.subscribers));
     let servers = graph.actions.values().flat_map(|nodes| &nodes.servers);
-    let behind: BTreeSet<String> = ends
-        .chain(servers)
-        .chain(graph.services.values())
-        .cloned()
-        .collect();
+    let behind: BTreeSet<String> = ends.chain(servers).chain(graph.services.values()).cloned().collect();
     graph.nodes.retain(|node, _| behind.contains(node));
     // Not part of any answer to clients.
     graph.ends.clear();
@@ -121,27 +108,16 @@ pub(super) fn topics(graph: &Graph) -> Value {
 }
 
 pub(super) fn topics_for_type(graph: &Graph, type_name: &str) -> Value {
-    let topics = graph
-        .topics
-        .iter()
-        .filter(|(_, nodes)| is_same_type(&nodes.type_name, type_name))
-        .map(|(topic, _)| topic);
+    let topics =
+        graph.topics.iter().filter(|(_, nodes)| is_same_type(&nodes.type_name, type_name)).map(|(topic, _)| topic);
     json!({ "topics": topics.collect::<Vec<_>>() })
 }
 
-pub(super) fn topics_and_raw_types(
-    graph: &Graph,
-    version: RosVersion,
-    registry: &Registry,
-) -> Value {
+pub(super) fn topics_and_raw_types(graph: &Graph, version: RosVersion, registry: &Registry) -> Value {
     let mut answer = topics(graph);
     let texts = graph.topics.values().map(|nodes| {
-        let found = find_with_own(version, registry, |registry| {
-            registry.message(topic_type_name(nodes))
-        });
-        found
-            .map(|found| found.full_text().to_owned())
-            .unwrap_or_default()
+        let found = find_with_own(version, registry, |registry| registry.message(topic_type_name(nodes)));
+        found.map(|found| found.full_text().to_owned()).unwrap_or_default()
     });
     answer["typedefs_full_text"] = texts.collect::<Vec<_>>().into();
     answer
@@ -167,10 +143,7 @@ pub(super) fn nodes(graph: &Graph) -> Value {
 
 pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
     let topics = |ends: fn(&TopicNodes) -> &Vec<String>| -> Vec<&String> {
-        let of_node = graph
-            .topics
-            .iter()
-            .filter(|(_, nodes)| ends(nodes).iter().any(|end| end == node));
+        let of_node = graph.topics.iter().filter(|(_, nodes)| ends(nodes).iter().any(|end| end == node));
         of_node.map(|(topic, _)| topic).collect()
     };
     let served = graph.services.iter().filter(|(_, server)| *server == node);
@@ -197,12 +170,7 @@ pub(super) fn action_type(graph: &Graph, action: &str) -> Value {
 }
 
 fn all_services(graph: &Graph) -> BTreeSet<String> {
-    graph
-        .services
-        .keys()
-        .cloned()
-        .chain(RosapiService::all().map(RosapiService::full_name))
-        .collect()
+    graph.services.keys().cloned().chain(RosapiService::all().map(RosapiService::full_name)).collect()
 }
 
 pub(super) fn services(graph: &Graph) -> Value {
@@ -239,20 +207,13 @@ async fn find_type(shared: &Arc<BridgeShared>, service: &str) -> String {
     match RosapiService::find(service) {
         Some(own) if !served => own.type_name(shared.bus.version()),
         _ => {
-            let found = shared
-                .service_types
-                .find(shared.bus.as_ref(), service)
-                .await;
+            let found = shared.service_types.find(shared.bus.as_ref(), service).await;
             found.map(|found| found.name).unwrap_or_default()
         }
     }
 }
 
-pub(super) async fn service_type(
-    shared: &Arc<BridgeShared>,
-    service: &str,
-    grants: &Grants,
-) -> Value {
+pub(super) async fn service_type(shared: &Arc<BridgeShared>, service: &str, grants: &Grants) -> Value {
     // The type is queried from the node, independently of the filtered graph.
     if RosapiService::find(service).is_none() && !grants.permits_any(service) {
         return json!({ "type": "" });
@@ -261,11 +222,7 @@ pub(super) async fn service_type(
 }
 
 /// Returns all services of a type, sorted.
-async fn services_of_type(
-    shared: &Arc<BridgeShared>,
-    graph: &Graph,
-    type_name: &str,
-) -> Vec<String> {
+async fn services_of_type(shared: &Arc<BridgeShared>, graph: &Graph, type_name: &str) -> Vec<String> {
     let asked = all_services(graph).into_iter().map(|service| {
         let shared = shared.clone();
         async move {
@@ -273,34 +230,16 @@ async fn services_of_type(
             (service, found)
         }
     });
-    let answers: BTreeMap<String, String> = stream::iter(asked)
-        .buffer_unordered(ASKED_AT_ONCE)
-        .collect()
-        .await;
-    answers
-        .into_iter()
-        .filter(|(_, found)| is_same_type(found, type_name))
-        .map(|(service, _)| service)
-        .collect()
+    let answers: BTreeMap<String, String> = stream::iter(asked).buffer_unordered(ASKED_AT_ONCE).collect().await;
+    answers.into_iter().filter(|(_, found)| is_same_type(found, type_name)).map(|(service, _)| service).collect()
 }
 
-pub(super) async fn services_for_type(
-    shared: &Arc<BridgeShared>,
-    graph: &Graph,
-    type_name: &str,
-) -> Value {
+pub(super) async fn services_for_type(shared: &Arc<BridgeShared>, graph: &Graph, type_name: &str) -> Value {
     json!({ "services": services_of_type(shared, graph, type_name).await })
 }
 
-pub(super) async fn service_providers(
-    shared: &Arc<BridgeShared>,
-    graph: &Graph,
-    type_name: &str,
-) -> Value {
+pub(super) async fn service_providers(shared: &Arc<BridgeShared>, graph: &Graph, type_name: &str) -> Value {
     let services = services_of_type(shared, graph, type_name).await;
-    let providers: Vec<_> = services
-        .iter()
-        .map(|service| service_server(graph, service))
-        .collect();
+    let providers: Vec<_> = services.iter().map(|service| service_server(graph, service)).collect();
     json!({ "providers": providers })
 }

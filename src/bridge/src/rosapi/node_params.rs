@@ -27,10 +27,9 @@ struct NodeParam {
 /// Parses the name of the requested parameter.
 fn parse_name(shared: &BridgeShared, args: &Args) -> Result<NodeParam, ParamRequestError> {
     match args.name.split_once(':') {
-        Some((node, parameter)) if !parameter.is_empty() => Ok(NodeParam {
-            node: resolve(shared.bus.version(), node)?.into_owned(),
-            parameter: parameter.to_owned(),
-        }),
+        Some((node, parameter)) if !parameter.is_empty() => {
+            Ok(NodeParam { node: resolve(shared.bus.version(), node)?.into_owned(), parameter: parameter.to_owned() })
+        }
         _ if args.name.is_empty() => Err(ParamRequestError::NoNodeName),
         _ => {
             let shown = args.name.chars().take(64).collect();
@@ -65,10 +64,7 @@ fn absence_reason(shared: &BridgeShared, NodeParam { node, parameter }: &NodePar
     }
 }
 
-pub(super) async fn get(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     let value = match read_value(shared, &of).await? {
         Some(value) => Some(to_json_text(&value)?),
@@ -84,48 +80,30 @@ pub(super) async fn get(
 }
 
 /// Changes a parameter, or removes it if `value` is `None`.
-async fn change(
-    shared: &BridgeShared,
-    of: NodeParam,
-    value: Option<ParamValue>,
-) -> Result<Value, ParamRequestError> {
+async fn change(shared: &BridgeShared, of: NodeParam, value: Option<ParamValue>) -> Result<Value, ParamRequestError> {
     let parameters = shared.bus.node_parameters()?;
     let NodeParam { node, parameter } = of;
     let changes = vec![(parameter.clone(), value)];
     let done = parameters.set(&node, changes).await?;
     match done.into_iter().next() {
         Some(Ok(())) => Ok(json!({ "successful": true, "reason": "" })),
-        Some(Err(reason)) => Err(ParamRequestError::Refused {
-            node,
-            parameter,
-            reason,
-        }),
+        Some(Err(reason)) => Err(ParamRequestError::Refused { node, parameter, reason }),
         None => Err(ParamRequestError::Unanswered { node, parameter }),
     }
 }
 
-pub(super) async fn set(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-    budget: &Budget,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn set(shared: &Arc<BridgeShared>, args: &Args, budget: &Budget) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     let given = GivenValue::read(args, budget)?;
     change(shared, of, Some(given.value)).await
 }
 
-pub(super) async fn has(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     Ok(json!({ "exists": read_value(shared, &of).await?.is_some() }))
 }
 
-pub(super) async fn delete(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let of = parse_name(shared, args)?;
     match read_value(shared, &of).await? {
         Some(_) => change(shared, of, None).await,
@@ -151,16 +129,11 @@ pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, ParamRequ
             let parameters = shared.bus.node_parameters().ok()?;
             let listed = parameters.list(&node, &[], 0).await.ok()?;
             let names = listed.names.into_iter();
-            Some(
-                names
-                    .map(|name| format!("{node}:{name}"))
-                    .collect::<Vec<_>>(),
-            )
+            Some(names.map(|name| format!("{node}:{name}")).collect::<Vec<_>>())
         }
     });
     let asked: Vec<_> = asked.collect();
-    let told: Vec<Option<Vec<String>>> =
-        stream::iter(asked).buffered(ASKED_AT_ONCE).collect().await;
+    let told: Vec<Option<Vec<String>>> = stream::iter(asked).buffered(ASKED_AT_ONCE).collect().await;
     let names: Vec<String> = told.into_iter().flatten().flatten().collect();
     Ok(json!({ "names": names }))
 }

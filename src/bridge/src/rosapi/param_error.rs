@@ -13,22 +13,16 @@ pub(super) const LONGEST_DEFAULT: usize = 1 << 20;
 pub(crate) enum ParamRequestError {
     #[error("field \"name\" is missing, a parameter's name is expected")]
     NoName,
-    #[error(
-        "field \"name\" is missing, a node and its parameter such as \"/camera:exposure\" is expected"
-    )]
+    #[error("field \"name\" is missing, a node and its parameter such as \"/camera:exposure\" is expected")]
     NoNodeName,
     /// The name, shortened, is not of the form `node:parameter`.
-    #[error(
-        "field \"name\" is {0:?}, a node and its parameter such as \"/camera:exposure\" is expected"
-    )]
+    #[error("field \"name\" is {0:?}, a node and its parameter such as \"/camera:exposure\" is expected")]
     NotOfNode(String),
     #[error(transparent)]
     Name(#[from] ResolveNameError),
     #[error("field {field:?} has {length} bytes, at most {limit} are taken", limit = LONGEST_DEFAULT)]
     LongDefault { field: &'static str, length: usize },
-    #[error(
-        "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one"
-    )]
+    #[error("field \"value\" is null, which no ROS parameter can be; call delete_param to remove one")]
     Null,
     /// The value contains null at this path.
     #[error("field \"value\" holds null at {0}, which no ROS parameter can; leave it out")]
@@ -40,9 +34,7 @@ pub(crate) enum ParamRequestError {
         source: serde_json::Error,
     },
     /// The value, shortened, is not JSON.
-    #[error(
-        "field \"value\" is {0:?}, JSON text (a boolean, number, string, list or object) is expected"
-    )]
+    #[error("field \"value\" is {0:?}, JSON text (a boolean, number, string, list or object) is expected")]
     NotJson(String),
     #[error("field \"value\": {0}")]
     NoRoom(#[from] Exceeded),
@@ -52,11 +44,7 @@ pub(crate) enum ParamRequestError {
     #[error(transparent)]
     Bus(#[from] BusError),
     #[error("node {node} refuses {parameter}: {reason}")]
-    Refused {
-        node: String,
-        parameter: String,
-        reason: FailureReason,
-    },
+    Refused { node: String, parameter: String, reason: FailureReason },
     #[error("node {node} did not answer for {parameter}")]
     Unanswered { node: String, parameter: String },
 }

@@ -30,10 +30,7 @@ pub(super) fn parse_default(args: &Args) -> Result<Option<String>, ParamRequestE
         return Ok(None);
     }
     if default.len() > LONGEST_DEFAULT {
-        return Err(ParamRequestError::LongDefault {
-            field,
-            length: default.len(),
-        });
+        return Err(ParamRequestError::LongDefault { field, length: default.len() });
     }
     // Only validated: a parsed tree would take many times its bytes.
     let json = serde_json::from_str::<IgnoredAny>(default);
@@ -49,10 +46,7 @@ pub(super) fn to_json_text(value: &ParamValue) -> Result<String, ParamRequestErr
     serde_json::to_string(value).map_err(ParamRequestError::Print)
 }
 
-pub(super) async fn get(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let value = match shared.bus.parameter(&param_name(args)?).await {
         Ok(value) => to_json_text(&value)?,
         Err(BusError::NoParam(_)) => parse_default(args)?.unwrap_or_else(|| "null".to_owned()),
@@ -97,11 +91,7 @@ fn value_error(text: &str, source: serde_json::Error) -> ParamRequestError {
     }
 }
 
-pub(super) async fn set(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-    budget: &Budget,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn set(shared: &Arc<BridgeShared>, args: &Args, budget: &Budget) -> Result<Value, ParamRequestError> {
     let (key, given) = (param_name(args)?, GivenValue::read(args, budget)?);
     let parameters = shared.bus.parameters()?;
     parameters.set(&key, given.value).await?;
@@ -112,38 +102,26 @@ pub(super) async fn set(
 fn find_null(value: &Value, place: String) -> Option<String> {
     match value {
         Value::Null => Some(place),
-        Value::Array(items) => items
-            .iter()
-            .enumerate()
-            .find_map(|(at, item)| find_null(item, format!("{place}/{at}"))),
-        Value::Object(members) => members
-            .iter()
-            .find_map(|(name, member)| find_null(member, format!("{place}/{name}"))),
+        Value::Array(items) => items.iter().enumerate().find_map(|(at, item)| find_null(item, format!("{place}/{at}"))),
+        Value::Object(members) => {
+            members.iter().find_map(|(name, member)| find_null(member, format!("{place}/{name}")))
+        }
         _ => None,
     }
 }
 
-pub(super) async fn has(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let parameters = shared.bus.parameters()?;
     Ok(json!({ "exists": parameters.has(&param_name(args)?).await? }))
 }
 
-pub(super) async fn search(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn search(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let parameters = shared.bus.parameters()?;
     let found = parameters.search("/", args.name.trim_start_matches('/'));
     Ok(json!({ "global_name": found.await?.unwrap_or_default() }))
 }
 
-pub(super) async fn delete(
-    shared: &Arc<BridgeShared>,
-    args: &Args,
-) -> Result<Value, ParamRequestError> {
+pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, ParamRequestError> {
     let parameters = shared.bus.parameters()?;
     match parameters.delete(&param_name(args)?).await {
         Ok(()) | Err(BusError::NoParam(_)) => Ok(json!({})),
@@ -161,10 +139,7 @@ mod tests {
     use super::*;
 
     fn args_with_value(value: &str) -> Args {
-        Args {
-            value: value.to_owned(),
-            ..Args::default()
-        }
+        Args { value: value.to_owned(), ..Args::default() }
     }
 
     #[test]
@@ -202,12 +177,7 @@ mod tests {
 
     #[test]
     fn a_default_is_sent_as_it_was_given() {
-        let of = |default: &str| {
-            super::parse_default(&Args {
-                default: default.to_owned(),
-                ..Args::default()
-            })
-        };
+        let of = |default: &str| super::parse_default(&Args { default: default.to_owned(), ..Args::default() });
         assert_eq!(of("").unwrap(), None);
         assert_eq!(of(" [1, 2]\n").unwrap(), Some("[1, 2]".to_owned()));
         assert_eq!(of("a \"b").unwrap(), Some(r#""a \"b""#.to_owned()));

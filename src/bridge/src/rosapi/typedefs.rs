@@ -5,9 +5,7 @@ use std::sync::Arc;
 
 use ros::bus::RosVersion;
 use ros::codec;
-use ros::schema::{
-    ActionDef, Arity, Base, Field, MessageType, Primitive, Registry, SchemaError, ServiceDef,
-};
+use ros::schema::{ActionDef, Arity, Base, Field, MessageType, Primitive, Registry, SchemaError, ServiceDef};
 use serde_json::{Value, json};
 
 use super::find_with_own;
@@ -32,9 +30,7 @@ impl Definitions<'_> {
         {
             return Ok(json!({ "typedefs": [special] }));
         }
-        if Primitive::from_versioned_name(self.version, type_name).is_some()
-            || is_idl_primitive(type_name)
-        {
+        if Primitive::from_versioned_name(self.version, type_name).is_some() || is_idl_primitive(type_name) {
             return Ok(json!({ "typedefs": [] }));
         }
         self.details(type_name, |registry, name| registry.message(name))
@@ -55,20 +51,12 @@ impl Definitions<'_> {
         type_name: &str,
         part: fn(&ServiceDef) -> &Arc<MessageType>,
     ) -> Result<Value, DefinitionError> {
-        self.details(type_name, |registry, name| {
-            registry.service(name).map(|service| part(&service).clone())
-        })
+        self.details(type_name, |registry, name| registry.service(name).map(|service| part(&service).clone()))
     }
 
     /// Describes a part of an action.
-    pub(super) fn action_part(
-        self,
-        type_name: &str,
-        part: ActionPart,
-    ) -> Result<Value, DefinitionError> {
-        self.details(type_name, |registry, name| {
-            registry.action(name).map(|action| part(&action).clone())
-        })
+    pub(super) fn action_part(self, type_name: &str, part: ActionPart) -> Result<Value, DefinitionError> {
+        self.details(type_name, |registry, name| registry.action(name).map(|action| part(&action).clone()))
     }
 
     fn details(
@@ -77,9 +65,7 @@ impl Definitions<'_> {
         find: impl Fn(&Registry, &str) -> Result<Arc<MessageType>, SchemaError>,
     ) -> Result<Value, DefinitionError> {
         let name = lookup_name(self.version, type_name);
-        let found = find_with_own(self.version, self.registry, |registry| {
-            find(registry, &name)
-        });
+        let found = find_with_own(self.version, self.registry, |registry| find(registry, &name));
         let found = found.map_err(|error| DefinitionError::new(self.version, error))?;
         Ok(typedefs(&found))
     }
@@ -118,9 +104,7 @@ fn typedef(message: &MessageType) -> Value {
     constants.sort_by_key(|constant| &constant.name);
     let defaults: Value = match version {
         RosVersion::One => Value::Null,
-        RosVersion::Two => {
-            serde_json::from_str(&codec::default_json(message)).unwrap_or(Value::Null)
-        }
+        RosVersion::Two => serde_json::from_str(&codec::default_json(message)).unwrap_or(Value::Null),
     };
     json!({
         "type": short_type_name(message.name()),

@@ -48,34 +48,21 @@ pub(crate) fn own_action_client(
     if nodes.is_some_and(|nodes| !nodes.servers.is_empty()) {
         return None;
     }
-    Some(Box::new(TfGoals {
-        shared: Arc::downgrade(shared),
-        of: of.clone(),
-        under_way: Mutex::default(),
-    }))
+    Some(Box::new(TfGoals { shared: Arc::downgrade(shared), of: of.clone(), under_way: Mutex::default() }))
 }
 
 impl TfGoals {
-    fn begin(
-        &self,
-        id: &str,
-        goal: &[u8],
-        events: Arc<dyn GoalEvents>,
-    ) -> Result<(), TransformRequestError> {
+    fn begin(&self, id: &str, goal: &[u8], events: Arc<dyn GoalEvents>) -> Result<(), TransformRequestError> {
         let shared = self.shared.upgrade();
         let shared = shared.ok_or(TransformRequestError::BridgeEnded)?;
         let mut json = Vec::new();
-        codec::to_json(&self.of.goal, goal, &mut json, &JsonOptions::default())
-            .map_err(Box::new)?;
+        codec::to_json(&self.of.goal, goal, &mut json, &JsonOptions::default()).map_err(Box::new)?;
         let wanted: TransformRequest = serde_json::from_slice(&json)?;
         let stop = CancellationToken::new();
         {
             let mut under_way = self.under_way.lock();
             check_limits(&wanted, under_way.len())?;
-            let followed = ActiveTfGoal {
-                events: events.clone(),
-                _stop: stop.clone().drop_guard(),
-            };
+            let followed = ActiveTfGoal { events: events.clone(), _stop: stop.clone().drop_guard() };
             under_way.insert(id.to_owned(), followed);
         }
         let buffer = shared.republisher.buffer(&shared);

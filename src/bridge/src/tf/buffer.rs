@@ -52,10 +52,7 @@ impl TransformBuffer {
             let ear = Arc::new(TfListener { frames, fixed });
             shared.fanout(topic, None).listen(ear)
         });
-        Self {
-            frames,
-            _listening: listening,
-        }
+        Self { frames, _listening: listening }
     }
 
     /// Returns the pose of `source` relative to `target`.
@@ -90,10 +87,7 @@ impl Frames {
         // Pose of the source in each of its ancestors.
         let mut above = HashMap::new();
         let mut at = source;
-        let mut path = FramePose {
-            transform: Transform::IDENTITY,
-            time: None,
-        };
+        let mut path = FramePose { transform: Transform::IDENTITY, time: None };
         loop {
             // A cycle: a publisher sends nonsense.
             if above.len() > MAX_DEPTH || above.insert(at, path).is_some() {
@@ -105,10 +99,7 @@ impl Frames {
         }
         // From the target up to the first common ancestor: what is above it does not matter.
         at = target;
-        let mut to = FramePose {
-            transform: Transform::IDENTITY,
-            time: None,
-        };
+        let mut to = FramePose { transform: Transform::IDENTITY, time: None };
         for _ in 0..MAX_DEPTH {
             if let Some(from) = above.get(at) {
                 return Some(FramePose {
@@ -127,10 +118,7 @@ impl Frames {
 impl FrameLink {
     /// Converts a pose in the child to one in the parent.
     fn to_parent(&self, found: FramePose) -> FramePose {
-        FramePose {
-            transform: self.transform.compose(&found.transform),
-            time: earlier(self.time, found.time),
-        }
+        FramePose { transform: self.transform.compose(&found.transform), time: earlier(self.time, found.time) }
     }
 }
 
@@ -154,11 +142,7 @@ fn parse_stamped(stamped: &Value<'_>) -> Option<(String, FrameLink)> {
     let number = |of: &str, axis: &str| moved.field(of)?.field(axis)?.number();
     let frame = |name: &Value<'_>| Some(strip_slash(&name.text()?).to_owned());
     let transform = Transform {
-        translation: [
-            number("translation", "x")?,
-            number("translation", "y")?,
-            number("translation", "z")?,
-        ],
+        translation: [number("translation", "x")?, number("translation", "y")?, number("translation", "z")?],
         rotation: [
             number("rotation", "x")?,
             number("rotation", "y")?,
@@ -166,11 +150,7 @@ fn parse_stamped(stamped: &Value<'_>) -> Option<(String, FrameLink)> {
             number("rotation", "w")?,
         ],
     };
-    let link = FrameLink {
-        parent: frame(header.field("frame_id")?)?,
-        transform,
-        time: header.field("stamp")?.time(),
-    };
+    let link = FrameLink { parent: frame(header.field("frame_id")?)?, transform, time: header.field("stamp")?.time() };
     Some((frame(stamped.field("child_frame_id")?)?, link))
 }
 
@@ -183,10 +163,7 @@ mod tests {
     use crate::tf::write_transforms;
 
     fn step(x: f64) -> Transform {
-        Transform {
-            translation: [x, 0.0, 0.0],
-            ..Transform::IDENTITY
-        }
+        Transform { translation: [x, 0.0, 0.0], ..Transform::IDENTITY }
     }
 
     fn seconds(secs: u32) -> Time {
@@ -202,8 +179,7 @@ mod tests {
 
     fn tf_message(links: &[(&str, &str, f64, u32)]) -> Vec<u8> {
         let links = links.iter();
-        let links =
-            links.map(|(parent, child, x, secs)| (*parent, *child, step(*x), seconds(*secs)));
+        let links = links.map(|(parent, child, x, secs)| (*parent, *child, step(*x), seconds(*secs)));
         write_transforms(&schema(), links).unwrap()
     }
 
@@ -216,11 +192,7 @@ mod tests {
     #[test]
     fn frames_are_found_through_their_common_ancestor() {
         let frames = Frames::default();
-        let message = tf_message(&[
-            ("/map", "base", 1.0, 1),
-            ("base", "arm", 2.0, 1),
-            ("map", "dock", 10.0, 1),
-        ]);
+        let message = tf_message(&[("/map", "base", 1.0, 1), ("base", "arm", 2.0, 1), ("map", "dock", 10.0, 1)]);
         frames.apply_bytes(&message, false);
         let x = |target, source| Some(frames.find(target, source)?.transform.translation[0]);
         assert_eq!(x("dock", "arm"), Some(-7.0));
@@ -235,17 +207,10 @@ mod tests {
     fn a_transform_is_as_old_as_the_oldest_that_it_is_made_of() {
         let frames = Frames::default();
         frames.apply_bytes(
-            &tf_message(&[
-                ("earth", "map", 1.0, 3),
-                ("map", "base", 1.0, 7),
-                ("base", "arm", 1.0, 9),
-            ]),
+            &tf_message(&[("earth", "map", 1.0, 3), ("map", "base", 1.0, 7), ("base", "arm", 1.0, 9)]),
             false,
         );
-        frames.apply_bytes(
-            &tf_message(&[("base", "laser", 1.0, 1), ("laser", "dot", 1.0, 1)]),
-            true,
-        );
+        frames.apply_bytes(&tf_message(&[("base", "laser", 1.0, 1), ("laser", "dot", 1.0, 1)]), true);
         let time = |target, source| frames.find(target, source).unwrap().time;
         assert_eq!(time("base", "arm"), Some(seconds(9)));
         assert_eq!(time("map", "arm"), Some(seconds(7)));
@@ -259,10 +224,7 @@ mod tests {
     #[test]
     fn nonsense_does_no_harm() {
         let frames = Frames::default();
-        frames.apply_bytes(
-            &tf_message(&[("a", "b", 1.0, 1), ("b", "a", 1.0, 1)]),
-            false,
-        );
+        frames.apply_bytes(&tf_message(&[("a", "b", 1.0, 1), ("b", "a", 1.0, 1)]), false);
         assert_eq!(frames.find("a", "b"), None);
         let whole = tf_message(&[("map", "base", 1.0, 1)]);
         for end in 0..whole.len() {

@@ -11,9 +11,7 @@ use ros::schema::{MessageType, SchemaError, ServiceDef};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-use super::sending::{
-    TransformRequest, TransformRequestError, check_limits, newest_listener_on, send_transforms,
-};
+use super::sending::{TransformRequest, TransformRequestError, check_limits, newest_listener_on, send_transforms};
 use super::{array_name, package};
 use crate::fanout::Listener;
 use crate::own_service::{Caller, OwnService, OwnServiceError};
@@ -32,22 +30,10 @@ pub(crate) const STATUS_TOPIC: &str = "/tf2_web_republisher/status";
 
 /// Topics of the action in ROS 1, their types, and whether the action's server publishes them.
 pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
-    (
-        GOAL_TOPIC,
-        "tf2_web_republisher/TFSubscriptionActionGoal",
-        false,
-    ),
+    (GOAL_TOPIC, "tf2_web_republisher/TFSubscriptionActionGoal", false),
     (CANCEL_TOPIC, "actionlib_msgs/GoalID", false),
-    (
-        FEEDBACK_TOPIC,
-        "tf2_web_republisher/TFSubscriptionActionFeedback",
-        true,
-    ),
-    (
-        RESULT_TOPIC,
-        "tf2_web_republisher/TFSubscriptionActionResult",
-        true,
-    ),
+    (FEEDBACK_TOPIC, "tf2_web_republisher/TFSubscriptionActionFeedback", true),
+    (RESULT_TOPIC, "tf2_web_republisher/TFSubscriptionActionResult", true),
     (STATUS_TOPIC, "actionlib_msgs/GoalStatusArray", true),
 ];
 /// Prefix of the topics created for callers of the service.
@@ -78,25 +64,18 @@ impl OwnService for RepublishTfs {
 impl Republisher {
     /// Returns the type of a topic created for a caller.
     pub(crate) fn type_name(&self, version: RosVersion, topic: &str) -> Option<&'static str> {
-        (topic.starts_with(TOPIC_PREFIX) && self.topics.lock().contains_key(topic))
-            .then(|| array_name(version))
+        (topic.starts_with(TOPIC_PREFIX) && self.topics.lock().contains_key(topic)).then(|| array_name(version))
     }
 
     /// Answers a call of the service; request and response are JSON.
     fn call(&self, shared: &Arc<BridgeShared>, request: &[u8]) -> Result<Vec<u8>, OwnServiceError> {
-        let wanted: TransformRequest =
-            serde_json::from_slice(request).map_err(OwnServiceError::Args)?;
+        let wanted: TransformRequest = serde_json::from_slice(request).map_err(OwnServiceError::Args)?;
         check_limits(&wanted, self.topics.lock().len())?;
         let topic = format!("{TOPIC_PREFIX}{}", shared.next_number());
         let stop = CancellationToken::new();
-        self.topics
-            .lock()
-            .insert(topic.clone(), stop.clone().drop_guard());
+        self.topics.lock().insert(topic.clone(), stop.clone().drop_guard());
         let patience = wanted.topic_timeout();
-        let (name, message_type) = (
-            topic.clone(),
-            shared.registry.message(array_name(shared.bus.version())),
-        );
+        let (name, message_type) = (topic.clone(), shared.registry.message(array_name(shared.bus.version())));
         let message_type = message_type?;
         let mut heard = Instant::now();
         let of = message_type.clone();
@@ -126,40 +105,25 @@ impl Republisher {
             stop,
             deliver,
         ));
-        Ok(serde_json::json!({ "topic_name": topic })
-            .to_string()
-            .into_bytes())
+        Ok(serde_json::json!({ "topic_name": topic }).to_string().into_bytes())
     }
 
     /// Listens to goals when a client is about to send some, unless a node serves them.
     pub(crate) fn listen_for_goals(&self, shared: &Arc<BridgeShared>) {
         let graph = shared.bus.graph().borrow().clone();
-        let served = graph
-            .topics
-            .get(FEEDBACK_TOPIC)
-            .is_some_and(|nodes| !nodes.publishers.is_empty());
+        let served = graph.topics.get(FEEDBACK_TOPIC).is_some_and(|nodes| !nodes.publishers.is_empty());
         if served || self.listening.get().is_some() {
             return;
         }
         let registry = &shared.registry;
-        let (Ok(action), Ok(cancel)) = (
-            registry.action("tf2_web_republisher/TFSubscription"),
-            registry.message("actionlib_msgs/GoalID"),
-        ) else {
+        let (Ok(action), Ok(cancel)) =
+            (registry.action("tf2_web_republisher/TFSubscription"), registry.message("actionlib_msgs/GoalID"))
+        else {
             return;
         };
-        let listener = |cancels| {
-            Arc::new(GoalListener {
-                shared: Arc::downgrade(shared),
-                cancels,
-            })
-        };
-        let goals = shared
-            .fanout(GOAL_TOPIC, Some(&action.action_goal))
-            .listen(listener(false));
-        let cancels = shared
-            .fanout(CANCEL_TOPIC, Some(&cancel))
-            .listen(listener(true));
+        let listener = |cancels| Arc::new(GoalListener { shared: Arc::downgrade(shared), cancels });
+        let goals = shared.fanout(GOAL_TOPIC, Some(&action.action_goal)).listen(listener(false));
+        let cancels = shared.fanout(CANCEL_TOPIC, Some(&cancel)).listen(listener(true));
         // The loser of a race drops its listeners.
         let _ = self.listening.set([goals, cancels]);
     }
@@ -175,25 +139,18 @@ impl Republisher {
         body: &[u8],
         publisher: PeerId,
     ) -> Result<(), TransformRequestError> {
-        let action = shared
-            .registry
-            .action("tf2_web_republisher/TFSubscription")?;
+        let action = shared.registry.action("tf2_web_republisher/TFSubscription")?;
         let mut json = Vec::new();
         codec::to_json(&action.goal, body, &mut json, &JsonOptions::default()).map_err(Box::new)?;
         let wanted: TransformRequest = serde_json::from_slice(&json)?;
         check_limits(&wanted, self.goals.lock().len())?;
         let stop = CancellationToken::new();
-        self.goals
-            .lock()
-            .insert(goal.id.clone(), stop.clone().drop_guard());
+        self.goals.lock().insert(goal.id.clone(), stop.clone().drop_guard());
         let of = action.feedback.clone();
         let deliver = move |shared: &Arc<BridgeShared>, transforms: Option<Vec<u8>>| {
             if let Some(transforms) = transforms {
-                let bytes = messages::write_state(
-                    Time::now(),
-                    &goal_state(&goal, ActionlibStatus::Active),
-                    &transforms,
-                );
+                let bytes =
+                    messages::write_state(Time::now(), &goal_state(&goal, ActionlibStatus::Active), &transforms);
                 shared.deliver(FEEDBACK_TOPIC, &message(&action.action_feedback, bytes));
             }
             // The goal of a client that is gone is given up.
@@ -219,36 +176,21 @@ impl Republisher {
         let mut goals = self.goals.lock();
         let ended: Vec<String> = match goal.id.as_str() {
             "" => goals.drain().map(|(id, _)| id).collect(),
-            id => goals
-                .remove(id)
-                .map(|_| id.to_owned())
-                .into_iter()
-                .collect(),
+            id => goals.remove(id).map(|_| id.to_owned()).into_iter().collect(),
         };
         drop(goals);
         let action = shared.registry.action("tf2_web_republisher/TFSubscription");
         let Ok(action) = action else { return };
         for id in ended {
-            let goal = GoalId {
-                id,
-                ..GoalId::default()
-            };
-            let bytes = messages::write_state(
-                Time::now(),
-                &goal_state(&goal, ActionlibStatus::Preempted),
-                &[],
-            );
+            let goal = GoalId { id, ..GoalId::default() };
+            let bytes = messages::write_state(Time::now(), &goal_state(&goal, ActionlibStatus::Preempted), &[]);
             shared.deliver(RESULT_TOPIC, &message(&action.action_result, bytes));
         }
     }
 }
 
 fn goal_state(goal: &GoalId, status: ActionlibStatus) -> GoalState {
-    GoalState {
-        goal: goal.clone(),
-        status,
-        text: String::new(),
-    }
+    GoalState { goal: goal.clone(), status, text: String::new() }
 }
 
 fn message(message_type: &MessageType, bytes: Bytes) -> SerializedMessage {
@@ -277,10 +219,7 @@ impl Listener for GoalListener {
                 shared.republisher.cancel(&shared, &goal);
             }
         } else if let Some((goal, body)) = messages::read_goal(&sample.bytes)
-            && let Err(reason) =
-                shared
-                    .republisher
-                    .begin(&shared, goal, &body, sample.publisher.clone())
+            && let Err(reason) = shared.republisher.begin(&shared, goal, &body, sample.publisher.clone())
         {
             tracing::debug!("a request for transforms was refused: {reason}");
         }

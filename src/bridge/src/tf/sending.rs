@@ -58,10 +58,7 @@ impl TransformRequest {
     /// Returns how long a topic without listeners is kept.
     pub(super) fn topic_timeout(&self) -> Duration {
         let Timeout { secs, nsecs } = self.timeout;
-        let patience = Duration::new(
-            u64::try_from(secs).unwrap_or(0),
-            nsecs.clamp(0, 999_999_999) as u32,
-        );
+        let patience = Duration::new(u64::try_from(secs).unwrap_or(0), nsecs.clamp(0, 999_999_999) as u32);
         patience.clamp(Duration::from_secs(1), Duration::from_secs(3600))
     }
 }
@@ -87,10 +84,7 @@ pub(crate) enum TransformRequestError {
 }
 
 /// Refuses requests above the limits.
-pub(super) fn check_limits(
-    wanted: &TransformRequest,
-    requests: usize,
-) -> Result<(), TransformRequestError> {
+pub(super) fn check_limits(wanted: &TransformRequest, requests: usize) -> Result<(), TransformRequestError> {
     let sources = wanted.source_frames.len();
     if sources > MAX_SOURCES {
         return Err(TransformRequestError::TooManySources(sources));
@@ -102,15 +96,11 @@ pub(super) fn check_limits(
 }
 
 /// Returns a function that finds the newest listener of this topic.
-pub(super) fn newest_listener_on(
-    topic: &str,
-) -> impl Fn(&BridgeShared) -> Option<u64> + Send + use<> {
+pub(super) fn newest_listener_on(topic: &str) -> impl Fn(&BridgeShared) -> Option<u64> + Send + use<> {
     let topic = topic.to_owned();
     move |shared| {
         let live = shared.live_fanouts(&topic);
-        live.iter()
-            .filter_map(|fanout| fanout.newest_listener())
-            .max()
+        live.iter().filter_map(|fanout| fanout.newest_listener()).max()
     }
 }
 
@@ -124,11 +114,7 @@ pub(super) async fn send_transforms(
     stop: CancellationToken,
     mut deliver: impl FnMut(&Arc<BridgeShared>, Option<Vec<u8>>) -> bool,
 ) {
-    let rate = if wanted.rate > 0.0 {
-        wanted.rate.clamp(0.01, 1000.0)
-    } else {
-        10.0
-    };
+    let rate = if wanted.rate > 0.0 { wanted.rate.clamp(0.01, 1000.0) } else { 10.0 };
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / rate));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let target = buffer::strip_slash(&wanted.target_frame);
@@ -155,16 +141,8 @@ pub(super) async fn send_transforms(
             continue;
         }
         let mut changed: Vec<(&str, &str, Transform, Option<Time>)> = Vec::new();
-        for source in wanted
-            .source_frames
-            .iter()
-            .map(|source| buffer::strip_slash(source))
-        {
-            let Some(FramePose {
-                transform: now,
-                time,
-            }) = buffer.find(target, source)
-            else {
+        for source in wanted.source_frames.iter().map(|source| buffer::strip_slash(source)) {
+            let Some(FramePose { transform: now, time }) = buffer.find(target, source) else {
                 continue;
             };
             let moved = sent.get(source).is_none_or(|before| {
@@ -177,22 +155,13 @@ pub(super) async fn send_transforms(
             }
         }
         // Static transforms have the current time.
-        let now = if changed.iter().any(|(.., time)| time.is_none()) {
-            clock::now(&shared).await
-        } else {
-            Time::default()
-        };
+        let now =
+            if changed.iter().any(|(.., time)| time.is_none()) { clock::now(&shared).await } else { Time::default() };
         let changed: Vec<_> = changed
             .into_iter()
-            .map(|(target, source, transform, time)| {
-                (target, source, transform, time.unwrap_or(now))
-            })
+            .map(|(target, source, transform, time)| (target, source, transform, time.unwrap_or(now)))
             .collect();
-        let transforms = if changed.is_empty() {
-            None
-        } else {
-            write_transforms(&of, changed).ok()
-        };
+        let transforms = if changed.is_empty() { None } else { write_transforms(&of, changed).ok() };
         if !deliver(&shared, transforms) {
             return;
         }

@@ -8,10 +8,7 @@ pub(crate) struct Transform {
 }
 
 impl Transform {
-    pub(crate) const IDENTITY: Transform = Transform {
-        translation: [0.0; 3],
-        rotation: [0.0, 0.0, 0.0, 1.0],
-    };
+    pub(crate) const IDENTITY: Transform = Transform { translation: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0] };
 
     /// Returns the composition: first `other`, then this transform.
     pub(crate) fn compose(&self, other: &Transform) -> Transform {
@@ -25,29 +22,19 @@ impl Transform {
     pub(crate) fn inverse(&self) -> Transform {
         let [x, y, z, w] = self.rotation;
         let rotation = [-x, -y, -z, w];
-        Transform {
-            translation: rotate(rotation, self.translation).map(|length| -length),
-            rotation,
-        }
+        Transform { translation: rotate(rotation, self.translation).map(|length| -length), rotation }
     }
 
     /// Returns the distance between two transforms: metres, radians.
     pub(crate) fn distance(&self, other: &Transform) -> (f64, f64) {
         let squares = (0..3).map(|at| (self.translation[at] - other.translation[at]).powi(2));
-        let dot: f64 = (0..4)
-            .map(|at| self.rotation[at] * other.rotation[at])
-            .sum();
+        let dot: f64 = (0..4).map(|at| self.rotation[at] * other.rotation[at]).sum();
         (squares.sum::<f64>().sqrt(), 2.0 * dot.abs().min(1.0).acos())
     }
 
     /// Returns the transform with a normalized rotation; `None` if that is impossible.
     pub(crate) fn normalize(mut self) -> Option<Transform> {
-        let length = self
-            .rotation
-            .iter()
-            .map(|part| part * part)
-            .sum::<f64>()
-            .sqrt();
+        let length = self.rotation.iter().map(|part| part * part).sum::<f64>().sqrt();
         let finite = self.translation.iter().all(|part| part.is_finite());
         if !finite || !length.is_finite() || length < 1e-6 {
             return None;
@@ -80,12 +67,7 @@ mod tests {
     /// A quarter turn to the left, then a step of one forward (x).
     const TURN: Transform = Transform {
         translation: [1.0, 0.0, 0.0],
-        rotation: [
-            0.0,
-            0.0,
-            std::f64::consts::FRAC_1_SQRT_2,
-            std::f64::consts::FRAC_1_SQRT_2,
-        ],
+        rotation: [0.0, 0.0, std::f64::consts::FRAC_1_SQRT_2, std::f64::consts::FRAC_1_SQRT_2],
     };
 
     #[track_caller]
@@ -97,13 +79,7 @@ mod tests {
     #[test]
     fn transforms_are_chained_and_undone() {
         let twice = TURN.compose(&TURN);
-        assert_close(
-            &twice,
-            &Transform {
-                translation: [1.0, 1.0, 0.0],
-                rotation: [0.0, 0.0, 1.0, 0.0],
-            },
-        );
+        assert_close(&twice, &Transform { translation: [1.0, 1.0, 0.0], rotation: [0.0, 0.0, 1.0, 0.0] });
         assert_close(&twice.compose(&twice.inverse()), &Transform::IDENTITY);
         assert_close(&TURN.inverse().compose(&TURN), &Transform::IDENTITY);
     }
@@ -117,20 +93,11 @@ mod tests {
 
     #[test]
     fn what_is_no_rotation_is_refused() {
-        let flat = Transform {
-            rotation: [0.0; 4],
-            ..TURN
-        };
+        let flat = Transform { rotation: [0.0; 4], ..TURN };
         assert_eq!(flat.normalize(), None);
-        let far = Transform {
-            translation: [f64::NAN, 0.0, 0.0],
-            ..TURN
-        };
+        let far = Transform { translation: [f64::NAN, 0.0, 0.0], ..TURN };
         assert_eq!(far.normalize(), None);
-        let long = Transform {
-            rotation: [0.0, 0.0, 0.0, 7.0],
-            ..TURN
-        };
+        let long = Transform { rotation: [0.0, 0.0, 0.0, 7.0], ..TURN };
         assert_eq!(long.normalize().unwrap().rotation, [0.0, 0.0, 0.0, 1.0]);
     }
 }

@@ -36,10 +36,7 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
             json!({"op": "advertise_service", "service": "/s", "type": "x_msgs/Add", "compression": "none"}),
             &["service", "type"],
         ),
-        (
-            json!({"op": "unadvertise_service", "service": "/s"}),
-            &["service"],
-        ),
+        (json!({"op": "unadvertise_service", "service": "/s"}), &["service"]),
         (
             json!({"op": "service_response", "service": "/s", "values": {}, "result": true, "compression": "none"}),
             &["service", "result"],
@@ -50,10 +47,7 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
                 "fragment_size": 1000, "compression": "none"}),
             &["action", "action_type"],
         ),
-        (
-            json!({"op": "cancel_action_goal", "action": "/f"}),
-            &["action", "id"],
-        ),
+        (json!({"op": "cancel_action_goal", "action": "/f"}), &["action", "id"]),
         (
             json!({"op": "action_feedback", "action": "/f", "values": {}, "compression": "none"}),
             &["action", "values", "id"],
@@ -67,23 +61,11 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
             json!({"op": "advertise_action", "action": "/f", "type": "x_msgs/Count", "compression": "none"}),
             &["action", "type"],
         ),
-        (
-            json!({"op": "unadvertise_action", "action": "/f"}),
-            &["action"],
-        ),
-        (
-            json!({"op": "fragment", "data": "x", "num": 0, "total": 2}),
-            &["data", "num", "total", "id"],
-        ),
-        (
-            json!({"op": "png", "data": "x", "num": 0, "total": 2}),
-            &["data", "num", "total"],
-        ),
+        (json!({"op": "unadvertise_action", "action": "/f"}), &["action"]),
+        (json!({"op": "fragment", "data": "x", "num": 0, "total": 2}), &["data", "num", "total", "id"]),
+        (json!({"op": "png", "data": "x", "num": 0, "total": 2}), &["data", "num", "total"]),
         (json!({"op": "set_level", "level": "error"}), &["level"]),
-        (
-            json!({"op": "status", "level": "error", "msg": "x"}),
-            &["level", "msg"],
-        ),
+        (json!({"op": "status", "level": "error", "msg": "x"}), &["level", "msg"]),
         (
             json!({"op": "auth", "mac": "a", "client": "b", "dest": "c", "rand": "d", "t": 1, "level": "e", "end": 2}),
             &["mac", "client", "dest", "rand", "t", "end"],
@@ -106,8 +88,7 @@ fn with_field(message: &Value, field: &str, value: Value) -> Value {
 
 /// Sends a message, and returns the status messages that answer it.
 async fn answers(client: &mut Client, message: &Value, format: Format) -> Vec<String> {
-    let marker =
-        json!({"op": "call_service", "id": "marker", "service": "/rosapi/get_ros_version"});
+    let marker = json!({"op": "call_service", "id": "marker", "service": "/rosapi/get_ros_version"});
     for message in [message, &marker] {
         match format {
             Format::Json => client.send(message.clone()).await,
@@ -145,9 +126,8 @@ async fn assert_refused_by_name(cases: Vec<(Value, &str)>) {
         for (case, field) in &cases {
             let op = case["op"].as_str().unwrap();
             let said = answers(&mut client, case, format).await;
-            let named = said.iter().any(|text| {
-                text.starts_with(&format!("{op}: ")) && text.contains(&format!("{field:?}"))
-            });
+            let named =
+                said.iter().any(|text| text.starts_with(&format!("{op}: ")) && text.contains(&format!("{field:?}")));
             let sent = case.to_string();
             let shown: String = sent.chars().take(300).collect();
             assert!(named, "{shown} was answered with {said:?}");
@@ -178,11 +158,7 @@ async fn a_field_of_another_kind_is_named() {
     for (message, _) in &messages {
         let op = message["op"].as_str().unwrap();
         let fields = message.as_object().unwrap().keys();
-        for field in fields
-            .map(String::as_str)
-            .chain(["id"])
-            .filter(|field| *field != "op")
-        {
+        for field in fields.map(String::as_str).chain(["id"]).filter(|field| *field != "op") {
             // An object is wrong for every field but payloads, and a number is wrong for these. The reason of a failed
             // response may be anything.
             let wrong = match field {
@@ -260,10 +236,7 @@ async fn a_huge_field_is_refused_and_not_repeated() {
             // Pieces of messages may be long. A client's own status is not answered.
             let told = !matches!(field.as_str(), "op" | "data") && op != "status";
             if told && value.is_string() {
-                cases.push((
-                    with_field(message, field, long.clone().into()),
-                    field.as_str(),
-                ));
+                cases.push((with_field(message, field, long.clone().into()), field.as_str()));
             }
         }
         cases.push((with_field(message, "id", long.clone().into()), "id"));
@@ -271,10 +244,7 @@ async fn a_huge_field_is_refused_and_not_repeated() {
         for (field, value) in fields.iter().filter(|(_, value)| !value.is_string()) {
             if op != "status" && !(field == "values" && op != "action_feedback") {
                 let _ = value;
-                cases.push((
-                    with_field(message, field, long.clone().into()),
-                    field.as_str(),
-                ));
+                cases.push((with_field(message, field, long.clone().into()), field.as_str()));
             }
         }
     }
@@ -285,34 +255,19 @@ async fn a_huge_field_is_refused_and_not_repeated() {
 async fn a_field_too_many_is_told_as_a_warning() {
     let world = World::new().await;
     let mut client = world.client().await;
-    client
-        .send(json!({"op": "set_level", "level": "warning"}))
-        .await;
+    client.send(json!({"op": "set_level", "level": "warning"})).await;
     let long = "y".repeat(10_000);
     for (message, _) in messages() {
         let op = message["op"].as_str().unwrap();
         if op == "set_level" {
             continue;
         }
-        let said = answers(
-            &mut client,
-            &with_field(&message, "colour", "red".into()),
-            Format::Json,
-        )
-        .await;
+        let said = answers(&mut client, &with_field(&message, "colour", "red".into()), Format::Json).await;
         let told = format!("{op}: field \"colour\" is not known and was ignored");
         assert!(said.contains(&told), "{op}: {said:?}");
-        let said = answers(
-            &mut client,
-            &with_field(&message, &long, 1.into()),
-            Format::Json,
-        )
-        .await;
+        let said = answers(&mut client, &with_field(&message, &long, 1.into()), Format::Json).await;
         let told = format!("{op}: field \"{}\" is not known", &long[..48]);
-        assert!(
-            said.iter().any(|text| text.starts_with(&told)),
-            "{op}: {said:?}"
-        );
+        assert!(said.iter().any(|text| text.starts_with(&told)), "{op}: {said:?}");
     }
 }
 
@@ -331,10 +286,7 @@ async fn fragments_that_make_no_sense_cost_only_themselves() {
     client.send(part(1, 2, second)).await;
     client.send(part(0, 2, first)).await;
     assert_eq!(client.json().await["id"], "whole");
-    for (message, reason) in [
-        (part(2, 2, "x"), "must be below"),
-        (part(0, 1_000_000, "x"), "at most 65536"),
-    ] {
+    for (message, reason) in [(part(2, 2, "x"), "must be below"), (part(0, 1_000_000, "x"), "at most 65536")] {
         client.send(message).await;
         assert!(client.refusal().await.contains(reason));
     }
@@ -343,18 +295,11 @@ async fn fragments_that_make_no_sense_cost_only_themselves() {
     assert!(client.refusal().await.contains("twice with different data"));
     client.send(part(0, 3, "a")).await;
     client.send(part(1, 4, "a")).await;
-    assert!(
-        client
-            .refusal()
-            .await
-            .contains("the earlier fragments said")
-    );
+    assert!(client.refusal().await.contains("the earlier fragments said"));
     // Started a thousand times and never completed: the oldest are dropped, nothing grows.
     for number in 0..1000 {
         let id = format!("never {number}");
-        client
-            .send(json!({"op": "fragment", "id": id, "num": 0, "total": 1000, "data": "x".repeat(1000)}))
-            .await;
+        client.send(json!({"op": "fragment", "id": id, "num": 0, "total": 1000, "data": "x".repeat(1000)})).await;
     }
     client.send(part(0, 2, first)).await;
     client.send(part(1, 2, second)).await;
@@ -378,19 +323,14 @@ async fn a_picture_that_unpacks_to_gigabytes_is_refused_unread() {
     let bomb = base64_simd::STANDARD.encode_to_string(file);
     client.send(json!({"op": "png", "data": bomb})).await;
     let refusal = client.refusal().await;
-    assert!(
-        refusal.starts_with("png: ") && refusal.contains("2700000000 bytes"),
-        "{refusal}"
-    );
+    assert!(refusal.starts_with("png: ") && refusal.contains("2700000000 bytes"), "{refusal}");
     client.sync().await;
 }
 
 /// The checksum at the end of a PNG chunk.
 fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(u32::MAX, |sum, &byte| {
-        (0..8).fold(sum ^ u32::from(byte), |sum, _| {
-            (sum >> 1) ^ (0xedb8_8320 & (sum & 1).wrapping_neg())
-        })
+        (0..8).fold(sum ^ u32::from(byte), |sum, _| (sum >> 1) ^ (0xedb8_8320 & (sum & 1).wrapping_neg()))
     })
 }
 
@@ -398,14 +338,9 @@ fn crc32(bytes: &[u8]) -> u32 {
 async fn deep_nesting_is_refused_in_json_and_in_cbor() {
     let world = World::new().await;
     let mut client = world.client().await;
-    client
-        .send(json!({"op": "advertise", "topic": "/a", "type": "std_msgs/String"}))
-        .await;
-    let deep = format!(
-        r#"{{"op":"publish","topic":"/a","msg":{}{}}}"#,
-        r#"{"data":"#.repeat(50_000),
-        "}".repeat(50_000)
-    );
+    client.send(json!({"op": "advertise", "topic": "/a", "type": "std_msgs/String"})).await;
+    let deep =
+        format!(r#"{{"op":"publish","topic":"/a","msg":{}{}}}"#, r#"{"data":"#.repeat(50_000), "}".repeat(50_000));
     client.send_text(&deep).await;
     assert!(client.refusal().await.contains("nested deeper"));
     let mut deep = b"\xa3\x62op\x67publish\x65topic\x62/a\x63msg".to_vec();

@@ -24,35 +24,21 @@ struct Budgets {
 impl Budgets {
     fn new(client: usize) -> Self {
         let daemon = Budget::new("the daemon", 64 * MIB);
-        Self {
-            servant: daemon.child("servant x", 32 * MIB),
-            client: daemon.child("client x", client),
-            daemon,
-        }
+        Self { servant: daemon.child("servant x", 32 * MIB), client: daemon.child("client x", client), daemon }
     }
 
     async fn world(&self) -> World {
-        World::with_options(BridgeOptions {
-            budget: self.servant.clone(),
-            ..patient()
-        })
-        .await
+        World::with_options(BridgeOptions { budget: self.servant.clone(), ..patient() }).await
     }
 
     async fn client(&self, world: &World) -> Client {
-        let options = SessionOptions {
-            budget: self.client.clone(),
-            ..SessionOptions::default()
-        };
+        let options = SessionOptions { budget: self.client.clone(), ..SessionOptions::default() };
         world.client_with(options).await
     }
 
     async fn assert_empty(&self) {
         wait_until(|| self.daemon.used_bytes() == 0).await;
-        assert_eq!(
-            (self.client.used_bytes(), self.servant.used_bytes()),
-            (0, 0)
-        );
+        assert_eq!((self.client.used_bytes(), self.servant.used_bytes()), (0, 0));
     }
 }
 
@@ -89,9 +75,7 @@ async fn subscribe_big(client: &mut Client, fragment_size: Option<usize>) {
 async fn a_message_counts_for_its_client_until_it_is_read() {
     let budgets = Budgets::new(8 * MIB);
     let world = budgets.world().await;
-    let publisher = world
-        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
-        .await;
+    let publisher = world.node_publishes("/big", "std_msgs/UInt8MultiArray", false).await;
     for fragment_size in [None, Some(10_000), Some(MIB)] {
         let mut client = budgets.client(&world).await;
         subscribe_big(&mut client, fragment_size).await;
@@ -120,9 +104,7 @@ async fn a_message_counts_for_its_client_until_it_is_read() {
 async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() {
     let budgets = Budgets::new(8 * MIB);
     let world = budgets.world().await;
-    let publisher = world
-        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
-        .await;
+    let publisher = world.node_publishes("/big", "std_msgs/UInt8MultiArray", false).await;
     let mut slow = Vec::new();
     for _ in 0..6 {
         slow.push(budgets.client(&world).await);
@@ -164,14 +146,10 @@ async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() 
 async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budget() {
     let budgets = Budgets::new(2 * MIB);
     let world = budgets.world().await;
-    let publisher = world
-        .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
-        .await;
+    let publisher = world.node_publishes("/big", "std_msgs/UInt8MultiArray", false).await;
     let (mut slow, mut quick) = (budgets.client(&world).await, world.client().await);
     for client in [&mut slow, &mut quick] {
-        client
-            .send(json!({"op": "subscribe", "topic": "/big", "compression": "cbor-raw"}))
-            .await;
+        client.send(json!({"op": "subscribe", "topic": "/big", "compression": "cbor-raw"})).await;
         client.sync().await;
     }
     wait_connected(publisher.as_ref(), 1).await;
@@ -215,13 +193,9 @@ async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
         let of = ServiceType::from_service(&say);
         let served = world.node.serve("/long", of, Arc::new(Says(words)));
         let _served = served.await.unwrap();
-        world
-            .wait_for_graph(|graph| graph.services.contains_key("/long"))
-            .await;
+        world.wait_for_graph(|graph| graph.services.contains_key("/long")).await;
         for _ in 0..calls {
-            client
-                .send(json!({"op": "call_service", "service": "/long"}))
-                .await;
+            client.send(json!({"op": "call_service", "service": "/long"})).await;
         }
         wait_until(|| budgets.client.refusal_count() > 0).await;
         let (code, reason) = client.expect_close().await;

@@ -41,18 +41,12 @@ async fn parameters_are_those_of_nodes() {
     ] {
         let got = ask(&mut client, "get_param", json!({"name": name})).await;
         assert_eq!(parse_value(&got), value);
-        assert_eq!(
-            (&got["successful"], &got["reason"]),
-            (&json!(true), &json!(""))
-        );
+        assert_eq!((&got["successful"], &got["reason"]), (&json!(true), &json!("")));
         let has = ask(&mut client, "has_param", json!({"name": name})).await;
         assert_eq!(has, json!({"exists": true}));
     }
     let names = ask(&mut client, "get_param_names", json!({})).await;
-    assert_eq!(
-        names,
-        json!({"names": ["/node:camera.exposures", "/node:frame", "/node:rate"]})
-    );
+    assert_eq!(names, json!({"names": ["/node:camera.exposures", "/node:frame", "/node:rate"]}));
     // JavaScript writes 5.0 like this.
     let set = json!({"name": "/node:rate", "value": "5"});
     let done = json!({"successful": true, "reason": ""});
@@ -74,16 +68,10 @@ async fn what_is_not_there_is_said_and_has_its_default() {
     let mut client = world.client().await;
     for (name, reason) in [
         ("/node:none", "node /node has no parameter none"),
-        (
-            "/gone:rate",
-            "there is no node /gone; /rosapi/nodes lists the existing ones",
-        ),
+        ("/gone:rate", "there is no node /gone; /rosapi/nodes lists the existing ones"),
     ] {
         let got = ask(&mut client, "get_param", json!({"name": name})).await;
-        assert_eq!(
-            got,
-            json!({"value": "null", "successful": false, "reason": reason})
-        );
+        assert_eq!(got, json!({"value": "null", "successful": false, "reason": reason}));
         for (default, value) in [("7", "7"), ("seven", "\"seven\"")] {
             let get = json!({"name": name, "default_value": default});
             assert_eq!(ask(&mut client, "get_param", get).await["value"], value);
@@ -104,11 +92,7 @@ async fn what_cannot_be_done_with_a_parameter_is_answered_with_the_reason() {
             json!({"name": "/node:rate", "value": "\"fast\""}),
             "node /node refuses rate: it is of another kind",
         ),
-        (
-            "set_param",
-            json!({"name": "/gone:rate", "value": "1"}),
-            "service /gone/get_parameters has no server",
-        ),
+        ("set_param", json!({"name": "/gone:rate", "value": "1"}), "service /gone/get_parameters has no server"),
         (
             "get_param",
             json!({"name": "/node/rate"}),
@@ -124,15 +108,9 @@ async fn what_cannot_be_done_with_a_parameter_is_answered_with_the_reason() {
             json!({}),
             "field \"name\" is missing, a node and its parameter such as \"/camera:exposure\" is expected",
         ),
-        (
-            "search_param",
-            json!({"name": "rate"}),
-            "global parameters are not offered by this version of ROS",
-        ),
+        ("search_param", json!({"name": "rate"}), "global parameters are not offered by this version of ROS"),
     ] {
-        client
-            .send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args}))
-            .await;
+        client.send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args})).await;
         let answer = client.json().await;
         assert_eq!(answer["result"], false, "{answer}");
         assert_eq!(answer["values"], reason);

@@ -14,9 +14,7 @@ async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
     let mut heard = node.subscribe("/map", of, qos).await.unwrap();
     let mut client = world.client().await;
     let publish = json!({"op": "publish", "topic": "/map", "msg": {"data": 7}});
-    client
-        .send(json!({"op": "advertise", "id": "a", "topic": "/map", "type": "std_msgs/msg/Int32"}))
-        .await;
+    client.send(json!({"op": "advertise", "id": "a", "topic": "/map", "type": "std_msgs/msg/Int32"})).await;
     for _ in 0..3 {
         client.send(publish.clone()).await;
     }
@@ -34,10 +32,8 @@ async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
     assert!(heard.messages.is_empty());
     // It receives messages if offered what it requests.
     client
-        .send(
-            json!({"op": "advertise", "id": "a", "topic": "/map", "type": "std_msgs/msg/Int32",
-            "qos": {"durability": "transient_local"}}),
-        )
+        .send(json!({"op": "advertise", "id": "a", "topic": "/map", "type": "std_msgs/msg/Int32",
+            "qos": {"durability": "transient_local"}}))
         .await;
     client.send(publish).await;
     let message = with_timeout(heard.messages.recv()).await.unwrap();
@@ -52,8 +48,7 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
     let message = |data: i32| world.message("std_msgs/Int32", json!({"data": data}));
     publisher.publish(message(1));
     let (mut eager, mut late) = (world.client().await, world.client().await);
-    let volatile =
-        json!({"op": "subscribe", "id": "new", "topic": "/map", "qos": {"durability": "volatile"}});
+    let volatile = json!({"op": "subscribe", "id": "new", "topic": "/map", "qos": {"durability": "volatile"}});
     eager.send(volatile.clone()).await;
     eager.sync().await;
     // A client that requests nothing gets everything, whatever others request for the same topic.
@@ -69,9 +64,7 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
     another.send(volatile).await;
     another.sync().await;
     // A client's subscriptions get what satisfies all of them.
-    eager
-        .send(json!({"op": "subscribe", "id": "old", "topic": "/map"}))
-        .await;
+    eager.send(json!({"op": "subscribe", "id": "old", "topic": "/map"})).await;
     assert_eq!(eager.json().await["msg"], json!({"data": 2}));
     publisher.publish(message(3));
     for client in [&mut eager, &mut another, &mut late] {
@@ -79,9 +72,7 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
         client.sync().await;
     }
     // And no more than that: a request ends with its subscription.
-    eager
-        .send(json!({"op": "unsubscribe", "id": "old", "topic": "/map"}))
-        .await;
+    eager.send(json!({"op": "unsubscribe", "id": "old", "topic": "/map"})).await;
     eager.sync().await;
     publisher.publish(message(4));
     assert_eq!(eager.json().await["msg"], json!({"data": 4}));
@@ -92,22 +83,16 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
 async fn what_a_subscription_cannot_ask_for_is_told_as_a_warning() {
     let world = World::new().await;
     let mut client = world.client().await;
-    client
-        .send(json!({"op": "set_level", "level": "warning"}))
-        .await;
+    client.send(json!({"op": "set_level", "level": "warning"})).await;
     let qos = json!({"deadline": 0.1, "liveliness": "manual_by_topic", "depth": 5});
-    client
-        .send(json!({"op": "subscribe", "id": "s", "topic": "/x", "type": "std_msgs/String", "qos": qos}))
-        .await;
+    client.send(json!({"op": "subscribe", "id": "s", "topic": "/x", "type": "std_msgs/String", "qos": qos})).await;
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "s", "level": "warning", "msg":
             "subscribe: \"qos.deadline\", \"qos.liveliness\" ignored: subscriptions here accept whatever publishers \
                 offer there"})
     );
-    client
-        .send(json!({"op": "advertise", "topic": "/y", "type": "std_msgs/String", "qos": qos}))
-        .await;
+    client.send(json!({"op": "advertise", "topic": "/y", "type": "std_msgs/String", "qos": qos})).await;
     client.sync().await;
 }
 

@@ -52,11 +52,7 @@ async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() 
     let def = world.registry.service("x_msgs/Add").unwrap();
     let _served = world
         .node
-        .serve(
-            "/add",
-            ServiceType::from_service(&def),
-            Arc::new(Refuses(world.by_version(0, 4))),
-        )
+        .serve("/add", ServiceType::from_service(&def), Arc::new(Refuses(world.by_version(0, 4))))
         .await
         .unwrap();
     let there = |graph: &ros::bus::Graph| graph.services.contains_key("/add");
@@ -64,18 +60,15 @@ async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() 
     let (mut client, mut own) = (world.client().await, world.client().await);
     let call = |service: &str, a: u8| json!({"op": "call_service", "service": service, "args": {"a": a, "b": 2}});
     // Answered by another client of the same robot.
-    own.send(json!({"op": "advertise_service", "service": "/own", "type": "x_msgs/Add"}))
-        .await;
+    own.send(json!({"op": "advertise_service", "service": "/own", "type": "x_msgs/Add"})).await;
     let there = |graph: &ros::bus::Graph| graph.services.contains_key("/own");
     world.wait_for_graph(there).await;
     client.sync().await;
     client.send(call("/own", 0)).await;
     let asked = own.json().await;
-    own.send(
-        json!({"op": "service_response", "id": asked["id"], "service": "/own", "values": {"sum": 1},
-        "result": true}),
-    )
-    .await;
+    own.send(json!({"op": "service_response", "id": asked["id"], "service": "/own", "values": {"sum": 1},
+        "result": true}))
+        .await;
     assert_eq!(client.json().await["result"], true);
     for (a, answered) in [(0, true), (1, false)] {
         client.send(call("/add", a)).await;
@@ -109,8 +102,7 @@ async fn goals_are_told_but_for_those_that_their_client_cancels() {
         "args": {"to": 3}}))
         .await;
     let asked = server.json().await;
-    user.send(json!({"op": "cancel_action_goal", "id": "c", "action": "/count"}))
-        .await;
+    user.send(json!({"op": "cancel_action_goal", "id": "c", "action": "/count"})).await;
     assert_eq!(server.json().await["op"], "cancel_action_goal");
     server
         .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 5,
@@ -128,9 +120,7 @@ async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
     let found = world.node_publishes("/found", "x_msgs/Place", false).await;
     let mut client = world.client().await;
     let metrics = world.bridge.metrics();
-    client
-        .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
-        .await;
+    client.send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"})).await;
     let place = |secs: u32| json!({"header": {"stamp": {"secs": secs, "nsecs": 5}}});
     let publish = |secs| json!({"op": "publish", "topic": "/place", "msg": place(secs)});
     // Time that a message waits for the node to connect is not the node's.
@@ -138,9 +128,7 @@ async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
     with_timeout(asked.messages.recv()).await.unwrap();
     client.sync().await;
     assert_eq!(metrics.asked.get(), 0, "nobody hears an answer");
-    client
-        .send(json!({"op": "subscribe", "topic": "/found"}))
-        .await;
+    client.send(json!({"op": "subscribe", "topic": "/found"})).await;
     client.sync().await;
     wait_connected(&*found, 1).await;
     for secs in [2, 3] {
@@ -156,9 +144,7 @@ async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
     assert!(next(&mut told).await.is_some());
     assert!(next(&mut told).await.is_some());
     assert!(told.try_recv().is_err(), "no more than those");
-    client
-        .send(json!({"op": "unsubscribe", "topic": "/found"}))
-        .await;
+    client.send(json!({"op": "unsubscribe", "topic": "/found"})).await;
     client.send(publish(5)).await;
     client.sync().await;
     assert_eq!(metrics.asked.get(), 2, "nobody hears an answer any more");

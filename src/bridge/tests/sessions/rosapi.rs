@@ -7,15 +7,9 @@ use serde_json::{Value, json};
 use super::support::{Client, World};
 
 pub(super) async fn ask(client: &mut Client, service: &str, args: Value) -> Value {
-    client
-        .send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args}))
-        .await;
+    client.send(json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args})).await;
     let answer = client.json().await;
-    assert_eq!(
-        (&answer["op"], &answer["result"]),
-        (&json!("service_response"), &json!(true)),
-        "{answer}"
-    );
+    assert_eq!((&answer["op"], &answer["result"]), (&json!("service_response"), &json!(true)), "{answer}");
     answer["values"].clone()
 }
 
@@ -26,31 +20,16 @@ pub(super) fn holds(list: &Value, item: &str) -> bool {
 #[tokio::test]
 async fn topics_nodes_and_services_are_found() {
     let world = World::new().await;
-    let _publisher = world
-        .node_publishes("/text", "std_msgs/String", false)
-        .await;
+    let _publisher = world.node_publishes("/text", "std_msgs/String", false).await;
     let _subscriber = world.node_subscribes("/number", "std_msgs/Int32").await;
     let mut client = world.client().await;
-    client
-        .send(json!({"op": "set_level", "level": "info"}))
-        .await;
-    client
-        .send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"}))
-        .await;
+    client.send(json!({"op": "set_level", "level": "info"})).await;
+    client.send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"})).await;
     client.json().await;
-    client
-        .send(json!({"op": "set_level", "level": "error"}))
-        .await;
-    world
-        .wait_for_graph(|graph| {
-            graph.services.contains_key("/add") && graph.topics.contains_key("/number")
-        })
-        .await;
+    client.send(json!({"op": "set_level", "level": "error"})).await;
+    world.wait_for_graph(|graph| graph.services.contains_key("/add") && graph.topics.contains_key("/number")).await;
     // The bridge sees a change of the graph when the node does, or a moment later.
-    while !holds(
-        &ask(&mut client, "services", json!({})).await["services"],
-        "/add",
-    ) {}
+    while !holds(&ask(&mut client, "services", json!({})).await["services"], "/add") {}
 
     let topics = ask(&mut client, "topics", json!({})).await;
     // Includes the bridge's own, as if nodes of rosbridge published them.
@@ -79,30 +58,18 @@ async fn topics_nodes_and_services_are_found() {
         ask(&mut client, "topic_type", json!({"topic": "/text"})).await,
         json!({"type": world.message_name("std_msgs/String")})
     );
-    assert_eq!(
-        ask(&mut client, "topic_type", json!({"topic": "/none"})).await,
-        json!({"type": ""})
-    );
+    assert_eq!(ask(&mut client, "topic_type", json!({"topic": "/none"})).await, json!({"type": ""}));
     for name in ["std_msgs/String", "std_msgs/msg/String"] {
         let of_type = ask(&mut client, "topics_for_type", json!({"type": name})).await;
         assert_eq!(of_type, json!({"topics": ["/text"]}));
     }
-    assert_eq!(
-        ask(&mut client, "publishers", json!({"topic": "/text"})).await,
-        json!({"publishers": ["/node"]})
-    );
-    assert_eq!(
-        ask(&mut client, "subscribers", json!({"topic": "/number"})).await,
-        json!({"subscribers": ["/node"]})
-    );
+    assert_eq!(ask(&mut client, "publishers", json!({"topic": "/text"})).await, json!({"publishers": ["/node"]}));
+    assert_eq!(ask(&mut client, "subscribers", json!({"topic": "/number"})).await, json!({"subscribers": ["/node"]}));
 
     let nodes = ask(&mut client, "nodes", json!({})).await;
     assert!(holds(&nodes["nodes"], "/node") && holds(&nodes["nodes"], "/rosapi"));
     let details = ask(&mut client, "node_details", json!({"node": "/node"})).await;
-    assert_eq!(
-        details,
-        json!({"subscribing": ["/number"], "publishing": ["/text"], "services": []})
-    );
+    assert_eq!(details, json!({"subscribing": ["/number"], "publishing": ["/text"], "services": []}));
 
     let services = ask(&mut client, "services", json!({})).await;
     assert!(holds(&services["services"], "/add") && holds(&services["services"], "/rosapi/topics"));
@@ -114,48 +81,22 @@ async fn topics_nodes_and_services_are_found() {
         ask(&mut client, "service_type", json!(["/rosapi/topics"])).await,
         json!({"type": world.by_version("rosapi/Topics", "rosapi_msgs/srv/Topics")})
     );
-    assert_eq!(
-        ask(&mut client, "service_type", json!({"service": "/no"})).await,
-        json!({"type": ""})
-    );
+    assert_eq!(ask(&mut client, "service_type", json!({"service": "/no"})).await, json!({"type": ""}));
     let node = ask(&mut client, "service_node", json!({"service": "/add"})).await;
     assert_eq!(node, json!({"node": "/cloudroid_bridge"}));
-    assert_eq!(
-        ask(&mut client, "service_host", json!({"service": "/add"})).await,
-        json!({"host": world.host()})
-    );
+    assert_eq!(ask(&mut client, "service_host", json!({"service": "/add"})).await, json!({"host": world.host()}));
     for name in ["x_msgs/Add", "x_msgs/srv/Add"] {
         let of_type = ask(&mut client, "services_for_type", json!({"type": name})).await;
         assert_eq!(of_type, json!({"services": ["/add"]}));
     }
-    let providers = ask(
-        &mut client,
-        "service_providers",
-        json!({"service": "x_msgs/Add"}),
-    )
-    .await;
+    let providers = ask(&mut client, "service_providers", json!({"service": "x_msgs/Add"})).await;
     assert_eq!(providers, json!({"providers": ["/cloudroid_bridge"]}));
 
-    let request = ask(
-        &mut client,
-        "service_request_details",
-        json!({"type": "x_msgs/Add"}),
-    )
-    .await;
+    let request = ask(&mut client, "service_request_details", json!({"type": "x_msgs/Add"})).await;
     assert_eq!(request["typedefs"][0]["fieldnames"], json!(["a", "b"]));
-    let response = ask(
-        &mut client,
-        "service_response_details",
-        json!({"type": "x_msgs/Add"}),
-    )
-    .await;
+    let response = ask(&mut client, "service_response_details", json!({"type": "x_msgs/Add"})).await;
     assert_eq!(response["typedefs"][0]["fieldtypes"], json!(["int64"]));
-    let message = ask(
-        &mut client,
-        "message_details",
-        json!({"type": "x_msgs/Place"}),
-    )
-    .await;
+    let message = ask(&mut client, "message_details", json!({"type": "x_msgs/Place"})).await;
     assert_eq!(message["typedefs"].as_array().unwrap().len(), 4);
     assert_eq!(
         ask(&mut client, "action_servers", json!({})).await,
@@ -186,10 +127,7 @@ async fn actions_and_interfaces_are_found() {
     let unknown = ask(&mut client, "action_type", json!({"action": "/no"})).await;
     assert_eq!(unknown, json!({"type": ""}));
     let servers = ask(&mut client, "action_servers", json!({})).await;
-    assert_eq!(
-        servers,
-        json!({"action_servers": ["/count", "/tf2_web_republisher"]})
-    );
+    assert_eq!(servers, json!({"action_servers": ["/count", "/tf2_web_republisher"]}));
     for (part, field) in [("goal", "to"), ("result", "all"), ("feedback", "at")] {
         for name in ["x_msgs/Count", "x_msgs/action/Count"] {
             let service = format!("action_{part}_details");
@@ -211,25 +149,15 @@ async fn actions_and_interfaces_are_found() {
 #[tokio::test]
 async fn who_is_connected_can_be_followed() {
     let world = World::new().await;
-    let named = |name: &str| bridge::SessionOptions {
-        client: name.to_owned(),
-        ..Default::default()
-    };
+    let named = |name: &str| bridge::SessionOptions { client: name.to_owned(), ..Default::default() };
     let mut client = world.client_with(named("10.0.0.1")).await;
-    client
-        .send(json!({"op": "subscribe", "topic": "/client_count", "type": "std_msgs/Int32"}))
-        .await;
+    client.send(json!({"op": "subscribe", "topic": "/client_count", "type": "std_msgs/Int32"})).await;
     assert_eq!(client.json().await["msg"], json!({"data": 1}));
     let mut other = world.client_with(named("10.0.0.2")).await;
     assert_eq!(client.json().await["msg"], json!({"data": 2}));
-    other
-        .send(json!({"op": "subscribe", "topic": "/connected_clients"}))
-        .await;
+    other.send(json!({"op": "subscribe", "topic": "/connected_clients"})).await;
     let clients = other.json().await["msg"]["clients"].clone();
-    assert_eq!(
-        (&clients[0]["ip_address"], &clients[1]["ip_address"]),
-        (&json!("10.0.0.1"), &json!("10.0.0.2"))
-    );
+    assert_eq!((&clients[0]["ip_address"], &clients[1]["ip_address"]), (&json!("10.0.0.1"), &json!("10.0.0.2")));
     other.abort().await;
     assert_eq!(client.json().await["msg"], json!({"data": 1}));
 }
@@ -239,16 +167,9 @@ async fn questions_that_make_no_sense_are_answered_with_the_reason() {
     let world = World::new().await;
     let mut client = world.client().await;
     let parameter = world.by_version("/p", "/node:p");
-    let unknown = format!(
-        "no definition of {} is known",
-        world.message_name("x_msgs/Lost")
-    );
+    let unknown = format!("no definition of {} is known", world.message_name("x_msgs/Lost"));
     for (service, args, reason) in [
-        (
-            "set_param",
-            json!({"name": parameter, "value": "{"}),
-            "field \"value\" is \"{\", JSON text",
-        ),
+        ("set_param", json!({"name": parameter, "value": "{"}), "field \"value\" is \"{\", JSON text"),
         (
             "set_param",
             json!({"name": parameter, "value": "null"}),
@@ -260,32 +181,15 @@ async fn questions_that_make_no_sense_are_answered_with_the_reason() {
             "field \"value\" holds null at /arms/1, which no ROS parameter can; leave it out",
         ),
         ("get_param", json!({}), "field \"name\" is missing"),
-        (
-            "get_param",
-            json!({"name": 5}),
-            "args: invalid type: integer `5`, expected a string",
-        ),
-        (
-            "message_details",
-            json!({"type": "x_msgs/Lost"}),
-            unknown.as_str(),
-        ),
-        (
-            "no_such",
-            json!({}),
-            "service /rosapi/no_such has no server",
-        ),
+        ("get_param", json!({"name": 5}), "args: invalid type: integer `5`, expected a string"),
+        ("message_details", json!({"type": "x_msgs/Lost"}), unknown.as_str()),
+        ("no_such", json!({}), "service /rosapi/no_such has no server"),
     ] {
         let service = format!("/rosapi/{service}");
-        client
-            .send(json!({"op": "call_service", "id": 1, "service": service, "args": args}))
-            .await;
+        client.send(json!({"op": "call_service", "id": 1, "service": service, "args": args})).await;
         let answer = client.json().await;
         assert_eq!(answer["result"], false);
-        assert!(
-            answer["values"].as_str().unwrap().starts_with(reason),
-            "{answer}"
-        );
+        assert!(answer["values"].as_str().unwrap().starts_with(reason), "{answer}");
     }
 }
 

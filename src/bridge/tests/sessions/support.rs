@@ -8,9 +8,7 @@ use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
 use ros::JoinOptions;
-use ros::bus::{
-    Bus, Graph, Publisher, QosProfile, RosVersion, ServiceType, Subscription, WireType,
-};
+use ros::bus::{Bus, Graph, Publisher, QosProfile, RosVersion, ServiceType, Subscription, WireType};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
 use ros::ros1::master::{Master, MasterOptions};
@@ -32,18 +30,12 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ("std_msgs/msg/String", "string data\n"),
     ("std_msgs/msg/Int32", "int32 data\n"),
     ("std_msgs/msg/UInt8MultiArray", "uint8[] data\n"),
-    (
-        "x_msgs/msg/Place",
-        "std_msgs/Header header\nfloat64 x\nfloat64[] near\nx_msgs/Tag[] tags\n",
-    ),
+    ("x_msgs/msg/Place", "std_msgs/Header header\nfloat64 x\nfloat64[] near\nx_msgs/Tag[] tags\n"),
     ("x_msgs/msg/Tag", "string name\nuint8 number\n"),
     ("x_msgs/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n"),
     ("x_msgs/srv/Nothing", "---\n"),
     ("x_msgs/srv/Say", "---\nstring words\n"),
-    (
-        "x_msgs/action/Count",
-        "int32 to\n---\nint32[] all\n---\nint32 at\n",
-    ),
+    ("x_msgs/action/Count", "int32 to\n---\nint32[] all\n---\nint32 at\n"),
     ("x_msgs/action/Dig", "int32 to\n---\n---\n"),
 ];
 
@@ -86,12 +78,8 @@ impl System for Ros1 {
     async fn start() -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let master = Master::new(MasterOptions {
-            uri: format!("http://{address}/"),
-            ..MasterOptions::default()
-        });
-        let master =
-            tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+        let master = Master::new(MasterOptions { uri: format!("http://{address}/"), ..MasterOptions::default() });
+        let master = tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
         Self { address, master }
     }
 
@@ -149,13 +137,7 @@ impl<S: System> World<S> {
         let bus = system.join("/cloudroid_bridge").await;
         let seen = bus.graph();
         let bridge = Bridge::new(bus, registry.clone(), options);
-        World {
-            bridge,
-            node,
-            registry,
-            system,
-            seen,
-        }
+        World { bridge, node, registry, system, seen }
     }
 
     /// Returns the host that nodes appear to run on.
@@ -188,12 +170,7 @@ impl<S: System> World<S> {
 
     /// Returns the name of the request's type of a service `package/Type`.
     pub fn request_name(&self, service: &str) -> String {
-        self.registry
-            .service(service)
-            .unwrap()
-            .request
-            .name()
-            .to_owned()
+        self.registry.service(service).unwrap().request.name().to_owned()
     }
 
     /// Returns the type of a service, `package/Type`.
@@ -237,11 +214,7 @@ impl<S: System> World<S> {
 
     /// Creates another bridge with the same Master.
     pub async fn another_bridge(&self) -> Arc<Bridge> {
-        Bridge::new(
-            self.another_node("/other_bridge").await,
-            self.registry.clone(),
-            patient(),
-        )
+        Bridge::new(self.another_node("/other_bridge").await, self.registry.clone(), patient())
     }
 
     pub async fn client(&self) -> Client {
@@ -256,13 +229,7 @@ impl<S: System> World<S> {
     pub fn message(&self, type_name: &str, json: Value) -> Bytes {
         let message_type = self.registry.message(type_name).unwrap();
         let mut out = Vec::new();
-        codec::from_json(
-            &message_type,
-            json.to_string().as_bytes(),
-            &mut out,
-            &FillOptions::default(),
-        )
-        .unwrap();
+        codec::from_json(&message_type, json.to_string().as_bytes(), &mut out, &FillOptions::default()).unwrap();
         out.into()
     }
 
@@ -278,44 +245,21 @@ impl<S: System> World<S> {
         WireType::from_message(&message_type)
     }
 
-    pub async fn node_publishes(
-        &self,
-        topic: &str,
-        type_name: &str,
-        latch: bool,
-    ) -> Box<dyn Publisher> {
+    pub async fn node_publishes(&self, topic: &str, type_name: &str, latch: bool) -> Box<dyn Publisher> {
         self.publishes(&*self.node, topic, type_name, latch).await
     }
 
-    pub async fn publishes(
-        &self,
-        node: &dyn Bus,
-        topic: &str,
-        type_name: &str,
-        latch: bool,
-    ) -> Box<dyn Publisher> {
+    pub async fn publishes(&self, node: &dyn Bus, topic: &str, type_name: &str, latch: bool) -> Box<dyn Publisher> {
         let publisher = node
-            .advertise(
-                topic,
-                self.wire_type(type_name),
-                QosProfile::keep_last(10_000).latching(latch),
-            )
+            .advertise(topic, self.wire_type(type_name), QosProfile::keep_last(10_000).latching(latch))
             .await
             .unwrap();
-        self.wait_for_graph(|graph| graph.topics.contains_key(topic))
-            .await;
+        self.wait_for_graph(|graph| graph.topics.contains_key(topic)).await;
         publisher
     }
 
     pub async fn node_subscribes(&self, topic: &str, type_name: &str) -> Subscription {
-        self.node
-            .subscribe(
-                topic,
-                self.wire_type(type_name),
-                QosProfile::keep_last(10_000),
-            )
-            .await
-            .unwrap()
+        self.node.subscribe(topic, self.wire_type(type_name), QosProfile::keep_last(10_000)).await.unwrap()
     }
 
     /// Waits until the graph satisfies the condition for both the node and the bridge.
@@ -329,20 +273,12 @@ impl<S: System> World<S> {
 
 /// Waits for something that must happen.
 pub async fn with_timeout<F: Future>(future: F) -> F::Output {
-    tokio::time::timeout(PATIENCE, future)
-        .await
-        .expect("it did not happen in time")
+    tokio::time::timeout(PATIENCE, future).await.expect("it did not happen in time")
 }
 
 /// Waits until `count` subscribers have connected to a publisher.
 pub async fn wait_connected(publisher: &dyn Publisher, count: usize) {
-    with_timeout(
-        publisher
-            .matched_subscribers()
-            .wait_for(|now| now.connected_count() >= count),
-    )
-    .await
-    .unwrap();
+    with_timeout(publisher.matched_subscribers().wait_for(|now| now.connected_count() >= count)).await.unwrap();
 }
 
 /// A client of the bridge.
@@ -356,13 +292,8 @@ impl Client {
         let (ours, theirs) = tokio::io::duplex(64 * 1024);
         let bridge = bridge.clone();
         let session = tokio::spawn(async move { bridge.serve(theirs, options).await });
-        let config = WebSocketConfig::default()
-            .max_frame_size(None)
-            .max_message_size(None);
-        Client {
-            socket: WebSocketStream::from_raw_socket(ours, Role::Client, Some(config)).await,
-            session,
-        }
+        let config = WebSocketConfig::default().max_frame_size(None).max_message_size(None);
+        Client { socket: WebSocketStream::from_raw_socket(ours, Role::Client, Some(config)).await, session }
     }
 
     pub async fn send(&mut self, message: Value) {
@@ -370,32 +301,21 @@ impl Client {
     }
 
     pub async fn send_text(&mut self, text: &str) {
-        with_timeout(self.socket.send(Message::text(text)))
-            .await
-            .unwrap();
+        with_timeout(self.socket.send(Message::text(text))).await.unwrap();
     }
 
     pub async fn send_binary(&mut self, bytes: Vec<u8>) {
-        with_timeout(self.socket.send(Message::binary(bytes)))
-            .await
-            .unwrap();
+        with_timeout(self.socket.send(Message::binary(bytes))).await.unwrap();
     }
 
-    pub async fn send_raw(
-        &mut self,
-        message: Message,
-    ) -> Result<(), tokio_tungstenite::tungstenite::Error> {
+    pub async fn send_raw(&mut self, message: Message) -> Result<(), tokio_tungstenite::tungstenite::Error> {
         with_timeout(self.socket.send(message)).await
     }
 
     /// Receives the next WebSocket message except pings and pongs.
     pub async fn next(&mut self) -> Message {
         loop {
-            match with_timeout(self.socket.next())
-                .await
-                .expect("the connection ended")
-                .unwrap()
-            {
+            match with_timeout(self.socket.next()).await.expect("the connection ended").unwrap() {
                 Message::Ping(_) | Message::Pong(_) => {}
                 message => return message,
             }
@@ -426,11 +346,7 @@ impl Client {
     /// Asserts that the next message is a status at level error, and returns its text.
     pub async fn refusal(&mut self) -> String {
         let status = self.json().await;
-        assert_eq!(
-            (&status["op"], &status["level"]),
-            (&"status".into(), &"error".into()),
-            "{status}"
-        );
+        assert_eq!((&status["op"], &status["level"]), (&"status".into(), &"error".into()), "{status}");
         status["msg"].as_str().unwrap().to_owned()
     }
 
@@ -452,9 +368,7 @@ impl Client {
         };
         // The server may have gone without waiting for it.
         let _ = with_timeout(self.socket.flush()).await;
-        close.map_or((1005, String::new()), |close| {
-            (close.code.into(), close.reason.to_string())
-        })
+        close.map_or((1005, String::new()), |close| (close.code.into(), close.reason.to_string()))
     }
 
     /// Drops the connection without closing it.

@@ -9,9 +9,7 @@ const TF: &str = "geometry_msgs/TransformStamped[] transforms\n";
 
 pub(super) async fn tf_publisher(world: &World) -> Box<dyn Publisher> {
     world.registry.insert("tf2_msgs/msg/TFMessage", TF).unwrap();
-    world
-        .node_publishes("/tf", "tf2_msgs/TFMessage", false)
-        .await
+    world.node_publishes("/tf", "tf2_msgs/TFMessage", false).await
 }
 
 fn publish_transform(world: &World, publisher: &dyn Publisher, child: &str, x: f64) {
@@ -48,25 +46,16 @@ fn subscribe(world: &World, topic: &Value) -> Value {
 
 pub(super) fn x_of(world: &World, transforms: &Value) -> f64 {
     assert_eq!(
-        (
-            &transforms[0]["header"]["frame_id"],
-            &transforms[0]["child_frame_id"]
-        ),
+        (&transforms[0]["header"]["frame_id"], &transforms[0]["child_frame_id"]),
         (&json!("world"), &json!("turtle"))
     );
     // The time of the transform, whenever it is sent.
     assert_eq!(transforms[0]["header"]["stamp"], world.time(1_000_000, 5));
-    transforms[0]["transform"]["translation"]["x"]
-        .as_f64()
-        .unwrap()
+    transforms[0]["transform"]["translation"]["x"].as_f64().unwrap()
 }
 
 /// Repeats a message whose arrival only shows by its effect.
-pub(super) async fn until_heard(
-    world: &World,
-    publisher: &dyn Publisher,
-    client: &mut Client,
-) -> Value {
+pub(super) async fn until_heard(world: &World, publisher: &dyn Publisher, client: &mut Client) -> Value {
     wait_connected(publisher, 1).await;
     publish_transform(world, publisher, "turtle", 1.0);
     client.json().await
@@ -85,10 +74,7 @@ async fn a_topic_made_for_the_caller_says_what_has_moved() {
     let topic = answer["values"]["topic_name"].clone();
     client.send(subscribe(&world, &topic)).await;
     let heard = until_heard(&world, publisher.as_ref(), &mut client).await;
-    assert_eq!(
-        (&heard["topic"], x_of(&world, &heard["msg"]["transforms"])),
-        (&topic, 1.0)
-    );
+    assert_eq!((&heard["topic"], x_of(&world, &heard["msg"]["transforms"])), (&topic, 1.0));
     // Too little, then enough.
     publish_transform(&world, publisher.as_ref(), "turtle", 1.2);
     publish_transform(&world, publisher.as_ref(), "turtle", 3.0);
@@ -101,9 +87,7 @@ async fn what_does_not_move_is_told_to_who_listens_late_and_to_who_listens_again
     let world = World::new().await;
     let publisher = tf_publisher(&world).await;
     let mut client = world.client().await;
-    client
-        .send(republish(&world, &transform_args("turtle")))
-        .await;
+    client.send(republish(&world, &transform_args("turtle"))).await;
     let topic = client.json().await["values"]["topic_name"].clone();
     wait_connected(publisher.as_ref(), 1).await;
     publish_transform(&world, publisher.as_ref(), "turtle", 1.0);
@@ -116,9 +100,7 @@ async fn what_does_not_move_is_told_to_who_listens_late_and_to_who_listens_again
         client.send(subscribe(&world, &topic)).await;
         let told = client.json().await;
         assert_eq!(x_of(&world, &told["msg"]["transforms"]), 1.0);
-        client
-            .send(json!({"op": "unsubscribe", "topic": topic}))
-            .await;
+        client.send(json!({"op": "unsubscribe", "topic": topic})).await;
         client.sync().await;
     }
 }
@@ -136,30 +118,19 @@ async fn a_goal_carries_transforms_as_feedback_until_it_is_cancelled() {
     let mut client = world.client().await;
     client.send(goal(&world)).await;
     let heard = until_heard(&world, publisher.as_ref(), &mut client).await;
-    assert_eq!(
-        (&heard["op"], &heard["id"]),
-        (&json!("action_feedback"), &json!("g"))
-    );
+    assert_eq!((&heard["op"], &heard["id"]), (&json!("action_feedback"), &json!("g")));
     assert_eq!(x_of(&world, &heard["values"]["transforms"]), 1.0);
     publish_transform(&world, publisher.as_ref(), "turtle", 3.0);
     let heard = client.json().await;
     assert_eq!(x_of(&world, &heard["values"]["transforms"]), 3.0);
-    client
-        .send(json!({"op": "cancel_action_goal", "id": "g", "action": "/tf2_web_republisher"}))
-        .await;
+    client.send(json!({"op": "cancel_action_goal", "id": "g", "action": "/tf2_web_republisher"})).await;
     assert_eq!(
         client.json().await,
         json!({"op": "action_result", "id": "g", "action": "/tf2_web_republisher", "values": {}, "status": 5,
             "result": true})
     );
     // Nobody needs /tf any more.
-    with_timeout(
-        publisher
-            .matched_subscribers()
-            .wait_for(|now| now.connected_count() == 0),
-    )
-    .await
-    .unwrap();
+    with_timeout(publisher.matched_subscribers().wait_for(|now| now.connected_count() == 0)).await.unwrap();
 }
 
 #[tokio::test]
@@ -170,11 +141,5 @@ async fn the_goals_of_a_client_that_is_gone_are_given_up() {
     client.send(goal(&world)).await;
     wait_connected(publisher.as_ref(), 1).await;
     client.abort().await;
-    with_timeout(
-        publisher
-            .matched_subscribers()
-            .wait_for(|now| now.connected_count() == 0),
-    )
-    .await
-    .unwrap();
+    with_timeout(publisher.matched_subscribers().wait_for(|now| now.connected_count() == 0)).await.unwrap();
 }

@@ -23,10 +23,7 @@ async fn connection(options: &BridgeOptions) -> (WaitingConnection<DuplexStream>
 }
 
 async fn next(client: &mut Socket) -> Message {
-    with_timeout(client.next())
-        .await
-        .expect("a message")
-        .unwrap()
+    with_timeout(client.next()).await.expect("a message").unwrap()
 }
 
 #[tokio::test]
@@ -46,10 +43,7 @@ async fn who_leaves_is_answered_at_once_and_needs_nothing_any_more() {
     client.close(None).await.unwrap();
     assert_eq!(next(&mut client).await, Message::Close(None));
     let end = with_timeout(waits).await.unwrap().unwrap_err();
-    assert!(
-        matches!(end, SessionEnd::Client { code: 1005, .. }),
-        "{end:?}"
-    );
+    assert!(matches!(end, SessionEnd::Client { code: 1005, .. }), "{end:?}");
     assert!(with_timeout(given_up).await.is_err());
 }
 
@@ -70,10 +64,7 @@ async fn who_is_gone_without_a_word_needs_nothing_any_more() {
     };
     let (mut waiting, _silent) = connection(&impatient).await;
     let end = with_timeout(waiting.wait_for(std::future::pending::<()>())).await;
-    assert!(
-        matches!(end, Err(SessionEnd::Closed { code: 1001, .. })),
-        "{end:?}"
-    );
+    assert!(matches!(end, Err(SessionEnd::Closed { code: 1001, .. })), "{end:?}");
 }
 
 #[tokio::test]
@@ -85,17 +76,10 @@ async fn what_was_said_meanwhile_is_carried_out_in_order() {
     let bridge = world.bridge.clone();
     let session = tokio::spawn(async move {
         let bridge: Arc<bridge::Bridge> = waiting.wait_for(servant).await.unwrap().unwrap();
-        bridge
-            .serve_waiting(waiting, SessionOptions::default())
-            .await
+        bridge.serve_waiting(waiting, SessionOptions::default()).await
     });
     let say = |message: Value| Message::text(message.to_string());
-    client
-        .send(say(
-            json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"}),
-        ))
-        .await
-        .unwrap();
+    client.send(say(json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"}))).await.unwrap();
     // More than the socket holds: none of it is lost.
     let padding = "x".repeat(40_000);
     let messages = 60;
@@ -131,9 +115,7 @@ async fn who_cannot_have_a_servant_is_told_why() {
     let refusing = tokio::spawn(waiting.refuse(1013, "the machine is full"));
     let status = next(&mut client).await;
     assert!(status.to_text().unwrap().contains("the machine is full"));
-    let Message::Close(Some(close)) = next(&mut client).await else {
-        panic!("not closed")
-    };
+    let Message::Close(Some(close)) = next(&mut client).await else { panic!("not closed") };
     assert_eq!(u16::from(close.code), 1013);
     while with_timeout(client.next()).await.is_some() {}
     with_timeout(refusing).await.unwrap();
@@ -156,9 +138,7 @@ async fn who_has_said_much_is_heard_all_the_same() {
     let bridge = Arc::clone(&world.bridge);
     let served = tokio::spawn(async move {
         waiting.wait_for(readiness).await.unwrap().unwrap();
-        bridge
-            .serve_waiting(waiting, SessionOptions::default())
-            .await
+        bridge.serve_waiting(waiting, SessionOptions::default()).await
     });
     let advertise = json!({"op": "advertise", "topic": "/text", "type": "std_msgs/String"});
     say(&mut client, &advertise, 1).await;
@@ -187,16 +167,11 @@ async fn who_has_said_much_is_heard_all_the_same() {
 #[tokio::test]
 async fn who_asks_for_more_than_is_kept_is_refused_with_a_reason() {
     let budget = budget::Budget::new("client x", 1 << 20);
-    for (length, times, reason) in [
-        (10, 10_001, "10000 messages of "),
-        (400_000, 4, "the memory for client x"),
-    ] {
+    for (length, times, reason) in [(10, 10_001, "10000 messages of "), (400_000, 4, "the memory for client x")] {
         let (waiting, mut client) = connection(&BridgeOptions::default()).await;
         let mut waiting = waiting.with_budget(&budget);
-        let waits =
-            tokio::spawn(async move { waiting.wait_for(std::future::pending::<()>()).await });
-        let call =
-            json!({"op": "call_service", "service": "/s", "args": {"x": "x".repeat(length)}});
+        let waits = tokio::spawn(async move { waiting.wait_for(std::future::pending::<()>()).await });
+        let call = json!({"op": "call_service", "service": "/s", "args": {"x": "x".repeat(length)}});
         say(&mut client, &call, times).await;
         let told = next(&mut client).await.into_text().unwrap();
         assert!(told.contains(reason), "{told}");
@@ -205,10 +180,7 @@ async fn who_asks_for_more_than_is_kept_is_refused_with_a_reason() {
             waits.await.unwrap().unwrap_err()
         })
         .await;
-        assert!(
-            matches!(end, SessionEnd::Closed { code: 1013, .. }),
-            "{end:?}"
-        );
+        assert!(matches!(end, SessionEnd::Closed { code: 1013, .. }), "{end:?}");
         assert_eq!(budget.used_bytes(), 0);
     }
 }

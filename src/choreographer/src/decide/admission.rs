@@ -118,20 +118,12 @@ pub struct AdmissionRequest {
 impl AdmissionRequest {
     /// Creates a request for a robot of this priority.
     pub fn robot(wanted: Amount, priority: i32) -> AdmissionRequest {
-        AdmissionRequest {
-            wanted,
-            origin: Origin::Robot,
-            priority,
-        }
+        AdmissionRequest { wanted, origin: Origin::Robot, priority }
     }
 
     /// Creates a request for a push.
     pub fn push(wanted: Amount) -> AdmissionRequest {
-        AdmissionRequest {
-            wanted,
-            origin: Origin::Push,
-            priority: 0,
-        }
+        AdmissionRequest { wanted, origin: Origin::Push, priority: 0 }
     }
 }
 
@@ -192,13 +184,7 @@ pub struct AdmissionLedger {
 impl AdmissionLedger {
     /// Creates the ledger of a machine with `capacity` for servants and a queue of at most `queue` robots.
     pub fn new(capacity: Amount, queue: usize) -> AdmissionLedger {
-        AdmissionLedger {
-            capacity,
-            promised: Amount::NONE,
-            waiting: Vec::new(),
-            queue,
-            stalled: None,
-        }
+        AdmissionLedger { capacity, promised: Amount::NONE, waiting: Vec::new(), queue, stalled: None }
     }
 
     /// Returns the capacity.
@@ -227,18 +213,9 @@ impl AdmissionLedger {
 
     /// Returns the positions of the waiting robots.
     pub fn queue_positions(&self) -> impl Iterator<Item = (Ticket, Position)> + '_ {
-        let robots = self
-            .by_rank()
-            .into_iter()
-            .filter(|waiter| waiter.is_robot());
-        let of = self
-            .waiting
-            .iter()
-            .filter(|waiter| waiter.is_robot())
-            .count();
-        robots
-            .zip(1..)
-            .map(move |(waiter, place)| (waiter.ticket, Position { place, of }))
+        let robots = self.by_rank().into_iter().filter(|waiter| waiter.is_robot());
+        let of = self.waiting.iter().filter(|waiter| waiter.is_robot()).count();
+        robots.zip(1..).map(move |(waiter, place)| (waiter.ticket, Position { place, of }))
     }
 
     /// Returns the waiting requests in the order in which they are to be admitted.
@@ -266,11 +243,7 @@ impl AdmissionLedger {
 
     /// Returns what the waiting robots requested that would be admitted before a new one of this priority.
     pub fn wanted_before(&self, priority: i32) -> Amount {
-        let new = Waiter {
-            ticket: 0,
-            ask: AdmissionRequest::robot(Amount::NONE, priority),
-            overtaken: 0,
-        };
+        let new = Waiter { ticket: 0, ask: AdmissionRequest::robot(Amount::NONE, priority), overtaken: 0 };
         self.wanted_by(|waiter| waiter.is_robot() && waiter.rank() <= new.rank())
     }
 
@@ -287,20 +260,12 @@ impl AdmissionLedger {
     /// Refuses a request that exceeds the capacity of the machine.
     pub fn check(&self, wanted: Amount) -> Result<(), AdmissionError> {
         let capacity = self.capacity;
-        if wanted.fits(capacity) {
-            Ok(())
-        } else {
-            Err(AdmissionError::TooBig { wanted, capacity })
-        }
+        if wanted.fits(capacity) { Ok(()) } else { Err(AdmissionError::TooBig { wanted, capacity }) }
     }
 
     /// Handles a request. Returns the decision, with the requests that are admitted because they were overtaken once
     /// more.
-    pub fn request(
-        &mut self,
-        ticket: Ticket,
-        ask: AdmissionRequest,
-    ) -> (AdmissionVerdict, Vec<AdmittedRequest>) {
+    pub fn request(&mut self, ticket: Ticket, ask: AdmissionRequest) -> (AdmissionVerdict, Vec<AdmittedRequest>) {
         self.enqueue(ticket, ask, None)
     }
 
@@ -318,9 +283,7 @@ impl AdmissionLedger {
     /// Returns how often a waiting request was overtaken.
     pub fn overtaken_count(&self, ticket: Ticket) -> Option<u32> {
         let mut waiting = self.waiting.iter();
-        waiting
-            .find(|one| one.ticket == ticket)
-            .map(|one| one.overtaken)
+        waiting.find(|one| one.ticket == ticket).map(|one| one.overtaken)
     }
 
     fn enqueue(
@@ -332,11 +295,7 @@ impl AdmissionLedger {
         if let Err(refused) = self.check(ask.wanted) {
             return (AdmissionVerdict::Refused(refused), Vec::new());
         }
-        let waiter = Waiter {
-            ticket,
-            ask,
-            overtaken: again.unwrap_or(0),
-        };
+        let waiter = Waiter { ticket, ask, overtaken: again.unwrap_or(0) };
         let robots = self.waiting.iter().filter(|one| one.is_robot()).count();
         let at = self.waiting.partition_point(|one| one.ticket < ticket);
         self.waiting.insert(at, waiter);
@@ -395,11 +354,7 @@ impl AdmissionLedger {
 
     /// Changes a servant's promise from `promised` to `wanted`, if the increase is free and no robot waits for it;
     /// returns the requests that are admitted for a decrease.
-    pub fn change_promise(
-        &mut self,
-        promised: Amount,
-        wanted: Amount,
-    ) -> Result<Vec<AdmittedRequest>, AdmissionError> {
+    pub fn change_promise(&mut self, promised: Amount, wanted: Amount) -> Result<Vec<AdmittedRequest>, AdmissionError> {
         let others = self.promised.minus(promised);
         let free = self.capacity.minus(others).minus(self.wanted_by_robots());
         let free = free.max(promised);
@@ -426,10 +381,7 @@ impl AdmissionLedger {
                 earlier.overtaken += 1;
             }
             self.promise(waiter.ask.wanted);
-            admitted.push(AdmittedRequest {
-                ticket,
-                amount: waiter.ask.wanted,
-            });
+            admitted.push(AdmittedRequest { ticket, amount: waiter.ask.wanted });
         }
         admitted
     }
@@ -471,12 +423,7 @@ mod tests {
         admitted.into_iter().map(|one| one.ticket).collect()
     }
 
-    fn ask(
-        book: &mut AdmissionLedger,
-        ticket: Ticket,
-        cpus: f64,
-        origin: Origin,
-    ) -> AdmissionVerdict {
+    fn ask(book: &mut AdmissionLedger, ticket: Ticket, cpus: f64, origin: Origin) -> AdmissionVerdict {
         ask_with_priority(book, ticket, cpus, origin, 0)
     }
 
@@ -487,11 +434,7 @@ mod tests {
         origin: Origin,
         priority: i32,
     ) -> AdmissionVerdict {
-        let ask = AdmissionRequest {
-            wanted: cores(cpus),
-            origin,
-            priority,
-        };
+        let ask = AdmissionRequest { wanted: cores(cpus), origin, priority };
         let (verdict, others) = book.request(ticket, ask);
         assert!(others.is_empty(), "{others:?}");
         verdict
@@ -506,22 +449,10 @@ mod tests {
             (1.5, None, 0.6, Robot, AdmissionVerdict::Waits),
             // Robots overtake only pushes, and the number of waiting robots is bounded.
             (1.5, Some((1.0, Robot)), 0.5, Robot, full),
-            (
-                1.5,
-                Some((1.0, Push)),
-                0.5,
-                Robot,
-                AdmissionVerdict::Admitted,
-            ),
+            (1.5, Some((1.0, Push)), 0.5, Robot, AdmissionVerdict::Admitted),
             (1.5, Some((1.0, Push)), 1.0, Robot, AdmissionVerdict::Waits),
             (1.5, Some((1.0, Push)), 0.6, Push, AdmissionVerdict::Waits),
-            (
-                1.5,
-                Some((1.0, Push)),
-                0.5,
-                Push,
-                AdmissionVerdict::Admitted,
-            ),
+            (1.5, Some((1.0, Push)), 0.5, Push, AdmissionVerdict::Admitted),
             (1.5, Some((1.0, Robot)), 0.5, Push, AdmissionVerdict::Waits),
             (0.0, None, 0.5, Push, AdmissionVerdict::Admitted),
         ] {
@@ -530,17 +461,11 @@ mod tests {
                 assert_eq!(ask(&mut book, 1, wanted, origin), AdmissionVerdict::Waits);
             }
             let verdict = ask(&mut book, 2, wanted, origin);
-            assert_eq!(
-                verdict, expected,
-                "{promised} {waits:?} {wanted} {origin:?}"
-            );
+            assert_eq!(verdict, expected, "{promised} {waits:?} {wanted} {origin:?}");
         }
         let ask = AdmissionRequest::robot(Amount::new(0.0, 1001), 0);
         let (verdict, _) = machine(1, 0.0).request(1, ask);
-        assert!(matches!(
-            verdict,
-            AdmissionVerdict::Refused(AdmissionError::TooBig { .. })
-        ));
+        assert!(matches!(verdict, AdmissionVerdict::Refused(AdmissionError::TooBig { .. })));
     }
 
     #[test]
@@ -561,10 +486,7 @@ mod tests {
         assert_eq!(book.shortage().all, cores(1.5));
         assert_eq!(book.shortage().first_robot, cores(1.0));
         assert_eq!(tickets(book.withdraw(1)), [2]);
-        assert_eq!(
-            (book.waiting_count(), book.shortage()),
-            (0, Shortage::default())
-        );
+        assert_eq!((book.waiting_count(), book.shortage()), (0, Shortage::default()));
     }
 
     #[test]
@@ -585,25 +507,16 @@ mod tests {
             let verdict = ask_with_priority(&mut book, ticket, cpus, Robot, priority);
             assert_eq!(verdict, AdmissionVerdict::Waits);
         }
-        let places: Vec<_> = book
-            .queue_positions()
-            .map(|(ticket, place)| (place.place, ticket))
-            .collect();
+        let places: Vec<_> = book.queue_positions().map(|(ticket, place)| (place.place, ticket)).collect();
         assert_eq!(places, [(1, 2), (2, 3), (3, 1), (4, 4)]);
         assert_eq!(
-            book.queue_positions()
-                .next()
-                .map(|one| one.1.to_string())
-                .as_deref(),
+            book.queue_positions().next().map(|one| one.1.to_string()).as_deref(),
             Some("number 1 of 4 waiting")
         );
         assert_eq!(tickets(book.release(cores(1.0))), [2]);
         // A request that is first and fits goes before all waiting ones.
         assert!(book.release(cores(0.5)).is_empty());
-        assert_eq!(
-            ask_with_priority(&mut book, 5, 0.5, Robot, 9),
-            AdmissionVerdict::Admitted
-        );
+        assert_eq!(ask_with_priority(&mut book, 5, 0.5, Robot, 9), AdmissionVerdict::Admitted);
         assert_eq!(tickets(book.release(cores(2.0))), [3, 1]);
     }
 
@@ -612,10 +525,7 @@ mod tests {
         let mut book = machine(64, 2.0);
         assert_eq!(ask(&mut book, 0, 1.0, Robot), AdmissionVerdict::Waits);
         for ticket in 1..=u64::from(OVERTAKEN) + 3 {
-            assert_eq!(
-                ask_with_priority(&mut book, ticket, 1.0, Robot, 9),
-                AdmissionVerdict::Waits
-            );
+            assert_eq!(ask_with_priority(&mut book, ticket, 1.0, Robot, 9), AdmissionVerdict::Waits);
         }
         let mut before = Vec::new();
         loop {
@@ -628,27 +538,15 @@ mod tests {
         assert_eq!(before, (1..=u64::from(OVERTAKEN)).collect::<Vec<_>>());
         // The last request that overtakes it lets it in.
         let mut book = machine(64, 2.0);
-        assert_eq!(
-            ask_with_priority(&mut book, 0, 0.1, Robot, 0),
-            AdmissionVerdict::Waits
-        );
-        assert_eq!(
-            ask_with_priority(&mut book, 1, 1.0, Robot, 5),
-            AdmissionVerdict::Waits
-        );
+        assert_eq!(ask_with_priority(&mut book, 0, 0.1, Robot, 0), AdmissionVerdict::Waits);
+        assert_eq!(ask_with_priority(&mut book, 1, 1.0, Robot, 5), AdmissionVerdict::Waits);
         assert!(book.release(cores(0.4)).is_empty(), "the first one blocks");
         let last = u64::from(OVERTAKEN) + 1;
         for ticket in 2..last {
-            assert_eq!(
-                ask_with_priority(&mut book, ticket, 0.01, Robot, 9),
-                AdmissionVerdict::Admitted
-            );
+            assert_eq!(ask_with_priority(&mut book, ticket, 0.01, Robot, 9), AdmissionVerdict::Admitted);
         }
         let (verdict, others) = book.request(last, AdmissionRequest::robot(cores(0.01), 9));
-        assert_eq!(
-            (verdict, tickets(others)),
-            (AdmissionVerdict::Admitted, vec![0])
-        );
+        assert_eq!((verdict, tickets(others)), (AdmissionVerdict::Admitted, vec![0]));
     }
 
     #[test]
@@ -663,16 +561,14 @@ mod tests {
         // Two wait, which is the maximum: a new one is refused, and one that had a position is not.
         let full = AdmissionVerdict::Refused(AdmissionError::QueueFull { waiting: 2 });
         assert_eq!(ask(&mut book, 4, 1.0, Robot), full);
-        let (verdict, others) =
-            book.request_again(1, AdmissionRequest::robot(cores(1.0), 0), OVERTAKEN);
+        let (verdict, others) = book.request_again(1, AdmissionRequest::robot(cores(1.0), 0), OVERTAKEN);
         assert_eq!((verdict, others), (AdmissionVerdict::Waits, vec![]));
         assert_eq!(book.overtaken_count(1), Some(OVERTAKEN));
         let order: Vec<Ticket> = book.queue_positions().map(|(ticket, _)| ticket).collect();
         assert_eq!(order, [1, 2, 3]);
         assert_eq!(tickets(book.release(cores(2.0))), [1, 2]);
         // A request that is served at once needs no position.
-        let (verdict, _) =
-            machine(2, 0.0).request_again(1, AdmissionRequest::robot(cores(1.0), 0), 3);
+        let (verdict, _) = machine(2, 0.0).request_again(1, AdmissionRequest::robot(cores(1.0), 0), 3);
         assert_eq!(verdict, AdmissionVerdict::Admitted);
         assert_eq!(book.overtaken_count(9), None);
     }
@@ -687,10 +583,7 @@ mod tests {
         assert_eq!(book.stall_reason(), Some("it swaps"));
         book.promise(cores(0.5));
         let why = "it swaps".to_owned();
-        assert_eq!(
-            book.change_promise(cores(0.5), cores(0.6)),
-            Err(AdmissionError::NoMoreNow { why })
-        );
+        assert_eq!(book.change_promise(cores(0.5), cores(0.6)), Err(AdmissionError::NoMoreNow { why }));
         assert_eq!(book.change_promise(cores(0.5), cores(0.4)), Ok(vec![]));
         assert_eq!(tickets(book.set_stall(None)), [1, 2]);
     }

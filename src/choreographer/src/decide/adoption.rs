@@ -28,16 +28,8 @@ pub enum LeftoverFate {
 pub fn decide_fate(found: LeftoverContainer) -> LeftoverFate {
     match found {
         LeftoverContainer { nobodys: true, .. } => LeftoverFate::Unused,
-        LeftoverContainer {
-            recorded: true,
-            published: true,
-            ..
-        } => LeftoverFate::Kept,
-        LeftoverContainer {
-            recorded: false,
-            empty: true,
-            ..
-        } => LeftoverFate::Unused,
+        LeftoverContainer { recorded: true, published: true, .. } => LeftoverFate::Kept,
+        LeftoverContainer { recorded: false, empty: true, .. } => LeftoverFate::Unused,
         _ => LeftoverFate::Unknown,
     }
 }
@@ -71,10 +63,7 @@ mod tests {
             (&[(true, false), (true, true)], true),
             (&[(true, false), (true, false)], false),
         ] {
-            let nodes = started.iter().map(|(planned, run)| StartedNode {
-                planned: *planned,
-                run: *run,
-            });
+            let nodes = started.iter().map(|(planned, run)| StartedNode { planned: *planned, run: *run });
             let nodes: Vec<StartedNode> = nodes.collect();
             assert_eq!(is_linked(&nodes), linked, "{started:?}");
         }
@@ -94,12 +83,7 @@ mod tests {
             (true, true, true, false, LeftoverFate::Unused),
             (true, true, false, false, LeftoverFate::Unused),
         ] {
-            let found = LeftoverContainer {
-                recorded,
-                nobodys,
-                published,
-                empty,
-            };
+            let found = LeftoverContainer { recorded, nobodys, published, empty };
             assert_eq!(decide_fate(found), expected, "{found:?}");
         }
     }

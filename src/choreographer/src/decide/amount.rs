@@ -11,17 +11,11 @@ pub struct Amount {
 
 impl Amount {
     /// No cores and no memory.
-    pub const NONE: Amount = Amount {
-        millicpus: 0,
-        memory: 0,
-    };
+    pub const NONE: Amount = Amount { millicpus: 0, memory: 0 };
 
     /// Creates an amount from cores and bytes.
     pub fn new(cpus: f64, memory: u64) -> Amount {
-        Amount {
-            millicpus: (cpus * 1000.0).round() as u64,
-            memory,
-        }
+        Amount { millicpus: (cpus * 1000.0).round() as u64, memory }
     }
 
     /// Returns the number of cores.
@@ -39,10 +33,7 @@ impl Amount {
 
     /// Returns the saturating product with `count`.
     pub fn times(self, count: u64) -> Amount {
-        Amount {
-            millicpus: self.millicpus.saturating_mul(count),
-            memory: self.memory.saturating_mul(count),
-        }
+        Amount { millicpus: self.millicpus.saturating_mul(count), memory: self.memory.saturating_mul(count) }
     }
 
     /// Returns the difference, at least zero.
@@ -55,10 +46,7 @@ impl Amount {
 
     /// Returns the maximum of cores and of memory.
     pub fn max(self, other: Amount) -> Amount {
-        Amount {
-            millicpus: self.millicpus.max(other.millicpus),
-            memory: self.memory.max(other.memory),
-        }
+        Amount { millicpus: self.millicpus.max(other.millicpus), memory: self.memory.max(other.memory) }
     }
 
     /// Returns true if neither cores nor memory exceed `free`.

@@ -39,25 +39,14 @@ pub fn after_failure(
         let recovered = ready_for.is_some_and(|time| time >= RECOVERED);
         before.revision == revision && !recovered && !is_forgotten(before, now)
     };
-    let failures = before
-        .filter(counts)
-        .map_or(1, |before| before.failures.saturating_add(1));
+    let failures = before.filter(counts).map_or(1, |before| before.failures.saturating_add(1));
     // A servant that was never ready has met no robot.
-    let longest = if shared && ready_for.is_some() {
-        LONGEST_SHARED
-    } else {
-        LONGEST_PAUSE
-    };
+    let longest = if shared && ready_for.is_some() { LONGEST_SHARED } else { LONGEST_PAUSE };
     let pause = match failures {
         1 => Duration::ZERO,
         n => double_pause(FIRST_PAUSE, n - 2, longest),
     };
-    FailureStreak {
-        revision,
-        failures,
-        reason: reason.to_owned(),
-        again: now + pause,
-    }
+    FailureStreak { revision, failures, reason: reason.to_owned(), again: now + pause }
 }
 
 /// Returns `first`, doubled `times` times, and at most `longest`.
@@ -129,12 +118,7 @@ mod tests {
     fn only_the_revision_that_fails_waits() {
         let now = Instant::now();
         let second = Duration::from_secs(1);
-        let failing = FailureStreak {
-            revision: 2,
-            failures: 3,
-            reason: "died".into(),
-            again: now + second,
-        };
+        let failing = FailureStreak { revision: 2, failures: 3, reason: "died".into(), again: now + second };
         assert_eq!(remaining_pause(&failing, 2, now), Some(second));
         assert_eq!(remaining_pause(&failing, 1, now), None);
         assert_eq!(remaining_pause(&failing, 2, now + second), None);

@@ -58,9 +58,9 @@ pub(crate) fn next_measurement(ladder: &[f64], named: bool, measured: &[Point]) 
         });
     };
     match elbow(measured) {
-        Some(elbow) if !named => NextMeasurement::Enough(format!(
-            "it does not get faster with more than {elbow} cores"
-        )),
+        Some(elbow) if !named => {
+            NextMeasurement::Enough(format!("it does not get faster with more than {elbow} cores"))
+        }
         _ => NextMeasurement::Measure(*limit),
     }
 }
@@ -122,11 +122,7 @@ pub(crate) fn propose_rows(
             measure: Measure::Rrt,
             value: round_up_to_two_digits(p95) / 1000.0,
             aux: aux.clone(),
-            limits: Limits {
-                cpus: Some(point.cpus),
-                memory: Some(memory),
-                ..Limits::default()
-            },
+            limits: Limits { cpus: Some(point.cpus), memory: Some(memory), ..Limits::default() },
             spread: Some(Spread {
                 p50: (compute.p50 + network.p50) / 1000.0,
                 p95: p95 / 1000.0,
@@ -160,11 +156,7 @@ mod tests {
             cpus,
             requests: 40,
             answered: 40,
-            compute: Some(TimeSpread {
-                p50,
-                p95,
-                max: p95 * 2.0,
-            }),
+            compute: Some(TimeSpread { p50, p95, max: p95 * 2.0 }),
             rate: 10.0,
             ..Point::default()
         }
@@ -200,10 +192,7 @@ mod tests {
         assert_eq!(ended, "it does not get faster with more than 1.14 cores");
         assert_eq!(measured.last().map(|point| point.cpus), Some(2.56));
         // Explicitly named limits are all measured.
-        assert_eq!(
-            next_measurement(&rungs, true, &measured),
-            NextMeasurement::Measure(4.0)
-        );
+        assert_eq!(next_measurement(&rungs, true, &measured), NextMeasurement::Measure(4.0));
         assert_eq!(
             next_measurement(&[1.0], false, &[point(1.0, 5.0, 6.0)]),
             NextMeasurement::Enough("1 cores are all that is available on this machine now".into())
@@ -213,27 +202,15 @@ mod tests {
     #[test]
     fn limits_at_which_nothing_is_answered_are_no_elbow() {
         let rungs = limit_ladder(4000);
-        let dead = Point {
-            requests: 3,
-            ..Point::default()
-        };
+        let dead = Point { requests: 3, ..Point::default() };
         let measured = [dead, dead, dead, dead];
-        assert_eq!(
-            next_measurement(&rungs, false, &measured),
-            NextMeasurement::Measure(rungs[4])
-        );
+        assert_eq!(next_measurement(&rungs, false, &measured), NextMeasurement::Measure(rungs[4]));
     }
 
     #[test]
     fn rows_are_proposed_where_more_is_faster_and_nothing_queues() {
-        let slow = Point {
-            rate: 5.0,
-            ..point(0.1, 190.0, 200.0)
-        };
-        let silent = Point {
-            answered: 30,
-            ..point(0.2, 90.0, 100.0)
-        };
+        let slow = Point { rate: 5.0, ..point(0.1, 190.0, 200.0) };
+        let silent = Point { answered: 30, ..point(0.2, 90.0, 100.0) };
         let points = [
             slow,
             silent,
@@ -243,11 +220,7 @@ mod tests {
             point(0.8, 40.0, 41.2),
             point(1.2, 40.0, 60.0),
         ];
-        let network = TimeSpread {
-            p50: 5.0,
-            p95: 20.0,
-            max: 90.0,
-        };
+        let network = TimeSpread { p50: 5.0, p95: 20.0, max: 90.0 };
         let aux = BTreeMap::from([("width".to_owned(), "640".to_owned())]);
         let rows = propose_rows(&points, Some(10.0), network, Size(7), &aux);
         let told: Vec<_> = rows
@@ -259,10 +232,7 @@ mod tests {
                 (row.limits.cpus, times)
             })
             .collect();
-        let expected = [
-            (Some(0.4), [100_000, 75_000, 100_000]),
-            (Some(0.8), [62_000, 45_000, 61_200]),
-        ];
+        let expected = [(Some(0.4), [100_000, 75_000, 100_000]), (Some(0.8), [62_000, 45_000, 61_200])];
         assert_eq!(told, expected);
         let row = &rows[0];
         assert_eq!((row.measure, &row.aux), (Measure::Rrt, &aux));
@@ -282,14 +252,7 @@ mod tests {
 
     #[test]
     fn times_are_rounded_up_to_two_digits() {
-        for (time, rounded) in [
-            (424.3, 430.0),
-            (8.21, 8.3),
-            (8.2, 8.2),
-            (100.0, 100.0),
-            (99.1, 100.0),
-            (0.0, 0.001),
-        ] {
+        for (time, rounded) in [(424.3, 430.0), (8.21, 8.3), (8.2, 8.2), (100.0, 100.0), (99.1, 100.0), (0.0, 0.001)] {
             assert_eq!(round_up_to_two_digits(time), rounded, "{time}");
         }
     }

@@ -39,10 +39,7 @@ pub fn make_room<'a>(
     servants: impl Iterator<Item = ServantFacts<'a>>,
     pushes: &[PushPromise],
 ) -> RoomPlan<'a> {
-    let Shortage {
-        all: mut lacking,
-        mut first_robot,
-    } = lacking;
+    let Shortage { all: mut lacking, mut first_robot } = lacking;
     if lacking == Amount::NONE {
         return RoomPlan::default();
     }
@@ -112,15 +109,9 @@ mod tests {
         let oldest = servant("oldest", 500, Some(10));
         let middle = servant("middle", 500, Some(20));
         let busy = servant("busy", 500, None);
-        let queued = ServantFacts {
-            promised: None,
-            ..servant("queued", 0, Some(1))
-        };
+        let queued = ServantFacts { promised: None, ..servant("queued", 0, Some(1)) };
         let useless = servant("useless", 0, Some(5));
-        let ending = ServantFacts {
-            ending: true,
-            ..servant("ending", 1000, None)
-        };
+        let ending = ServantFacts { ending: true, ..servant("ending", 1000, None) };
         let idle = [newest, busy, oldest, queued, useless, middle];
         for (lacking, extra, expected) in [
             (0, None, vec![]),
@@ -131,44 +122,22 @@ mod tests {
             (1000, Some(ending), vec![]),
             (1100, Some(ending), vec!["oldest"]),
         ] {
-            let lacking = Amount {
-                millicpus: lacking,
-                memory: 0,
-            };
-            let lacking = Shortage {
-                all: lacking,
-                ..Shortage::default()
-            };
+            let lacking = Amount { millicpus: lacking, memory: 0 };
+            let lacking = Shortage { all: lacking, ..Shortage::default() };
             let room = make_room(lacking, idle.into_iter().chain(extra), &[]);
             let ids: Vec<&str> = room.ends.iter().map(|end| end.id).collect();
             assert_eq!(ids, expected, "{lacking:?}");
         }
-        let lacking = Shortage {
-            all: Amount {
-                millicpus: 0,
-                memory: 1,
-            },
-            ..Shortage::default()
-        };
+        let lacking = Shortage { all: Amount { millicpus: 0, memory: 1 }, ..Shortage::default() };
         let room = make_room(lacking, idle.into_iter(), &[]);
         assert_eq!(room, RoomPlan::default(), "none has any");
     }
 
     #[test]
     fn pushes_give_way_to_the_first_robot_where_that_helps() {
-        let push = |ticket, memory, gives_way| PushPromise {
-            ticket,
-            has: Amount {
-                millicpus: 10,
-                memory,
-            },
-            gives_way,
-        };
+        let push = |ticket, memory, gives_way| PushPromise { ticket, has: Amount { millicpus: 10, memory }, gives_way };
         let idle = servant("idle", 100, Some(1));
-        let idle = ServantFacts {
-            promised: Some(Amount::new(0.1, 50)),
-            ..idle
-        };
+        let idle = ServantFacts { promised: Some(Amount::new(0.1, 50)), ..idle };
         let pushes = [push(1, 500, false), push(2, 300, false)];
         let leaving = [push(1, 500, false), push(2, 300, true)];
         for (lacks, pushes, expected) in [
@@ -183,14 +152,8 @@ mod tests {
             (350, leaving, vec![]),
             (351, leaving, vec![1]),
         ] {
-            let first_robot = Amount {
-                millicpus: 0,
-                memory: lacks,
-            };
-            let lacking = Shortage {
-                all: first_robot.plus(Amount::new(0.0, 1000)),
-                first_robot,
-            };
+            let first_robot = Amount { millicpus: 0, memory: lacks };
+            let lacking = Shortage { all: first_robot.plus(Amount::new(0.0, 1000)), first_robot };
             let room = make_room(lacking, [idle].into_iter(), &pushes);
             assert_eq!(room.give_way, expected, "{lacks} {pushes:?}");
         }

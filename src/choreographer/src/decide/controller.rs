@@ -214,10 +214,7 @@ impl ControlFacts<'_> {
 
 /// Returns the decisions for all servants on a machine with so many `cores` (thousandths), in their order.
 pub fn control(cores: u64, servants: &[ControlFacts<'_>], now: Instant) -> Vec<ControlDecision> {
-    let mut histories: Vec<ControlHistory> = servants
-        .iter()
-        .map(|one| update_history(one, now))
-        .collect();
+    let mut histories: Vec<ControlHistory> = servants.iter().map(|one| update_history(one, now)).collect();
     yielding::update_yields(cores, servants, &mut histories, now);
     let roles: Vec<Role> = servants
         .iter()
@@ -229,18 +226,13 @@ pub fn control(cores: u64, servants: &[ControlFacts<'_>], now: Instant) -> Vec<C
             (None, None) => Role::Rest,
         })
         .collect();
-    let near = servants
-        .iter()
-        .zip(&roles)
-        .find(|(_, role)| **role == Role::Near);
+    let near = servants.iter().zip(&roles).find(|(_, role)| **role == Role::Near);
     let near = near.map(|(one, _)| one.id);
     let quotas = cpu_quotas(cores, servants, &roles, near.is_some(), now);
     let weights = cpu_weights(cores, servants, &roles, &quotas);
     let all = servants.iter().zip(&roles).zip(histories);
     all.zip(quotas.iter().zip(weights))
-        .map(|(((one, role), history), (quota, weight))| {
-            to_decision(one, *role, history, (*quota, weight), near, now)
-        })
+        .map(|(((one, role), history), (quota, weight))| to_decision(one, *role, history, (*quota, weight), near, now))
         .collect()
 }
 
@@ -251,11 +243,7 @@ fn update_history(one: &ControlFacts<'_>, now: Instant) -> ControlHistory {
     if one.is_near() {
         if history.near.is_none() {
             let soon = elapsed_since(history.over, now) < hold * SOON;
-            history.again = if soon {
-                DOUBLED.min(history.again + 1)
-            } else {
-                0
-            };
+            history.again = if soon { DOUBLED.min(history.again + 1) } else { 0 };
         }
         history.near = Some(now);
     } else if history.near.is_some() && elapsed_since(history.near, now) >= hold {
@@ -270,22 +258,14 @@ fn elapsed_since(since: Option<Instant>, now: Instant) -> Duration {
 }
 
 /// Returns `cpu.max` for each servant.
-fn cpu_quotas(
-    cores: u64,
-    servants: &[ControlFacts<'_>],
-    roles: &[Role],
-    any_near: bool,
-    now: Instant,
-) -> Vec<u64> {
+fn cpu_quotas(cores: u64, servants: &[ControlFacts<'_>], roles: &[Role], any_near: bool, now: Instant) -> Vec<u64> {
     let all = || servants.iter().zip(roles);
     if !any_near {
         return all().map(|(one, _)| restored_quota(one, now)).collect();
     }
     // Satisfied servants come first, then those that are near, then all others.
     let content = all().filter(|(_, role)| **role == Role::Content);
-    let needed = content.fold(0u64, |sum, (one, _)| {
-        sum.saturating_add(one.estimated_need().min(one.quota))
-    });
+    let needed = content.fold(0u64, |sum, (one, _)| sum.saturating_add(one.estimated_need().min(one.quota)));
     let beyond = cores.saturating_sub(needed);
     let near = |one: &ControlFacts<'_>| {
         if one.is_near() && one.is_held_up() {
@@ -295,32 +275,21 @@ fn cpu_quotas(
         }
     };
     let for_near = fill_role(beyond, all(), Role::Near, near);
-    let given = all()
-        .zip(&for_near)
-        .filter(|((_, role), _)| **role == Role::Near);
+    let given = all().zip(&for_near).filter(|((_, role), _)| **role == Role::Near);
     let given = given.fold(0u64, |sum, (_, share)| sum.saturating_add(*share));
     let left = cores.saturating_sub(needed).saturating_sub(given);
-    let for_rest = fill_role(left, all(), Role::Rest, |one| {
-        one.estimated_need().min(one.limit)
-    });
+    let for_rest = fill_role(left, all(), Role::Rest, |one| one.estimated_need().min(one.limit));
     all()
         .zip(for_near.into_iter().zip(for_rest))
         .map(|((one, role), (_, rest))| match role {
             // A near servant keeps its quota: others that need more get it by weight. The same holds between near
             // servants: each is limited by what the others do not need, and none by its share of that, since a
             // throttled servant waits for the rest of a period although cores are idle.
-            Role::Near => near(one)
-                .min(beyond)
-                .max(one.quota.min(one.ceiling))
-                .max(one.promised),
+            Role::Near => near(one).min(beyond).max(one.quota.min(one.ceiling)).max(one.promised),
             Role::Content => restored_quota(one, now),
             Role::Rest if one.used.is_none() => one.quota.max(one.promised),
             // At most halved in one step.
-            Role::Rest => rest
-                .max(one.quota / 2)
-                .min(one.quota)
-                .max(one.floor().min(one.limit))
-                .max(one.promised),
+            Role::Rest => rest.max(one.quota / 2).min(one.quota).max(one.floor().min(one.limit)).max(one.promised),
         })
         .collect()
 }
@@ -338,16 +307,9 @@ fn fill_role<'a, 'b: 'a>(
     role: Role,
     wants: impl Fn(&ControlFacts<'_>) -> u64,
 ) -> Vec<u64> {
-    let claims: Vec<Claim> = all
-        .map(|(one, its)| {
-            if *its == role {
-                Claim {
-                    floor: one.floor(),
-                    wants: wants(one),
-                }
-            } else {
-                Claim { floor: 0, wants: 0 }
-            }
+    let claims: Vec<Claim> =
+        all.map(|(one, its)| {
+            if *its == role { Claim { floor: one.floor(), wants: wants(one) } } else { Claim { floor: 0, wants: 0 } }
         })
         .collect();
     fill_shares(capacity, &claims)
@@ -370,22 +332,11 @@ fn restored_quota(one: &ControlFacts<'_>, now: Instant) -> u64 {
 }
 
 /// Returns `cpu.weight` for each servant: a thousand per promised core, and per core granted beyond.
-fn cpu_weights(
-    cores: u64,
-    servants: &[ControlFacts<'_>],
-    roles: &[Role],
-    quotas: &[u64],
-) -> Vec<u64> {
-    let promised = servants
-        .iter()
-        .fold(0u64, |sum, one| sum.saturating_add(one.promised));
+fn cpu_weights(cores: u64, servants: &[ControlFacts<'_>], roles: &[Role], quotas: &[u64]) -> Vec<u64> {
+    let promised = servants.iter().fold(0u64, |sum, one| sum.saturating_add(one.promised));
     // If no cores are promised, none need protection.
     let open = promised == 0 && !roles.contains(&Role::Near);
-    let free = if open {
-        u64::MAX
-    } else {
-        cores.saturating_sub(promised)
-    };
+    let free = if open { u64::MAX } else { cores.saturating_sub(promised) };
     let all = || servants.iter().zip(roles).zip(quotas);
     let of = |first: bool| -> Vec<Claim> {
         all()
@@ -406,13 +357,7 @@ fn cpu_weights(
     servants
         .iter()
         .zip(near.into_iter().zip(rest))
-        .map(|(one, (near, rest))| {
-            if one.weighed {
-                one.weight
-            } else {
-                (one.promised + near + rest).clamp(1, 10_000)
-            }
-        })
+        .map(|(one, (near, rest))| if one.weighed { one.weight } else { (one.promised + near + rest).clamp(1, 10_000) })
         .collect()
 }
 
@@ -425,8 +370,7 @@ fn to_decision(
     near: Option<&str>,
     now: Instant,
 ) -> ControlDecision {
-    let quota =
-        Some(quota).filter(|quota| is_worthwhile(one.quota, *quota, one.limit.max(one.promised)));
+    let quota = Some(quota).filter(|quota| is_worthwhile(one.quota, *quota, one.limit.max(one.promised)));
     let weight = Some(weight).filter(|weight| is_worthwhile(one.weight, *weight, one.plain));
     match quota {
         Some(quota) if quota > one.quota => history.raised = Some(now),
@@ -434,17 +378,8 @@ fn to_decision(
         None => {}
     }
     let changes = quota.is_some() || weight.is_some();
-    let reason = if changes {
-        change_reason(one, role, near, weight)
-    } else {
-        String::new()
-    };
-    ControlDecision {
-        quota,
-        weight,
-        reason,
-        history,
-    }
+    let reason = if changes { change_reason(one, role, near, weight) } else { String::new() };
+    ControlDecision { quota, weight, reason, history }
 }
 
 /// Returns true if a change is worthwhile: it is not small, or restores the setting without a controller.
@@ -453,18 +388,12 @@ fn is_worthwhile(is: u64, to_be: u64, without: u64) -> bool {
     is != to_be && is.abs_diff(to_be).saturating_mul(part) >= is
 }
 
-fn change_reason(
-    one: &ControlFacts<'_>,
-    role: Role,
-    near: Option<&str>,
-    weight: Option<u64>,
-) -> String {
+fn change_reason(one: &ControlFacts<'_>, role: Role, near: Option<&str>, weight: Option<u64>) -> String {
     match (role, near) {
         (Role::Near, _) => match (one.measured, one.goal.and_then(ResponseGoal::upper_bound)) {
-            (Some(measured), Some(bound)) => format!(
-                "its requests take {:.0} ms; its robot accepts {bound:.0} ms",
-                measured.total
-            ),
+            (Some(measured), Some(bound)) => {
+                format!("its requests take {:.0} ms; its robot accepts {bound:.0} ms", measured.total)
+            }
             _ => format!(
                 "its robot has set a goal, and it was throttled {:.0} % of the time",
                 one.throttled.max(one.waited) * 100.0

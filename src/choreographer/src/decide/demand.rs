@@ -33,21 +33,13 @@ impl LimitSources {
 /// Adds the default weight of servants with promised cores, which get them before others: a thousand for each core,
 /// while others have a hundred in all. A requested weight stays.
 pub fn with_default_weight(asked: Limits) -> Limits {
-    Limits {
-        cpu_weight: asked.cpu_weight.or(asked.cpus.map(weight_for_cpus)),
-        ..asked
-    }
+    Limits { cpu_weight: asked.cpu_weight.or(asked.cpus.map(weight_for_cpus)), ..asked }
 }
 
 /// Bounds the weight to the one of the promised cores, so that a deployer's service does not outweigh the promises to
 /// others.
 pub fn with_bounded_weight(asked: Limits) -> Limits {
-    Limits {
-        cpu_weight: asked
-            .cpu_weight
-            .map(|weight| weight.min(max_weight(&asked))),
-        ..asked
-    }
+    Limits { cpu_weight: asked.cpu_weight.map(|weight| weight.min(max_weight(&asked))), ..asked }
 }
 
 /// Returns the maximum weight of these limits without an operator's permission.
@@ -62,10 +54,7 @@ fn weight_for_cpus(cpus: f64) -> u64 {
 /// Returns the capacity promised to a servant with these limits; resources without a limit are taken from `reserve`,
 /// which is cores and bytes.
 pub fn promised_amount(asked: &Limits, reserve: (f64, u64)) -> Amount {
-    Amount::new(
-        asked.cpus.unwrap_or(reserve.0),
-        asked.memory.map_or(reserve.1, |memory| memory.0),
-    )
+    Amount::new(asked.cpus.unwrap_or(reserve.0), asked.memory.map_or(reserve.1, |memory| memory.0))
 }
 
 #[cfg(test)]
@@ -75,11 +64,7 @@ mod tests {
     #[test]
     fn a_promise_of_cores_weighs_more_than_none() {
         let weight = |cpus, cpu_weight| {
-            let asked = Limits {
-                cpus,
-                cpu_weight,
-                ..Limits::default()
-            };
+            let asked = Limits { cpus, cpu_weight, ..Limits::default() };
             with_default_weight(asked).cpu_weight
         };
         for (cpus, asked, gets) in [
@@ -104,11 +89,7 @@ mod tests {
             (Some(1.5), Some(7), Some(7)),
             (Some(1.5), None, None),
         ] {
-            let asked = Limits {
-                cpus,
-                cpu_weight: asked,
-                ..Limits::default()
-            };
+            let asked = Limits { cpus, cpu_weight: asked, ..Limits::default() };
             assert_eq!(with_bounded_weight(asked).cpu_weight, gets, "{asked:?}");
         }
     }
@@ -116,11 +97,7 @@ mod tests {
     #[test]
     fn limits_that_were_asked_for_are_promised_and_others_reserved() {
         let reserve = (0.25, 64);
-        let of = |cpus, memory: Option<u64>| Limits {
-            cpus,
-            memory: memory.map(api::Size),
-            ..Limits::default()
-        };
+        let of = |cpus, memory: Option<u64>| Limits { cpus, memory: memory.map(api::Size), ..Limits::default() };
         for (cpus, memory, gets) in [
             (None, None, Amount::new(0.25, 64)),
             (Some(2.0), None, Amount::new(2.0, 64)),

@@ -76,10 +76,7 @@ pub enum RowChoice<'a> {
 type Cost = (f64, f64, i64);
 
 fn compare_costs(one: Cost, other: Cost) -> std::cmp::Ordering {
-    one.0
-        .total_cmp(&other.0)
-        .then(one.1.total_cmp(&other.1))
-        .then(one.2.cmp(&other.2))
+    one.0.total_cmp(&other.0).then(one.1.total_cmp(&other.1)).then(one.2.cmp(&other.2))
 }
 
 impl<'a> DictionaryView<'a> {
@@ -102,8 +99,7 @@ impl<'a> DictionaryView<'a> {
         if of_measure().next().is_none() {
             return RowChoice::Silent;
         }
-        let holding = of_measure()
-            .filter(|row| row_applies(row, |key| self.aux.get(key).or(row.aux.get(key))));
+        let holding = of_measure().filter(|row| row_applies(row, |key| self.aux.get(key).or(row.aux.get(key))));
         let mut holding: Vec<CandidateRow<'a>> = holding
             .map(|row| CandidateRow {
                 row,
@@ -119,8 +115,7 @@ impl<'a> DictionaryView<'a> {
         let cases: BTreeSet<AuxCase<'a>> = holding.iter().map(CandidateRow::aux_case).collect();
         let mut dearest: Option<(&CandidateRow<'a>, bool, AuxCase<'a>)> = None;
         for case in cases {
-            let numbers: Vec<Option<f64>> =
-                case.iter().map(|(_, value)| parse_number(value)).collect();
+            let numbers: Vec<Option<f64>> = case.iter().map(|(_, value)| parse_number(value)).collect();
             let applying = || holding.iter().filter(|row| row.applies_in(&case, &numbers));
             match best_row(goal, applying) {
                 Ok((row, desired)) => {
@@ -130,26 +125,16 @@ impl<'a> DictionaryView<'a> {
                     }
                 }
                 Err((best, beyond)) => {
-                    return RowChoice::Unmet {
-                        best,
-                        beyond,
-                        assumed: to_aux(&case),
-                    };
+                    return RowChoice::Unmet { best, beyond, assumed: to_aux(&case) };
                 }
             }
         }
         match dearest {
-            Some((CandidateRow { row, .. }, desired, case)) => RowChoice::Taken {
-                row,
-                desired,
-                assumed: to_aux(&case),
-            },
+            Some((CandidateRow { row, .. }, desired, case)) => {
+                RowChoice::Taken { row, desired, assumed: to_aux(&case) }
+            }
             // Without any case no row matches the known parameters.
-            None => RowChoice::Unmet {
-                best: None,
-                beyond: None,
-                assumed: Aux::new(),
-            },
+            None => RowChoice::Unmet { best: None, beyond: None, assumed: Aux::new() },
         }
     }
 
@@ -161,18 +146,15 @@ impl<'a> DictionaryView<'a> {
             let known = |key: &str| self.aux.get(key).or(taken.aux.get(key));
             rows.filter(move |row| row.measure == taken.measure && row_applies(row, known))
         };
-        let cheaper =
-            |one: &&'a Row, other: &&'a Row| compare_costs(self.cost(one), self.cost(other));
-        let dearer =
-            beside().filter(|row| compare_values(row.measure, row.value, taken.value).is_lt());
+        let cheaper = |one: &&'a Row, other: &&'a Row| compare_costs(self.cost(one), self.cost(other));
+        let dearer = beside().filter(|row| compare_values(row.measure, row.value, taken.value).is_lt());
         let weaker = beside().filter(|row| {
             row.id != taken.id
                 && compare_costs(self.cost(row), self.cost(taken)).is_lt()
                 && !compare_values(row.measure, row.value, taken.value).is_lt()
         });
-        let weaker = weaker.min_by(|one, other| {
-            compare_values(one.measure, one.value, other.value).then_with(|| cheaper(one, other))
-        });
+        let weaker = weaker
+            .min_by(|one, other| compare_values(one.measure, one.value, other.value).then_with(|| cheaper(one, other)));
         (dearer.min_by(cheaper), weaker)
     }
 
@@ -187,11 +169,7 @@ impl<'a> DictionaryView<'a> {
 
 /// Compares two values of a measure; the better one is less.
 fn compare_values(measure: Measure, one: f64, other: f64) -> std::cmp::Ordering {
-    if measure.is_less_better() {
-        one.total_cmp(&other)
-    } else {
-        other.total_cmp(&one)
-    }
+    if measure.is_less_better() { one.total_cmp(&other) } else { other.total_cmp(&one) }
 }
 
 /// Values of the unknown parameters, as named in rows that match the known ones; sorted by name.
@@ -199,9 +177,7 @@ type AuxCase<'a> = Vec<(&'a str, &'a str)>;
 
 fn to_aux(case: &AuxCase<'_>) -> Aux {
     let pairs = case.iter();
-    pairs
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 /// A row that matches the known parameters of the robot, with precomputed data for the choice among many.
@@ -224,11 +200,10 @@ impl<'a> CandidateRow<'a> {
     fn applies_in(&self, case: &AuxCase<'a>, numbers: &[Option<f64>]) -> bool {
         let mut has = case.iter().zip(numbers);
         self.unknown.iter().all(|(key, most, upto)| {
-            has.find(|((name, _), _)| name == key)
-                .is_some_and(|((_, value), number)| match (number, upto) {
-                    (Some(number), Some(upto)) => number <= upto,
-                    _ => value == most,
-                })
+            has.find(|((name, _), _)| name == key).is_some_and(|((_, value), number)| match (number, upto) {
+                (Some(number), Some(upto)) => number <= upto,
+                _ => value == most,
+            })
         })
     }
 }
@@ -249,8 +224,7 @@ where
         return Ok((one, true));
     }
     // Among equally good rows the first is the cheapest.
-    let best =
-        open().min_by(|one, other| compare_values(goal.measure, one.row.value, other.row.value));
+    let best = open().min_by(|one, other| compare_values(goal.measure, one.row.value, other.row.value));
     match best {
         Some(one) if reaches(one, goal.bound) => Ok((one, false)),
         best => {
@@ -317,14 +291,9 @@ pub enum RowError {
 /// Checks a row; the error says what to write.
 pub fn check(row: &Row) -> Result<(), RowError> {
     let measure = row.measure;
-    measure
-        .parse_value(&row.value.to_string())
-        .map_err(|error| RowError::Value { measure, error })?;
+    measure.parse_value(&row.value.to_string()).map_err(|error| RowError::Value { measure, error })?;
     for (key, value) in &row.aux {
-        check_aux(key, value).map_err(|error| RowError::Aux {
-            key: key.clone(),
-            error,
-        })?;
+        check_aux(key, value).map_err(|error| RowError::Aux { key: key.clone(), error })?;
     }
     row.limits.check()?;
     if let Some(spread) = &row.spread {

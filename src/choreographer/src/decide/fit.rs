@@ -38,14 +38,8 @@ pub struct Fit {
 
 impl Fit {
     /// Prediction for a servant that needs no capacity.
-    pub const NOTHING: Fit = Fit {
-        now: true,
-        ends: Vec::new(),
-        lacking: Amount::NONE,
-        costs: Vec::new(),
-        more: None,
-        beyond: Amount::NONE,
-    };
+    pub const NOTHING: Fit =
+        Fit { now: true, ends: Vec::new(), lacking: Amount::NONE, costs: Vec::new(), more: None, beyond: Amount::NONE };
 }
 
 /// Cost of one more servant to another one.
@@ -64,19 +58,11 @@ pub struct NeighbourCost {
 
 /// Predicts how one more servant of this priority that is promised `wanted` would fit on a machine of so many `cores`
 /// (thousandths); these exist, whatever is promised of them.
-pub fn fit(
-    (wanted, priority): (Amount, i32),
-    book: &AdmissionLedger,
-    cores: u64,
-    others: &[Neighbour<'_>],
-) -> Fit {
+pub fn fit((wanted, priority): (Amount, i32), book: &AdmissionLedger, cores: u64, others: &[Neighbour<'_>]) -> Fit {
     let free = book.capacity().minus(book.promised_total());
     let spoken_for = book.wanted_before(priority);
     let lacking = wanted.plus(spoken_for).minus(free);
-    let asked = Shortage {
-        all: lacking,
-        first_robot: Amount::NONE,
-    };
+    let asked = Shortage { all: lacking, first_robot: Amount::NONE };
     let room = make_room(asked, others.iter().map(|other| other.servant), &[]);
     let comes_free = |ends: &[&str]| {
         let leave = others.iter().map(|other| &other.servant);
@@ -92,28 +78,17 @@ pub fn fit(
         wanted.minus(book.capacity())
     };
     let fits = lacking == Amount::NONE;
-    let idle = others
-        .iter()
-        .filter(|other| other.servant.idle_until.is_some());
+    let idle = others.iter().filter(|other| other.servant.idle_until.is_some());
     let idle: Vec<&str> = idle.map(|other| other.servant.id).collect();
     let usable = free.plus(comes_free(&idle)).minus(spoken_for);
     let more = count_parts(usable, wanted);
     Fit {
-        now: fits
-            && ends.is_empty()
-            && book.stall_reason().is_none()
-            && wanted.plus(spoken_for).fits(free),
-        ends: if fits {
-            ends.iter().map(|id| (*id).to_owned()).collect()
-        } else {
-            Vec::new()
-        },
+        now: fits && ends.is_empty() && book.stall_reason().is_none() && wanted.plus(spoken_for).fits(free),
+        ends: if fits { ends.iter().map(|id| (*id).to_owned()).collect() } else { Vec::new() },
         lacking,
         costs: neighbour_costs(wanted, cores, others),
         more,
-        beyond: more.map_or(Amount::NONE, |more| {
-            wanted.times(more.saturating_add(1)).minus(usable)
-        }),
+        beyond: more.map_or(Amount::NONE, |more| wanted.times(more.saturating_add(1)).minus(usable)),
     }
 }
 
@@ -123,10 +98,7 @@ fn neighbour_costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<
         floor: other.servant.promised.unwrap_or_default().millicpus,
         wants: other.uses,
     };
-    let new = Claim {
-        floor: wanted.millicpus,
-        wants: wanted.millicpus,
-    };
+    let new = Claim { floor: wanted.millicpus, wants: wanted.millicpus };
     let claims: Vec<Claim> = others.iter().map(claim).chain([new]).collect();
     let shares = fill_shares(cores, &claims);
     let pairs = others.iter().zip(shares);
@@ -136,9 +108,7 @@ fn neighbour_costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<
             id: other.servant.id.to_owned(),
             uses: other.uses,
             left,
-            times: other
-                .measured
-                .and_then(|measured| slowed_times(measured, other.uses, left)),
+            times: other.measured.and_then(|measured| slowed_times(measured, other.uses, left)),
         })
         .collect()
 }
@@ -207,17 +177,7 @@ mod tests {
             let fit = fit((Amount::new(wanted, 0), 0), &book(3.0, waits), 4000, &both);
             let got = (fit.now, fit.ends, fit.lacking, fit.more, fit.beyond);
             let ends: Vec<String> = ends.into_iter().map(str::to_owned).collect();
-            assert_eq!(
-                got,
-                (
-                    now,
-                    ends,
-                    Amount::new(lacking, 0),
-                    more,
-                    Amount::new(beyond, 0)
-                ),
-                "{wanted} {waits:?}"
-            );
+            assert_eq!(got, (now, ends, Amount::new(lacking, 0), more, Amount::new(beyond, 0)), "{wanted} {waits:?}");
         }
         let mut stalls = book(3.0, None);
         stalls.set_stall(Some("it swaps".into()));
@@ -236,19 +196,12 @@ mod tests {
             let costs = fit.costs.into_iter();
             costs.map(|cost| (cost.id, cost.left)).collect::<Vec<_>>()
         };
-        assert_eq!(
-            cost(0.0),
-            [("greedy".to_owned(), 2500)],
-            "they lack cores already"
-        );
+        assert_eq!(cost(0.0), [("greedy".to_owned(), 2500)], "they lack cores already");
         assert_eq!(cost(1.5), [("greedy".to_owned(), 1000)]);
         // Times grow with the part spent in the cloud.
         let times = |uses, promised, total, cloud| {
             let measured = Some(MeasuredTimes { total, cloud });
-            let one = Neighbour {
-                measured,
-                ..neighbour("one", promised, uses, None)
-            };
+            let one = Neighbour { measured, ..neighbour("one", promised, uses, None) };
             let fit = fit((Amount::new(3.0, 0), 0), &book(0.0, None), 4000, &[one]);
             fit.costs[0].times
         };
@@ -261,10 +214,7 @@ mod tests {
         ] {
             assert_eq!(times(uses, promised, total, cloud), then, "{uses} {cloud}");
         }
-        let nothing = MeasuredTimes {
-            total: 1.0,
-            cloud: 1.0,
-        };
+        let nothing = MeasuredTimes { total: 1.0, cloud: 1.0 };
         assert_eq!(slowed_times(nothing, 5, 0), None, "for ever");
         let others = [neighbour("small", 0.0, 100, None)];
         let fit = fit((Amount::new(1.0, 0), 0), &book(0.0, None), 4000, &others);

@@ -32,11 +32,7 @@ pub struct Arrivals {
 impl Arrivals {
     /// Starts without arrivals.
     pub fn new(now: Instant) -> Arrivals {
-        Arrivals {
-            begun: now,
-            count: 0,
-            smoothed: None,
-        }
+        Arrivals { begun: now, count: 0, smoothed: None }
     }
 
     /// Records the arrival of a robot.
@@ -83,9 +79,7 @@ pub fn erlang_b(containers: usize, offered: f64) -> f64 {
 
 /// Returns the fewest containers with which at most `share` of the arrivals find none.
 pub fn containers_needed(offered: f64, share: f64) -> usize {
-    (0..MOST)
-        .find(|n| erlang_b(*n, offered) <= share)
-        .unwrap_or(MOST)
+    (0..MOST).find(|n| erlang_b(*n, offered) <= share).unwrap_or(MOST)
 }
 
 #[cfg(test)]
@@ -130,13 +124,9 @@ mod tests {
     /// Values from tables of Erlang's B.
     #[test]
     fn the_loss_is_erlangs() {
-        for (containers, offered, expected) in [
-            (0, 2.0, 1.0),
-            (1, 1.0, 0.5),
-            (2, 1.0, 0.2),
-            (5, 3.0, 0.1101),
-            (10, 5.0, 0.0184),
-        ] {
+        for (containers, offered, expected) in
+            [(0, 2.0, 1.0), (1, 1.0, 0.5), (2, 1.0, 0.2), (5, 3.0, 0.1101), (10, 5.0, 0.0184)]
+        {
             let is = erlang_b(containers, offered);
             assert!((is - expected).abs() < 5e-5, "{containers} {offered}: {is}");
         }

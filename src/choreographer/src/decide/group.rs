@@ -71,11 +71,7 @@ pub(crate) struct LoadSince {
 
 /// Decides what is to be done now; also returns the times since which the load has been high or low, to be passed in
 /// the next time.
-pub(crate) fn decide_group(
-    facts: &GroupFacts,
-    since: LoadSince,
-    now: Instant,
-) -> (Option<GroupAction>, LoadSince) {
+pub(crate) fn decide_group(facts: &GroupFacts, since: LoadSince, now: Instant) -> (Option<GroupAction>, LoadSince) {
     let (least, most) = facts.bounds;
     let (least, most) = (least.max(1), most.max(least).max(1));
     let there = facts.ready + facts.starting;
@@ -96,17 +92,11 @@ pub(crate) fn decide_group(
         return (None, LoadSince::default());
     }
     let servants = facts.ready as f64;
-    let late = facts
-        .time
-        .filter(|(takes, may)| takes > may && facts.requests > LATE * servants);
+    let late = facts.time.filter(|(takes, may)| takes > may && facts.requests > LATE * servants);
     let many = facts.requests > MANY * servants || late.is_some();
     let few = facts.requests < FEW * (servants - 1.0);
-    let since = LoadSince {
-        many: many.then(|| since.many.unwrap_or(now)),
-        few: few.then(|| since.few.unwrap_or(now)),
-    };
-    let has_been =
-        |since: Option<Instant>, long: Duration| since.is_some_and(|at| now >= at + long);
+    let since = LoadSince { many: many.then(|| since.many.unwrap_or(now)), few: few.then(|| since.few.unwrap_or(now)) };
+    let has_been = |since: Option<Instant>, long: Duration| since.is_some_and(|at| now >= at + long);
     if has_been(since.many, STEADY) && there < most && (facts.retiring > 0 || !rests) {
         let requests = facts.requests;
         let reason = match late {
@@ -119,10 +109,7 @@ pub(crate) fn decide_group(
         return (one_more(reason), LoadSince::default());
     }
     if has_been(since.few, facts.calm) && there > least {
-        let reason = format!(
-            "{:.1} concurrent requests are few for {there} servants",
-            facts.requests
-        );
+        let reason = format!("{:.1} concurrent requests are few for {there} servants", facts.requests);
         return (Some(GroupAction::Retire(reason)), LoadSince::default());
     }
     (None, since)
@@ -147,16 +134,7 @@ mod tests {
     const LOOKS: Duration = Duration::from_millis(250);
 
     fn facts(ready: usize, requests: f64) -> GroupFacts {
-        GroupFacts {
-            bounds: (1, 4),
-            ready,
-            starting: 0,
-            retiring: 0,
-            requests,
-            time: None,
-            failed: None,
-            calm: CALM,
-        }
+        GroupFacts { bounds: (1, 4), ready, starting: 0, retiring: 0, requests, time: None, failed: None, calm: CALM }
     }
 
     /// Returns the decision after the facts have stayed the same for `long`.
@@ -178,89 +156,36 @@ mod tests {
         let now = Instant::now();
         for (facts, long, expected) in [
             (facts(0, 0.0), LOOKS, "start: a robot asks for the service"),
-            (
-                GroupFacts {
-                    bounds: (2, 4),
-                    ..facts(1, 0.0)
-                },
-                LOOKS,
-                "start: the minimum is 2 servants",
-            ),
+            (GroupFacts { bounds: (2, 4), ..facts(1, 0.0) }, LOOKS, "start: the minimum is 2 servants"),
             (facts(1, 1.4), CALM, ""),
             (facts(1, 2.0), LOOKS, ""),
-            (
-                facts(1, 2.0),
-                STEADY,
-                "start: 2.0 concurrent requests are many for 1 servants",
-            ),
+            (facts(1, 2.0), STEADY, "start: 2.0 concurrent requests are many for 1 servants"),
             (facts(4, 90.0), CALM, ""),
             (
-                GroupFacts {
-                    time: Some(late),
-                    ..facts(2, 2.5)
-                },
+                GroupFacts { time: Some(late), ..facts(2, 2.5) },
                 STEADY,
                 "start: 2.5 concurrent requests delay each other at 2 servants: they take 300ms instead of 200ms",
             ),
             // Slow, but without queueing: another servant is no faster.
-            (
-                GroupFacts {
-                    time: Some(late),
-                    ..facts(2, 1.5)
-                },
-                CALM,
-                "",
-            ),
+            (GroupFacts { time: Some(late), ..facts(2, 1.5) }, CALM, ""),
             (facts(2, 0.6), STEADY, ""),
-            (
-                facts(2, 0.6),
-                CALM,
-                "retire: 0.6 concurrent requests are few for 2 servants",
-            ),
+            (facts(2, 0.6), CALM, "retire: 0.6 concurrent requests are few for 2 servants"),
             (facts(2, 0.8), CALM, ""),
             (facts(1, 0.0), CALM, ""),
-            (
-                GroupFacts {
-                    starting: 1,
-                    ..facts(1, 9.0)
-                },
-                CALM,
-                "",
-            ),
+            (GroupFacts { starting: 1, ..facts(1, 9.0) }, CALM, ""),
             // A retiring servant may take for ever: the group grows and shrinks nevertheless.
             (
-                GroupFacts {
-                    retiring: 1,
-                    ..facts(2, 0.0)
-                },
+                GroupFacts { retiring: 1, ..facts(2, 0.0) },
                 CALM,
                 "retire: 0.0 concurrent requests are few for 2 servants",
             ),
             (
-                GroupFacts {
-                    retiring: 1,
-                    failed: Some(now),
-                    ..facts(1, 10.0)
-                },
+                GroupFacts { retiring: 1, failed: Some(now), ..facts(1, 10.0) },
                 STEADY,
                 "take back: 10.0 concurrent requests are many for 1 servants",
             ),
-            (
-                GroupFacts {
-                    retiring: 1,
-                    ..facts(0, 0.0)
-                },
-                LOOKS,
-                "take back: a robot asks for the service",
-            ),
-            (
-                GroupFacts {
-                    failed: Some(now),
-                    ..facts(0, 0.0)
-                },
-                LOOKS,
-                "",
-            ),
+            (GroupFacts { retiring: 1, ..facts(0, 0.0) }, LOOKS, "take back: a robot asks for the service"),
+            (GroupFacts { failed: Some(now), ..facts(0, 0.0) }, LOOKS, ""),
         ] {
             assert_eq!(words(action_after(facts, long)), expected, "{facts:?}");
         }
@@ -296,8 +221,7 @@ mod tests {
         // Not in the order in which they were left.
         let left = |count: usize| {
             let left = ids.iter().take(count).rev().enumerate();
-            left.map(|(until, id)| (until as u64, id.as_str()))
-                .collect()
+            left.map(|(until, id)| (until as u64, id.as_str())).collect()
         };
         assert_eq!(expired_places(left(LEFT)), Vec::<&str>::new());
         let last = [&*ids[LEFT + 1], &*ids[LEFT]];

@@ -99,11 +99,7 @@ mod tests {
         let mut watched = None;
         let mut told = Vec::new();
         for (second, (inputs, outputs)) in flows.iter().enumerate() {
-            let flow = Flow {
-                inputs: *inputs,
-                outputs: *outputs,
-                starts: 0,
-            };
+            let flow = Flow { inputs: *inputs, outputs: *outputs, starts: 0 };
             let now = begun + Duration::from_secs(second as u64);
             let (next, hung) = observe_flow(watched, flow, PATIENCE, now);
             watched = Some(next);
@@ -115,10 +111,7 @@ mod tests {
     #[test]
     fn nodes_hang_that_answered_and_answer_no_more() {
         for (flows, expected) in [
-            (
-                &[(0, 0), (9, 0), (9, 0), (9, 0), (9, 0), (9, 0)][..],
-                &[][..],
-            ),
+            (&[(0, 0), (9, 0), (9, 0), (9, 0), (9, 0), (9, 0)][..], &[][..]),
             (&[(1, 1), (1, 1), (1, 1), (1, 1), (1, 1), (1, 1)], &[]),
             (&[(1, 1), (4, 1), (5, 1), (6, 1), (7, 1), (8, 1)], &[4]),
             // Too few.
@@ -132,11 +125,7 @@ mod tests {
             assert_eq!(seconds_reported(flows), expected, "{flows:?}");
         }
         let begun = Instant::now();
-        let flow = |inputs| Flow {
-            inputs,
-            outputs: 1,
-            starts: 0,
-        };
+        let flow = |inputs| Flow { inputs, outputs: 1, starts: 0 };
         let (watched, _) = observe_flow(None, flow(1), Duration::ZERO, begun);
         let (watched, _) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun);
         let (_, hung) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun + LEAST / 2);
@@ -148,11 +137,7 @@ mod tests {
         let begun = Instant::now();
         let mut watched = None;
         let mut hangs = |second: u32, inputs, outputs, starts| {
-            let flow = Flow {
-                inputs,
-                outputs,
-                starts,
-            };
+            let flow = Flow { inputs, outputs, starts };
             let now = begun + Duration::from_secs(second.into());
             let (next, hung) = observe_flow(watched, flow, PATIENCE, now);
             watched = Some(next);

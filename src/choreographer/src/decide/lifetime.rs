@@ -104,11 +104,7 @@ pub fn readiness(of: &InterfaceStatus<'_>, now: Instant) -> Readiness {
         return Readiness::Ready;
     }
     let nodes_there = of.nodes_missing.is_empty();
-    let until = if of.patient || !nodes_there {
-        of.deadline
-    } else {
-        of.deadline.min(of.changed + SETTLED)
-    };
+    let until = if of.patient || !nodes_there { of.deadline } else { of.deadline.min(of.changed + SETTLED) };
     if now < until {
         Readiness::Waits(until)
     } else if nodes_there {
@@ -138,58 +134,20 @@ mod tests {
         let (long, short) = (Some(now - GRACE), Some(now - GRACE / 3));
         let waits = Retention::Until(now + GRACE * 2 / 3);
         for (stage, anonymous, idle_since, expected) in [
-            (
-                ServantStage::Queued,
-                false,
-                None,
-                over("its robot left while it was queued"),
-            ),
-            (
-                ServantStage::Queued,
-                true,
-                None,
-                over("its robot left while it was queued"),
-            ),
+            (ServantStage::Queued, false, None, over("its robot left while it was queued")),
+            (ServantStage::Queued, true, None, over("its robot left while it was queued")),
             (ServantStage::Admitted, false, None, Retention::Stays),
-            (
-                ServantStage::Admitted,
-                true,
-                None,
-                over("its robot left before it was started"),
-            ),
+            (ServantStage::Admitted, true, None, over("its robot left before it was started")),
             (ServantStage::Starting, false, None, Retention::Stays),
-            (
-                ServantStage::Starting,
-                true,
-                None,
-                over("its robot left before it was ready"),
-            ),
+            (ServantStage::Starting, true, None, over("its robot left before it was ready")),
             (ServantStage::Ready, false, short, waits),
-            (
-                ServantStage::Ready,
-                false,
-                long,
-                over("no robot was connected for 60 s"),
-            ),
+            (ServantStage::Ready, false, long, over("no robot was connected for 60 s")),
         ] {
-            let tenancy = Tenancy {
-                stage,
-                adopted: false,
-                anonymous,
-                connections: 0,
-                idle_since,
-                grace: GRACE,
-            };
+            let tenancy = Tenancy { stage, adopted: false, anonymous, connections: 0, idle_since, grace: GRACE };
             assert_eq!(retention(&tenancy, now), expected, "{tenancy:?}");
-            let used = Tenancy {
-                connections: 1,
-                ..tenancy
-            };
+            let used = Tenancy { connections: 1, ..tenancy };
             assert_eq!(retention(&used, now), Retention::Stays, "{used:?}");
-            let adopted = Tenancy {
-                adopted: true,
-                ..tenancy
-            };
+            let adopted = Tenancy { adopted: true, ..tenancy };
             if stage == ServantStage::Starting {
                 assert_eq!(retention(&adopted, now), Retention::Stays, "{adopted:?}");
             }

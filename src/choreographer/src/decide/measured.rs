@@ -47,11 +47,7 @@ pub fn aux_from_inputs(inputs: &[MeasuredInput], rows: &[Row]) -> Aux {
         }
         let seen = &input.seen;
         let name = input.name.trim_matches('/').replace('/', ".");
-        let sides = [
-            ("bytes", Some(seen.largest)),
-            ("width", seen.width),
-            ("height", seen.height),
-        ];
+        let sides = [("bytes", Some(seen.largest)), ("width", seen.width), ("height", seen.height)];
         for (key, value) in sides {
             let Some(value) = value else { continue };
             all.insert(format!("{name}.{key}"), value);
@@ -93,42 +89,28 @@ mod tests {
             "id": 1, "measure": "rrt", "value": 0.1, "limits": {},
         }))
         .expect("a row");
-        row.aux = aux
-            .iter()
-            .map(|key| ((*key).to_owned(), "1".to_owned()))
-            .collect();
+        row.aux = aux.iter().map(|key| ((*key).to_owned(), "1".to_owned())).collect();
         row
     }
 
     fn input(name: &str, count: u64, largest: u64, width: Option<u64>) -> MeasuredInput {
         MeasuredInput {
             name: name.to_owned(),
-            seen: SizeSummary {
-                count,
-                largest,
-                typical: largest / 2,
-                width,
-                height: width.map(|width| width / 2),
-            },
+            seen: SizeSummary { count, largest, typical: largest / 2, width, height: width.map(|width| width / 2) },
             known: Duration::ZERO,
         }
     }
 
     fn aux_of(pairs: &[(&str, &str)]) -> Aux {
         let pairs = pairs.iter();
-        pairs
-            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-            .collect()
+        pairs.map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
     }
 
     #[test]
     fn what_rows_name_is_told_once_it_is_known() {
         let camera = input("/camera/image", 8, 1000, Some(640));
         let few = input("/map", 7, 5000, Some(900));
-        let map = MeasuredInput {
-            known: PATIENCE,
-            ..few.clone()
-        };
+        let map = MeasuredInput { known: PATIENCE, ..few.clone() };
         let silent = input("/other", 0, 0, None);
         let text = input("/text", 9, 10, None);
         let keys = ["width", "bytes", "camera.image.typical", "text.width"];
@@ -137,32 +119,18 @@ mod tests {
             (vec![silent.clone()], aux_of(&[])),
             (
                 vec![camera.clone(), silent],
-                aux_of(&[
-                    ("bytes", "1000"),
-                    ("camera.image.typical", "500"),
-                    ("width", "640"),
-                ]),
+                aux_of(&[("bytes", "1000"), ("camera.image.typical", "500"), ("width", "640")]),
             ),
             // The size of the map is not known yet.
-            (
-                vec![camera.clone(), few],
-                aux_of(&[("camera.image.typical", "500")]),
-            ),
+            (vec![camera.clone(), few], aux_of(&[("camera.image.typical", "500")])),
             (
                 vec![camera.clone(), map, text],
-                aux_of(&[
-                    ("bytes", "5000"),
-                    ("camera.image.typical", "500"),
-                    ("width", "900"),
-                ]),
+                aux_of(&[("bytes", "5000"), ("camera.image.typical", "500"), ("width", "900")]),
             ),
         ] {
             assert_eq!(aux_from_inputs(&inputs, &[row(&keys)]), told, "{inputs:?}");
         }
-        assert_eq!(
-            aux_from_inputs(std::slice::from_ref(&camera), &[]),
-            aux_of(&[])
-        );
+        assert_eq!(aux_from_inputs(std::slice::from_ref(&camera), &[]), aux_of(&[]));
         // A name that no row can have.
         let odd = input("/a b", 8, 1, None);
         assert_eq!(aux_from_inputs(&[odd], &[row(&["a b.bytes"])]), aux_of(&[]));

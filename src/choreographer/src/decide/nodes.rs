@@ -76,10 +76,7 @@ pub enum NodeExitAction {
 /// Decides what happens after a node has exited.
 pub fn decide_after_exit(crew: NodeExitContext, end: EndedNode<'_>) -> NodeExitAction {
     let EndedNode { node, how, .. } = end;
-    let fail = |reason| NodeExitAction::Fail {
-        event: None,
-        reason,
-    };
+    let fail = |reason| NodeExitAction::Fail { event: None, reason };
     let event = |kind, message| NodeReport { kind, message };
     if crew.linked {
         // A stub manages the nodes.
@@ -101,11 +98,7 @@ pub fn decide_after_exit(crew: NodeExitContext, end: EndedNode<'_>) -> NodeExitA
             return fail(format!("gave up on {node}: it {how} repeatedly"));
         };
         let message = format!("{node} {how}; restart in {} ms", after.as_millis());
-        return NodeExitAction::Restart {
-            after,
-            failures,
-            event: event("node-failed", message),
-        };
+        return NodeExitAction::Restart { after, failures, event: event("node-failed", message) };
     }
     if crew.alive <= 1 {
         return fail(format!("has no running nodes left: {node} {how}"));
@@ -125,12 +118,7 @@ fn restart_pause(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
 mod tests {
     use super::*;
 
-    const CREW: NodeExitContext = NodeExitContext {
-        linked: false,
-        ready: true,
-        restarts: true,
-        alive: 2,
-    };
+    const CREW: NodeExitContext = NodeExitContext { linked: false, ready: true, restarts: true, alive: 2 };
 
     const END: EndedNode<'_> = EndedNode {
         node: "/a",
@@ -143,76 +131,32 @@ mod tests {
 
     #[test]
     fn what_the_end_of_a_node_means() {
-        let done = EndedNode {
-            failed: false,
-            how: "exited with status 0",
-            ..END
-        };
-        let killed = EndedNode {
-            out_of_memory: true,
-            how: "was killed",
-            ..END
-        };
-        let starting = NodeExitContext {
-            ready: false,
-            ..CREW
-        };
+        let done = EndedNode { failed: false, how: "exited with status 0", ..END };
+        let killed = EndedNode { out_of_memory: true, how: "was killed", ..END };
+        let starting = NodeExitContext { ready: false, ..CREW };
         let last = NodeExitContext { alive: 1, ..CREW };
-        let fragile = NodeExitContext {
-            restarts: false,
-            ..CREW
-        };
-        let linked = NodeExitContext {
-            linked: true,
-            ready: false,
-            ..CREW
-        };
+        let fragile = NodeExitContext { restarts: false, ..CREW };
+        let linked = NodeExitContext { linked: true, ready: false, ..CREW };
         let in_words = |next| match next {
             NodeExitAction::Nothing => "nothing".to_owned(),
             NodeExitAction::Without(event) => format!("{}: {}", event.kind, event.message),
             NodeExitAction::Restart { event, .. } => format!("{}: {}", event.kind, event.message),
-            NodeExitAction::Fail {
-                event: None,
-                reason,
-            } => format!("it {reason}"),
-            NodeExitAction::Fail {
-                event: Some(event),
-                reason,
-            } => format!("{}, it {reason}", event.kind),
+            NodeExitAction::Fail { event: None, reason } => format!("it {reason}"),
+            NodeExitAction::Fail { event: Some(event), reason } => format!("{}, it {reason}", event.kind),
         };
         for (crew, end, expected) in [
-            (
-                CREW,
-                END,
-                "node-failed: /a exited with status 1; restart in 500 ms",
-            ),
+            (CREW, END, "node-failed: /a exited with status 1; restart in 500 ms"),
             (CREW, done, "node-ended: /a exited with status 0"),
             (CREW, killed, "out-of-memory, it lost /a: it was killed"),
-            (
-                starting,
-                END,
-                "it did not become ready: /a exited with status 1",
-            ),
+            (starting, END, "it did not become ready: /a exited with status 1"),
             (starting, done, "node-ended: /a exited with status 0"),
             (fragile, END, "node-ended: /a exited with status 1"),
-            (
-                last,
-                END,
-                "node-failed: /a exited with status 1; restart in 500 ms",
-            ),
-            (
-                last,
-                done,
-                "it has no running nodes left: /a exited with status 0",
-            ),
+            (last, END, "node-failed: /a exited with status 1; restart in 500 ms"),
+            (last, done, "it has no running nodes left: /a exited with status 0"),
             (linked, END, "nothing"),
             (linked, killed, "nothing"),
         ] {
-            assert_eq!(
-                in_words(decide_after_exit(crew, end)),
-                expected,
-                "{crew:?} {end:?}"
-            );
+            assert_eq!(in_words(decide_after_exit(crew, end)), expected, "{crew:?} {end:?}");
         }
     }
 
@@ -221,17 +165,9 @@ mod tests {
         let mut failures = 0;
         let mut pauses = Vec::new();
         for ran in runs {
-            let end = EndedNode {
-                ran,
-                failures,
-                ..END
-            };
+            let end = EndedNode { ran, failures, ..END };
             match decide_after_exit(CREW, end) {
-                NodeExitAction::Restart {
-                    after,
-                    failures: now,
-                    ..
-                } => {
+                NodeExitAction::Restart { after, failures: now, .. } => {
                     failures = now;
                     pauses.push(after);
                 }

@@ -32,10 +32,7 @@ pub fn place<'a>(
         if servant.revision == current || servant.connections > 0 {
             return Placement::Keep(servant.id);
         }
-        ends = Some(StopOrder {
-            id: servant.id,
-            reason: "replaced by another revision",
-        });
+        ends = Some(StopOrder { id: servant.id, reason: "replaced by another revision" });
     }
     let warm = warm.is_some_and(|warm| warm.runs && warm.is_from(current, image));
     Placement::Start { ends, warm }
@@ -47,10 +44,7 @@ mod tests {
 
     #[test]
     fn a_robot_keeps_its_servant_until_another_revision_or_its_end() {
-        let end = StopOrder {
-            id: "one",
-            reason: "replaced by another revision",
-        };
+        let end = StopOrder { id: "one", reason: "replaced by another revision" };
         let start = |ends| Placement::Start { ends, warm: false };
         for (revision, connections, ending, expected) in [
             (2, 0, false, Placement::Keep("one")),
@@ -60,14 +54,7 @@ mod tests {
             (2, 1, true, start(None)),
             (1, 0, true, start(None)),
         ] {
-            let has = ServantFacts {
-                id: "one",
-                revision,
-                connections,
-                promised: None,
-                idle_until: None,
-                ending,
-            };
+            let has = ServantFacts { id: "one", revision, connections, promised: None, idle_until: None, ending };
             assert_eq!(place(Some(&has), None, 2, "sha256:2"), expected, "{has:?}");
         }
         assert_eq!(place(None, None, 2, "sha256:2"), start(None));
@@ -82,19 +69,9 @@ mod tests {
             // Of a service that was removed and published anew.
             (2, "sha256:1", true, false),
         ] {
-            let warm = WarmContainer {
-                id: "two",
-                service: "detect",
-                revision,
-                image,
-                runs,
-                nodes: false,
-            };
+            let warm = WarmContainer { id: "two", service: "detect", revision, image, runs, nodes: false };
             let placement = place(None, Some(&warm), 2, "sha256:2");
-            let expected = Placement::Start {
-                ends: None,
-                warm: used,
-            };
+            let expected = Placement::Start { ends: None, warm: used };
             assert_eq!(placement, expected, "{warm:?}");
         }
     }

@@ -6,9 +6,7 @@ mod machine;
 use proptest::prelude::*;
 
 use super::Amount;
-use super::admission::{
-    AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, OVERTAKEN, Ticket,
-};
+use super::admission::{AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, OVERTAKEN, Ticket};
 use machine::MachineModel;
 
 /// Services of the machine, with the thousandths of a core promised to each servant; the first needs all cores.
@@ -18,11 +16,7 @@ const SERVICES: [(&str, u64); 3] = [("map", 4000), ("detect", 1000), ("plan", 25
 #[derive(Debug, Clone)]
 enum MachineStep {
     /// A robot requests a service.
-    Asks {
-        service: usize,
-        robot: usize,
-        priority: i32,
-    },
+    Asks { service: usize, robot: usize, priority: i32 },
     /// One connection of a servant ends.
     Leaves(usize),
     /// A servant advances by one stage.

@@ -19,11 +19,7 @@ pub fn find_topic_request(ros: RosVersion, interface: &Interface) -> Option<Topi
         topics.any(|it| it.direction == Direction::Output && it.latched && it.name == *name)
     };
     pair.outputs.retain(|name| !is_latched(name));
-    let is_alone = || {
-        request.reason == Reason::Alone
-            && interface.services.is_empty()
-            && interface.actions.is_empty()
-    };
+    let is_alone = || request.reason == Reason::Alone && interface.services.is_empty() && interface.actions.is_empty();
     let is_certain = match pair.by? {
         Correlation::Stamp => true,
         _ => request.reason == Reason::Stated || is_alone(),
@@ -44,9 +40,7 @@ mod tests {
             let latched = name.ends_with("latched");
             serde_json::json!({ "name": name, "type": type_name, "direction": direction, "latched": latched })
         });
-        let services = services
-            .iter()
-            .map(|name| serde_json::json!({ "name": name, "type": "x/Ask" }));
+        let services = services.iter().map(|name| serde_json::json!({ "name": name, "type": "x/Ask" }));
         let definitions = serde_json::json!({
             "x/msg/Text": "string data\n",
             "x/msg/Stamped": "std_msgs/Header header\n",
@@ -72,37 +66,16 @@ mod tests {
     #[test]
     fn what_leaves_no_doubt_is_a_pair() {
         for (topics, services, expected) in [
-            (
-                &["</in x/Stamped", ">/out x/Stamped"][..],
-                &[][..],
-                "/in -> /out by stamp",
-            ),
+            (&["</in x/Stamped", ">/out x/Stamped"][..], &[][..], "/in -> /out by stamp"),
             // With stamps other topics do not matter.
             (
-                &[
-                    "</in x/Stamped",
-                    "</also x/Text",
-                    ">/out x/Stamped",
-                    ">/beat x/Text",
-                ],
+                &["</in x/Stamped", "</also x/Text", ">/out x/Stamped", ">/beat x/Text"],
                 &["/ask"],
                 "/in -> /out by stamp",
             ),
-            (
-                &["</in x/Text", ">/out x/Text"],
-                &[],
-                "/in -> /out by arrival",
-            ),
-            (
-                &["</in x/Text", ">/out x/Text", ">/state_latched x/Text"],
-                &[],
-                "/in -> /out by arrival",
-            ),
-            (
-                &["</in x/Text", ">/out x/Text", ">/rosout x/Text"],
-                &[],
-                "/in -> /out by arrival",
-            ),
+            (&["</in x/Text", ">/out x/Text"], &[], "/in -> /out by arrival"),
+            (&["</in x/Text", ">/out x/Text", ">/state_latched x/Text"], &[], "/in -> /out by arrival"),
+            (&["</in x/Text", ">/out x/Text", ">/rosout x/Text"], &[], "/in -> /out by arrival"),
             // Which of them?
             (&["</in x/Text", "</also x/Text", ">/out x/Text"], &[], ""),
             (&["</in x/Text", ">/out x/Text", ">/beat x/Text"], &[], ""),

@@ -121,20 +121,12 @@ pub fn assign_revision(of: &Rollout, service: &str, robot: &str) -> AssignedRevi
         return AssignedRevision::Current;
     };
     match share {
-        Share::Robots(_) if of.robots.iter().any(|known| known == robot) => {
-            AssignedRevision::Candidate
-        }
-        Share::Robots(most) if of.robots.len() < most as usize => {
-            AssignedRevision::CandidateFromNow
-        }
+        Share::Robots(_) if of.robots.iter().any(|known| known == robot) => AssignedRevision::Candidate,
+        Share::Robots(most) if of.robots.len() < most as usize => AssignedRevision::CandidateFromNow,
         Share::Robots(_) => AssignedRevision::Current,
         Share::Percent(percent) => {
             let part = stable_hash(&[service, robot], of.candidate) as f64 / u64::MAX as f64;
-            if part * 100.0 < percent {
-                AssignedRevision::Candidate
-            } else {
-                AssignedRevision::Current
-            }
+            if part * 100.0 < percent { AssignedRevision::Candidate } else { AssignedRevision::Current }
         }
     }
 }
@@ -201,15 +193,10 @@ impl fmt::Display for PromotionBlocker {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             PromotionBlocker::Servant => write!(out, "none of its servants serves a robot yet"),
-            PromotionBlocker::Requests { seen, needed } => write!(
-                out,
-                "it has had {seen} requests of the {needed} required (--samples)"
-            ),
-            PromotionBlocker::Comparison {
-                failed,
-                seen,
-                needed,
-            } => write!(
+            PromotionBlocker::Requests { seen, needed } => {
+                write!(out, "it has had {seen} requests of the {needed} required (--samples)")
+            }
+            PromotionBlocker::Comparison { failed, seen, needed } => write!(
                 out,
                 "{} of its {} requests failed, but the previous revision has had {seen} requests of the {needed} \
                     required for a comparison (--samples)",
@@ -230,18 +217,11 @@ fn promotion_blocker(
     }
     let (needed, requests) = (u64::from(terms.samples.max(1)), candidate.requests);
     if requests.all < needed {
-        return Some(PromotionBlocker::Requests {
-            seen: requests.all,
-            needed,
-        });
+        return Some(PromotionBlocker::Requests { seen: requests.all, needed });
     }
     let seen = stable.requests.all;
     let fails = requests.failed as f64 > terms.bound * requests.all as f64;
-    (seen < needed && fails).then_some(PromotionBlocker::Comparison {
-        failed: requests,
-        seen,
-        needed,
-    })
+    (seen < needed && fails).then_some(PromotionBlocker::Comparison { failed: requests, seen, needed })
 }
 
 /// Decides the next step of a rollout at `now`.
@@ -260,9 +240,7 @@ pub fn next_step(of: &Rollout, now: Millis) -> RolloutStep {
                 return RolloutStep::Waits(wait);
             }
             let seen = candidate.requests.all;
-            RolloutStep::Promotes(format!(
-                "it was not worse within {after} s and {seen} requests"
-            ))
+            RolloutStep::Promotes(format!("it was not worse within {after} s and {seen} requests"))
         }
         RolloutState::Draining if of.terms.deadline.is_none_or(since) => RolloutStep::EndsOthers,
         _ => RolloutStep::Stays,
@@ -270,11 +248,7 @@ pub fn next_step(of: &Rollout, now: Millis) -> RolloutStep {
 }
 
 /// Returns in what respect the candidate is worse than the stable revision by more than the terms allow, if it is.
-pub fn regression(
-    stable: &RevisionStats,
-    candidate: &RevisionStats,
-    terms: &RolloutTerms,
-) -> Option<String> {
+pub fn regression(stable: &RevisionStats, candidate: &RevisionStats, terms: &RolloutTerms) -> Option<String> {
     let (bound, samples) = (terms.bound, u64::from(terms.samples.max(1)));
     let percent = |tries: AttemptCounts| 100.0 * tries.failed as f64 / tries.all.max(1) as f64;
     let says = |what: &str, candidate: AttemptCounts, stable: AttemptCounts| {
@@ -299,10 +273,8 @@ pub fn regression(
         return Some(says("requests", requests, stable.requests));
     }
     let median = stable.times.quantile(0.5)?;
-    let slow = AttemptCounts {
-        all: candidate.times.count(),
-        failed: candidate.times.count_above(median * (1.0 + bound)),
-    };
+    let slow =
+        AttemptCounts { all: candidate.times.count(), failed: candidate.times.count_above(median * (1.0 + bound)) };
     if slow.all >= samples && lower_bound(slow) > 0.5 {
         return Some(format!(
             "its p50 response time is {:.0} ms; previous revision: {median:.0} ms",
@@ -332,11 +304,7 @@ fn max_divergence(tries: AttemptCounts) -> f64 {
 fn bisect(mut inside: f64, mut outside: f64, seen: f64, allowed: f64) -> f64 {
     for _ in 0..60 {
         let middle = f64::midpoint(inside, outside);
-        if kl_divergence(seen, middle) <= allowed {
-            inside = middle
-        } else {
-            outside = middle
-        }
+        if kl_divergence(seen, middle) <= allowed { inside = middle } else { outside = middle }
     }
     outside
 }

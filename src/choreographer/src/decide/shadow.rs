@@ -31,14 +31,7 @@ pub(crate) struct Tally {
 
 impl Tally {
     pub(crate) fn new(kind: Kind, name: &str) -> Tally {
-        Tally {
-            row: Compared {
-                kind,
-                name: name.to_owned(),
-                ..Compared::default()
-            },
-            ..Tally::default()
-        }
+        Tally { row: Compared { kind, name: name.to_owned(), ..Compared::default() }, ..Tally::default() }
     }
 
     /// Records a pair of answers and their differences.
@@ -49,12 +42,7 @@ impl Tally {
         }
         self.row.different += 1;
         let mut counted = Vec::new();
-        for DifferingField {
-            field,
-            present,
-            candidate,
-        } in differing
-        {
+        for DifferingField { field, present, candidate } in differing {
             // Elements of an array share one name.
             if counted.contains(&field) {
                 continue;
@@ -64,12 +52,7 @@ impl Tally {
                 continue;
             }
             let known = self.fields.entry(field.clone());
-            let known = known.or_insert(FieldDifference {
-                field,
-                answers: 0,
-                present,
-                candidate,
-            });
+            let known = known.or_insert(FieldDifference { field, answers: 0, present, candidate });
             known.answers += 1;
         }
     }
@@ -108,60 +91,38 @@ impl Tally {
     fn is_slower(row: &Compared, bound: f64) -> bool {
         let enough = row.answers() >= FEWEST as u64;
         match (&row.present, &row.candidate) {
-            (Some(present), Some(candidate)) if enough => {
-                candidate.p50 > present.p50 * (1.0 + bound) + SLACK
-            }
+            (Some(present), Some(candidate)) if enough => candidate.p50 > present.p50 * (1.0 + bound) + SLACK,
             _ => false,
         }
     }
 }
 
 /// Returns the overall verdict; `failed` is the reason why the candidate ended unexpectedly.
-pub(crate) fn overall_verdict(
-    rows: &[Compared],
-    failed: Option<&str>,
-    bound: f64,
-) -> (Verdict, String) {
+pub(crate) fn overall_verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (Verdict, String) {
     if let Some(reason) = failed {
         return (Verdict::Failed, format!("the candidate {reason}"));
     }
     let answers: u64 = rows.iter().map(Compared::answers).sum();
     let unequal: u64 = rows.iter().map(Compared::unequal).sum();
     if answers == 0 {
-        return (
-            Verdict::Nothing,
-            "there were no answers to compare".to_owned(),
-        );
+        return (Verdict::Nothing, "there were no answers to compare".to_owned());
     }
     if unequal > 0 {
-        let of: Vec<&str> = rows
-            .iter()
-            .filter(|row| row.unequal() > 0)
-            .map(|row| row.name.as_str())
-            .collect();
-        return (
-            Verdict::Different,
-            format!("{unequal} of {answers} answers differ: {}", of.join(", ")),
-        );
+        let of: Vec<&str> = rows.iter().filter(|row| row.unequal() > 0).map(|row| row.name.as_str()).collect();
+        return (Verdict::Different, format!("{unequal} of {answers} answers differ: {}", of.join(", ")));
     }
     let slower: Vec<String> = rows
         .iter()
         .filter(|row| Tally::is_slower(row, bound))
         .filter_map(|row| {
             let (present, candidate) = (row.present?, row.candidate?);
-            Some(format!(
-                "{} takes {:.1} ms instead of {:.1} ms (p50)",
-                row.name, candidate.p50, present.p50
-            ))
+            Some(format!("{} takes {:.1} ms instead of {:.1} ms (p50)", row.name, candidate.p50, present.p50))
         })
         .collect();
     if !slower.is_empty() {
         return (Verdict::Slower, slower.join(", "));
     }
-    (
-        Verdict::Equal,
-        format!("{answers} answers are equal and not slower"),
-    )
+    (Verdict::Equal, format!("{answers} answers are equal and not slower"))
 }
 
 #[cfg(test)]

@@ -37,11 +37,7 @@ fn water_level(capacity: u64, claims: &[Claim]) -> u64 {
     }
     while over - fits > 1 {
         let middle = fits + (over - fits) / 2;
-        if used(middle) <= capacity {
-            fits = middle
-        } else {
-            over = middle
-        }
+        if used(middle) <= capacity { fits = middle } else { over = middle }
     }
     fits
 }
@@ -60,27 +56,15 @@ mod tests {
     fn what_is_left_goes_to_those_who_have_least() {
         for (capacity, claims, expected) in [
             (4000, vec![(0, 1000), (0, 1000)], vec![1000, 1000]),
-            (
-                3000,
-                vec![(0, 500), (0, 4000), (0, 4000)],
-                vec![500, 1250, 1250],
-            ),
+            (3000, vec![(0, 500), (0, 4000), (0, 4000)], vec![500, 1250, 1250]),
             (3000, vec![(2000, 4000), (0, 4000)], vec![2000, 1000]),
             (3000, vec![(2000, 100), (0, 4000)], vec![100, 2900]),
             // Floors are kept even if they exceed the capacity.
-            (
-                1000,
-                vec![(800, 4000), (700, 4000), (0, 9)],
-                vec![800, 700, 0],
-            ),
+            (1000, vec![(800, 4000), (700, 4000), (0, 9)], vec![800, 700, 0]),
             (1000, vec![], vec![]),
         ] {
             let all: Vec<_> = claims.iter().copied().map(claim).collect();
-            assert_eq!(
-                fill_shares(capacity, &all),
-                expected,
-                "{capacity} {claims:?}"
-            );
+            assert_eq!(fill_shares(capacity, &all), expected, "{capacity} {claims:?}");
         }
     }
 

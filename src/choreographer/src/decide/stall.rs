@@ -48,15 +48,10 @@ impl StallDetector {
         };
         let short = reading.available.is_none_or(|percent| percent < PLENTY);
         let why = if short && full >= stalls {
-            format!(
-                "this machine stalls: all tasks waited for memory in {full:.0} % of the last 10 s"
-            )
+            format!("this machine stalls: all tasks waited for memory in {full:.0} % of the last 10 s")
         } else if reading.swapped_in >= swaps {
             let bytes = reading.swapped_in.max(0.0) as u64;
-            format!(
-                "this machine swaps: it reads {} per second from swap",
-                api::Size(bytes)
-            )
+            format!("this machine swaps: it reads {} per second from swap", api::Size(bytes))
         } else {
             match self.seen {
                 Some(seen) if now.saturating_duration_since(seen) < QUIET => {
@@ -80,20 +75,13 @@ mod tests {
     use super::*;
 
     fn reading(memory_full: f64, swapped_in: f64) -> PressureReading {
-        PressureReading {
-            memory_full: Some(memory_full),
-            available: Some(3.0),
-            swapped_in,
-        }
+        PressureReading { memory_full: Some(memory_full), available: Some(3.0), swapped_in }
     }
 
     #[test]
     fn servants_that_wait_at_their_own_limits_are_not_the_machine() {
         for (available, stalls) in [(Some(80.0), false), (Some(24.9), true), (None, true)] {
-            let of = PressureReading {
-                available,
-                ..reading(90.0, 0.0)
-            };
+            let of = PressureReading { available, ..reading(90.0, 0.0) };
             let why = StallDetector::default().judge(of, Instant::now());
             assert_eq!(why.is_some(), stalls, "{available:?}: {why:?}");
         }
@@ -108,11 +96,7 @@ mod tests {
             (1, PressureReading::default(), None),
             (2, reading(12.4, 0.0), Some("waited for memory in 12 %")),
             (3, reading(5.0, 0.0), Some("waited for memory in 5 %")),
-            (
-                4,
-                reading(4.9, SETTLED),
-                Some("swaps: it reads 256K per second"),
-            ),
+            (4, reading(4.9, SETTLED), Some("swaps: it reads 256K per second")),
             (5, reading(0.0, 0.0), Some("a moment ago")),
             (8, reading(4.9, 0.0), Some("a moment ago")),
             (9, reading(4.9, 0.0), None),

@@ -129,17 +129,10 @@ struct TermsContext<'a> {
 }
 
 impl<'a> TermsContext<'a> {
-    fn from_stated(
-        stated: &BTreeMap<String, Stated>,
-        offer: &Offer<'a>,
-    ) -> Result<TermsContext<'a>, TermsError> {
+    fn from_stated(stated: &BTreeMap<String, Stated>, offer: &Offer<'a>) -> Result<TermsContext<'a>, TermsError> {
         let priority = |name: &str| offer.classes.get(name).map(|class| class.priority);
         let prefer = |one: &str, other: &str| priority(one) > priority(other);
-        let together = stated
-            .values()
-            .cloned()
-            .reduce(|one, other| one.merge(other, prefer))
-            .unwrap_or_default();
+        let together = stated.values().cloned().reduce(|one, other| one.merge(other, prefer)).unwrap_or_default();
         let class = find_class(together.class.as_deref(), offer.classes)?;
         let by_class = class.map_or(Limits::default(), |(_, class)| class.limits);
         let mut measured = offer.measured.clone();
@@ -175,19 +168,12 @@ impl<'a> TermsContext<'a> {
 
     /// Returns the explicitly stated resources.
     fn stated_resources(&self) -> Limits {
-        Limits {
-            cpus: self.together.cpus,
-            memory: self.together.memory,
-            ..Limits::default()
-        }
+        Limits { cpus: self.together.cpus, memory: self.together.memory, ..Limits::default() }
     }
 }
 
 /// Derives the terms for the statements of one robot's clients, by node. Deterministic.
-pub fn compute_terms(
-    stated: &BTreeMap<String, Stated>,
-    offer: &Offer<'_>,
-) -> Result<Terms, TermsError> {
+pub fn compute_terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Terms, TermsError> {
     let reading = TermsContext::from_stated(stated, offer)?;
     reading.bounds.check(&reading.together)?;
     let (direct, own) = (reading.stated_resources(), reading.own);
@@ -198,35 +184,25 @@ pub fn compute_terms(
     let (mut rows, mut by_rows): (Vec<Row>, Option<Limits>) = (Vec::new(), None);
     for goal in reading.sla.goals() {
         let shelf = reading.dictionary_view(offer);
-        let choice = shelf.choose(&goal, |row| {
-            reading.bounds.exceeded_by(row, &shelf).is_none()
-        });
+        let choice = shelf.choose(&goal, |row| reading.bounds.exceeded_by(row, &shelf).is_none());
         let (row, reason) = match choice {
             RowChoice::Silent => {
                 let name = goal.measure.name();
                 let service = offer.service;
-                why.push(format!(
-                    "the SLA table of {service} has no entry for {name}"
-                ));
+                why.push(format!("the SLA table of {service} has no entry for {name}"));
                 continue;
             }
-            RowChoice::Taken {
-                row,
-                desired,
-                assumed,
-            } => (row, taken_reason(&goal, row, desired, &assumed)),
-            RowChoice::Unmet {
-                best: Some(row), ..
-            } if !reading.strict => (row, format!("{} is the best available", row_in_words(row))),
+            RowChoice::Taken { row, desired, assumed } => (row, taken_reason(&goal, row, desired, &assumed)),
+            RowChoice::Unmet { best: Some(row), .. } if !reading.strict => {
+                (row, format!("{} is the best available", row_in_words(row)))
+            }
             RowChoice::Unmet { .. } if !reading.strict => {
                 why.push(format!("no entry for {} applies", goal_in_words(&goal)));
                 continue;
             }
-            RowChoice::Unmet {
-                best,
-                beyond,
-                assumed,
-            } => return Err(unmet_error(&goal, best, beyond, assumed, offer, &reading)),
+            RowChoice::Unmet { best, beyond, assumed } => {
+                return Err(unmet_error(&goal, best, beyond, assumed, offer, &reading));
+            }
         };
         let enough = row.limits.or(own);
         by_rows = Some(by_rows.map_or(enough, |sum| sum.combine_max(enough)));
@@ -241,11 +217,7 @@ pub fn compute_terms(
     // The weight of a class was set by an operator.
     let asks = |limits: &Limits| limits.cpu_weight.is_some();
     let by_deployer = asks(&offer.limits) || rows.iter().any(|row| asks(&row.limits));
-    let limits = if offer.is_deployers && by_deployer {
-        with_bounded_weight(limits)
-    } else {
-        limits
-    };
+    let limits = if offer.is_deployers && by_deployer { with_bounded_weight(limits) } else { limits };
     Ok(Terms {
         stated: stated.clone(),
         measured: offer.measured.clone(),
@@ -259,19 +231,10 @@ pub fn compute_terms(
 
 /// Returns the reason why a row is taken.
 fn taken_reason(goal: &Goal, row: &Row, desired: bool, assumed: &Aux) -> String {
-    let reason = if desired {
-        "is the cheapest that reaches"
-    } else {
-        "is the best acceptable entry for"
-    };
+    let reason = if desired { "is the cheapest that reaches" } else { "is the best acceptable entry for" };
     let measure = goal.measure;
     let wished = measure.format_value(goal.desire);
-    format!(
-        "{} {reason} {} {wished}{}",
-        row_in_words(row),
-        measure.name(),
-        for_what(assumed)
-    )
+    format!("{} {reason} {} {wished}{}", row_in_words(row), measure.name(), for_what(assumed))
 }
 
 fn unmet_error(
@@ -288,21 +251,11 @@ fn unmet_error(
     let shelf = reading.dictionary_view(offer);
     let beyond = beyond.and_then(|row| Some((row, reading.bounds.exceeded_by(row, &shelf)?)));
     match beyond {
-        Some((row, cap)) => TermsError::Beyond {
-            goal,
-            assumed,
-            needs: row_in_words(row),
-            cap: Box::new(cap),
-            fits,
-        },
+        Some((row, cap)) => TermsError::Beyond { goal, assumed, needs: row_in_words(row), cap: Box::new(cap), fits },
         None => TermsError::Unmet {
             service: offer.service.to_owned(),
             goal,
-            assumed: if assumed.is_empty() {
-                reading.aux.clone()
-            } else {
-                assumed
-            },
+            assumed: if assumed.is_empty() { reading.aux.clone() } else { assumed },
             best: best.map(row_in_words),
             fits,
         },
@@ -325,20 +278,12 @@ pub(crate) fn row_in_words(row: &Row) -> String {
 
 /// Returns the assumed parameters that were not stated, in words.
 fn assumed_in_words(assumed: &Aux) -> String {
-    if assumed.is_empty() {
-        String::new()
-    } else {
-        format!(" with {} (assumed because not given)", aux_pairs(assumed))
-    }
+    if assumed.is_empty() { String::new() } else { format!(" with {} (assumed because not given)", aux_pairs(assumed)) }
 }
 
 /// Returns the assumed auxiliary parameters as a suffix.
 fn for_what(assumed: &Aux) -> String {
-    if assumed.is_empty() {
-        String::new()
-    } else {
-        format!(" with {}", aux_pairs(assumed))
-    }
+    if assumed.is_empty() { String::new() } else { format!(" with {}", aux_pairs(assumed)) }
 }
 
 /// Returns auxiliary parameters in the form of a statement.
@@ -354,19 +299,16 @@ fn find_class<'a>(
 ) -> Result<Option<(&'a str, &'a ClassOptions)>, TermsError> {
     let found = classes.get_key_value(named.unwrap_or(DEFAULT_CLASS));
     match (named, found) {
-        (Some(name), None) => Err(TermsError::UnknownClass {
-            name: name.to_owned(),
-            exists: classes.keys().cloned().collect(),
-        }),
+        (Some(name), None) => {
+            Err(TermsError::UnknownClass { name: name.to_owned(), exists: classes.keys().cloned().collect() })
+        }
         (_, found) => Ok(found.map(|(name, class)| (name.as_str(), class))),
     }
 }
 
 /// Returns a human-readable form of limits, by the names of their flags.
 pub(crate) fn limits_in_words(limits: &Limits) -> String {
-    let set = limits
-        .flag_values()
-        .map(|(name, value)| format!("{name} {value}"));
+    let set = limits.flag_values().map(|(name, value)| format!("{name} {value}"));
     set.collect::<Vec<_>>().join(", ")
 }
 

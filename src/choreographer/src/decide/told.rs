@@ -35,15 +35,8 @@ impl RefusalLog {
                 return None;
             }
         }
-        let fresh = || Window {
-            began: now,
-            robots: BTreeSet::new(),
-            left_out: 0,
-        };
-        let window = self
-            .services
-            .entry(service.to_owned())
-            .or_insert_with(fresh);
+        let fresh = || Window { began: now, robots: BTreeSet::new(), left_out: 0 };
+        let window = self.services.entry(service.to_owned()).or_insert_with(fresh);
         let mut left_out = 0;
         if over(window) {
             left_out = window.left_out;
@@ -87,20 +80,10 @@ mod tests {
             ("a", 121, Some(0)),
         ] {
             let now = began + second * after;
-            assert_eq!(
-                told.record_refusal("s", robot, now),
-                tells,
-                "{robot} {after}"
-            );
+            assert_eq!(told.record_refusal("s", robot, now), tells, "{robot} {after}");
         }
         assert_eq!(told.record_refusal("other", "a", began), Some(0));
-        assert_eq!(
-            (
-                suppressed_note(0).as_str(),
-                suppressed_note(2).contains("2 more")
-            ),
-            ("", true)
-        );
+        assert_eq!((suppressed_note(0).as_str(), suppressed_note(2).contains("2 more")), ("", true));
     }
 
     #[test]

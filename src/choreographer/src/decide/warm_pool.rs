@@ -43,10 +43,7 @@ pub fn choose_container<'a>(
     default_names: bool,
 ) -> Option<WarmContainer<'a>> {
     let fits = |warm: &WarmContainer<'_>| {
-        warm.service == service
-            && warm.runs
-            && warm.is_from(revision, image)
-            && (default_names || !warm.nodes)
+        warm.service == service && warm.runs && warm.is_from(revision, image) && (default_names || !warm.nodes)
     };
     let mut best: Option<WarmContainer<'a>> = None;
     for warm in pool.filter(fits) {
@@ -116,10 +113,7 @@ pub fn pool_sizes(demands: &[PoolDemand], budget: PoolBudget) -> Vec<PoolSize> {
         left -= if has { cost } else { 0 };
         has
     };
-    let offered: Vec<f64> = demands
-        .iter()
-        .map(|demand| demand.rate * demand.lead.as_secs_f64())
-        .collect();
+    let offered: Vec<f64> = demands.iter().map(|demand| demand.rate * demand.lead.as_secs_f64()).collect();
     for size in &mut sizes {
         size.makes = usize::from(take(CONTAINER));
     }
@@ -140,9 +134,7 @@ pub fn pool_sizes(demands: &[PoolDemand], budget: PoolBudget) -> Vec<PoolSize> {
             let spared = demands[index].rate * (waits - forecast::erlang_b(has + 1, offered));
             (has > 0 && waits > LOSS).then_some((index, spared))
         };
-        let most = (0..sizes.len())
-            .filter_map(spared)
-            .reduce(|best, next| if next.1 > best.1 { next } else { best });
+        let most = (0..sizes.len()).filter_map(spared).reduce(|best, next| if next.1 > best.1 { next } else { best });
         let Some((index, _)) = most.filter(|_| take(CONTAINER)) else {
             break;
         };
@@ -187,16 +179,10 @@ impl WantedPool<'_> {
 
 /// Returns the containers of `pool` to end: of none of the wanted revisions, not running, or too many. Of the latter,
 /// those without nodes that were made last come first.
-pub fn stale_containers<'a>(
-    pool: &[WarmContainer<'a>],
-    wanted: &[WantedPool<'_>],
-) -> Vec<StopOrder<'a>> {
+pub fn stale_containers<'a>(pool: &[WarmContainer<'a>], wanted: &[WantedPool<'_>]) -> Vec<StopOrder<'a>> {
     let mut ends = Vec::new();
     let mut end = |warm: &WarmContainer<'a>, reason| {
-        ends.push(StopOrder {
-            id: warm.id,
-            reason,
-        });
+        ends.push(StopOrder { id: warm.id, reason });
     };
     for warm in pool {
         if !warm.runs {
@@ -206,10 +192,7 @@ pub fn stale_containers<'a>(
         }
     }
     for wanted in wanted {
-        let mut of: Vec<&WarmContainer<'a>> = pool
-            .iter()
-            .filter(|warm| warm.runs && wanted.includes(warm))
-            .collect();
+        let mut of: Vec<&WarmContainer<'a>> = pool.iter().filter(|warm| warm.runs && wanted.includes(warm)).collect();
         let with = of.iter().filter(|warm| warm.nodes).count();
         // Nodes cost memory: they end as soon as there are too many.
         let (mut nodes, mut all) = (with.saturating_sub(wanted.size.nodes), of.len());
@@ -259,32 +242,16 @@ mod tests {
 
     use super::*;
 
-    const WARM: WarmContainer<'_> = WarmContainer {
-        id: "it",
-        service: "a",
-        revision: 2,
-        image: "sha256:2",
-        runs: true,
-        nodes: false,
-    };
+    const WARM: WarmContainer<'_> =
+        WarmContainer { id: "it", service: "a", revision: 2, image: "sha256:2", runs: true, nodes: false };
 
     fn wanted_pool(makes: usize, keeps: usize, nodes: usize) -> WantedPool<'static> {
-        WantedPool {
-            service: "a",
-            revision: 2,
-            image: "sha256:2",
-            size: PoolSize {
-                makes,
-                keeps,
-                nodes,
-            },
-        }
+        WantedPool { service: "a", revision: 2, image: "sha256:2", size: PoolSize { makes, keeps, nodes } }
     }
 
     #[test]
     fn the_services_asked_for_last_have_containers() {
-        let names =
-            |names: &[&str]| -> Vec<String> { names.iter().map(|it| (*it).into()).collect() };
+        let names = |names: &[&str]| -> Vec<String> { names.iter().map(|it| (*it).into()).collect() };
         let published = names(&["a", "b", "c", "d"]);
         for (asked_for, count, expected) in [
             (names(&[]), 2, ["a", "b"].as_slice()),
@@ -300,21 +267,9 @@ mod tests {
     #[test]
     fn a_robot_gets_nodes_only_where_it_takes_them_as_they_are() {
         let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
-        let dead = WarmContainer {
-            runs: false,
-            ..named("dead", true)
-        };
-        let older = WarmContainer {
-            revision: 1,
-            ..named("older", true)
-        };
-        let pool = [
-            dead,
-            older,
-            named("bare", false),
-            named("first", true),
-            named("second", true),
-        ];
+        let dead = WarmContainer { runs: false, ..named("dead", true) };
+        let older = WarmContainer { revision: 1, ..named("older", true) };
+        let pool = [dead, older, named("bare", false), named("first", true), named("second", true)];
         let id = |pool: &[WarmContainer<'static>], default_names| {
             let of = ("a", 2, "sha256:2");
             choose_container(pool.iter().copied(), of, default_names).map(|warm| warm.id)
@@ -338,44 +293,15 @@ mod tests {
         let one = wanted_pool(1, 1, 0);
         for (warm, stays) in [
             (WARM, true),
-            (
-                WarmContainer {
-                    runs: false,
-                    ..WARM
-                },
-                false,
-            ),
-            (
-                WarmContainer {
-                    revision: 1,
-                    ..WARM
-                },
-                false,
-            ),
-            (
-                WarmContainer {
-                    image: "sha256:1",
-                    ..WARM
-                },
-                false,
-            ),
-            (
-                WarmContainer {
-                    service: "b",
-                    ..WARM
-                },
-                false,
-            ),
+            (WarmContainer { runs: false, ..WARM }, false),
+            (WarmContainer { revision: 1, ..WARM }, false),
+            (WarmContainer { image: "sha256:1", ..WARM }, false),
+            (WarmContainer { service: "b", ..WARM }, false),
         ] {
             assert_eq!(ends(&[warm], one).is_empty(), stays, "{warm:?}");
         }
         let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
-        let pool = [
-            named("n1", true),
-            named("b1", false),
-            named("b2", false),
-            named("n2", true),
-        ];
+        let pool = [named("n1", true), named("b1", false), named("b2", false), named("n2", true)];
         assert_eq!(ends(&pool, wanted_pool(1, 4, 2)), [] as [&str; 0]);
         assert_eq!(ends(&pool, wanted_pool(1, 3, 2)), ["b2"]);
         assert_eq!(ends(&pool, wanted_pool(1, 4, 1)), ["n2"]);
@@ -387,38 +313,23 @@ mod tests {
     fn containers_are_made_first_and_then_their_nodes() {
         let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
         let lacks = |pool: &[WarmContainer<'static>], wanted| pool_shortage(pool, &wanted);
-        assert_eq!(
-            lacks(&[], wanted_pool(2, 2, 1)),
-            PoolShortage::Containers(2)
-        );
-        assert_eq!(
-            lacks(&[named("n", true)], wanted_pool(2, 2, 1)),
-            PoolShortage::Containers(1)
-        );
+        assert_eq!(lacks(&[], wanted_pool(2, 2, 1)), PoolShortage::Containers(2));
+        assert_eq!(lacks(&[named("n", true)], wanted_pool(2, 2, 1)), PoolShortage::Containers(1));
         let two = [named("one", false), named("two", false)];
-        assert_eq!(
-            lacks(&two, wanted_pool(2, 2, 1)),
-            PoolShortage::Nodes("one")
-        );
+        assert_eq!(lacks(&two, wanted_pool(2, 2, 1)), PoolShortage::Nodes("one"));
         assert_eq!(lacks(&two, wanted_pool(1, 2, 0)), PoolShortage::Nothing);
         let warm = [named("n", true), named("b", false)];
         assert_eq!(lacks(&warm, wanted_pool(2, 2, 1)), PoolShortage::Nothing);
         assert_eq!(lacks(&warm, wanted_pool(2, 2, 2)), PoolShortage::Nodes("b"));
     }
 
-    const DEMAND: PoolDemand = PoolDemand {
-        rate: 0.0,
-        lead: Duration::from_secs(1),
-        nodes: Some(64 << 20),
-    };
+    const DEMAND: PoolDemand = PoolDemand { rate: 0.0, lead: Duration::from_secs(1), nodes: Some(64 << 20) };
 
     #[test]
     fn pools_are_as_big_as_arrivals_need_and_memory_allows() {
         let busy = |rate| PoolDemand { rate, ..DEMAND };
-        let budget = |containers, nodes| PoolBudget {
-            memory: containers * CONTAINER + nodes as u64 * (64 << 20),
-            nodes,
-        };
+        let budget =
+            |containers, nodes| PoolBudget { memory: containers * CONTAINER + nodes as u64 * (64 << 20), nodes };
         let makes = |demands: &[PoolDemand], budget| {
             let sizes = pool_sizes(demands, budget);
             let of = sizes.iter().map(|size| (size.makes, size.nodes));
@@ -430,10 +341,7 @@ mod tests {
         // Erlang's B of one in a lead time: 5 % with four.
         assert_eq!(makes(&[busy(1.0), DEMAND], budget(99, 0))[0], (4, 0));
         assert_eq!(makes(&[DEMAND, busy(1.0)], budget(4, 0)), [(1, 0), (3, 0)]);
-        let nobodys = PoolDemand {
-            nodes: None,
-            ..busy(1.0)
-        };
+        let nobodys = PoolDemand { nodes: None, ..busy(1.0) };
         assert_eq!(makes(&[nobodys], budget(99, 3)), [(4, 0)]);
         assert_eq!(makes(&[busy(1.0)], budget(99, 9))[0].1, 4);
     }

@@ -12,9 +12,7 @@ use super::driver::{self, ServantSource};
 use super::waiting::Permit;
 use super::warm_pool::NOBODY;
 use crate::Error;
-use crate::decide::adoption::{
-    LeftoverContainer, LeftoverFate, StartedNode, decide_fate, is_linked,
-};
+use crate::decide::adoption::{LeftoverContainer, LeftoverFate, StartedNode, decide_fate, is_linked};
 use crate::decide::demand::LimitSources;
 use crate::{Choreographer, Handle};
 
@@ -43,20 +41,12 @@ impl Choreographer {
     /// Adopts the servants that an earlier daemon left, and forgets those that are gone.
     pub async fn adopt(&self) -> Result<AdoptionResult, Error> {
         let inner = &self.inner;
-        let AdoptedServants {
-            running,
-            ended,
-            failures,
-        } = inner.engine.adopt().await?;
+        let AdoptedServants { running, ended, failures } = inner.engine.adopt().await?;
         for error in &failures {
             self.report_leftover(error);
         }
-        let mut records: HashMap<String, ServantRecord> = inner
-            .state
-            .servants()?
-            .into_iter()
-            .map(|record| (record.id.clone(), record))
-            .collect();
+        let mut records: HashMap<String, ServantRecord> =
+            inner.state.servants()?.into_iter().map(|record| (record.id.clone(), record)).collect();
         let mut adopted = 0;
         let mut useless = Vec::new();
         for servant in running {
@@ -77,9 +67,8 @@ impl Choreographer {
                     adopted += 1;
                 }
                 (fate, _, revision) => {
-                    let had = revision.map_or(Limits::default(), |revision| {
-                        inner.push_limits(&revision).promised_limits()
-                    });
+                    let had =
+                        revision.map_or(Limits::default(), |revision| inner.push_limits(&revision).promised_limits());
                     useless.push(UnneededContainer {
                         servant,
                         fate,
@@ -112,10 +101,8 @@ impl Choreographer {
     /// Forgets servants that are gone, and reports how they ended.
     fn forget(&self, records: HashMap<String, ServantRecord>, ended: &[EndedServant]) {
         let inner = &self.inner;
-        let ends: HashMap<&str, Option<&ContainerState>> = ended
-            .iter()
-            .map(|ended| (ended.id.as_str(), ended.state.as_ref()))
-            .collect();
+        let ends: HashMap<&str, Option<&ContainerState>> =
+            ended.iter().map(|ended| (ended.id.as_str(), ended.state.as_ref())).collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
             if is_unassigned(&gone) {
@@ -133,11 +120,7 @@ impl Choreographer {
                     "servant {} of {} for {} ended while the daemon was not running{why}",
                     gone.id, gone.service, gone.robot
                 ),
-                &NewEvent {
-                    service: Some(&gone.service),
-                    servant: Some(&gone.id),
-                    robot: Some(&gone.robot),
-                },
+                &NewEvent { service: Some(&gone.service), servant: Some(&gone.id), robot: Some(&gone.robot) },
             );
         }
     }
@@ -145,10 +128,7 @@ impl Choreographer {
     /// Ends an unneeded container. What cannot be removed of it is reported and does no harm.
     async fn end(&self, useless: UnneededContainer) {
         let (inner, servant) = (&self.inner, &useless.servant);
-        let about = NewEvent {
-            servant: Some(servant.id()),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { servant: Some(servant.id()), ..NewEvent::default() };
         if useless.fate != LeftoverFate::Unused {
             let id = servant.id();
             let message = format!("ended servant {id} because its service no longer exists");
@@ -161,29 +141,16 @@ impl Choreographer {
         inner.state.remove_servant(servant.id());
     }
 
-    fn adopt_one(
-        &self,
-        record: ServantRecord,
-        revision: Arc<RevisionRecord>,
-        servant: Arc<dyn ServantHandle>,
-    ) {
+    fn adopt_one(&self, record: ServantRecord, revision: Arc<RevisionRecord>, servant: Arc<dyn ServantHandle>) {
         let inner = &self.inner;
         let of_push = || inner.push_limits(&revision);
         let asked = LimitSources {
             set: record.limits,
-            ..record
-                .terms
-                .map_or_else(of_push, |terms| inner.limit_sources(terms))
+            ..record.terms.map_or_else(of_push, |terms| inner.limit_sources(terms))
         };
         let key = (record.service, record.robot.clone());
-        let handle = Arc::new(Handle::new(
-            record.id.clone(),
-            record.robot,
-            record.anonymous,
-            asked,
-            revision,
-            record.created,
-        ));
+        let handle =
+            Arc::new(Handle::new(record.id.clone(), record.robot, record.anonymous, asked, revision, record.created));
         let planned = &handle.revision.plan.nodes;
         let started = servant.nodes().into_iter().map(|name| StartedNode {
             planned: planned.iter().any(|node| node.name == name),
@@ -197,9 +164,7 @@ impl Choreographer {
             servants.all.insert(record.id, Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
         }
-        let permit = inner
-            .admission
-            .adopt(inner.promised_amount(&handle.requested_limits()));
+        let permit = inner.admission.adopt(inner.promised_amount(&handle.requested_limits()));
         let beginning = ServantSource::Adopted(servant, Some(permit));
         driver::start(inner, handle, beginning);
     }

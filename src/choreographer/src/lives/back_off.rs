@@ -9,9 +9,7 @@ use tokio::time::Instant;
 
 use super::ChoreographerInner;
 use crate::Error;
-use crate::decide::back_off::{
-    FailureStreak, RECOVERED, after_failure, is_forgotten, remaining_pause, seconds,
-};
+use crate::decide::back_off::{FailureStreak, RECOVERED, after_failure, is_forgotten, remaining_pause, seconds};
 use crate::lives::handle::{Failure, Handle};
 
 pub(crate) use failures::BackOffs;
@@ -39,9 +37,7 @@ impl BackOffs {
     pub(crate) fn is_failing(&self, service: &str, robot: &str, revision: &RevisionRecord) -> bool {
         let failing = self.failing.lock();
         let known = failing.get(&(service.to_owned(), robot.to_owned()));
-        known.is_some_and(|known| {
-            known.revision == revision.number && !is_forgotten(known, Instant::now().into_std())
-        })
+        known.is_some_and(|known| known.revision == revision.number && !is_forgotten(known, Instant::now().into_std()))
     }
 
     /// Records the failure of a servant; returns the resulting state.
@@ -75,25 +71,14 @@ impl BackOffs {
 /// Returns the key of a robot's failures. A measurement (`~try-…`), which may look for the limits at which a servant
 /// fails, is no robot.
 fn back_off_key(robot: &str, anonymous: bool) -> &str {
-    if anonymous && !robot.contains('-') {
-        NAMELESS
-    } else {
-        robot
-    }
+    if anonymous && !robot.contains('-') { NAMELESS } else { robot }
 }
 
 impl ChoreographerInner {
     /// Refuses a servant that has failed repeatedly until its pause is over.
-    pub(crate) fn check_back_off(
-        &self,
-        revision: &RevisionRecord,
-        robot: &str,
-        anonymous: bool,
-    ) -> Result<(), Error> {
+    pub(crate) fn check_back_off(&self, revision: &RevisionRecord, robot: &str, anonymous: bool) -> Result<(), Error> {
         let service = &revision.service;
-        let known = self
-            .back_offs
-            .find_refusal(service, back_off_key(robot, anonymous), revision);
+        let known = self.back_offs.find_refusal(service, back_off_key(robot, anonymous), revision);
         match known {
             None => Ok(()),
             Some((failing, again)) => Err(Error::BackOff {
@@ -120,9 +105,7 @@ impl ChoreographerInner {
             }
             _ => return,
         };
-        let failing = self
-            .back_offs
-            .record_failure(service, robot, revision, ready_for, reason);
+        let failing = self.back_offs.record_failure(service, robot, revision, ready_for, reason);
         let now = Instant::now().into_std();
         if let Some(left) = remaining_pause(&failing, revision.number, now) {
             let message = format!(

@@ -82,21 +82,13 @@ impl Choreographer {
             options.input.as_deref(),
         )?;
         // Set, not stated: caps on robots do not limit measurements.
-        let set = api::Limits {
-            memory: options.memory,
-            ..api::Limits::default()
-        };
+        let set = api::Limits { memory: options.memory, ..api::Limits::default() };
         // An impossible limit is reported before anything is started.
         if let Some(least) = options.cpus.iter().copied().min_by(f64::total_cmp) {
-            self.check_limits(&api::Limits {
-                cpus: Some(least),
-                ..set
-            })?;
+            self.check_limits(&api::Limits { cpus: Some(least), ..set })?;
         }
         let measured = self.start_measured(service, PURPOSE, set)?;
-        let found = self
-            .run_calibration(&measured, service, requests, options, events)
-            .await;
+        let found = self.run_calibration(&measured, service, requests, options, events).await;
         // The next measurement finds the capacity that this one had.
         let handle = Arc::clone(measured.lease.handle());
         drop(measured);
@@ -189,11 +181,7 @@ impl Choreographer {
     }
 
     /// Returns the limits to measure: the named ones, or up to all that can be promised now.
-    fn limits_for(
-        &self,
-        measured: &MeasuredServant,
-        options: &CalibrationOptions,
-    ) -> Result<Vec<f64>, Error> {
+    fn limits_for(&self, measured: &MeasuredServant, options: &CalibrationOptions) -> Result<Vec<f64>, Error> {
         if options.own {
             let asked = measured.lease.handle().requested_limits().cpus;
             return Ok(vec![asked.unwrap_or(self.inner.options.cores.min(CORES))]);
@@ -205,9 +193,7 @@ impl Choreographer {
             return Ok(named);
         }
         let (capacity, promised, _) = self.admission().snapshot();
-        let own = self
-            .inner
-            .promised_amount(&measured.lease.handle().requested_limits());
+        let own = self.inner.promised_amount(&measured.lease.handle().requested_limits());
         let most = capacity.minus(promised.minus(own)).millicpus;
         if most < LEAST {
             let service = measured.lease.handle().service();
@@ -236,20 +222,11 @@ struct CalibrationRun<'a> {
 impl CalibrationRun<'_> {
     /// Measures at one limit and records the point; returns it with the times of the answered requests, in
     /// milliseconds.
-    async fn measure_at(
-        &mut self,
-        cpus: f64,
-        material: &Material,
-    ) -> Result<(Point, Vec<f64>), Error> {
+    async fn measure_at(&mut self, cpus: f64, material: &Material) -> Result<(Point, Vec<f64>), Error> {
         let handle = self.measured.lease.handle();
-        let change = api::Limits {
-            cpus: Some(cpus),
-            ..api::Limits::default()
-        };
+        let change = api::Limits { cpus: Some(cpus), ..api::Limits::default() };
         self.choreographer.set_limits(&handle.id, change).await?;
-        let container = handle
-            .container()
-            .ok_or(Error::Internal("measuring a servant"))?;
+        let container = handle.container().ok_or(Error::Internal("measuring a servant"))?;
         let own = self.own;
         let in_force = || match container.enforced_limits().limits.cpus {
             Some(enforced) => Amount::new(enforced, 0) == Amount::new(cpus, 0),
@@ -308,11 +285,7 @@ impl CalibrationRun<'_> {
         sum.pace = replay.pace;
         sum.unused = replay.unused;
         for input in replay.inputs {
-            match sum
-                .inputs
-                .iter_mut()
-                .find(|known| known.topic == input.topic)
-            {
+            match sum.inputs.iter_mut().find(|known| known.topic == input.topic) {
                 Some(Fed { sent, .. }) => *sent += input.sent,
                 None => sum.inputs.push(input),
             }
@@ -345,9 +318,7 @@ fn pace(options: &CalibrationOptions) -> ReplayPace {
         again: true,
         gap: match options.rate {
             Some(rate) => RequestGap::Rate(rate),
-            None if options.fast || options.source == api::calibration::Source::Frames => {
-                RequestGap::None
-            }
+            None if options.fast || options.source == api::calibration::Source::Frames => RequestGap::None,
             None => RequestGap::Recorded,
         },
         answer: ANSWER,
@@ -358,11 +329,7 @@ fn pace(options: &CalibrationOptions) -> ReplayPace {
 
 /// Returns the time between a robot and the node: as given, or as measured by the robot.
 fn network(requests: &CalibrationRequests, options: &CalibrationOptions) -> Option<TimeSpread> {
-    let given = options.network.map(|time| TimeSpread {
-        p50: time,
-        p95: time,
-        max: time,
-    });
+    let given = options.network.map(|time| TimeSpread { p50: time, p95: time, max: time });
     given.or(requests.network)
 }
 

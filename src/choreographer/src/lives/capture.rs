@@ -43,15 +43,11 @@ impl Choreographer {
         budget: &Budget,
     ) -> Result<CalibrationRequests, Error> {
         let handle = self.find_serving(service, robot)?;
-        let container = handle
-            .container()
-            .ok_or_else(|| not_served(service, robot))?;
+        let container = handle.container().ok_or_else(|| not_served(service, robot))?;
         let revision = &handle.revision;
         let opener = &self.inner.opener;
         // It connects to no external host.
-        let look = opener
-            .observe(&container, revision.flavour.ros.ros_version(), NODE, &[])
-            .await?;
+        let look = opener.observe(&container, revision.flavour.ros.ros_version(), NODE, &[]).await?;
         let mut recording = Recording::begin(&look.bus, &handle).await?;
         let mut permit = budget.permit();
         let messages = recording.record_until(bounds, &mut permit).await;
@@ -62,10 +58,7 @@ impl Choreographer {
                     (--bag)"
             )));
         }
-        let links = handle
-            .reach()
-            .map(|reach| reach.links())
-            .unwrap_or_default();
+        let links = handle.reach().map(|reach| reach.links()).unwrap_or_default();
         Ok(CalibrationRequests {
             material: Material::Bag(messages),
             network: network_times(links.iter().flat_map(|link| &link.requests)),
@@ -77,9 +70,7 @@ impl Choreographer {
     fn find_serving(&self, service: &str, robot: &str) -> Result<Arc<Handle>, Error> {
         self.inner.catalogue.current_revision(service)?;
         let of_it = |handle: &Arc<Handle>| {
-            handle.service() == service
-                && handle.robot == robot
-                && handle.life().phase == Phase::Ready
+            handle.service() == service && handle.robot == robot && handle.life().phase == Phase::Ready
         };
         let found = self.servants().into_iter().find(of_it);
         found.ok_or_else(|| not_served(service, robot))
@@ -108,15 +99,10 @@ struct Recording {
 impl Recording {
     async fn begin(bus: &Arc<dyn Bus>, handle: &Handle) -> Result<Recording, Error> {
         let (sender, heard) = mpsc::channel(1);
-        let mut recording = Recording {
-            heard,
-            tasks: Vec::new(),
-        };
+        let mut recording = Recording { heard, tasks: Vec::new() };
         let topics = handle.revision.interface.topics.iter();
         for topic in topics.filter(|topic| topic.direction == Direction::Input) {
-            let subscribed = bus
-                .subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE))
-                .await;
+            let subscribed = bus.subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE)).await;
             let subscription = subscribed.map_err(reach::Error::from)?;
             let name: Arc<str> = topic.name.as_str().into();
             let task = tokio::spawn(record_topic(name, subscription, sender.clone()));
@@ -126,11 +112,7 @@ impl Recording {
     }
 
     /// Records messages until one of the bounds is reached or the memory budget is exhausted.
-    async fn record_until(
-        &mut self,
-        bounds: CaptureBounds,
-        permit: &mut Permit,
-    ) -> Vec<BagMessage> {
+    async fn record_until(&mut self, bounds: CaptureBounds, permit: &mut Permit) -> Vec<BagMessage> {
         let ends = Instant::now() + bounds.time;
         let (mut messages, mut bytes) = (Vec::new(), 0);
         while messages.len() < bounds.messages {
@@ -153,11 +135,7 @@ impl Drop for Recording {
     }
 }
 
-async fn record_topic(
-    topic: Arc<str>,
-    mut subscription: Subscription,
-    heard: mpsc::Sender<BagMessage>,
-) {
+async fn record_topic(topic: Arc<str>, mut subscription: Subscription, heard: mpsc::Sender<BagMessage>) {
     while let Some(message) = subscription.messages.recv().await {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
         let recorded = BagMessage {
@@ -188,11 +166,7 @@ mod tests {
             ..RequestTiming::default()
         };
         // An unanswered request says nothing about the way down.
-        let requests = [
-            request(4.0, Some(1407.0)),
-            request(800.0, None),
-            request(7.0, Some(1410.0)),
-        ];
+        let requests = [request(4.0, Some(1407.0)), request(800.0, None), request(7.0, Some(1410.0))];
         let network = network_times(requests.iter()).expect("two were answered");
         assert_eq!((network.p50, network.p95), (7.0, 10.0));
         assert_eq!(network_times([].iter()), None);

@@ -16,9 +16,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::ChoreographerInner;
 use super::visits::Visits;
-use crate::decide::controller::{
-    ControlDecision, ControlFacts, ControlHistory, ResponseGoal, control,
-};
+use crate::decide::controller::{ControlDecision, ControlFacts, ControlHistory, ResponseGoal, control};
 use crate::decide::stall::{PressureReading, StallDetector};
 use crate::lives::handle::Handle;
 
@@ -124,9 +122,7 @@ impl ControllerWatch {
     /// Samples the running servants; also their usage, if any of their robots has stated what it accepts.
     async fn observe(&mut self, inner: &ChoreographerInner) -> Vec<WorkingServant> {
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
-        inner
-            .recent
-            .retain(|id| handles.iter().any(|handle| handle.id == id));
+        inner.recent.retain(|id| handles.iter().any(|handle| handle.id == id));
         let fresh = self.looks % LINKED == 0;
         self.looks += 1;
         let mut before = std::mem::take(&mut self.servants);
@@ -144,29 +140,19 @@ impl ControllerWatch {
             }
             working.push((handle, container, seen));
         }
-        let goals: Vec<_> = working
-            .iter()
-            .map(|(handle, _, seen)| response_goal(inner, handle).or(seen.linked))
-            .collect();
+        let goals: Vec<_> =
+            working.iter().map(|(handle, _, seen)| response_goal(inner, handle).or(seen.linked)).collect();
         // Sampling has a cost.
         let usages = if goals.iter().any(Option::is_some) {
-            join_all(
-                working
-                    .iter()
-                    .map(|(_, container, _)| read_usage(container)),
-            )
-            .await
+            join_all(working.iter().map(|(_, container, _)| read_usage(container))).await
         } else {
             working.iter().map(|_| None).collect()
         };
         let now = Instant::now();
         let mut all = Vec::new();
-        for (((handle, container, mut seen), goal), usage) in
-            working.into_iter().zip(goals).zip(usages)
-        {
+        for (((handle, container, mut seen), goal), usage) in working.into_iter().zip(goals).zip(usages) {
             let rates = usage.as_ref().zip(seen.usage.as_ref());
-            let rates =
-                rates.and_then(|(usage, (then, before))| usage_rates(before, usage, now - *then));
+            let rates = rates.and_then(|(usage, (then, before))| usage_rates(before, usage, now - *then));
             let pressure = usage.as_ref().and_then(|usage| usage.pressure);
             seen.usage = usage.map(|usage| (now, usage));
             let (used, throttled) = rates.unzip();
@@ -196,10 +182,7 @@ impl ControllerWatch {
         // Cores that this host cannot limit are not moved.
         looked.retain(|one| one.enforced.cpus.is_some());
         let now = Instant::now().into_std();
-        let facts: Vec<ControlFacts<'_>> = looked
-            .iter()
-            .map(|one| one.facts(inner, cores, now))
-            .collect();
+        let facts: Vec<ControlFacts<'_>> = looked.iter().map(|one| one.facts(inner, cores, now)).collect();
         let outcomes = control(cores, &facts, now);
         for (one, outcome) in looked.into_iter().zip(outcomes) {
             let id = one.handle.id.clone();
@@ -208,8 +191,7 @@ impl ControllerWatch {
             }
             if outcome.quota.is_some() || outcome.weight.is_some() {
                 let inner = Arc::clone(inner);
-                self.moves
-                    .begin(&id, async move { one.carry_out(&inner, &outcome).await });
+                self.moves.begin(&id, async move { one.carry_out(&inner, &outcome).await });
             }
         }
     }
@@ -230,12 +212,7 @@ pub(super) fn usage_rates(before: &Usage, usage: &Usage, passed: Duration) -> Op
 }
 
 impl WorkingServant {
-    fn facts(
-        &self,
-        inner: &ChoreographerInner,
-        cores: u64,
-        now: std::time::Instant,
-    ) -> ControlFacts<'_> {
+    fn facts(&self, inner: &ChoreographerInner, cores: u64, now: std::time::Instant) -> ControlFacts<'_> {
         let limit = self.limits.cpus.map_or(cores, millicpus);
         let promised = self.asked.cpus.map_or(0, millicpus);
         ControlFacts {
@@ -256,9 +233,7 @@ impl WorkingServant {
             waited: self.waited,
             goal: self.goal,
             // Requests sent before its cores were raised say nothing about their effect.
-            measured: inner
-                .recent
-                .p95_since(&self.handle.id, self.history.raised_at(), now),
+            measured: inner.recent.p95_since(&self.handle.id, self.history.raised_at(), now),
             history: self.history,
         }
     }
@@ -307,11 +282,7 @@ impl WorkingServant {
             let was = self.enforced.cpu_weight.unwrap_or_default();
             format!("cpu.weight {was} → {weight}")
         });
-        quota
-            .into_iter()
-            .chain(weight)
-            .collect::<Vec<_>>()
-            .join(", ")
+        quota.into_iter().chain(weight).collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -351,28 +322,16 @@ fn strictest_goal(slas: impl Iterator<Item = (Option<f64>, Option<f64>)>) -> Opt
         (Some(one), Some(other)) => Some(one.min(other)),
         (one, other) => one.or(other),
     };
-    slas.map(|(desire, max)| ResponseGoal {
-        desire: milliseconds(desire),
-        max: milliseconds(max),
-    })
-    .reduce(|one, other| ResponseGoal {
-        desire: least(one.desire, other.desire),
-        max: least(one.max, other.max),
-    })
+    slas.map(|(desire, max)| ResponseGoal { desire: milliseconds(desire), max: milliseconds(max) })
+        .reduce(|one, other| ResponseGoal { desire: least(one.desire, other.desire), max: least(one.max, other.max) })
 }
 
 impl ChoreographerInner {
     /// Returns the maximum number of cores for its robot, in thousandths, by its class and its service.
     fn max_cores(&self, handle: &Handle) -> u64 {
         let terms = handle.terms();
-        let class = terms
-            .class
-            .as_ref()
-            .and_then(|name| self.options.classes.get(name));
-        let caps = [
-            class.map(|class| class.caps),
-            Some(handle.revision.plan.caps),
-        ];
+        let class = terms.class.as_ref().and_then(|name| self.options.classes.get(name));
+        let caps = [class.map(|class| class.caps), Some(handle.revision.plan.caps)];
         let cpus = caps.into_iter().flatten().filter_map(|caps| caps.cpus);
         cpus.map(millicpus).min().unwrap_or(u64::MAX)
     }

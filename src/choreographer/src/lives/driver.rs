@@ -36,11 +36,7 @@ pub(crate) enum ServantSource {
 }
 
 /// Starts the task that runs the servant's life.
-pub(crate) fn start(
-    inner: &Arc<ChoreographerInner>,
-    handle: Arc<Handle>,
-    beginning: ServantSource,
-) {
+pub(crate) fn start(inner: &Arc<ChoreographerInner>, handle: Arc<Handle>, beginning: ServantSource) {
     let span = handle.span(None);
     tokio::spawn(drive(Arc::clone(inner), handle, beginning).instrument(span));
 }
@@ -69,9 +65,7 @@ async fn drive(inner: Arc<ChoreographerInner>, handle: Arc<Handle>, mut beginnin
         && let Err(error) = container.stop().await
     {
         let message = format!("cannot clean up servant {}: {error}", handle.id);
-        inner
-            .journal
-            .error("servant-leftover", &message, &handle.event_context());
+        inner.journal.error("servant-leftover", &message, &handle.event_context());
     }
     inner.state.remove_servant(&handle.id);
     drop(permit);
@@ -82,41 +76,20 @@ async fn drive(inner: Arc<ChoreographerInner>, handle: Arc<Handle>, mut beginnin
         warm_pool::give_back(&inner, *warm).await;
     }
     inner.warm_pool.wake();
-    handle.set_phase(if outcome.is_ok() {
-        Phase::Stopped
-    } else {
-        Phase::Failed
-    });
+    handle.set_phase(if outcome.is_ok() { Phase::Stopped } else { Phase::Failed });
 }
 
 /// Writes the reason of the servant's end to the journal; returns the message for its robots.
-fn report_end(
-    inner: &ChoreographerInner,
-    handle: &Handle,
-    outcome: &Result<String, Failure>,
-) -> String {
-    let who = format!(
-        "servant {} of {} for {}",
-        handle.id,
-        handle.service(),
-        handle.robot
-    );
+fn report_end(inner: &ChoreographerInner, handle: &Handle, outcome: &Result<String, Failure>) -> String {
+    let who = format!("servant {} of {} for {}", handle.id, handle.service(), handle.robot);
     let (journal, about) = (&inner.journal, handle.event_context());
     match outcome {
         Ok(reason) => {
-            journal.info(
-                "servant-stopped",
-                &format!("{who} was ended: {reason}"),
-                &about,
-            );
+            journal.info("servant-stopped", &format!("{who} was ended: {reason}"), &about);
             format!("the servant was ended: {reason}")
         }
         Err(Failure::Full(refused)) => {
-            journal.warning(
-                "servant-refused",
-                &format!("{who} was refused: {refused}"),
-                &about,
-            );
+            journal.warning("servant-refused", &format!("{who} was refused: {refused}"), &about);
             refused.to_string()
         }
         Err(Failure::Broken { reason, log }) => {
@@ -224,39 +197,17 @@ async fn run(
     inner.warm_pool.wake();
     let took = store::now().saturating_sub(handle.created);
     let message = if fresh {
-        format!(
-            "servant {} of {} is ready for {} after {took} ms",
-            handle.id,
-            handle.service(),
-            handle.robot
-        )
+        format!("servant {} of {} is ready for {} after {took} ms", handle.id, handle.service(), handle.robot)
     } else {
-        format!(
-            "servant {} of {} was adopted, for {}",
-            handle.id,
-            handle.service(),
-            handle.robot
-        )
+        format!("servant {} of {} was adopted, for {}", handle.id, handle.service(), handle.robot)
     };
     let about = handle.event_context();
-    inner.journal.info(
-        if fresh {
-            "servant-ready"
-        } else {
-            "servant-adopted"
-        },
-        &message,
-        &about,
-    );
+    inner.journal.info(if fresh { "servant-ready" } else { "servant-adopted" }, &message, &about);
     Err(nodes.supervise().await)
 }
 
 /// Waits for admission. `ahead` is a promise from before the servant had a robot, which then applies to the robot.
-async fn admit(
-    inner: &Arc<ChoreographerInner>,
-    handle: &Handle,
-    ahead: Option<Permit>,
-) -> Result<Permit, Failure> {
+async fn admit(inner: &Arc<ChoreographerInner>, handle: &Handle, ahead: Option<Permit>) -> Result<Permit, Failure> {
     let deadline = inner.options.deadline;
     let wanted = inner.promised_amount(&handle.requested_limits());
     // A servant that gives way must be registered as such.
@@ -293,10 +244,7 @@ async fn with_log(failure: Failure, handle: &Handle) -> Failure {
     match (failure, handle.container()) {
         (Failure::Broken { reason, log }, Some(container)) if log.is_empty() => {
             let lines = container.logs(LOG_LINES, None).await;
-            let log = lines
-                .into_iter()
-                .map(|line| format!("{}: {}", line.node, line.line))
-                .collect();
+            let log = lines.into_iter().map(|line| format!("{}: {}", line.node, line.line)).collect();
             Failure::Broken { reason, log }
         }
         (failure, _) => failure,

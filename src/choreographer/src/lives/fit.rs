@@ -22,25 +22,15 @@ impl Choreographer {
     pub async fn fit(&self, service: &str, stated: api::Stated) -> Result<api::Fit, Error> {
         let inner = &self.inner;
         let revision = inner.catalogue.current_revision(service)?;
-        let stated = if stated.is_empty() {
-            BTreeMap::new()
-        } else {
-            [(String::new(), stated)].into()
-        };
+        let stated = if stated.is_empty() { BTreeMap::new() } else { [(String::new(), stated)].into() };
         let terms = inner.terms(&stated, &revision)?;
         let priority = terms.priority;
         let expected = terms.rows.iter().find(|row| row.measure == Measure::Rrt);
-        let expected = expected.map(|row| api::Expected {
-            rrt: row.value,
-            from: format!("entry {} of the SLA table", row.id),
-        });
+        let expected =
+            expected.map(|row| api::Expected { rrt: row.value, from: format!("entry {} of the SLA table", row.id) });
         let shared = revision.plan.shared.is_some();
         // A group's servants belong to no robot.
-        let asked = if shared {
-            inner.push_limits(&revision)
-        } else {
-            inner.limit_sources(terms)
-        };
+        let asked = if shared { inner.push_limits(&revision) } else { inner.limit_sources(terms) };
         let uses = self.measure_uses().await;
         let warm = inner.warm_pool.promised_servants(inner);
         let servants = inner.servants.lock();
@@ -51,11 +41,7 @@ impl Choreographer {
             uses: uses.get(&handle.id).copied().unwrap_or_default(),
             measured: inner.recent.p95(&handle.id, now),
         });
-        let ahead = warm_facts(&warm).map(|servant| Neighbour {
-            servant,
-            uses: 0,
-            measured: None,
-        });
+        let ahead = warm_facts(&warm).map(|servant| Neighbour { servant, uses: 0, measured: None });
         let others: Vec<Neighbour<'_>> = ahead.chain(neighbours).collect();
         let of_service = of_robots.filter(|handle| handle.service() == service);
         let group = of_service.clone().filter(|handle| !handle.is_ending());
@@ -74,10 +60,7 @@ impl Choreographer {
             _ => fit((wanted, priority), &book, cores, &others),
         };
         let cores = |millicpus: u64| millicpus as f64 / 1000.0;
-        let (waiting, free) = (
-            book.waiting_count(),
-            book.capacity().minus(book.promised_total()),
-        );
+        let (waiting, free) = (book.waiting_count(), book.capacity().minus(book.promised_total()));
         let costs = fit.costs.into_iter().filter_map(|cost| {
             let handle = servants.all.get(&cost.id)?;
             let seconds = |milliseconds: f64| milliseconds / 1000.0;
@@ -89,9 +72,7 @@ impl Choreographer {
                 left: cores(cost.left),
                 rrt: cost.times.map(|(now, _)| seconds(now)),
                 later: cost.times.map(|(_, then)| seconds(then)),
-                accepts: response_goal(inner, handle)
-                    .and_then(ResponseGoal::upper_bound)
-                    .map(seconds),
+                accepts: response_goal(inner, handle).and_then(ResponseGoal::upper_bound).map(seconds),
             })
         });
         Ok(api::Fit {
@@ -135,10 +116,7 @@ impl Choreographer {
 }
 
 /// Returns the expected response time: the median over robots of the same service.
-fn expected_from_others(
-    service: &str,
-    measured: impl Iterator<Item = MeasuredTimes>,
-) -> Option<api::Expected> {
+fn expected_from_others(service: &str, measured: impl Iterator<Item = MeasuredTimes>) -> Option<api::Expected> {
     let mut totals: Vec<f64> = measured.map(|measured| measured.total).collect();
     totals.sort_unstable_by(f64::total_cmp);
     let median = totals.get(totals.len() / 2)?;
@@ -146,8 +124,5 @@ fn expected_from_others(
         1 => "the robot".to_owned(),
         count => format!("{count} robots"),
     };
-    Some(api::Expected {
-        rrt: median / 1000.0,
-        from: format!("recent measurements of {robots} of {service}"),
-    })
+    Some(api::Expected { rrt: median / 1000.0, from: format!("recent measurements of {robots} of {service}") })
 }

@@ -45,8 +45,7 @@ impl Groups {
         let mut all = self.all.lock();
         let key = (revision.service.clone(), revision.number);
         let known = all.get(&key).cloned();
-        let over =
-            |shares: &Arc<SharedGroup>| matches!(*shares.state.borrow(), GroupStage::Over(_));
+        let over = |shares: &Arc<SharedGroup>| matches!(*shares.state.borrow(), GroupStage::Over(_));
         let shares = match known.filter(|known| !over(known)) {
             Some(known) => known,
             None => {
@@ -72,10 +71,7 @@ impl Groups {
             one.lease.handle().end(UNUSED);
         }
         let key = (shares.revision.service.clone(), shares.revision.number);
-        if all
-            .get(&key)
-            .is_some_and(|known| Arc::ptr_eq(known, shares))
-        {
+        if all.get(&key).is_some_and(|known| Arc::ptr_eq(known, shares)) {
             all.remove(&key);
         }
         true
@@ -84,19 +80,11 @@ impl Groups {
 
 impl SharedGroup {
     fn new(revision: &Arc<RevisionRecord>, shared: Shared) -> SharedGroup {
-        let rules = Rules {
-            window: shared.calls as usize,
-            replicas: shared.replicas as usize,
-            idempotent: shared.idempotent,
-        };
+        let rules =
+            Rules { window: shared.calls as usize, replicas: shared.replicas as usize, idempotent: shared.idempotent };
         let flavour = &revision.flavour;
         SharedGroup {
-            group: ServantGroup::new(
-                flavour.ros.ros_version(),
-                &flavour.distribution,
-                &revision.interface,
-                rules,
-            ),
+            group: ServantGroup::new(flavour.ros.ros_version(), &flavour.distribution, &revision.interface, rules),
             revision: Arc::clone(revision),
             rules: shared,
             state: watch::Sender::new(GroupStage::Queued),
@@ -112,9 +100,7 @@ impl SharedGroup {
             id: one.lease.handle().id.clone(),
             ready: one.member.is_some(),
             retiring: one.retiring,
-            under_way: one
-                .member
-                .map_or(0, |member| self.group.member_load(member)),
+            under_way: one.member.map_or(0, |member| self.group.member_load(member)),
         });
         let counts = self.group.counts();
         api::Group {
@@ -126,9 +112,7 @@ impl SharedGroup {
             failed: counts.failed.load(Ordering::Relaxed),
             asked_again: counts.asked_again.load(Ordering::Relaxed),
             wasted: counts.wasted.load(Ordering::Relaxed),
-            mean_ms: counts
-                .mean_response_time()
-                .map(|mean| mean.as_secs_f64() * 1000.0),
+            mean_ms: counts.mean_response_time().map(|mean| mean.as_secs_f64() * 1000.0),
         }
     }
 }
@@ -137,9 +121,7 @@ impl Choreographer {
     /// Returns the groups of a service, newest revision first.
     pub fn groups(&self, service: &str) -> Vec<api::Group> {
         let all = self.inner.groups.all.lock();
-        let of = all
-            .values()
-            .filter(|shares| shares.revision.service == service);
+        let of = all.values().filter(|shares| shares.revision.service == service);
         let mut groups: Vec<api::Group> = of.map(|shares| shares.describe()).collect();
         drop(all);
         groups.sort_by_key(|group| std::cmp::Reverse(group.revision));
@@ -171,9 +153,7 @@ async fn run_group(inner: Arc<ChoreographerInner>, shares: Arc<SharedGroup>) {
             Some(GroupAction::Start(reason)) => {
                 let begun = members::start_servant(&inner, &shares, &reason);
                 if !begun {
-                    break Some(Failure::from_reason(
-                        "was not started: the daemon is ending",
-                    ));
+                    break Some(Failure::from_reason("was not started: the daemon is ending"));
                 }
             }
             Some(GroupAction::TakeBack(reason)) => members::take_back(&inner, &shares, &reason),
@@ -199,15 +179,10 @@ async fn run_group(inner: Arc<ChoreographerInner>, shares: Arc<SharedGroup>) {
     }
 }
 
-fn group_facts(
-    inner: &ChoreographerInner,
-    shares: &SharedGroup,
-    failed: Option<Instant>,
-) -> GroupFacts {
+fn group_facts(inner: &ChoreographerInner, shares: &SharedGroup, failed: Option<Instant>) -> GroupFacts {
     let desired = places::shortest_desired_time(inner, shares);
     let servants = shares.servants.lock();
-    let count =
-        |which: &dyn Fn(&SharedServant) -> bool| servants.iter().filter(|one| which(one)).count();
+    let count = |which: &dyn Fn(&SharedServant) -> bool| servants.iter().filter(|one| which(one)).count();
     GroupFacts {
         bounds: (shares.rules.min as usize, shares.rules.max as usize),
         ready: count(&|one| one.member.is_some() && !one.retiring),

@@ -37,10 +37,7 @@ pub enum Failure {
 impl Failure {
     /// Creates a failure without a log.
     pub fn from_reason(reason: impl Into<String>) -> Failure {
-        Failure::Broken {
-            reason: reason.into(),
-            log: Vec::new(),
-        }
+        Failure::Broken { reason: reason.into(), log: Vec::new() }
     }
 }
 
@@ -134,11 +131,7 @@ impl Handle {
             revision,
             created,
             stands: watch::Sender::new(None),
-            life: watch::Sender::new(Life {
-                phase: Phase::Requested,
-                failure: None,
-                ended: None,
-            }),
+            life: watch::Sender::new(Life { phase: Phase::Requested, failure: None, ended: None }),
             asked: Mutex::new(asked),
             limits_turn: tokio::sync::Mutex::default(),
             promise: OnceLock::new(),
@@ -187,10 +180,7 @@ impl Handle {
     /// Returns the limits that would be promised after this change, with no weight but an explicitly set one.
     pub fn requested_limits_after(&self, change: Limits) -> Limits {
         let asked = self.asked.lock();
-        Limits {
-            cpu_weight: change.cpu_weight.or(asked.set.cpu_weight),
-            ..change.or(asked.promised_limits())
-        }
+        Limits { cpu_weight: change.cpu_weight.or(asked.set.cpu_weight), ..change.or(asked.promised_limits()) }
     }
 
     /// Returns the terms: its robot's statements and the consequences.
@@ -244,11 +234,7 @@ impl Handle {
 
     /// Returns the context of its events.
     pub fn event_context(&self) -> NewEvent<'_> {
-        NewEvent {
-            service: Some(self.service()),
-            servant: Some(&self.id),
-            robot: Some(&self.robot),
-        }
+        NewEvent { service: Some(self.service()), servant: Some(&self.id), robot: Some(&self.robot) }
     }
 
     /// Returns the current lifecycle state.
@@ -286,11 +272,7 @@ impl Handle {
         if !self.is_place() {
             return Ok(());
         }
-        Err(Error::Place {
-            id: self.id.clone(),
-            service: self.service().to_owned(),
-            robot: self.robot.clone(),
-        })
+        Err(Error::Place { id: self.id.clone(), service: self.service().to_owned(), robot: self.robot.clone() })
     }
 
     /// Returns access to its ROS and its bridge, once reached.
@@ -362,9 +344,7 @@ impl Handle {
     /// Waits until nothing is left of it.
     pub async fn wait_ended(&self) {
         let mut life = self.watch();
-        let _ = life
-            .wait_for(|life| matches!(life.phase, Phase::Stopped | Phase::Failed))
-            .await;
+        let _ = life.wait_for(|life| matches!(life.phase, Phase::Stopped | Phase::Failed)).await;
     }
 
     /// Returns how long it has been ready, if it ever was.
@@ -409,10 +389,7 @@ impl Handle {
     /// Adds a connection of this client of the robot.
     pub(crate) fn add_connection(&self, who: &str) {
         let mut users = self.users.lock();
-        let user = users.entry(who.to_owned()).or_insert(ClientConnections {
-            connections: 0,
-            since: Instant::now(),
-        });
+        let user = users.entry(who.to_owned()).or_insert(ClientConnections { connections: 0, since: Instant::now() });
         user.connections += 1;
         self.connections.send_modify(|count| *count += 1);
     }
@@ -461,10 +438,7 @@ impl Handle {
             None => Error::Servant {
                 service: self.service().to_owned(),
                 robot: self.robot.clone(),
-                reason: format!(
-                    "was ended: {}",
-                    life.ended.as_deref().unwrap_or("the daemon is ending")
-                ),
+                reason: format!("was ended: {}", life.ended.as_deref().unwrap_or("the daemon is ending")),
                 log: Vec::new(),
             },
         }

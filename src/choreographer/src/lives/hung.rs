@@ -52,11 +52,7 @@ pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
                 };
                 let patience = max.duration().mul_f64(inner.options.hung_after);
                 let key = (handle.id.clone(), flow.node);
-                let seen = Flow {
-                    inputs: flow.inputs,
-                    outputs: flow.outputs,
-                    starts: handle.starts(&key.1),
-                };
+                let seen = Flow { inputs: flow.inputs, outputs: flow.outputs, starts: handle.starts(&key.1) };
                 let (before, mut words) = watched.remove(&key).unzip();
                 let (after, hung) = observe_flow(before, seen, patience, Instant::now().into_std());
                 if let Some(hung) = hung {
@@ -99,12 +95,7 @@ struct HungAction {
 }
 
 /// Reports hung nodes. `node`: the node of a stub; empty for those used by rosbridge clients.
-fn handle_hung(
-    inner: &ChoreographerInner,
-    handle: &Handle,
-    node: &str,
-    hung: HungNodes,
-) -> HungAction {
+fn handle_hung(inner: &ChoreographerInner, handle: &Handle, node: &str, hung: HungNodes) -> HungAction {
     let own = &handle.revision.plan.nodes;
     let nodes: Vec<&str> = match node {
         "" => own.iter().map(|node| &*node.name).collect(),
@@ -118,33 +109,20 @@ fn handle_hung(
     };
     let kills = restarts && matches!(&*nodes, [one] if again(one));
     let next = match &*nodes {
-        _ if !restarts => {
-            "see its log, or have hung nodes restarted: hung = \"restart\" in [servant]"
-        }
+        _ if !restarts => "see its log, or have hung nodes restarted: hung = \"restart\" in [servant]",
         [_] if kills => "it is killed and restarted as after a failure",
-        [_] => {
-            "it is not killed, because its launch file does not set respawn and it would not be restarted"
-        }
+        [_] => "it is not killed, because its launch file does not set respawn and it would not be restarted",
         _ => "it is unknown which of them hangs, so none is restarted",
     };
-    let what = format!(
-        "{} answered none of {} inputs in {:.1} s",
-        nodes.join(", "),
-        hung.inputs,
-        hung.since.as_secs_f64()
-    );
+    let what =
+        format!("{} answered none of {} inputs in {:.1} s", nodes.join(", "), hung.inputs, hung.since.as_secs_f64());
     let message = format!("servant {}: {what}; {next}", handle.id);
-    inner
-        .journal
-        .warning("node-hung", &message, &handle.event_context());
+    inner.journal.warning("node-hung", &message, &handle.event_context());
     if let Some(reach) = handle.reach() {
         reach.warn_flow(node, &format!("servant {}: {what}", handle.id));
     }
     let killed = nodes.first().filter(|_| kills);
-    HungAction {
-        kills: killed.map(|node| (*node).to_owned()),
-        words: what,
-    }
+    HungAction { kills: killed.map(|node| (*node).to_owned()), words: what }
 }
 
 async fn kill(handle: Arc<Handle>, node: String) {

@@ -57,18 +57,14 @@ impl Lease {
         let span = handle.span(Span::current().id());
         let agreed = async move { inner.agree_terms(&handle, &who, &stated).await };
         // The client may go away meanwhile; a change in progress is completed.
-        tokio::spawn(agreed.instrument(span))
-            .await
-            .map_err(|_| Error::Internal("changing a servant's limits"))?
+        tokio::spawn(agreed.instrument(span)).await.map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
     /// Waits until the servant's interface is registered.
     pub async fn wait_ready(&self) -> Result<Arc<dyn Reach>, Error> {
         self.wait_admitted().await?;
         self.wait_phase(Phase::Ready).await?;
-        self.handle
-            .reach()
-            .ok_or(Error::Internal("reaching a ready servant"))
+        self.handle.reach().ok_or(Error::Internal("reaching a ready servant"))
     }
 
     /// Waits until the servant has failed or is ended; returns the reason.
@@ -82,17 +78,10 @@ impl Lease {
 
     async fn wait_phase(&self, phase: Phase) -> Result<(), Error> {
         let mut life = self.handle.watch();
-        let Ok(life) = life
-            .wait_for(|life| life.is_over() || life.phase >= phase)
-            .await
-        else {
+        let Ok(life) = life.wait_for(|life| life.is_over() || life.phase >= phase).await else {
             return Err(Error::Internal("waiting for a servant"));
         };
-        if life.is_over() {
-            Err(self.handle.error(&life))
-        } else {
-            Ok(())
-        }
+        if life.is_over() { Err(self.handle.error(&life)) } else { Ok(()) }
     }
 }
 

@@ -30,8 +30,7 @@ pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
             return;
         }
         for (id, (handle, outcome)) in visits.take_finished() {
-            let refused =
-                ResizeRefusal::from_outcome(refusals.remove(&id), outcome, &inner, &handle);
+            let refused = ResizeRefusal::from_outcome(refusals.remove(&id), outcome, &inner, &handle);
             refusals.extend(refused.map(|refused| (id, refused)));
         }
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();

@@ -12,9 +12,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
 use super::ChoreographerInner;
-use crate::decide::lifetime::{
-    InterfaceStatus, Readiness, Retention, ServantStage, Tenancy, readiness, retention,
-};
+use crate::decide::lifetime::{InterfaceStatus, Readiness, Retention, ServantStage, Tenancy, readiness, retention};
 use crate::lives::handle::{Failure, Handle};
 
 /// Waits until the whole interface is registered. Nodes may take the full start time of the servant between their
@@ -62,9 +60,7 @@ pub(super) async fn wait_for_interface(
                 let missing = missing.join(", ");
                 let message = format!("servant {} is ready without {missing}", handle.id);
                 let about = handle.event_context();
-                inner
-                    .journal
-                    .warning("interface-incomplete", &message, &about);
+                inner.journal.warning("interface-incomplete", &message, &about);
                 return Ok(());
             }
             Readiness::Late(reason) => return Err(Failure::from_reason(reason)),
@@ -99,9 +95,7 @@ fn loading_containers(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>,
     let loads = loads.borrow_and_update();
     let loading = loads.iter().filter_map(|(container, load)| match load {
         ContainerLoad::Loading => Some(Ok(container.clone())),
-        ContainerLoad::Refused(why) => {
-            Some(Err(Failure::from_reason(format!("is unusable: {why}"))))
-        }
+        ContainerLoad::Refused(why) => Some(Err(Failure::from_reason(format!("is unusable: {why}")))),
         ContainerLoad::Loaded(_) => None,
     });
     loading.collect()
@@ -118,17 +112,9 @@ async fn wait_changed<T>(of: &mut Option<watch::Receiver<T>>) {
 }
 
 /// Waits until the servant is not needed any more; returns the reason. It is withdrawn from its robot then.
-pub(super) async fn wait_unneeded(
-    inner: &Arc<ChoreographerInner>,
-    handle: &Arc<Handle>,
-    fresh: bool,
-) -> String {
+pub(super) async fn wait_unneeded(inner: &Arc<ChoreographerInner>, handle: &Arc<Handle>, fresh: bool) -> String {
     let times = &inner.options;
-    let grace = if handle.anonymous {
-        times.anonymous_grace
-    } else {
-        times.grace
-    };
+    let grace = if handle.anonymous { times.anonymous_grace } else { times.grace };
     let (mut connections, mut life) = (handle.watch_connections(), handle.watch());
     let mut idle_since = None;
     loop {
@@ -143,14 +129,8 @@ pub(super) async fn wait_unneeded(
         let idle = stage == ServantStage::Ready && count == 0;
         let was_idle = idle_since.is_some();
         idle_since = idle.then(|| idle_since.unwrap_or(now.into_std()));
-        let tenancy = Tenancy {
-            stage,
-            adopted: !fresh,
-            anonymous: handle.anonymous,
-            connections: count,
-            idle_since,
-            grace,
-        };
+        let tenancy =
+            Tenancy { stage, adopted: !fresh, anonymous: handle.anonymous, connections: count, idle_since, grace };
         let until = match retention(&tenancy, now.into_std()) {
             Retention::Stays => None,
             Retention::Until(until) => Some(Instant::from_std(until)),
@@ -185,11 +165,7 @@ mod tests {
 
     #[test]
     fn a_node_that_is_not_active_yet_is_missing() {
-        let stage = |begins| reach::lifecycle::LifecycleStage {
-            state: "inactive".to_owned(),
-            refused: None,
-            begins,
-        };
+        let stage = |begins| reach::lifecycle::LifecycleStage { state: "inactive".to_owned(), refused: None, begins };
         let stages = [("/arm", stage(true)), ("/eye", stage(false))];
         let stages = Stages::from(stages.map(|(node, stage)| (node.to_owned(), stage)));
         let missing: Vec<String> = inactive_nodes(&stages).collect();

@@ -28,9 +28,7 @@ impl Choreographer {
         let span = handle.span(None);
         let set = async move { whole.apply_limits(&handle, change).await };
         // The caller may go away meanwhile; a change in progress is completed.
-        tokio::spawn(set.instrument(span))
-            .await
-            .map_err(|_| Error::Internal("changing a servant's limits"))?
+        tokio::spawn(set.instrument(span)).await.map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
     async fn apply_limits(&self, handle: &Handle, change: Limits) -> Result<(), Error> {
@@ -39,20 +37,13 @@ impl Choreographer {
         // One change at a time: the promise, the limits in force and the stored limits must agree.
         let _turn = handle.lock_limits().await;
         let before = handle.limit_sources();
-        let after = LimitSources {
-            set: change.or(before.set),
-            ..before
-        };
+        let after = LimitSources { set: change.or(before.set), ..before };
         let inner = &self.inner;
         let set = after.set;
-        let in_force = inner
-            .resize(handle, with_default_weight(change), after)
-            .await?;
+        let in_force = inner.resize(handle, with_default_weight(change), after).await?;
         inner.state.set_servant_limits(id, &set)?;
         let message = format!("servant {id}: limits changed to {in_force}");
-        inner
-            .journal
-            .info("limits-changed", &message, &handle.event_context());
+        inner.journal.info("limits-changed", &message, &handle.event_context());
         Ok(())
     }
 }
@@ -61,11 +52,7 @@ impl ChoreographerInner {
     /// Reports a robot that is refused for its statement.
     pub(crate) fn report_refused(&self, request: &ServantRequest, error: &Error) {
         let (service, robot) = (&request.service, &request.robot);
-        let about = NewEvent {
-            service: Some(service),
-            servant: None,
-            robot: Some(robot),
-        };
+        let about = NewEvent { service: Some(service), servant: None, robot: Some(robot) };
         self.report_terms_refused(service, robot, &about, || {
             let stated = &request.stated;
             format!("robot {robot} requests {stated} of {service} and is refused: {error}")
@@ -75,18 +62,10 @@ impl ChoreographerInner {
     /// Reports a servant that keeps its limits although its robot states or sends something else.
     pub(crate) fn report_not_resized(&self, handle: &Handle, error: &Error) {
         let (service, robot) = (handle.service(), &handle.robot);
-        self.report_terms_refused(service, robot, &handle.event_context(), || {
-            error.to_string()
-        });
+        self.report_terms_refused(service, robot, &handle.event_context(), || error.to_string());
     }
 
-    fn report_terms_refused(
-        &self,
-        service: &str,
-        robot: &str,
-        about: &NewEvent<'_>,
-        message: impl FnOnce() -> String,
-    ) {
+    fn report_terms_refused(&self, service: &str, robot: &str, about: &NewEvent<'_>, message: impl FnOnce() -> String) {
         let now = Instant::now().into_std();
         let told = self.refusals.lock().record_refusal(service, robot, now);
         if let Some(before) = told {
@@ -97,12 +76,7 @@ impl ChoreographerInner {
 
     /// Applies the new statement of one of the robot's clients to a running servant. If that is impossible, it keeps
     /// its limits.
-    pub(crate) async fn agree_terms(
-        &self,
-        handle: &Handle,
-        who: &str,
-        stated: &Stated,
-    ) -> Result<(), Error> {
+    pub(crate) async fn agree_terms(&self, handle: &Handle, who: &str, stated: &Stated) -> Result<(), Error> {
         let agreed = self.apply_statement(handle, who, stated).await;
         if let Err(error @ Error::NotResized { .. }) = &agreed {
             self.report_not_resized(handle, error);
@@ -110,12 +84,7 @@ impl ChoreographerInner {
         agreed
     }
 
-    async fn apply_statement(
-        &self,
-        handle: &Handle,
-        who: &str,
-        stated: &Stated,
-    ) -> Result<(), Error> {
+    async fn apply_statement(&self, handle: &Handle, who: &str, stated: &Stated) -> Result<(), Error> {
         let _turn = handle.lock_limits().await;
         let before = handle.limit_sources();
         let mut all = before.terms.stated.clone();
@@ -132,11 +101,7 @@ impl ChoreographerInner {
             });
         }
         let measured = before.terms.measured.clone();
-        let terms = self.with_offer(
-            &handle.revision,
-            |_| measured,
-            |offer| compute_terms(&all, offer),
-        )?;
+        let terms = self.with_offer(&handle.revision, |_| measured, |offer| compute_terms(&all, offer))?;
         let why = stated.to_string();
         let changed = self.apply_terms(handle, before, terms, &why).await?;
         if !handle.is_place() {
@@ -148,11 +113,7 @@ impl ChoreographerInner {
 
     /// Removes the statements of clients that have been away for the grace time from a running servant. If it cannot be
     /// made smaller, it keeps its limits.
-    pub(crate) async fn forget_stated(
-        &self,
-        handle: &Handle,
-        grace: Duration,
-    ) -> Result<(), Error> {
+    pub(crate) async fn forget_stated(&self, handle: &Handle, grace: Duration) -> Result<(), Error> {
         // A client that is back by now waits for this lock, and states it again.
         let _turn = handle.lock_limits().await;
         let away = handle.clients_away_for(grace);
@@ -163,20 +124,12 @@ impl ChoreographerInner {
             return Ok(());
         }
         let measured = before.terms.measured.clone();
-        let terms = self.with_offer(
-            &handle.revision,
-            |_| measured,
-            |offer| compute_terms(&left, offer),
-        )?;
+        let terms = self.with_offer(&handle.revision, |_| measured, |offer| compute_terms(&left, offer))?;
         let away: Vec<&str> = away.iter().map(|who| client_in_words(who)).collect();
         let why = format!("its robot's clients without {}", away.join(", "));
         let changed = self.apply_terms(handle, before, terms, &why).await?;
         if !handle.is_place() {
-            let why = format!(
-                "the requests of {} expired {} s after it left",
-                away.join(", "),
-                grace.as_secs_f64()
-            );
+            let why = format!("the requests of {} expired {} s after it left", away.join(", "), grace.as_secs_f64());
             self.report_changed(handle, changed, &why);
         }
         Ok(())
@@ -184,11 +137,7 @@ impl ChoreographerInner {
 
     /// Applies the dictionary's rows for the measured message sizes to a running servant. If that is impossible, it
     /// keeps its limits.
-    pub(crate) async fn apply_measured(
-        &self,
-        handle: &Handle,
-        inputs: &[MeasuredInput],
-    ) -> Result<(), Error> {
+    pub(crate) async fn apply_measured(&self, handle: &Handle, inputs: &[MeasuredInput]) -> Result<(), Error> {
         let _turn = handle.lock_limits().await;
         let before = handle.limit_sources();
         let known = &before.terms.measured;
@@ -204,9 +153,7 @@ impl ChoreographerInner {
             return Ok(());
         };
         let why = format!("messages of {sends}");
-        let changed = self
-            .apply_terms(handle, before.clone(), terms, &why)
-            .await?;
+        let changed = self.apply_terms(handle, before.clone(), terms, &why).await?;
         if changed.is_some() {
             self.report_changed(handle, changed, &format!("its robot sends {why}"));
         }
@@ -223,8 +170,7 @@ impl ChoreographerInner {
             ),
             None => format!("servant {id}: {why}; its limits are unchanged"),
         };
-        self.journal
-            .info("terms-changed", &message, &handle.event_context());
+        self.journal.info("terms-changed", &message, &handle.event_context());
     }
 
     /// Applies these terms to a servant, for the reason `why`; returns the previous limits if they change. Requires
@@ -243,10 +189,7 @@ impl ChoreographerInner {
             reason: Box::new(reason),
         };
         let terms = terms.map_err(|untenable| refused(ResizeError::Untenable(untenable)))?;
-        let after = LimitSources {
-            terms,
-            ..before.clone()
-        };
+        let after = LimitSources { terms, ..before.clone() };
         if handle.is_place() {
             // It has no container; the group takes the goals of its SLA into account.
             handle.set_limit_sources(after);
@@ -278,12 +221,7 @@ impl ChoreographerInner {
 
     /// Applies the limits of `change` to a servant and promises `after` to it; all or nothing. Requires
     /// [`Handle::lock_limits`]. Returns the limits in force afterwards.
-    async fn resize(
-        &self,
-        handle: &Handle,
-        change: Limits,
-        after: LimitSources,
-    ) -> Result<String, Error> {
+    async fn resize(&self, handle: &Handle, change: Limits, after: LimitSources) -> Result<String, Error> {
         let unreached = || Error::Servant {
             service: handle.service().to_owned(),
             robot: handle.robot.clone(),
@@ -293,10 +231,8 @@ impl ChoreographerInner {
         let container = handle.container().ok_or_else(unreached)?;
         let promise = handle.promise().ok_or_else(unreached)?;
         let before = handle.limit_sources();
-        let (has, wanted) = (
-            self.promised_amount(&before.promised_limits()),
-            self.promised_amount(&after.promised_limits()),
-        );
+        let (has, wanted) =
+            (self.promised_amount(&before.promised_limits()), self.promised_amount(&after.promised_limits()));
         // An increase is promised before the kernel grants it, and a decrease is released only after the kernel has
         // applied it: otherwise more would be promised than there is if the kernel refuses.
         promise.change(has.max(wanted))?;
@@ -337,11 +273,7 @@ pub(super) async fn fit_container(
 
 /// Restores the promised cores of an adopted servant, if an earlier daemon's controller has moved them and this daemon
 /// has no controller.
-pub(super) async fn restore_cores(
-    inner: &ChoreographerInner,
-    handle: &Handle,
-    container: &dyn ServantHandle,
-) {
+pub(super) async fn restore_cores(inner: &ChoreographerInner, handle: &Handle, container: &dyn ServantHandle) {
     let (has, wanted) = (container.enforced_limits().limits, handle.limits());
     // Cores that this host cannot limit were not moved.
     if inner.options.controller || has.cpus.is_none() {
@@ -356,9 +288,7 @@ pub(super) async fn restore_cores(
     };
     let after = Limits {
         cpus: wanted.cpus,
-        cpu_weight: wanted
-            .cpu_weight
-            .or(has.cpu_weight.and(Some(DEFAULT_CPU_WEIGHT))),
+        cpu_weight: wanted.cpu_weight.or(has.cpu_weight.and(Some(DEFAULT_CPU_WEIGHT))),
         ..Limits::default()
     };
     let change = before.changes_to(after, inner.options.cores);
@@ -382,8 +312,7 @@ pub(super) async fn restore_cores(
             inner.journal.warning("limits-unmet", &message, &about);
         }
         Err(_) => {
-            let message =
-                format!("servant {id} keeps cores set by the controller: it does not answer");
+            let message = format!("servant {id} keeps cores set by the controller: it does not answer");
             inner.journal.warning("limits-unmet", &message, &about);
         }
     }

@@ -107,11 +107,7 @@ pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
                     let (id, inner) = (handle.id.clone(), Arc::clone(&inner));
                     visits.begin(&id, async move {
                         let outcome = inner.apply_measured(&handle, &inputs).await;
-                        ResizeOutcome {
-                            handle,
-                            inputs,
-                            outcome,
-                        }
+                        ResizeOutcome { handle, inputs, outcome }
                     });
                 }
             }
@@ -121,22 +117,14 @@ pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
 
 impl InputWatch {
     /// Returns the measured inputs if they are to be applied to the servant.
-    fn look(
-        &mut self,
-        seen: Vec<(String, SizeSummary)>,
-        now: Instant,
-    ) -> Option<Vec<MeasuredInput>> {
+    fn look(&mut self, seen: Vec<(String, SizeSummary)>, now: Instant) -> Option<Vec<MeasuredInput>> {
         let inputs = self.inputs(seen, now);
         let again = self.refused.as_ref().is_some_and(|it| it.is_due(now));
         (self.known != inputs || again).then_some(inputs)
     }
 
     fn note(&mut self, given: ResizeOutcome, inner: &ChoreographerInner) {
-        let ResizeOutcome {
-            handle,
-            inputs,
-            outcome,
-        } = given;
+        let ResizeOutcome { handle, inputs, outcome } = given;
         self.known = inputs;
         self.refused = ResizeRefusal::from_outcome(self.refused.take(), outcome, inner, &handle);
     }
@@ -149,15 +137,8 @@ impl InputWatch {
             let first = *self.first.entry(name.clone()).or_insert(now);
             let known = now.saturating_duration_since(first).min(PATIENCE);
             MeasuredInput {
-                known: if known < PATIENCE {
-                    Duration::ZERO
-                } else {
-                    known
-                },
-                seen: SizeSummary {
-                    count: seen.count.min(ENOUGH),
-                    ..seen
-                },
+                known: if known < PATIENCE { Duration::ZERO } else { known },
+                seen: SizeSummary { count: seen.count.min(ENOUGH), ..seen },
                 name,
             }
         })

@@ -14,9 +14,7 @@ use tokio::sync::broadcast::error::RecvError;
 use tokio::time::Instant;
 
 use super::ChoreographerInner;
-use crate::decide::nodes::{
-    EndedNode, NodeExitAction, NodeExitContext, NodeReport, decide_after_exit,
-};
+use crate::decide::nodes::{EndedNode, NodeExitAction, NodeExitContext, NodeReport, decide_after_exit};
 use crate::lives::handle::{Failure, Handle};
 
 /// Number of a node's log lines attached to its failure.
@@ -60,13 +58,7 @@ impl<'a> NodeSupervisor<'a> {
         if handle.is_linked() {
             return nodes;
         }
-        for node in handle
-            .revision
-            .plan
-            .nodes
-            .iter()
-            .filter(|node| !node.respawn)
-        {
+        for node in handle.revision.plan.nodes.iter().filter(|node| !node.respawn) {
             nodes.watch(node.clone());
         }
         nodes
@@ -107,29 +99,12 @@ impl<'a> NodeSupervisor<'a> {
     /// Handles an event of the engine.
     fn on_node_event(&mut self, event: NodeEvent) {
         let (node, exit) = match event {
-            NodeEvent::Exited {
-                node,
-                code,
-                signal,
-                out_of_memory,
-            } => (
-                node,
-                NodeExit {
-                    code,
-                    signal,
-                    out_of_memory,
-                    exec_error: None,
-                },
-            ),
-            NodeEvent::ExecFailed { node, reason } => (
-                node,
-                NodeExit {
-                    code: None,
-                    signal: None,
-                    out_of_memory: false,
-                    exec_error: Some(reason),
-                },
-            ),
+            NodeEvent::Exited { node, code, signal, out_of_memory } => {
+                (node, NodeExit { code, signal, out_of_memory, exec_error: None })
+            }
+            NodeEvent::ExecFailed { node, reason } => {
+                (node, NodeExit { code: None, signal: None, out_of_memory: false, exec_error: Some(reason) })
+            }
             NodeEvent::Respawning { node } => {
                 let nodes = &self.handle.revision.plan.nodes;
                 let delay = nodes.iter().find(|one| one.name == node);
@@ -137,10 +112,7 @@ impl<'a> NodeSupervisor<'a> {
                 let how = self.ends.remove(&node);
                 let how = how.as_deref().unwrap_or("ended");
                 let message = format!("{node} {how} and is restarted after {delay} s");
-                let event = NodeReport {
-                    kind: "node-respawned",
-                    message,
-                };
+                let event = NodeReport { kind: "node-respawned", message };
                 return self.report(&node, &event);
             }
             NodeEvent::Started { node } => return self.handle.note_start(&node),
@@ -149,10 +121,7 @@ impl<'a> NodeSupervisor<'a> {
             self.handle.note_out_of_memory();
         }
         let respawns = self.handle.revision.plan.nodes.iter();
-        if respawns
-            .filter(|one| one.respawn)
-            .any(|one| one.name == node)
-        {
+        if respawns.filter(|one| one.respawn).any(|one| one.name == node) {
             let how = describe_exit(&exit, &self.handle.limits());
             self.ends.insert(node, how);
         }
@@ -191,11 +160,7 @@ impl<'a> NodeSupervisor<'a> {
                 self.report(&node.name, &event);
                 Ok(())
             }
-            NodeExitAction::Restart {
-                after,
-                failures,
-                event,
-            } => {
+            NodeExitAction::Restart { after, failures, event } => {
                 self.report(&node.name, &event);
                 self.handle.set_down(&node.name, Some((failures, after)));
                 self.failures.insert(node.name.clone(), failures);
@@ -206,9 +171,7 @@ impl<'a> NodeSupervisor<'a> {
                 Ok(())
             }
             NodeExitAction::Fail { event, reason } => {
-                event
-                    .iter()
-                    .for_each(|event| self.report(&node.name, event));
+                event.iter().for_each(|event| self.report(&node.name, event));
                 Err(self.failure(&node, reason).await)
             }
         }
@@ -229,18 +192,13 @@ impl<'a> NodeSupervisor<'a> {
                 self.watch(node);
                 Ok(())
             }
-            Err(error) => Err(self
-                .failure(&node, format!("cannot restart {}: {error}", node.name))
-                .await),
+            Err(error) => Err(self.failure(&node, format!("cannot restart {}: {error}", node.name)).await),
         }
     }
 
     async fn failure(&mut self, node: &NodeSpec, reason: String) -> Failure {
         let lines = self.container.logs(LOG_LINES, Some(&node.name)).await;
-        Failure::Broken {
-            reason,
-            log: lines.into_iter().map(|line| line.line).collect(),
-        }
+        Failure::Broken { reason, log: lines.into_iter().map(|line| line.line).collect() }
     }
 
     fn report(&self, node: &str, event: &NodeReport) {

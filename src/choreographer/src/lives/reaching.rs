@@ -30,10 +30,7 @@ pub(crate) async fn open(
         let known = inner.catalogue.revision_contents(revision).await;
         // A running container is to be reached nevertheless.
         let known = known.unwrap_or_else(|error| {
-            tracing::warn!(
-                "the contents of the image of {} are unknown: {error}",
-                revision.service
-            );
+            tracing::warn!("the contents of the image of {} are unknown: {error}", revision.service);
             RevisionContents::default()
         });
         recorded_revision(revision, known)
@@ -82,11 +79,7 @@ pub(crate) struct RequestRecorder {
 }
 
 impl RequestRecorder {
-    pub(crate) fn new(
-        inner: &ChoreographerInner,
-        revision: &Arc<RevisionRecord>,
-        servant: &str,
-    ) -> Arc<Self> {
+    pub(crate) fn new(inner: &ChoreographerInner, revision: &Arc<RevisionRecord>, servant: &str) -> Arc<Self> {
         Arc::new(RequestRecorder {
             servant: servant.to_owned(),
             revision: Arc::clone(revision),
@@ -120,10 +113,7 @@ impl RequestRecorder {
         let measures = Arc::clone(self);
         RequestObserver::new(move |took| {
             let total = took.map(|took| took.as_secs_f64() * 1e3);
-            let request = RequestTiming {
-                total,
-                ..RequestTiming::default()
-            };
+            let request = RequestTiming { total, ..RequestTiming::default() };
             let cloud = total.unwrap_or_default();
             measures.record(&request, cloud, RequestUpdate::Answered);
         })
@@ -131,14 +121,8 @@ impl RequestRecorder {
 }
 
 /// Combines what is recorded of a revision with what was found in its image.
-pub(crate) fn recorded_revision(
-    revision: &RevisionRecord,
-    known: RevisionContents,
-) -> RecordedRevision {
-    let RevisionContents {
-        inventory,
-        registry,
-    } = known;
+pub(crate) fn recorded_revision(revision: &RevisionRecord, known: RevisionContents) -> RecordedRevision {
+    let RevisionContents { inventory, registry } = known;
     let plan = &revision.plan;
     RecordedRevision {
         service: revision.service.clone(),
@@ -171,11 +155,7 @@ impl Observer for ServantObserver {
     }
 
     fn record_event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {
-        let about = NewEvent {
-            service: Some(&self.revision.service),
-            servant: Some(&self.id),
-            robot,
-        };
+        let about = NewEvent { service: Some(&self.revision.service), servant: Some(&self.id), robot };
         match level {
             Level::Info => self.journal.info(kind, message, &about),
             Level::Warning => self.journal.warning(kind, message, &about),
@@ -185,8 +165,7 @@ impl Observer for ServantObserver {
 
     fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>) {
         let service = &self.revision.service;
-        self.journal
-            .record_local_period((service, robot, node), at, why);
+        self.journal.record_local_period((service, robot, node), at, why);
     }
 
     fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {

@@ -38,10 +38,7 @@ pub struct AnsweredRequest {
 
 impl Default for RecentRequests {
     fn default() -> Self {
-        Self {
-            by_servant: Mutex::default(),
-            told: broadcast::Sender::new(UNHEARD),
-        }
+        Self { by_servant: Mutex::default(), told: broadcast::Sender::new(UNHEARD) }
     }
 }
 
@@ -95,30 +92,17 @@ impl RecentRequests {
     }
 
     /// Returns the percentiles of requests sent after `since`; of all recent ones, if these are too few.
-    pub(crate) fn p95_since(
-        &self,
-        servant: &str,
-        since: Option<Instant>,
-        now: Instant,
-    ) -> Option<MeasuredTimes> {
+    pub(crate) fn p95_since(&self, servant: &str, since: Option<Instant>, now: Instant) -> Option<MeasuredTimes> {
         let measured = self.p95_times(servant, since, now);
         measured.or_else(|| self.p95(servant, now))
     }
 
-    fn p95_times(
-        &self,
-        servant: &str,
-        since: Option<Instant>,
-        now: Instant,
-    ) -> Option<MeasuredTimes> {
+    fn p95_times(&self, servant: &str, since: Option<Instant>, now: Instant) -> Option<MeasuredTimes> {
         let (total, cloud) = self.times(servant, since, now)?;
         if total.len() < LEAST {
             return None;
         }
-        Some(MeasuredTimes {
-            total: nearest_rank(&total, 95)?,
-            cloud: nearest_rank(&cloud, 95)?,
-        })
+        Some(MeasuredTimes { total: nearest_rank(&total, 95)?, cloud: nearest_rank(&cloud, 95)? })
     }
 
     /// Returns the recent response times for display; `None` if nothing is known.
@@ -133,12 +117,7 @@ impl RecentRequests {
 
     /// Returns the recent response times of requests sent after `since`, and the parts in the cloud; each in ascending
     /// order.
-    fn times(
-        &self,
-        servant: &str,
-        since: Option<Instant>,
-        now: Instant,
-    ) -> Option<(Vec<f64>, Vec<f64>)> {
+    fn times(&self, servant: &str, since: Option<Instant>, now: Instant) -> Option<(Vec<f64>, Vec<f64>)> {
         let mut all = self.by_servant.lock();
         let took = all.get_mut(servant)?;
         took.retain(|one| now.saturating_duration_since(one.known) < LATELY);
@@ -175,16 +154,9 @@ mod tests {
         for nonsense in [f64::NAN, f64::INFINITY, -1.0] {
             recent.record("a", nonsense, 1.0, now);
         }
-        let measured = MeasuredTimes {
-            total: 19.0,
-            cloud: 9.5,
-        };
+        let measured = MeasuredTimes { total: 19.0, cloud: 9.5 };
         assert_eq!(recent.p95("a", now), Some(measured));
-        let shown = ResponseTimes {
-            requests: 20,
-            p50_ms: 10.0,
-            p95_ms: 19.0,
-        };
+        let shown = ResponseTimes { requests: 20, p50_ms: 10.0, p95_ms: 19.0 };
         assert_eq!(recent.response_times("a", now), Some(shown));
         // The time in the cloud is at most the total.
         for _ in 0..LEAST {
@@ -196,17 +168,11 @@ mod tests {
         // One is enough for display, and too few for a decision.
         recent.record("d", 5.0, 5.0, now);
         assert_eq!(recent.p95("d", now), None);
-        assert_eq!(
-            recent.response_times("d", now).map(|it| it.requests),
-            Some(1)
-        );
+        assert_eq!(recent.response_times("d", now).map(|it| it.requests), Some(1));
         assert_eq!(recent.p95("a", now + LATELY), None);
         assert_eq!(recent.response_times("a", now + LATELY), None);
         recent.retain(|id| id == "c");
-        assert_eq!(
-            (recent.p95("b", now), recent.p95("c", now).is_some()),
-            (None, true)
-        );
+        assert_eq!((recent.p95("b", now), recent.p95("c", now).is_some()), (None, true));
     }
 
     #[test]

@@ -14,9 +14,7 @@ pub use orders::check_terms;
 pub(crate) use table::Rollouts;
 
 use super::ChoreographerInner;
-use crate::decide::rollout::{
-    AssignedRevision, PromotionBlocker, Rollout, RolloutStep, assign_revision, next_step,
-};
+use crate::decide::rollout::{AssignedRevision, PromotionBlocker, Rollout, RolloutStep, assign_revision, next_step};
 use crate::lives::handle::Handle;
 use crate::request::serves_no_robot;
 use crate::{Error, ServantRequest};
@@ -66,12 +64,7 @@ impl Rollouts {
         }
     }
 
-    fn record(
-        &self,
-        service: &str,
-        revision: u64,
-        change: impl FnOnce(&mut crate::decide::rollout::RevisionStats),
-    ) {
+    fn record(&self, service: &str, revision: u64, change: impl FnOnce(&mut crate::decide::rollout::RevisionStats)) {
         let mut kept = self.kept.lock();
         let Some(rollout) = kept.by_service.get_mut(service) else {
             return;
@@ -126,10 +119,7 @@ impl ChoreographerInner {
     /// Returns the revision for a robot, and whether it is newly assigned to the candidate. The assignment takes effect
     /// with [`Rollouts::add_canary_robot`]: a robot that is refused, or keeps another servant, does not use up a
     /// canary's place.
-    pub(crate) fn revision_for(
-        &self,
-        request: &ServantRequest,
-    ) -> Result<(Arc<RevisionRecord>, bool), Error> {
+    pub(crate) fn revision_for(&self, request: &ServantRequest) -> Result<(Arc<RevisionRecord>, bool), Error> {
         let (service, robot) = (&request.service, &request.robot);
         let current = self.catalogue.current_revision(service)?;
         if serves_no_robot(robot, request.anonymous) {
@@ -170,10 +160,7 @@ impl ChoreographerInner {
         let news = wait.filter(|wait| !before.is_some_and(|before| before.is_same_kind(wait)));
         if let Some(wait) = news {
             let message = format!("revision {candidate} of {service} is not promoted yet: {wait}");
-            let about = NewEvent {
-                service: Some(service),
-                ..NewEvent::default()
-            };
+            let about = NewEvent { service: Some(service), ..NewEvent::default() };
             self.journal.info("rollout-waits", &message, &about);
         }
     }
@@ -183,8 +170,7 @@ impl ChoreographerInner {
     }
 
     fn write_rollout(&self, service: &str, rollout: &Rollout) -> Result<(), Error> {
-        let text =
-            serde_json::to_string(rollout).map_err(|_| Error::Internal("writing a rollout"))?;
+        let text = serde_json::to_string(rollout).map_err(|_| Error::Internal("writing a rollout"))?;
         Ok(self.state.set_rollout(service, &text)?)
     }
 
@@ -227,8 +213,7 @@ impl ChoreographerInner {
         let next = {
             let _writing = self.rollouts.writing.lock();
             let rollout = self.rollout(service);
-            let Some(mut next) = rollout.filter(|it| it.candidate == candidate && is_ongoing(it))
-            else {
+            let Some(mut next) = rollout.filter(|it| it.candidate == candidate && is_ongoing(it)) else {
                 return Ok(false);
             };
             next.state = state;
@@ -259,10 +244,7 @@ impl ChoreographerInner {
             RolloutState::Replaced => ("rollout-replaced", "was replaced"),
         };
         let message = format!("revision {candidate} of {service} {what}: {reason}");
-        let about = NewEvent {
-            service: Some(service),
-            ..NewEvent::default()
-        };
+        let about = NewEvent { service: Some(service), ..NewEvent::default() };
         match rollout.state {
             RolloutState::RolledBack => self.journal.warning(kind, &message, &about),
             _ => self.journal.info(kind, &message, &about),
@@ -279,13 +261,7 @@ impl ChoreographerInner {
     }
 
     /// Rolls a canary back: its robots get the previous revision when they come back.
-    fn take_back(
-        &self,
-        service: &str,
-        candidate: u64,
-        state: RolloutState,
-        reason: &str,
-    ) -> Result<(), Error> {
+    fn take_back(&self, service: &str, candidate: u64, state: RolloutState, reason: &str) -> Result<(), Error> {
         if self.set_rollout_state(service, candidate, state, reason)? {
             let words = format!("its revision was rolled back: {reason}");
             self.end_servants(service, &words, |revision| revision == candidate);
@@ -329,8 +305,7 @@ impl ChoreographerInner {
             RolloutStep::EndsOthers => {
                 let reason = "the deadline of the other revisions has passed";
                 if self.set_rollout_state(service, candidate, RolloutState::Promoted, reason)? {
-                    let words =
-                        format!("its deadline has passed: revision {candidate} replaces it");
+                    let words = format!("its deadline has passed: revision {candidate} replaces it");
                     self.end_servants(service, &words, |revision| revision != candidate);
                 }
             }
@@ -353,10 +328,6 @@ pub(crate) async fn run_rollouts(inner: Arc<ChoreographerInner>) {
                 tracing::warn!("cannot continue the rollout of {service}: {error}");
             }
         }
-        if on_the_way.is_empty() {
-            inner.rollouts.begun.notified().await
-        } else {
-            tokio::time::sleep(LOOK).await
-        }
+        if on_the_way.is_empty() { inner.rollouts.begun.notified().await } else { tokio::time::sleep(LOOK).await }
     }
 }

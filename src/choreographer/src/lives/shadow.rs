@@ -83,11 +83,7 @@ impl Choreographer {
     }
 
     /// Returns the revision to compare, if that is allowed.
-    fn candidate_of(
-        &self,
-        service: &str,
-        options: &ShadowOptions,
-    ) -> Result<Arc<RevisionRecord>, Error> {
+    fn candidate_of(&self, service: &str, options: &ShadowOptions) -> Result<Arc<RevisionRecord>, Error> {
         self.inner.catalogue.current_revision(service)?;
         let number = options.revision;
         let Some(revision) = self.inner.state.revision(service, number)? else {
@@ -109,11 +105,7 @@ impl Choreographer {
     }
 
     /// Returns the servant of the named robot, or of any, if it can be compared with.
-    fn robot_for(
-        &self,
-        service: &str,
-        options: &ShadowOptions,
-    ) -> Result<Option<Arc<Handle>>, Error> {
+    fn robot_for(&self, service: &str, options: &ShadowOptions) -> Result<Option<Arc<Handle>>, Error> {
         let named = options.robot.as_deref();
         let of_it = |handle: &&Arc<Handle>| {
             handle.service() == service
@@ -145,11 +137,7 @@ impl Choreographer {
         }
     }
 
-    async fn await_robot(
-        &self,
-        service: &str,
-        options: &ShadowOptions,
-    ) -> Result<Arc<Handle>, Error> {
+    async fn await_robot(&self, service: &str, options: &ShadowOptions) -> Result<Arc<Handle>, Error> {
         let ends = Instant::now() + Duration::from_secs_f64(options.seconds);
         loop {
             tokio::time::sleep(LOOK).await;
@@ -157,15 +145,11 @@ impl Choreographer {
                 return Ok(found);
             }
             if Instant::now() >= ends {
-                let who = options.robot.as_deref().map_or_else(
-                    || "no robot".to_owned(),
-                    |robot| format!("robot {robot} did not"),
-                );
-                let used = if options.robot.is_some() {
-                    "use"
-                } else {
-                    "used"
-                };
+                let who = options
+                    .robot
+                    .as_deref()
+                    .map_or_else(|| "no robot".to_owned(), |robot| format!("robot {robot} did not"));
+                let used = if options.robot.is_some() { "use" } else { "used" };
                 return Err(Error::Shadow(format!(
                     "{who} {used} {service} within {} s; see which robots do with: cloudroidctl servants",
                     options.seconds
@@ -176,20 +160,13 @@ impl Choreographer {
 
     /// Starts a servant of this revision with the limits of the present one. It is promised the reserved cores of
     /// servants without limits, like the probe of a push; memory is promised in full.
-    fn start_candidate(
-        &self,
-        present: &Handle,
-        revision: Arc<RevisionRecord>,
-    ) -> Result<MeasuredServant, Error> {
+    fn start_candidate(&self, present: &Handle, revision: Arc<RevisionRecord>) -> Result<MeasuredServant, Error> {
         let inner = &self.inner;
         let limits = present.limits();
         let asked = LimitSources {
             set: api::Limits::default(),
             terms: api::Terms {
-                limits: api::Limits {
-                    memory: limits.memory,
-                    ..api::Limits::default()
-                },
+                limits: api::Limits { memory: limits.memory, ..api::Limits::default() },
                 ..api::Terms::default()
             },
             default: limits,

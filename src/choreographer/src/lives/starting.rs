@@ -60,9 +60,7 @@ pub(super) async fn use_warm(
     let warm = warm?;
     warm.span.record("robot", &*handle.robot);
     let limits = handle.limits();
-    if let Err(error) =
-        limits::fit_container(&*warm.container, &warm.limits, &limits, inner.options.cores).await
-    {
+    if let Err(error) = limits::fit_container(&*warm.container, &warm.limits, &limits, inner.options.cores).await {
         tracing::debug!("a warm container cannot be given {limits:?}: {error}");
         warm.end(inner).await;
         return None;
@@ -98,9 +96,7 @@ pub(super) async fn reach(
 ) -> Result<Arc<dyn Reach>, Failure> {
     let late = |_| {
         let limit = inner.options.start.as_secs();
-        Failure::from_reason(format!(
-            "could not be reached within {limit} s: its ROS did not start"
-        ))
+        Failure::from_reason(format!("could not be reached within {limit} s: its ROS did not start"))
     };
     timeout_at(deadline, reaching::open(inner, &handle.revision, container))
         .await
@@ -118,11 +114,7 @@ pub(super) fn container_spec(
 ) -> Result<Spec, Error> {
     let plan = &revision.plan;
     for what in inner.engine.check_grants(&plan.grants)? {
-        let about = NewEvent {
-            service: Some(&revision.service),
-            servant: Some(id),
-            robot: None,
-        };
+        let about = NewEvent { service: Some(&revision.service), servant: Some(id), robot: None };
         let message = format!("servant {id} of {}: {what}", revision.service);
         inner.journal.warning("device-incomplete", &message, &about);
     }
@@ -154,26 +146,14 @@ pub(super) fn report_terms(inner: &ChoreographerInner, handle: &Handle) {
         terms.describe_stated(),
         terms.why.join("; "),
     );
-    inner
-        .journal
-        .info("terms", &message, &handle.event_context());
+    inner.journal.info("terms", &message, &handle.event_context());
 }
 
 /// Reports requested limits that are not in force; the daemon has warned about the others at its start.
-pub(super) fn report_unmet(
-    inner: &ChoreographerInner,
-    handle: &Handle,
-    container: &Arc<dyn ServantHandle>,
-) {
-    let unmet = container
-        .enforced_limits()
-        .unmet_limits(&handle.requested_limits());
+pub(super) fn report_unmet(inner: &ChoreographerInner, handle: &Handle, container: &Arc<dyn ServantHandle>) {
+    let unmet = container.enforced_limits().unmet_limits(&handle.requested_limits());
     if !unmet.is_empty() {
-        let message = format!(
-            "servant {} runs without a requested limit: {}",
-            handle.id,
-            unmet.join(", ")
-        );
+        let message = format!("servant {} runs without a requested limit: {}", handle.id, unmet.join(", "));
         let about = handle.event_context();
         inner.journal.warning("limits-unmet", &message, &about);
     }

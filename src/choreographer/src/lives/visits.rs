@@ -17,10 +17,7 @@ pub(super) struct Visits<T> {
 
 impl<T> Default for Visits<T> {
     fn default() -> Self {
-        Self {
-            tasks: JoinSet::new(),
-            servants: HashMap::new(),
-        }
+        Self { tasks: JoinSet::new(), servants: HashMap::new() }
     }
 }
 

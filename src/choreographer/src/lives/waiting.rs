@@ -12,8 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::decide::Amount;
 use crate::decide::admission::{
-    AdmissionError, AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, Origin,
-    Position, Ticket,
+    AdmissionError, AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, Origin, Position, Ticket,
 };
 use crate::decide::capacity::{PushPromise, Shortage};
 
@@ -71,11 +70,7 @@ pub struct QueueStanding {
 impl fmt::Display for QueueStanding {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.stalled {
-            Some(why) => write!(
-                out,
-                "{why}, so no robot is admitted; this robot is {}",
-                self.place
-            ),
+            Some(why) => write!(out, "{why}, so no robot is admitted; this robot is {}", self.place),
             None => write!(out, "this machine is full; this robot is {}", self.place),
         }
     }
@@ -159,17 +154,12 @@ impl Admission {
             kept: HashMap::new(),
             tickets: 0,
         };
-        Admission {
-            desk: Arc::new(Mutex::new(desk)),
-        }
+        Admission { desk: Arc::new(Mutex::new(desk)) }
     }
 
     /// Decides and records atomically; then issues permits to the admitted requests, and reports the positions of the
     /// others.
-    fn update<T>(
-        &self,
-        decision: impl FnOnce(&mut AdmissionLedger) -> (T, Vec<AdmittedRequest>),
-    ) -> T {
+    fn update<T>(&self, decision: impl FnOnce(&mut AdmissionLedger) -> (T, Vec<AdmittedRequest>)) -> T {
         let mut desk = self.desk.lock();
         let (outcome, admitted) = decision(&mut desk.book);
         let told = self.issue_permits(&mut desk, admitted);
@@ -195,20 +185,11 @@ impl Admission {
         told
     }
 
-    fn new_permit(
-        &self,
-        desk: &mut AdmissionState,
-        ticket: Ticket,
-        origin: Origin,
-        has: Amount,
-    ) -> Permit {
+    fn new_permit(&self, desk: &mut AdmissionState, ticket: Ticket, origin: Origin, has: Amount) -> Permit {
         let promise = self.new_promise(has);
         let work = (origin == Origin::Push).then(|| {
             let gives_way = CancellationToken::new();
-            let working = PushWork {
-                has: Arc::clone(&promise.amount),
-                gives_way: gives_way.clone(),
-            };
+            let working = PushWork { has: Arc::clone(&promise.amount), gives_way: gives_way.clone() };
             desk.pushes.insert(ticket, working);
             (ticket, gives_way)
         });
@@ -216,10 +197,7 @@ impl Admission {
     }
 
     fn new_promise(&self, amount: Amount) -> Promise {
-        Promise {
-            amount: Arc::new(Mutex::new(Some(amount))),
-            admission: self.clone(),
-        }
+        Promise { amount: Arc::new(Mutex::new(Some(amount))), admission: self.clone() }
     }
 
     /// Returns the capacity, the promised part, and the number of waiting requests.
@@ -274,10 +252,7 @@ impl Admission {
     /// Takes `wanted` even if it is not free: for servants that run already.
     pub(crate) fn adopt(&self, wanted: Amount) -> Permit {
         self.desk.lock().book.promise(wanted);
-        Permit {
-            promise: self.new_promise(wanted),
-            work: None,
-        }
+        Permit { promise: self.new_promise(wanted), work: None }
     }
 
     /// Returns true if no request waits and the machine does not stall.
@@ -288,10 +263,7 @@ impl Admission {
     /// Takes `wanted` for background work, if it is free and no request waits.
     pub(crate) fn try_admit(&self, wanted: Amount) -> Option<Permit> {
         let spare = self.desk.lock().book.take_spare(wanted);
-        spare.then(|| Permit {
-            promise: self.new_promise(wanted),
-            work: None,
-        })
+        spare.then(|| Permit { promise: self.new_promise(wanted), work: None })
     }
 
     /// Takes the requested amount, waiting at most `deadline`, and reports its position by `stands` meanwhile. Calls
@@ -322,10 +294,7 @@ impl Admission {
             let kept = who.and_then(|who| desk.kept.remove(who));
             let kept = kept.filter(|kept| kept.since.elapsed() < KEPT);
             let (ticket, (verdict, others)) = match kept {
-                Some(kept) => (
-                    kept.ticket,
-                    desk.book.request_again(kept.ticket, ask, kept.overtaken),
-                ),
+                Some(kept) => (kept.ticket, desk.book.request_again(kept.ticket, ask, kept.overtaken)),
                 None => {
                     desk.tickets += 1;
                     let ticket = desk.tickets;
@@ -334,17 +303,11 @@ impl Admission {
             };
             let told = self.issue_permits(&mut desk, others);
             let outcome = match verdict {
-                AdmissionVerdict::Admitted => Err(Ok(
-                    self.new_permit(&mut desk, ticket, ask.origin, ask.wanted)
-                )),
+                AdmissionVerdict::Admitted => Err(Ok(self.new_permit(&mut desk, ticket, ask.origin, ask.wanted))),
                 AdmissionVerdict::Refused(refused) => Err(Err(refused)),
                 AdmissionVerdict::Waits => {
                     let (opens, admitted) = oneshot::channel();
-                    let door = WaitingRequest {
-                        opens,
-                        origin: ask.origin,
-                        stands,
-                    };
+                    let door = WaitingRequest { opens, origin: ask.origin, stands };
                     desk.doors.insert(ticket, door);
                     desk.update_standings();
                     Ok((ticket, admitted))
@@ -354,11 +317,7 @@ impl Admission {
             deliver_permits(told);
             match outcome {
                 Ok((ticket, admitted)) => {
-                    let waiting = QueuedTicket {
-                        admission: self,
-                        ticket,
-                        who,
-                    };
+                    let waiting = QueuedTicket { admission: self, ticket, who };
                     (waiting, admitted)
                 }
                 Err(at_once) => return at_once,
@@ -389,11 +348,7 @@ fn deliver_permits(told: Vec<(Option<WaitingRequest>, Permit)>) {
 }
 
 /// Returns the error of a request that waited in vain.
-fn timeout_error(
-    waited: Duration,
-    standing: Option<QueueStanding>,
-    stalled: Option<String>,
-) -> AdmissionError {
+fn timeout_error(waited: Duration, standing: Option<QueueStanding>, stalled: Option<String>) -> AdmissionError {
     let place = standing.map(|standing| standing.place);
     match stalled {
         Some(why) => AdmissionError::Stalled { why, waited, place },
@@ -407,11 +362,7 @@ impl AdmissionState {
         let overtaken = self.book.overtaken_count(ticket).unwrap_or(0);
         self.kept.retain(|_, kept| kept.since.elapsed() < KEPT);
         if self.kept.len() < MOST_KEPT {
-            let kept = KeptPosition {
-                ticket,
-                overtaken,
-                since: Instant::now(),
-            };
+            let kept = KeptPosition { ticket, overtaken, since: Instant::now() };
             self.kept.insert(who.to_owned(), kept);
         }
     }
@@ -422,10 +373,7 @@ impl AdmissionState {
             let Some(door) = self.doors.get(&ticket) else {
                 continue;
             };
-            let stands = Some(QueueStanding {
-                place,
-                stalled: self.book.stall_reason().map(str::to_owned),
-            });
+            let stands = Some(QueueStanding { place, stalled: self.book.stall_reason().map(str::to_owned) });
             door.stands.send_if_modified(|before| {
                 let changed = *before != stands;
                 *before = stands;
@@ -452,8 +400,7 @@ impl Drop for QueuedTicket<'_> {
             }
             desk.doors.remove(&self.ticket)
         };
-        self.admission
-            .update(|book| ((), book.withdraw(self.ticket)));
+        self.admission.update(|book| ((), book.withdraw(self.ticket)));
         // A permit that was not received is dropped with it, which locks the state.
         drop(door);
     }
@@ -477,8 +424,7 @@ mod tests {
         on_wait: impl FnOnce(),
     ) -> Result<Permit, AdmissionError> {
         let ask = AdmissionRequest::robot(Amount::new(cpus, 0), 0);
-        room.admit(ask, patience, watch::Sender::new(None), on_wait)
-            .await
+        room.admit(ask, patience, watch::Sender::new(None), on_wait).await
     }
 
     #[tokio::test(start_paused = true)]
@@ -488,10 +434,7 @@ mod tests {
         let first = std::cell::Cell::new(Some(first.await.expect("it is free")));
         let second = robot(&room, 1.0, SECOND, || drop(first.take()));
         let second = second.await.expect("it came free");
-        assert_eq!(
-            room.snapshot(),
-            (Amount::new(2.0, 1000), Amount::new(1.0, 0), 0)
-        );
+        assert_eq!(room.snapshot(), (Amount::new(2.0, 1000), Amount::new(1.0, 0), 0));
         drop(second);
         assert_eq!(room.snapshot().1, Amount::NONE);
     }
@@ -516,13 +459,9 @@ mod tests {
         let room = machine();
         let all = robot(&room, 2.0, SECOND, || {}).await.expect("it is free");
         let asks = |who, patience| {
-            let (stands, ask) = (
-                watch::Sender::new(None),
-                AdmissionRequest::robot(Amount::new(1.0, 0), 0),
-            );
+            let (stands, ask) = (watch::Sender::new(None), AdmissionRequest::robot(Amount::new(1.0, 0), 0));
             let (watched, room) = (stands.subscribe(), room.clone());
-            let waiting =
-                async move { room.admit_as(Some(who), ask, patience, stands, || {}).await };
+            let waiting = async move { room.admit_as(Some(who), ask, patience, stands, || {}).await };
             (watched, waiting)
         };
         let place = |stands: &watch::Receiver<Option<QueueStanding>>| {
@@ -559,10 +498,7 @@ mod tests {
         let room = machine();
         let mut all = Some(robot(&room, 2.0, SECOND, || {}).await.expect("it is free"));
         let asks = |who: &'static str| {
-            let (stands, ask) = (
-                watch::Sender::new(None),
-                AdmissionRequest::robot(Amount::new(2.0, 0), 0),
-            );
+            let (stands, ask) = (watch::Sender::new(None), AdmissionRequest::robot(Amount::new(2.0, 0), 0));
             let (watched, room) = (stands.subscribe(), room.clone());
             let waiting = async move {
                 let admitted = room.admit_as(Some(who), ask, SECOND * 100, stands, || {});
@@ -651,40 +587,27 @@ mod tests {
             let (room, stands) = (room.clone(), watch::Sender::new(None));
             let watched = stands.subscribe();
             let ask = AdmissionRequest::robot(Amount::new(1.0, 0), priority);
-            let waiting =
-                tokio::spawn(async move { room.admit(ask, SECOND * 60, stands, || {}).await });
+            let waiting = tokio::spawn(async move { room.admit(ask, SECOND * 60, stands, || {}).await });
             (watched, waiting)
         };
         let told = |stands: &mut watch::Receiver<Option<QueueStanding>>| {
-            stands
-                .borrow_and_update()
-                .as_ref()
-                .map(QueueStanding::to_string)
+            stands.borrow_and_update().as_ref().map(QueueStanding::to_string)
         };
         let (mut first, first_waits) = wait(0);
         first.changed().await.expect("it is told");
         let words = told(&mut first).unwrap_or_default();
-        assert_eq!(
-            words,
-            "this machine is full; this robot is number 1 of 1 waiting"
-        );
+        assert_eq!(words, "this machine is full; this robot is number 1 of 1 waiting");
         let (mut second, second_waits) = wait(1);
         second.changed().await.expect("it is told");
         assert!(told(&mut second).is_some_and(|words| words.contains("number 1 of 2")));
         first.changed().await.expect("it was overtaken");
         assert!(told(&mut first).is_some_and(|words| words.contains("number 2 of 2")));
         assert!(room.set_stall(Some("this machine swaps".into())));
-        assert!(
-            !room.set_stall(Some("this machine swaps more".into())),
-            "that is not new"
-        );
+        assert!(!room.set_stall(Some("this machine swaps more".into())), "that is not new");
         drop(all);
         first.changed().await.expect("the machine stalls");
         let words = told(&mut first).unwrap_or_default();
-        assert!(
-            words.starts_with("this machine swaps more, so no robot is admitted"),
-            "{words}"
-        );
+        assert!(words.starts_with("this machine swaps more, so no robot is admitted"), "{words}");
         assert!(room.set_stall(None));
         first_waits.await.expect("no panic").expect("it fits");
         second_waits.await.expect("no panic").expect("it fits");
@@ -695,9 +618,7 @@ mod tests {
     async fn who_waits_in_vain_for_a_machine_that_stalls_is_told_that() {
         let room = machine();
         room.set_stall(Some("this machine swaps".into()));
-        let refused = robot(&room, 1.0, SECOND, || {})
-            .await
-            .expect_err("nobody is admitted");
+        let refused = robot(&room, 1.0, SECOND, || {}).await.expect_err("nobody is admitted");
         assert_eq!(
             refused.to_string(),
             "this machine swaps; this did not end within 1 s; it was number 1 of 1 waiting"
@@ -751,10 +672,7 @@ mod tests {
         let promise = one.promise();
         promise.change(Amount::new(1.5, 90)).expect("just so");
         assert_eq!(room.snapshot().1, Amount::new(2.0, 90));
-        let refused = promise
-            .change(Amount::new(1.6, 90))
-            .expect_err("more than is left")
-            .to_string();
+        let refused = promise.change(Amount::new(1.6, 90)).expect_err("more than is left").to_string();
         assert!(refused.contains("1.5 cores"), "{refused}");
         assert_eq!(room.snapshot().1, Amount::new(2.0, 90));
         promise.change(Amount::new(0.1, 1)).expect("less");

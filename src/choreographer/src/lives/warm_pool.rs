@@ -113,11 +113,7 @@ impl WarmPool {
         let mut kept = self.kept.lock();
         let service = &revision.service;
         let wanted = (&**service, revision.number, &*revision.image);
-        let warm = choose_container(
-            kept.pool.iter().map(WarmServant::facts),
-            wanted,
-            default_names,
-        );
+        let warm = choose_container(kept.pool.iter().map(WarmServant::facts), wanted, default_names);
         let placement = place(has, warm.as_ref(), revision.number, &revision.image);
         let Placement::Start { warm: used, .. } = placement else {
             return (placement, None);
@@ -128,16 +124,11 @@ impl WarmPool {
         kept.asked_for.push(service.clone());
         if !is_internal_robot(robot) {
             let arrivals = kept.arrivals.entry(service.clone());
-            arrivals
-                .or_insert_with(|| Arrivals::new(now.into_std()))
-                .record_arrival(now.into_std());
+            arrivals.or_insert_with(|| Arrivals::new(now.into_std())).record_arrival(now.into_std());
         }
         let taken = id.and_then(|id| kept.take(&id));
         if taken.is_some() {
-            kept.leads
-                .entry(service.clone())
-                .or_default()
-                .record_taken(now);
+            kept.leads.entry(service.clone()).or_default().record_taken(now);
         }
         (placement, taken)
     }
@@ -174,19 +165,11 @@ impl WarmPool {
 
     /// Returns the containers with running nodes, which count as unused servants: they end before any that a robot has
     /// left.
-    pub(crate) fn promised_servants(
-        &self,
-        inner: &ChoreographerInner,
-    ) -> Vec<(String, Amount, bool)> {
+    pub(crate) fn promised_servants(&self, inner: &ChoreographerInner) -> Vec<(String, Amount, bool)> {
         let kept = self.kept.lock();
         let pooled = kept.pool.iter();
-        let pooled = pooled.filter_map(|warm| {
-            Some((
-                warm.container.id().to_owned(),
-                warm.promised_amount(inner)?,
-                false,
-            ))
-        });
+        let pooled =
+            pooled.filter_map(|warm| Some((warm.container.id().to_owned(), warm.promised_amount(inner)?, false)));
         let ending = kept.ending.iter();
         let ending = ending.map(|(id, amount)| (id.clone(), *amount, true));
         pooled.chain(ending).collect()
@@ -210,11 +193,7 @@ impl WarmPool {
         let kept = self.kept.lock();
         let now = Instant::now().into_std();
         // Nodes exit, and the pauses after failures end.
-        inner.options.warm_nodes > 0
-            || kept
-                .arrivals
-                .values()
-                .any(|service| service.expected_rate(now) > 0.0)
+        inner.options.warm_nodes > 0 || kept.arrivals.values().any(|service| service.expected_rate(now) > 0.0)
     }
 }
 

@@ -29,12 +29,7 @@ fn record_requests(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
 }
 
 /// Advances the time until it has the wanted cores; in each second its requests take this long.
-async fn run_until_cpus(
-    daemon: &Choreographer,
-    lease: &Lease,
-    milliseconds: f64,
-    wanted: impl Fn(f64) -> bool,
-) {
+async fn run_until_cpus(daemon: &Choreographer, lease: &Lease, milliseconds: f64, wanted: impl Fn(f64) -> bool) {
     for _ in 0..120 {
         record_requests(daemon, lease, milliseconds);
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -64,11 +59,7 @@ async fn one_that_is_near_gets_more_than_its_promise_and_gives_it_back() {
     assert!(daemon.move_count() > 0);
     run_until_cpus(&daemon, &near, 5.0, |cpus| cpus == 0.02).await;
     assert_eq!(cpus(&other), Some(0.5), "nobody has less than was promised");
-    assert_eq!(
-        daemon.admission().snapshot().1.cpus(),
-        0.52,
-        "promises are as they were"
-    );
+    assert_eq!(daemon.admission().snapshot().1.cpus(), 0.52, "promises are as they were");
 }
 
 #[tokio::test(start_paused = true)]
@@ -109,11 +100,7 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     assert_eq!(before[0], (Some(0.25), Some(250)));
     for (lease, cpus, cpu_weight) in [(&moved, 1.5, 1500), (&plain, 0.05, 1)] {
         let container = lease.handle().container().expect("it runs");
-        let moves = api::Limits {
-            cpus: Some(cpus),
-            cpu_weight: Some(cpu_weight),
-            ..Default::default()
-        };
+        let moves = api::Limits { cpus: Some(cpus), cpu_weight: Some(cpu_weight), ..Default::default() };
         container.set_limits(moves).await.expect("it takes them");
     }
     // A daemon with a controller continues from the current state.
@@ -152,16 +139,12 @@ async fn a_machine_that_stalls_admits_nobody_and_says_so() {
     let inner = &daemon.inner;
     inner.note_stall(Some("this machine swaps".to_owned()));
     inner.note_stall(Some("this machine swaps still".to_owned()));
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     let mut standing = lease.handle().watch_standing();
     standing
         .wait_for(|standing| {
             let words = standing.as_ref().map(ToString::to_string);
-            words.is_some_and(|words| {
-                words.contains("swaps still") && words.contains("number 1 of 1")
-            })
+            words.is_some_and(|words| words.contains("swaps still") && words.contains("number 1 of 1"))
         })
         .await
         .expect("it is told");
@@ -170,15 +153,9 @@ async fn a_machine_that_stalls_admits_nobody_and_says_so() {
     assert_eq!((fit.now, fit.stalled.is_some()), (false, true));
     inner.note_stall(None);
     lease.wait_ready().await.expect("it is admitted");
-    let told = (
-        world.event_messages("machine-stalled"),
-        world.event_messages("machine-recovered"),
-    );
+    let told = (world.event_messages("machine-stalled"), world.event_messages("machine-recovered"));
     assert_eq!((told.0.len(), told.1.len()), (1, 1), "{told:?}");
-    assert!(
-        told.0[0].starts_with("this machine swaps; no servant"),
-        "{told:?}"
-    );
+    assert!(told.0[0].starts_with("this machine swaps; no servant"), "{told:?}");
 }
 
 #[tokio::test(start_paused = true)]
@@ -198,10 +175,7 @@ async fn what_would_fit_is_told_with_what_it_costs() {
     let lease = ready(&daemon, "r1", &[]).await;
     assert_eq!(fit(&[]).await.more, Some(1));
     let big = fit(&[("cpus", "1.5")]).await;
-    assert_eq!(
-        (big.now, big.lacking_cpus, big.ends.len()),
-        (false, 0.25, 0)
-    );
+    assert_eq!((big.now, big.lacking_cpus, big.ends.len()), (false, 0.25, 0));
     let id = lease.handle().id.clone();
     drop(lease);
     let idle = daemon.servant(&id).expect("it lives");
@@ -209,10 +183,7 @@ async fn what_would_fit_is_told_with_what_it_costs() {
         tokio::task::yield_now().await;
     }
     let big = fit(&[("cpus", "1.5")]).await;
-    assert_eq!(
-        (big.now, big.lacking_cpus, big.ends),
-        (false, 0.0, vec![id])
-    );
+    assert_eq!((big.now, big.lacking_cpus, big.ends), (false, 0.0, vec![id]));
     let unknown = daemon.fit("nothing", api::Stated::default()).await;
     assert!(matches!(unknown, Err(Error::Catalogue(_))));
 }

@@ -8,8 +8,8 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use in_memory::Process;
 use ros::bus::{
-    ActionClient, ActionHandler, Bus, BusError, FailureReason, GoalEnd, GoalError, GoalEvents,
-    GoalOutcome, ServiceHandler,
+    ActionClient, ActionHandler, Bus, BusError, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome,
+    ServiceHandler,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::Semaphore;
@@ -84,11 +84,8 @@ impl Shop {
         let goals = Arc::<AtomicUsize>::default();
         let taken = Arc::clone(&goals);
         world.engine.program("/echo", move |process: Process| {
-            let echo = Echo {
-                servant: process.servant().to_owned(),
-                answers: Arc::clone(&gives),
-                asked: Arc::clone(&counts),
-            };
+            let echo =
+                Echo { servant: process.servant().to_owned(), answers: Arc::clone(&gives), asked: Arc::clone(&counts) };
             let deaf = Arc::new(Deaf(Arc::clone(&taken)));
             async move {
                 let _counts = process.serve_action("/count", &count(), deaf);
@@ -105,12 +102,7 @@ impl Shop {
             record.plan.shared = Some(shared);
             record.plan.limits.cpus = Some(0.1);
         });
-        Shop {
-            world,
-            answers,
-            asked,
-            goals,
-        }
+        Shop { world, answers, asked, goals }
     }
 }
 
@@ -127,9 +119,7 @@ impl Shop {
 
 /// Connects a robot.
 async fn robot(daemon: &Choreographer, name: &str) -> (Lease, Arc<dyn Bus>) {
-    let lease = daemon
-        .ensure(ServantRequest::new("echo", name))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("echo", name)).expect("a lease");
     let bus = lease.wait_ready().await.expect("ready").bus();
     (lease, bus)
 }
@@ -164,11 +154,7 @@ async fn wait_for_group(daemon: &Choreographer, is: impl Fn(&api::Group) -> bool
 }
 
 fn ready(group: &api::Group) -> usize {
-    group
-        .servants
-        .iter()
-        .filter(|servant| servant.ready)
-        .count()
+    group.servants.iter().filter(|servant| servant.ready).count()
 }
 
 #[tokio::test(start_paused = true)]
@@ -191,25 +177,15 @@ async fn a_place_has_no_limits_of_its_own() {
     let shop = Shop::new(api::Shared::default());
     let daemon = shop.world.daemon();
     let (lease, _bus) = robot(&daemon, "r1").await;
-    let change = api::Limits {
-        cpus: Some(0.5),
-        ..api::Limits::default()
-    };
+    let change = api::Limits { cpus: Some(0.5), ..api::Limits::default() };
     let refused = daemon.set_limits(&lease.handle().id, change).await;
     let refused = refused.expect_err("it has no container").to_string();
-    assert!(
-        refused.contains("the reservation of robot r1 at the shared service echo"),
-        "{refused}"
-    );
+    assert!(refused.contains("the reservation of robot r1 at the shared service echo"), "{refused}");
 }
 
 #[tokio::test(start_paused = true)]
 async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() {
-    let shop = Shop::new(api::Shared {
-        min: 2,
-        max: 2,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { min: 2, max: 2, ..api::Shared::default() });
     let daemon = shop.world.daemon();
     let robots = (0..20).map(|number| {
         let daemon = daemon.clone();
@@ -218,9 +194,10 @@ async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() 
     let robots = join_all(robots).await;
     let group = wait_for_group(&daemon, |group| ready(group) == 2).await;
     assert_eq!((group.robots, shop.world.engine.servants().len()), (20, 2));
-    let calls = robots.iter().enumerate().flat_map(|(number, (_, bus))| {
-        (0..5).map(move |call| (format!("r{number} c{call}"), Arc::clone(bus)))
-    });
+    let calls = robots
+        .iter()
+        .enumerate()
+        .flat_map(|(number, (_, bus))| (0..5).map(move |call| (format!("r{number} c{call}"), Arc::clone(bus))));
     let calls = calls.map(|(words, bus)| async move { (call(&bus, &words).await, words) });
     let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
     // Some are answered, some in progress, the others wait.
@@ -242,10 +219,7 @@ async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() 
                 *by.entry(servant.to_owned()).or_default() += 1;
             }
             Err(reason) => {
-                assert!(
-                    reason.contains(victim) && reason.contains("--idempotent"),
-                    "{reason}"
-                );
+                assert!(reason.contains(victim) && reason.contains("--idempotent"), "{reason}");
                 assert!(reason.contains("SIGKILL"), "{reason}");
                 failed += 1;
             }
@@ -261,12 +235,7 @@ async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() 
 
 #[tokio::test(start_paused = true)]
 async fn what_a_lost_servant_had_is_asked_again_where_that_may_be() {
-    let shop = Shop::new(api::Shared {
-        min: 2,
-        max: 2,
-        idempotent: true,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { min: 2, max: 2, idempotent: true, ..api::Shared::default() });
     let daemon = shop.world.daemon();
     let (_lease, bus) = robot(&daemon, "r1").await;
     wait_for_group(&daemon, |group| ready(group) == 2).await;
@@ -275,10 +244,7 @@ async fn what_a_lost_servant_had_is_asked_again_where_that_may_be() {
         async move { call(&bus, &number.to_string()).await }
     });
     let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
-    wait_for_group(&daemon, |group| {
-        group.servants.iter().all(|it| it.under_way == 5)
-    })
-    .await;
+    wait_for_group(&daemon, |group| group.servants.iter().all(|it| it.under_way == 5)).await;
     let victim = &shop.world.engine.servants()[0];
     shop.lose_servant(victim).await;
     shop.answers.add_permits(100);
@@ -286,19 +252,12 @@ async fn what_a_lost_servant_had_is_asked_again_where_that_may_be() {
         assert!(answer.is_ok(), "{answer:?}");
     }
     let group = wait_for_group(&daemon, |_| true).await;
-    assert_eq!(
-        (group.answered, group.failed, group.asked_again),
-        (10, 0, 5)
-    );
+    assert_eq!((group.answered, group.failed, group.asked_again), (10, 0, 5));
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_group_grows_under_load_and_shrinks_after_it() {
-    let shop = Shop::new(api::Shared {
-        max: 3,
-        calls: 2,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { max: 3, calls: 2, ..api::Shared::default() });
     let daemon = shop.world.daemon();
     let (lease, bus) = robot(&daemon, "r1").await;
     assert_eq!(shop.world.engine.servants().len(), 1);
@@ -310,10 +269,7 @@ async fn a_group_grows_under_load_and_shrinks_after_it() {
     let group = wait_for_group(&daemon, |group| ready(group) == 3).await;
     assert_eq!(group.waiting, 14, "each works at two");
     let grown = shop.world.event_messages("shared-servant");
-    assert!(
-        grown[1].contains("concurrent requests are many"),
-        "{grown:?}"
-    );
+    assert!(grown[1].contains("concurrent requests are many"), "{grown:?}");
     shop.answers.add_permits(100);
     assert!(calls.await.expect("no panic").iter().all(Result::is_ok));
     wait_for_group(&daemon, |group| group.servants.len() == 1).await;
@@ -330,13 +286,7 @@ async fn a_group_grows_under_load_and_shrinks_after_it() {
 
 #[tokio::test(start_paused = true)]
 async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
-    let shop = Shop::new(api::Shared {
-        min: 2,
-        max: 2,
-        replicas: 2,
-        idempotent: true,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { min: 2, max: 2, replicas: 2, idempotent: true, ..api::Shared::default() });
     let daemon = shop.world.daemon();
     let (_lease, bus) = robot(&daemon, "r1").await;
     wait_for_group(&daemon, |group| ready(group) == 2).await;
@@ -354,10 +304,7 @@ async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
         let bus = Arc::clone(&bus);
         async move { call(&bus, "two").await }
     });
-    wait_for_group(&daemon, |group| {
-        group.servants.iter().all(|it| it.under_way == 1)
-    })
-    .await;
+    wait_for_group(&daemon, |group| group.servants.iter().all(|it| it.under_way == 1)).await;
     let victim = &shop.world.engine.servants()[0];
     shop.lose_servant(victim).await;
     shop.answers.add_permits(100);
@@ -369,24 +316,13 @@ async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
 #[tokio::test(start_paused = true)]
 async fn a_group_that_does_not_start_says_why_and_is_started_anew() {
     let shop = Shop::new(api::Shared::default());
-    shop.world
-        .engine
-        .break_image("sha256:echo", "the registry is away");
+    shop.world.engine.break_image("sha256:echo", "the registry is away");
     let daemon = shop.world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("echo", "r1"))
-        .expect("a lease");
-    let refused = lease
-        .wait_ready()
-        .await
-        .err()
-        .expect("it cannot start")
-        .to_string();
+    let lease = daemon.ensure(ServantRequest::new("echo", "r1")).expect("a lease");
+    let refused = lease.wait_ready().await.err().expect("it cannot start").to_string();
     assert!(refused.contains("the registry is away"), "{refused}");
     lease.handle().wait_ended().await;
-    let lease = daemon
-        .ensure(ServantRequest::new("echo", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("echo", "r1")).expect("a lease");
     assert!(lease.wait_ready().await.is_err(), "it was tried again");
     assert_eq!(shop.world.engine.started_specs().len(), 2);
 }
@@ -420,10 +356,7 @@ async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
     let id = last.handle().id.clone();
     drop(last);
     wait_for_group(&daemon, |group| group.robots <= LEFT + 1).await;
-    assert!(
-        began.elapsed() < options().grace,
-        "all of them were kept until their time was over"
-    );
+    assert!(began.elapsed() < options().grace, "all of them were kept until their time was over");
     // The robot that left last finds its place, and the one that stayed was not disturbed.
     let (last, _) = robot(&daemon, "last").await;
     assert_eq!(last.handle().id, id);
@@ -433,11 +366,7 @@ async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
 
 #[tokio::test(start_paused = true)]
 async fn servants_of_a_group_are_no_robots_that_arrive() {
-    let shop = Shop::new(api::Shared {
-        min: 8,
-        max: 8,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { min: 8, max: 8, ..api::Shared::default() });
     let daemon = shop.world.daemon_with(|options| options.warm_pool = 8);
     daemon.keep_warm_pool();
     let (_lease, _bus) = robot(&daemon, "r1").await;
@@ -466,10 +395,7 @@ async fn what_is_measured_of_a_shared_service_is_a_servant_of_its_own() {
 
 #[tokio::test(start_paused = true)]
 async fn a_goal_that_its_node_does_not_end_holds_up_others_only_while_its_robot_is_there() {
-    let shop = Shop::new(api::Shared {
-        max: 1,
-        ..api::Shared::default()
-    });
+    let shop = Shop::new(api::Shared { max: 1, ..api::Shared::default() });
     let daemon = shop.world.daemon();
     let (_one, one) = robot(&daemon, "one").await;
     let (_two, two) = robot(&daemon, "two").await;

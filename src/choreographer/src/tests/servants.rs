@@ -38,19 +38,13 @@ impl World {
         let home = tempfile::tempdir().expect("a directory");
         let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
         let state = Arc::new(state);
-        let store = image::Store::open(&home.path().join("images"), &home.path().join("layers"))
-            .expect("a store");
+        let store = image::Store::open(&home.path().join("images"), &home.path().join("layers")).expect("a store");
         let engine = MemoryEngine::default();
         engine.program("/greet", |process| async move {
             process.advertise("/greeting", "std_msgs/String");
             pending().await
         });
-        World {
-            home,
-            catalogue: Arc::new(Catalogue::new(Arc::clone(&state), Arc::new(store))),
-            state,
-            engine,
-        }
+        World { home, catalogue: Arc::new(Catalogue::new(Arc::clone(&state), Arc::new(store))), state, engine }
     }
 
     /// Starts a daemon, which promises a core to each servant and has two.
@@ -60,12 +54,7 @@ impl World {
 
     /// Starts a daemon with other options.
     pub(super) fn daemon_with(&self, change: impl FnOnce(&mut Options)) -> Choreographer {
-        let mut options = Options {
-            warm_pool: 0,
-            reserve_cpus: 1.0,
-            reserve_memory: 0,
-            ..options()
-        };
+        let mut options = Options { warm_pool: 0, reserve_cpus: 1.0, reserve_memory: 0, ..options() };
         change(&mut options);
         Choreographer::new(
             options,
@@ -91,12 +80,7 @@ impl World {
     }
 
     /// Publishes a service with one node, `/greeter`, that runs `program` and publishes a topic.
-    pub(super) fn publish(
-        &self,
-        service: &str,
-        program: &str,
-        change: impl FnOnce(&mut RevisionRecord),
-    ) {
+    pub(super) fn publish(&self, service: &str, program: &str, change: impl FnOnce(&mut RevisionRecord)) {
         let mut record = World::record(service, program);
         change(&mut record);
         let published = self.state.publish(&record, &Default::default());
@@ -134,9 +118,7 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     let reach = lease.wait_ready().await.expect("ready");
     assert!(reach.graph().borrow().nodes.contains_key("/greeter"));
     let handle = Arc::clone(lease.handle());
@@ -146,9 +128,7 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     assert_eq!(world.engine.started_specs()[0].image, "sha256:greet");
     // Back within the grace time, and then not.
     drop(lease);
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     assert!(Arc::ptr_eq(lease.handle(), &handle), "the same servant");
     drop(lease);
     handle.wait_ended().await;
@@ -167,15 +147,11 @@ async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
     world.publish("greet", "/broken", |_| {});
     world.publish("other", "/missing", |_| {});
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     let (reason, log) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("/greeter exited with status 3"), "{reason}");
     assert_eq!(log, ["no model in /models"]);
-    let lease = daemon
-        .ensure(ServantRequest::new("other", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("other", "r1")).expect("a lease");
     let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("there is no program /missing"), "{reason}");
 }
@@ -184,33 +160,20 @@ async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
 async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    world
-        .engine
-        .break_image("sha256:greet", "the registry is away");
+    world.engine.break_image("sha256:greet", "the registry is away");
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.ends_with("the registry is away"), "{reason}");
-    let camera = api::Grants {
-        devices: vec!["lab.org/camera=0".to_owned()],
-        ..api::Grants::default()
-    };
+    let camera = api::Grants { devices: vec!["lab.org/camera=0".to_owned()], ..api::Grants::default() };
     let refused = daemon.check_grants(&camera).expect_err("not allowed");
     assert!(refused.to_string().contains("[allow]"), "{refused}");
-    world.publish("see", "/greet", |record| {
-        record.plan.grants = camera.clone()
-    });
-    let lease = daemon
-        .ensure(ServantRequest::new("see", "r1"))
-        .expect("a lease");
+    world.publish("see", "/greet", |record| record.plan.grants = camera.clone());
+    let lease = daemon.ensure(ServantRequest::new("see", "r1")).expect("a lease");
     let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("lab.org/camera=0"), "{reason}");
     world.engine.allow(camera.clone());
-    let lease = daemon
-        .ensure(ServantRequest::new("see", "r2"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("see", "r2")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     let started = world.engine.started_specs();
     assert_eq!(started.last().expect("it was started").grants, camera);
@@ -230,18 +193,12 @@ async fn a_failing_node_is_started_again_after_pauses_and_then_given_up() {
     world.engine.program("/fails", program);
     world.publish("greet", "/fails", |record| record.plan.restart = true);
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     let reason = failure(&lease).await;
     assert!(reason.contains("gave up on /greeter"), "{reason}");
     let told = world.event_messages("node-failed");
-    let pauses: Vec<_> = told
-        .iter()
-        .filter_map(|text| text.rsplit_once(" in "))
-        .map(|(_, pause)| pause)
-        .collect();
+    let pauses: Vec<_> = told.iter().filter_map(|text| text.rsplit_once(" in ")).map(|(_, pause)| pause).collect();
     let expected = ["500", "1000", "2000", "4000", "8000", "16000"];
     assert_eq!(pauses, expected.map(|pause| format!("{pause} ms")));
 }
@@ -262,22 +219,14 @@ async fn a_respawning_node_is_the_engines_and_its_servant_lives_on() {
         record.plan.nodes[0].respawn_delay = 2.0;
     });
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     let reach = lease.wait_ready().await.expect("ready");
     let mut graph = reach.graph();
     let there = |graph: &Arc<ros::bus::Graph>| graph.nodes.contains_key("/greeter");
-    graph
-        .wait_for(|graph| !there(graph))
-        .await
-        .expect("a graph");
+    graph.wait_for(|graph| !there(graph)).await.expect("a graph");
     graph.wait_for(there).await.expect("a graph");
     let told = world.event_messages("node-respawned");
-    assert!(
-        told[0].contains("exited with status 7") && told[0].contains("after 2 s"),
-        "{told:?}"
-    );
+    assert!(told[0].contains("exited with status 7") && told[0].contains("after 2 s"), "{told:?}");
     assert_eq!(lease.handle().life().phase, Phase::Ready);
 }
 
@@ -296,15 +245,10 @@ async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it()
             0
         }
     });
-    let memory = |mib: u64| api::Limits {
-        memory: Some(api::Size(mib << 20)),
-        ..api::Limits::default()
-    };
+    let memory = |mib: u64| api::Limits { memory: Some(api::Size(mib << 20)), ..api::Limits::default() };
     world.publish("greet", "/eats", |record| record.plan.limits = memory(150));
     let daemon = world.daemon();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     let id = lease.handle().id.clone();
     let enforced = async || {
@@ -332,16 +276,12 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
     world.publish("greet", "/greet", |_| {});
     let daemon = world.daemon();
     let ready = async |robot: &str| {
-        let lease = daemon
-            .ensure(ServantRequest::new("greet", robot))
-            .expect("a lease");
+        let lease = daemon.ensure(ServantRequest::new("greet", robot)).expect("a lease");
         lease.wait_ready().await.expect("ready");
         lease
     };
     let (first, _second) = (ready("r1").await, ready("r2").await);
-    let third = daemon
-        .ensure(ServantRequest::new("greet", "r3"))
-        .expect("a lease");
+    let third = daemon.ensure(ServantRequest::new("greet", "r3")).expect("a lease");
     let waiting = tokio::time::timeout(Duration::from_secs(1), third.wait_admitted());
     waiting.await.expect_err("there are two cores");
     let ended = Arc::clone(first.handle());
@@ -349,9 +289,7 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
     third.wait_ready().await.expect("ready");
     assert_eq!(ended.life().phase, Phase::Stopped);
     // Nobody leaves this time.
-    let fourth = daemon
-        .ensure(ServantRequest::new("greet", "r4"))
-        .expect("a lease");
+    let fourth = daemon.ensure(ServantRequest::new("greet", "r4")).expect("a lease");
     let refused = fourth.wait_ready().await.err().expect("no room");
     assert!(matches!(refused, Error::Full(_)), "{refused}");
 }
@@ -367,9 +305,7 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
         let ids = runtime.block_on(async {
             let mut ids = Vec::new();
             for robot in ["r1", "r2"] {
-                let lease = daemon
-                    .ensure(ServantRequest::new("greet", robot))
-                    .expect("a lease");
+                let lease = daemon.ensure(ServantRequest::new("greet", robot)).expect("a lease");
                 lease.wait_ready().await.expect("ready");
                 ids.push(lease.handle().id.clone());
                 // It dies before its robots leave.
@@ -391,14 +327,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     let left = world.event_messages("servant-leftover");
     assert!(left.len() == 1 && left[0].contains("half-made"), "{left:?}");
     let lost = world.event_messages("servant-lost");
-    assert!(
-        lost.len() == 1 && lost[0].contains(&ids[1]) && lost[0].ends_with("its node was killed"),
-        "{lost:?}"
-    );
+    assert!(lost.len() == 1 && lost[0].contains(&ids[1]) && lost[0].ends_with("its node was killed"), "{lost:?}");
     // The robot finds its servant, and nothing was started for that.
-    let lease = next
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = next.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     assert_eq!(lease.handle().id, ids[0]);
     assert_eq!(world.engine.started_specs().len(), 2);
@@ -416,10 +347,7 @@ async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
     });
     world.publish("greet", "/eats", |_| {});
     let daemon = world.daemon();
-    let little = api::Limits {
-        memory: Some(api::Size(50 << 20)),
-        ..api::Limits::default()
-    };
+    let little = api::Limits { memory: Some(api::Size(50 << 20)), ..api::Limits::default() };
     // As often as would make a robot without a name wait.
     for _ in 0..5 {
         let measured = daemon.start_measured("greet", "calibrate", little);
@@ -443,20 +371,12 @@ async fn what_robots_may_ask_for_at_most_bounds_no_measurement() {
     });
     let daemon = world.daemon();
     let memory = Some(api::Size(64 << 20));
-    let stated = api::Stated {
-        memory,
-        ..api::Stated::default()
-    };
+    let stated = api::Stated { memory, ..api::Stated::default() };
     let robot = ServantRequest::new("greet", "r1").with_stated(stated);
     let refused = daemon.ensure(robot).err().expect("it is more");
     assert!(matches!(refused, Error::Terms(_)), "{refused}");
-    let set = api::Limits {
-        memory,
-        ..api::Limits::default()
-    };
-    let measured = daemon
-        .start_measured("greet", "calibrate", set)
-        .expect("a lease");
+    let set = api::Limits { memory, ..api::Limits::default() };
+    let measured = daemon.start_measured("greet", "calibrate", set).expect("a lease");
     measured.lease.wait_ready().await.expect("ready");
     assert_eq!(measured.lease.handle().limits().memory, memory);
     assert_eq!(daemon.admission().snapshot().1.memory, 64 << 20, "promised");

@@ -15,11 +15,7 @@ fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
 }
 
 /// Starts robots whose servants answer, and as many whose servants stop answering now.
-async fn robots(
-    world: &World,
-    daemon: &Choreographer,
-    query: &[(&str, &str)],
-) -> (Vec<Lease>, Vec<Lease>) {
+async fn robots(world: &World, daemon: &Choreographer, query: &[(&str, &str)]) -> (Vec<Lease>, Vec<Lease>) {
     let (mut sound, mut stuck) = (Vec::new(), Vec::new());
     for number in 0..EACH {
         sound.push(ready(daemon, request_stating(&format!("sound{number}"), query)).await);
@@ -90,11 +86,7 @@ async fn nodes_that_hang_are_ended_although_other_servants_are_stuck() {
         }
     }
     assert_eq!(world.event_messages("node-hung").len(), 2 * EACH);
-    assert_eq!(
-        world.event_messages("node-failed").len(),
-        EACH,
-        "each that answers was ended"
-    );
+    assert_eq!(world.event_messages("node-failed").len(), EACH, "each that answers was ended");
     // A servant that does not answer is reported, and watched as before.
     for lease in &stuck {
         container(&world, lease).stuck.send_replace(false);
@@ -114,12 +106,9 @@ async fn cores_are_moved_although_other_servants_are_stuck() {
     let takes = |lease: &Lease| {
         let handle = lease.handle();
         let inner = &daemon.inner;
-        let measures =
-            crate::lives::reaching::RequestRecorder::new(inner, &handle.revision, &handle.id);
+        let measures = crate::lives::reaching::RequestRecorder::new(inner, &handle.revision, &handle.id);
         for _ in 0..3 {
-            measures
-                .rosbridge_observer()
-                .record(Some(Duration::from_millis(95)));
+            measures.rosbridge_observer().record(Some(Duration::from_millis(95)));
         }
     };
     let moved = |lease: &Lease| container(&world, lease).enforced_limits().limits.cpus > Some(0.02);

@@ -25,10 +25,7 @@ impl std::fmt::Display for Scalar {
 
 /// Auxiliary parameters: a table, or text such as `width=640 model=big`, as the environment gives it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "a table such as { width = 640 }, or a string such as \"width=640\""
-)]
+#[serde(untagged, expecting = "a table such as { width = 640 }, or a string such as \"width=640\"")]
 pub enum Aux {
     /// Values by name.
     Table(BTreeMap<String, Scalar>),
@@ -46,10 +43,7 @@ impl Aux {
     /// Returns names and values; an error if a part of the text is not a pair.
     pub fn pairs(&self) -> Result<Vec<(String, String)>, ParseAuxError> {
         match self {
-            Self::Table(table) => Ok(table
-                .iter()
-                .map(|(key, value)| (key.clone(), value.to_string()))
-                .collect()),
+            Self::Table(table) => Ok(table.iter().map(|(key, value)| (key.clone(), value.to_string())).collect()),
             Self::Text(text) => text
                 .split_whitespace()
                 .map(|pair| match pair.split_once('=') {

@@ -30,19 +30,14 @@ impl Config {
         ];
         for (key, value) in times.into_iter().chain(measured) {
             if let Some(value) = value.filter(|value| !(*value > 0.0 && *value < MOST)) {
-                let reason = format!(
-                    "is {value}; it should be a number greater than 0 and less than {MOST}"
-                );
+                let reason = format!("is {value}; it should be a number greater than 0 and less than {MOST}");
                 return wrong(key, reason);
             }
         }
         if let Err((key, reason)) = terms::check(self) {
             return wrong(key, reason);
         }
-        if let Some(quality) = self
-            .quality
-            .filter(|quality| !(1.0..=100.0).contains(quality))
-        {
+        if let Some(quality) = self.quality.filter(|quality| !(1.0..=100.0).contains(quality)) {
             let reason = format!("is {quality}; it should be a number from 1 to 100");
             return wrong("quality", reason);
         }
@@ -58,8 +53,7 @@ impl Config {
         if let (Some(desire), Some(max)) = (self.desire, self.max)
             && desire > max
         {
-            let reason =
-                format!("({desire} s) is greater than max ({max} s); lower it, or raise max");
+            let reason = format!("({desire} s) is greater than max ({max} s); lower it, or raise max");
             return wrong("desire", reason);
         }
         Ok(())
@@ -76,10 +70,7 @@ impl Config {
         }
         if self.request.is_some() && self.requests.is_some() {
             let reason = "and requests are both given; remove one".to_owned();
-            return Err(InvalidSetting {
-                key: "request",
-                reason,
-            });
+            return Err(InvalidSetting { key: "request", reason });
         }
         for measure in &OUTPUT_MEASURES {
             if let [Some(_), None] = measure.values(self) {

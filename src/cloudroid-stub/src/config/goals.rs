@@ -65,13 +65,9 @@ impl OutputMeasure {
         let (key, unit) = (self.key, self.unit);
         let is_least = self.bound == "min";
         if is_least && desired < bound {
-            Some(format!(
-                "({desired}{unit}) is less than {key} ({bound}{unit}), the minimum; raise it, or lower {key}"
-            ))
+            Some(format!("({desired}{unit}) is less than {key} ({bound}{unit}), the minimum; raise it, or lower {key}"))
         } else if !is_least && desired > bound {
-            Some(format!(
-                "({desired}{unit}) is greater than {key} ({bound}{unit}); lower it, or raise {key}"
-            ))
+            Some(format!("({desired}{unit}) is greater than {key} ({bound}{unit}); lower it, or raise {key}"))
         } else {
             None
         }
@@ -89,8 +85,7 @@ impl Config {
             age: self.age,
             desired_age: self.desired_age,
             threshold: self.threshold,
-            fallback_after: (!self.has_promise() && self.local != LocalMode::None)
-                .then_some(self.fallback_after),
+            fallback_after: (!self.has_promise() && self.local != LocalMode::None).then_some(self.fallback_after),
         }
     }
 }

@@ -45,9 +45,7 @@ pub fn group_names(node: &str) -> Vec<String> {
     let ends = node.match_indices('/').map(|(at, _)| at).skip(1);
     let namespaces = std::iter::once("").chain(ends.map(|at| &node[..at]));
     let namespaces = namespaces.chain([node.trim_end_matches('/')]);
-    namespaces
-        .map(|namespace| format!("{namespace}/{GROUP}"))
-        .collect()
+    namespaces.map(|namespace| format!("{namespace}/{GROUP}")).collect()
 }
 
 impl Config {
@@ -64,9 +62,7 @@ impl Config {
                 let (giver, removal) = group.source(key);
                 let refused = |reason: &str| {
                     let value = format_value(value);
-                    anyhow::anyhow!(
-                        "parameter {giver} is {value}: {reason}; correct it, or {removal}"
-                    )
+                    anyhow::anyhow!("parameter {giver} is {value}: {reason}; correct it, or {removal}")
                 };
                 let given = Value::try_from(value).map_err(|error| refused(&error.to_string()))?;
                 table.insert(key.clone(), given);
@@ -83,9 +79,7 @@ impl Config {
                 "desire" => "max",
                 "max" => "desire",
                 "request" => "requests",
-                key => measures
-                    .find(|measure| measure.desired_key == key)
-                    .map_or("", |measure| measure.key),
+                key => measures.find(|measure| measure.desired_key == key).map_or("", |measure| measure.key),
             };
             let giver = givers.get(wrong.key).or_else(|| givers.get(other));
             match giver {
@@ -118,9 +112,7 @@ mod tests {
         let settings = settings.iter();
         ParameterGroup {
             name: Some(name.to_owned()),
-            settings: settings
-                .map(|(key, value)| ((*key).to_owned(), value.clone()))
-                .collect(),
+            settings: settings.map(|(key, value)| ((*key).to_owned(), value.clone())).collect(),
         }
     }
 
@@ -135,18 +127,10 @@ mod tests {
 
     #[test]
     fn a_node_is_in_its_namespaces() {
-        assert_eq!(
-            group_names("/reporter"),
-            ["/cloudroid", "/reporter/cloudroid"]
-        );
+        assert_eq!(group_names("/reporter"), ["/cloudroid", "/reporter/cloudroid"]);
         assert_eq!(
             group_names("/a/b/reporter"),
-            [
-                "/cloudroid",
-                "/a/cloudroid",
-                "/a/b/cloudroid",
-                "/a/b/reporter/cloudroid"
-            ]
+            ["/cloudroid", "/a/cloudroid", "/a/b/cloudroid", "/a/b/reporter/cloudroid"]
         );
     }
 
@@ -154,18 +138,9 @@ mod tests {
     fn the_nearest_wins() {
         let (half, two) = (ParamValue::Double(0.5), ParamValue::Int(2));
         let config = config(&[
-            group(
-                "/cloudroid",
-                &[("desire", half.clone()), ("max", two.clone())],
-            ),
-            group(
-                "/front/cloudroid",
-                &[("max", ParamValue::Int(1)), ("local", text("warm"))],
-            ),
-            group(
-                "/front/reporter/cloudroid",
-                &[("local", text("first-sign"))],
-            ),
+            group("/cloudroid", &[("desire", half.clone()), ("max", two.clone())]),
+            group("/front/cloudroid", &[("max", ParamValue::Int(1)), ("local", text("warm"))]),
+            group("/front/reporter/cloudroid", &[("local", text("first-sign"))]),
         ])
         .unwrap();
         assert_eq!((config.desire, config.max), (Some(0.5), Some(1.0)));
@@ -194,57 +169,27 @@ mod tests {
                 vec![("desire", ParamValue::Double(-0.5)), ("max", one.clone())],
                 vec!["desire is -0.5", "greater than 0"],
             ),
+            (vec![("desire", text("soon"))], vec!["desire is \"soon\"", "expected f64"]),
+            (vec![("desire", one.clone())], vec!["desire is given without max"]),
+            (vec![("desre", one.clone())], vec!["desre is 1", "unknown field"]),
+            (vec![("local", text("hot"))], vec!["local is \"hot\"", "first-sign"]),
             (
-                vec![("desire", text("soon"))],
-                vec!["desire is \"soon\"", "expected f64"],
-            ),
-            (
-                vec![("desire", one.clone())],
-                vec!["desire is given without max"],
-            ),
-            (
-                vec![("desre", one.clone())],
-                vec!["desre is 1", "unknown field"],
-            ),
-            (
-                vec![("local", text("hot"))],
-                vec!["local is \"hot\"", "first-sign"],
-            ),
-            (
-                vec![
-                    ("desired_frames_per_second", one.clone()),
-                    ("frames_per_second", two.clone()),
-                ],
+                vec![("desired_frames_per_second", one.clone()), ("frames_per_second", two.clone())],
                 vec!["(1) is less than frames_per_second (2)", "raise it"],
             ),
             (
                 vec![("desired_age", two.clone()), ("age", one.clone())],
                 vec!["desired_age (2 s) is greater than age (1 s)"],
             ),
-            (
-                vec![("desired_age", two.clone())],
-                vec!["desired_age is given without age"],
-            ),
-            (
-                vec![("request", text("auto")), ("requests", text("/a -> /b"))],
-                vec!["both given"],
-            ),
-            (
-                vec![("max", ParamValue::List(vec![]))],
-                vec!["max is not a single value", "f64"],
-            ),
+            (vec![("desired_age", two.clone())], vec!["desired_age is given without age"]),
+            (vec![("request", text("auto")), ("requests", text("/a -> /b"))], vec!["both given"]),
+            (vec![("max", ParamValue::List(vec![]))], vec!["max is not a single value", "f64"]),
         ] {
             let error = config(&[group("/front/cloudroid", &settings)]).unwrap_err();
             let error = format!("{error:#}");
             let named = format!("parameter /front/cloudroid/{}", settings[0].0);
             assert!(error.starts_with(&named), "{error}");
-            assert!(
-                error.contains(&format!(
-                    "rosparam delete /front/cloudroid/{}",
-                    settings[0].0
-                )),
-                "{error}"
-            );
+            assert!(error.contains(&format!("rosparam delete /front/cloudroid/{}", settings[0].0)), "{error}");
             for words in words {
                 assert!(error.contains(words), "{words}: {error}");
             }

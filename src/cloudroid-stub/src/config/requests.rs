@@ -21,10 +21,7 @@ pub enum RequestsSetting {
 
 /// A request as written.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "\"/input -> /output\", or a table with request, desire and max"
-)]
+#[serde(untagged, expecting = "\"/input -> /output\", or a table with request, desire and max")]
 pub enum RequestSetting {
     /// `INPUT -> OUTPUT, …`, with the times that hold for all.
     Line(String),
@@ -66,9 +63,7 @@ impl RequestsSetting {
         let lines = |text: &String| -> Vec<RequestSetting> {
             let lines = text.split(';').map(str::trim);
             let lines = lines.filter(|line| !line.is_empty());
-            lines
-                .map(|line| RequestSetting::Line(line.to_owned()))
-                .collect()
+            lines.map(|line| RequestSetting::Line(line.to_owned())).collect()
         };
         let all = match self {
             Self::Line(text) => lines(text),
@@ -138,15 +133,11 @@ mod tests {
                  { request = \"/plan\", desire = 1, max = 5.5 }]",
         )
         .unwrap();
-        assert_eq!(
-            pair_texts(&all),
-            ["/image -> /found, /marked", "/scan -> /pose by stamp"]
-        );
+        assert_eq!(pair_texts(&all), ["/image -> /found, /marked", "/scan -> /pose by stamp"]);
         let times = [("/plan", (1.0, 5.5)), ("/scan", (0.5, 2.0))];
         let times = times.map(|(name, times)| (name.to_owned(), times));
         assert_eq!(all.times, BTreeMap::from(times));
-        let only =
-            parse_requests("requests = [{ request = \"/plan\", desire = 1, max = 5 }]").unwrap();
+        let only = parse_requests("requests = [{ request = \"/plan\", desire = 1, max = 5 }]").unwrap();
         assert_eq!(only.answers, None, "what answers what is still found");
         let none = parse_requests("requests = []").unwrap();
         assert_eq!(none, ParsedRequests::default());
@@ -163,18 +154,9 @@ mod tests {
         for (toml, named) in [
             ("requests = [\"/a\"]", "neither an output nor times"),
             ("requests = [\"a -> /b\"]", "\"a\""),
-            (
-                "requests = [\"/a -> /b\", \"/a -> /c\"]",
-                "/a appears twice",
-            ),
-            (
-                "requests = [{ request = \"plan\", desire = 1, max = 2 }]",
-                "begin it with a slash",
-            ),
-            (
-                "requests = [{ request = \"/plan\", desire = 1 }]",
-                "a list such as",
-            ),
+            ("requests = [\"/a -> /b\", \"/a -> /c\"]", "/a appears twice"),
+            ("requests = [{ request = \"plan\", desire = 1, max = 2 }]", "begin it with a slash"),
+            ("requests = [{ request = \"/plan\", desire = 1 }]", "a list such as"),
             ("requests = 5", "a list such as"),
             (
                 "requests = [{ request = \"/p\", desire = 1, max = 2 }, { request = \"/p\", desire = 1, max = 2 }]",

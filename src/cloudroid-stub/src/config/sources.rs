@@ -9,31 +9,20 @@ use super::{Config, FILE, OUTPUT_MEASURES};
 use crate::address::Address;
 
 /// Reads `stub.toml` in `share`, with the overrides of the environment.
-pub fn load(
-    share: &Path,
-    environment: impl Iterator<Item = (String, String)>,
-) -> anyhow::Result<Config> {
+pub fn load(share: &Path, environment: impl Iterator<Item = (String, String)>) -> anyhow::Result<Config> {
     let path = share.join(FILE);
     let text = std::fs::read_to_string(&path).with_context(|| {
-        format!(
-            "cannot read {}: the stub's package is incomplete; install it again",
-            path.display()
-        )
+        format!("cannot read {}: the stub's package is incomplete; install it again", path.display())
     })?;
     let table: Table = toml::from_str(&text).with_context(|| format!("{}", path.display()))?;
-    apply_overrides(
-        table,
-        environment.filter_map(|(name, value)| Some((key_for_variable(&name)?, value))),
-    )
-    .with_context(|| format!("{} with CLOUDROID_* environment variables", path.display()))
+    apply_overrides(table, environment.filter_map(|(name, value)| Some((key_for_variable(&name)?, value))))
+        .with_context(|| format!("{} with CLOUDROID_* environment variables", path.display()))
 }
 
 /// Returns the key that an environment variable sets.
 pub(super) fn key_for_variable(variable: &str) -> Option<String> {
     let key = variable.strip_prefix("CLOUDROID_")?.to_ascii_lowercase();
-    let is_measure = OUTPUT_MEASURES
-        .iter()
-        .any(|measure| [measure.key, measure.desired_key].contains(&key.as_str()));
+    let is_measure = OUTPUT_MEASURES.iter().any(|measure| [measure.key, measure.desired_key].contains(&key.as_str()));
     (is_measure || KEYS.contains(&key.as_str())).then_some(key)
 }
 
@@ -93,9 +82,6 @@ fn parse_value(text: &str) -> Value {
     match text.trim() {
         "true" => Value::Boolean(true),
         "false" => Value::Boolean(false),
-        other => other.parse().map_or_else(
-            |_| Value::String(text.to_owned()),
-            |number: f64| Value::Float(number),
-        ),
+        other => other.parse().map_or_else(|_| Value::String(text.to_owned()), |number: f64| Value::Float(number)),
     }
 }

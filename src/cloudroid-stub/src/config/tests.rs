@@ -6,9 +6,7 @@ use super::*;
 const FILE: &str = "server = 'ws://cloud:9090/'\nservice = 'opencv_apps'\ndesire = 0.1\nmax = 1\n";
 
 fn config(instead: &[(&str, &str)]) -> anyhow::Result<Config> {
-    let instead = instead
-        .iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+    let instead = instead.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
     apply_overrides(toml::from_str(FILE)?, instead)
 }
 
@@ -17,72 +15,42 @@ fn the_file_is_enough() {
     let config = config(&[]).unwrap();
     assert_eq!(config.server, "ws://cloud:9090");
     assert_eq!((config.desire, config.max), (Some(0.1), Some(1.0)));
-    assert_eq!(
-        (config.local, config.codec),
-        (LocalMode::Cold, CodecSetting::Auto)
-    );
+    assert_eq!((config.local, config.codec), (LocalMode::Cold, CodecSetting::Auto));
     let local = toml::from_str::<Config>(&format!("{FILE}local = 'first-sign'"));
     assert_eq!(local.unwrap().local, LocalMode::FirstSign);
 }
 
 #[test]
 fn the_environment_says_otherwise() {
-    assert_eq!(
-        key_for_variable("CLOUDROID_LOCAL").as_deref(),
-        Some("local")
-    );
+    assert_eq!(key_for_variable("CLOUDROID_LOCAL").as_deref(), Some("local"));
     assert_eq!(key_for_variable("CLOUDROID_HOME"), None);
     let config = config(&[("local", "warm"), ("max", "0.5"), ("stateful", "true")]).unwrap();
-    assert_eq!(
-        (config.local, config.max, config.stateful),
-        (LocalMode::Warm, Some(0.5), true)
-    );
+    assert_eq!((config.local, config.max, config.stateful), (LocalMode::Warm, Some(0.5), true));
 }
 
 #[test]
 fn a_codec_that_one_side_has_not_is_named_with_what_to_do() {
-    let has = |names: &[&str]| {
-        names
-            .iter()
-            .map(|name| (*name).to_owned())
-            .collect::<Vec<_>>()
-    };
+    let has = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
     let with = |codec: &str| config(&[("codec", codec)]).unwrap().codec;
     assert_eq!(with("auto").unsupported_reason(&[]), None);
-    assert_eq!(
-        with("jpeg").unsupported_reason(&has(&["raw", "jpeg"])),
-        None
-    );
+    assert_eq!(with("jpeg").unsupported_reason(&has(&["raw", "jpeg"])), None);
     let unmet = with("jpeg").unsupported_reason(&has(&["raw"])).unwrap();
-    assert!(
-        unmet.contains("codec = \"jpeg\" is not supported by the server"),
-        "{unmet}"
-    );
+    assert!(unmet.contains("codec = \"jpeg\" is not supported by the server"), "{unmet}");
     let unmet = with("video").unsupported_reason(&has(&["raw"])).unwrap();
     assert!(unmet.contains("codec = \"video\" is not"), "{unmet}");
     assert!(unmet.contains("set codec = \"jpeg\""), "{unmet}");
     let built = with("video").unsupported_reason(&has(&["raw", "video"]));
-    assert_eq!(
-        built.is_none(),
-        codec::Codec::Video.is_available(),
-        "{built:?}"
-    );
+    assert_eq!(built.is_none(), codec::Codec::Video.is_available(), "{built:?}");
 }
 
 #[test]
 fn quality_is_one_of_jpeg() {
     let given = config(&[("codec", "jpeg"), ("quality", "90")]).unwrap();
-    assert_eq!(
-        (given.codec.lossy(), given.quality()),
-        (Some(codec::Codec::Jpeg), Some(90))
-    );
+    assert_eq!((given.codec.lossy(), given.quality()), (Some(codec::Codec::Jpeg), Some(90)));
     given.with_parameters(&[]).unwrap();
     let alone = config(&[("quality", "90")]).unwrap().with_parameters(&[]);
     let error = format!("{:#}", alone.unwrap_err());
-    assert!(
-        error.contains("quality is given without codec = \"jpeg\""),
-        "{error}"
-    );
+    assert!(error.contains("quality is given without codec = \"jpeg\""), "{error}");
 }
 
 #[test]
@@ -98,11 +66,7 @@ fn nonsense_is_named() {
         ("cap", "-1", "cap is -1"),
         ("desired_age", "nan", "desired_age is NaN"),
         ("codec", "mpeg", "mpeg"),
-        (
-            "quality",
-            "0",
-            "quality is 0; it should be a number from 1 to 100",
-        ),
+        ("quality", "0", "quality is 0; it should be a number from 1 to 100"),
         ("quality", "best", "quality"),
     ] {
         let error = format!("{:#}", config(&[(key, value)]).unwrap_err());
@@ -126,10 +90,8 @@ fn what_comments_show_as_defaults_are_the_defaults() {
         .map(|line| format!("{line}\n"))
         .collect();
     let handed_out = include_str!("../../../package/src/stub/inside/settings.toml").lines();
-    let handed_out: String = handed_out
-        .filter_map(|line| line.strip_prefix("# "))
-        .map(|line| format!("{line}\n"))
-        .collect();
+    let handed_out: String =
+        handed_out.filter_map(|line| line.strip_prefix("# ")).map(|line| format!("{line}\n")).collect();
     let minimal: Config = toml::from_str("server = 'ws://s'\nservice = 's'").unwrap();
     let mut defaults = Table::try_from(&minimal).unwrap();
     let sla = serde_json::json!({"t_desire": 1, "t_max": 1});

@@ -22,36 +22,15 @@ pub(super) struct Check {
 
 impl Check {
     pub(super) fn good(name: &'static str, found: impl Into<String>) -> Check {
-        Check {
-            name,
-            verdict: CheckVerdict::Good,
-            found: found.into(),
-            fix: None,
-        }
+        Check { name, verdict: CheckVerdict::Good, found: found.into(), fix: None }
     }
 
-    pub(super) fn bad(
-        name: &'static str,
-        found: impl Into<String>,
-        fix: impl Into<String>,
-    ) -> Check {
-        Check {
-            name,
-            verdict: CheckVerdict::Bad,
-            found: found.into(),
-            fix: Some(fix.into()),
-        }
+    pub(super) fn bad(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
+        Check { name, verdict: CheckVerdict::Bad, found: found.into(), fix: Some(fix.into()) }
     }
 
-    pub(super) fn warning(
-        name: &'static str,
-        found: impl Into<String>,
-        fix: impl Into<String>,
-    ) -> Check {
-        Check {
-            verdict: CheckVerdict::Warning,
-            ..Check::bad(name, found, fix)
-        }
+    pub(super) fn warning(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
+        Check { verdict: CheckVerdict::Warning, ..Check::bad(name, found, fix) }
     }
 
     /// Formats the check for printing.
@@ -61,15 +40,7 @@ impl Check {
             CheckVerdict::Warning => "warn",
             CheckVerdict::Bad => "FAIL",
         };
-        let fix = self
-            .fix
-            .iter()
-            .map(|fix| format!("\n                 fix it:  {fix}"));
-        format!(
-            "{mark}  {:<10} {}{}",
-            self.name,
-            self.found,
-            fix.collect::<String>()
-        )
+        let fix = self.fix.iter().map(|fix| format!("\n                 fix it:  {fix}"));
+        format!("{mark}  {:<10} {}{}", self.name, self.found, fix.collect::<String>())
     }
 }

@@ -31,19 +31,13 @@ impl ExaminedStub {
         let share = match &asked.share {
             Some(share) => share.clone(),
             None => {
-                let program =
-                    std::env::current_exe().context("cannot find the path of this program")?;
-                find_share(&program).context(
-                    "this program is not in a stub's lib/PKG: name the stub with --share DIR",
-                )?
+                let program = std::env::current_exe().context("cannot find the path of this program")?;
+                find_share(&program)
+                    .context("this program is not in a stub's lib/PKG: name the stub with --share DIR")?
             }
         };
         let name = || Some(share.file_name()?.to_str()?.to_owned());
-        let package = asked
-            .package
-            .clone()
-            .or_else(name)
-            .context("name the package with --package PKG")?;
+        let package = asked.package.clone().or_else(name).context("name the package with --package PKG")?;
         Ok(ExaminedStub { share, package })
     }
 
@@ -87,9 +81,7 @@ pub async fn checks(stub: &ExaminedStub, config: &Config, variable: Variable<'_>
 /// Returns whether an entry of a search path is this directory, after resolving links.
 fn is_same_directory(entry: &Path, directory: &Path) -> bool {
     // The comparison of paths ignores the trailing slash.
-    entry
-        .canonicalize()
-        .is_ok_and(|entry| entry == directory.join(""))
+    entry.canonicalize().is_ok_and(|entry| entry == directory.join(""))
 }
 
 /// Returns the check's result if a package is found elsewhere than in the stub.
@@ -105,10 +97,7 @@ fn shadowed_check(name: &str, first: Option<&PathBuf>, stub: &ExaminedStub) -> C
 
 fn found_check(stub: &ExaminedStub) -> Check {
     let overlay = stub.overlay();
-    Check::good(
-        "shadowing",
-        format!("{} is found in {}", stub.package, overlay.display()),
-    )
+    Check::good("shadowing", format!("{} is found in {}", stub.package, overlay.display()))
 }
 
 fn original_check(
@@ -117,18 +106,13 @@ fn original_check(
     node: String,
     variable: &dyn Fn(&str) -> Option<String>,
 ) -> Check {
-    let wanted = NodeArgs {
-        package: stub.package.clone(),
-        node,
-        share: stub.share.clone(),
-    };
+    let wanted = NodeArgs { package: stub.package.clone(), node, share: stub.share.clone() };
     let name = &wanted.node;
     match original::find(&wanted, variable) {
         Some(path) => Check::good("original", format!("{name} is {}", path.display())),
-        None if config.local == crate::config::LocalMode::None => Check::good(
-            "original",
-            format!("{name} runs in the cloud only, as configured"),
-        ),
+        None if config.local == crate::config::LocalMode::None => {
+            Check::good("original", format!("{name} runs in the cloud only, as configured"))
+        }
         None => Check::warning(
             "original",
             format!("{name} is not installed on this robot, so it runs in the cloud only"),

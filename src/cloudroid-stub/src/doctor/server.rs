@@ -24,14 +24,9 @@ pub async fn checks(config: &Config, stub: &ExaminedStub) -> Vec<Check> {
         Err(check) => return vec![*check],
     };
     let reached = match portal.get("/healthz").await {
-        Ok(answer) if answer.status == 200 => Check::good(
-            "server",
-            format!(
-                "{} answers in {:.1} ms",
-                config.server,
-                millis(answer.waited)
-            ),
-        ),
+        Ok(answer) if answer.status == 200 => {
+            Check::good("server", format!("{} answers in {:.1} ms", config.server, millis(answer.waited)))
+        }
         Ok(answer) => {
             let found = format!("{} answers with status {}", config.server, answer.status);
             return vec![Check::bad("server", found, portal.other_server())];
@@ -73,16 +68,7 @@ impl PortalProbe {
         // A paired robot presents its certificate instead.
         let token = token.filter(|token| !token.is_empty() && trust.identity.is_none());
         match resolver::resolve(&address.host).await {
-            Ok(ip) => Ok(PortalProbe {
-                server: http::HttpServer {
-                    address,
-                    ip,
-                    trust,
-                    only: None,
-                },
-                token,
-                installer,
-            }),
+            Ok(ip) => Ok(PortalProbe { server: http::HttpServer { address, ip, trust, only: None }, token, installer }),
             Err(error) => Err(bad(format!("{} is not found: {error}", address.host), fix)),
         }
     }
@@ -93,11 +79,7 @@ impl PortalProbe {
 
     /// Returns a URL for people.
     fn url(&self, path: &str) -> String {
-        let scheme = if self.server.address.secure {
-            "https"
-        } else {
-            "http"
-        };
+        let scheme = if self.server.address.secure { "https" } else { "http" };
         format!("{scheme}://{}{path}", self.server.address.authority)
     }
 
@@ -129,8 +111,7 @@ impl PortalProbe {
                 return Check::bad("token", format!("{given}: {words}"), fix);
             }
             404 => {
-                let fix =
-                    "have it pushed there (cloudroidctl push), or correct service in stub.toml";
+                let fix = "have it pushed there (cloudroidctl push), or correct service in stub.toml";
                 return Check::bad("service", words, fix);
             }
             status => {
@@ -142,13 +123,8 @@ impl PortalProbe {
         match (there, stub.revision()) {
             (Some(there), Some(here)) if there != here => Check::warning(
                 "service",
-                format!(
-                    "{name} is at revision {there}, but this stub was made from revision {here}"
-                ),
-                format!(
-                    "download it again: {}",
-                    self.url(&format!("/stubs/{name}.tar.gz"))
-                ),
+                format!("{name} is at revision {there}, but this stub was made from revision {here}"),
+                format!("download it again: {}", self.url(&format!("/stubs/{name}.tar.gz"))),
             ),
             _ => {
                 let by = match self.server.trust.identity {
@@ -193,11 +169,7 @@ impl PortalProbe {
             unsure * 1000.0
         );
         if ahead.abs() > IN_STEP + unsure {
-            Check::warning(
-                "clock",
-                found,
-                "sudo apt install chrony, on the robot and on the server",
-            )
+            Check::warning("clock", found, "sudo apt install chrony, on the robot and on the server")
         } else {
             Check::good("clock", found)
         }
@@ -208,9 +180,7 @@ impl PortalProbe {
     async fn mtu(&self) -> Check {
         match self.get("/api/v1/openapi.json").await {
             Ok(answer) => {
-                let mtu = answer
-                    .mtu
-                    .map_or_else(|| "not known".to_owned(), |mtu| format!("{mtu} bytes"));
+                let mtu = answer.mtu.map_or_else(|| "not known".to_owned(), |mtu| format!("{mtu} bytes"));
                 let found = format!("{mtu}; received a response of {} bytes", answer.body.len());
                 Check::good("mtu", found)
             }

@@ -10,10 +10,7 @@ use super::*;
 use crate::testing::{SOON, World};
 
 /// The defaults, with a short interval after refusals.
-const QUICK: RetryPauses = RetryPauses {
-    refused: Duration::from_millis(20),
-    ..PAUSES
-};
+const QUICK: RetryPauses = RetryPauses { refused: Duration::from_millis(20), ..PAUSES };
 
 /// Returns the robot's next request and its connection.
 async fn next_request(listener: &TcpListener) -> (String, TcpStream) {

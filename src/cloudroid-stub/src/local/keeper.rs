@@ -17,8 +17,8 @@ use std::time::Instant;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{
-    DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, Phases,
-    QosEvent, QosSla, RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
+    DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, Phases, QosEvent, QosSla,
+    RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
 };
 use ros::bus::{FailureReason, SerializedMessage, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -130,9 +130,7 @@ impl Keeper {
             callers: HashMap::new(),
             goals: KeeperGoals::default(),
         };
-        let remembered = original
-            .as_ref()
-            .map(|original| original.remembered_settings());
+        let remembered = original.as_ref().map(|original| original.remembered_settings());
         let keeper = Arc::new_cyclic(|this| Self {
             state: Mutex::new(state),
             cloud,
@@ -147,10 +145,7 @@ impl Keeper {
         });
         tokio::spawn(run_timer(Arc::downgrade(&keeper), keeper.wake.clone()));
         match news {
-            Some(news) => drop(tokio::spawn(process_original_events(
-                Arc::downgrade(&keeper),
-                news,
-            ))),
+            Some(news) => drop(tokio::spawn(process_original_events(Arc::downgrade(&keeper), news))),
             None if promised => keeper.report_missing_original(),
             None => {}
         }
@@ -159,11 +154,7 @@ impl Keeper {
     }
 
     /// Adds newly known parts of the interface.
-    pub async fn learn(
-        &self,
-        pairs: Vec<TopicPair>,
-        interface: ExpectedInterface,
-    ) -> anyhow::Result<()> {
+    pub async fn learn(&self, pairs: Vec<TopicPair>, interface: ExpectedInterface) -> anyhow::Result<()> {
         self.update(|state, now| {
             state.context.learn(&pairs);
             state.governor.add_pairs(now, pairs);
@@ -202,11 +193,7 @@ impl Keeper {
     }
 
     /// Handles a service call of the application. The request is cancelled if the returned future is dropped.
-    pub async fn call(
-        self: &Arc<Self>,
-        service: &Arc<str>,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn call(self: &Arc<Self>, service: &Arc<str>, request: Bytes) -> Result<Bytes, FailureReason> {
         let (sender, answer) = oneshot::channel();
         let id = self.update(|state, now| {
             state.ledger.record_input(now, service);
@@ -221,22 +208,12 @@ impl Keeper {
     }
 
     /// Handles an answer of the cloud to a call.
-    pub fn on_cloud_answer(
-        &self,
-        id: RequestId,
-        result: Result<Bytes, Failure>,
-        phases: Option<Phases>,
-    ) {
+    pub fn on_cloud_answer(&self, id: RequestId, result: Result<Bytes, Failure>, phases: Option<Phases>) {
         self.on_answer(Responder::Cloud, id, result, phases);
     }
 
     /// Handles a message that the servant's node has published; returns whether to publish it to the application.
-    pub fn on_cloud_output(
-        &self,
-        topic: &str,
-        message: &SerializedMessage,
-        phases: Option<Phases>,
-    ) -> bool {
+    pub fn on_cloud_output(&self, topic: &str, message: &SerializedMessage, phases: Option<Phases>) -> bool {
         self.on_output(Responder::Cloud, topic, message, phases)
     }
 
@@ -273,18 +250,9 @@ impl Keeper {
         }
     }
 
-    fn on_output(
-        &self,
-        side: Responder,
-        topic: &str,
-        message: &SerializedMessage,
-        phases: Option<Phases>,
-    ) -> bool {
+    fn on_output(&self, side: Responder, topic: &str, message: &SerializedMessage, phases: Option<Phases>) -> bool {
         let verdict = self.update(|state, now| {
-            let stamp = state
-                .stamps
-                .read_stamp(message)
-                .filter(|stamp| !stamp.is_zero());
+            let stamp = state.stamps.read_stamp(message).filter(|stamp| !stamp.is_zero());
             let age = stamp.map(age).unwrap_or_default();
             let key = goals::feedback_key(topic, message);
             let key = key.or_else(|| state.stamps.key(message));
@@ -297,13 +265,7 @@ impl Keeper {
         verdict == DeliveryVerdict::Deliver
     }
 
-    fn on_answer(
-        &self,
-        side: Responder,
-        id: RequestId,
-        result: Result<Bytes, Failure>,
-        phases: Option<Phases>,
-    ) {
+    fn on_answer(&self, side: Responder, id: RequestId, result: Result<Bytes, Failure>, phases: Option<Phases>) {
         self.update(|state, now| {
             match result {
                 Ok(bytes) => {
@@ -375,10 +337,7 @@ async fn run_timer(keeper: Weak<Keeper>, wake: Arc<Notify>) {
 }
 
 /// Handles the events of the local original.
-async fn process_original_events(
-    keeper: Weak<Keeper>,
-    mut news: mpsc::UnboundedReceiver<OriginalEvent>,
-) {
+async fn process_original_events(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<OriginalEvent>) {
     while let Some(news) = news.recv().await {
         let Some(keeper) = keeper.upgrade() else {
             return;
@@ -388,9 +347,7 @@ async fn process_original_events(
                 state.context.set_state(local);
                 state.governor.on_local_state(now, local);
             }),
-            OriginalEvent::Crashed(reason) => {
-                keeper.update(|state, now| state.governor.on_local_crash(now, &reason))
-            }
+            OriginalEvent::Crashed(reason) => keeper.update(|state, now| state.governor.on_local_crash(now, &reason)),
             OriginalEvent::Output(topic, message) => {
                 if keeper.on_output(Responder::Local, &topic, &message, None) {
                     keeper.robot.deliver(&topic, message);

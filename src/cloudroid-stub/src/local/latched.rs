@@ -46,10 +46,7 @@ impl PendingLatched {
             let key = (topic.clone(), publisher.clone());
             let of = known.entry(key.clone()).or_insert_with(|| {
                 turns.push_back(key);
-                LatchedUpdate {
-                    left: false,
-                    messages: Ring::new(RingBounds::with_messages(QUEUE)),
-                }
+                LatchedUpdate { left: false, messages: Ring::new(RingBounds::with_messages(QUEUE)) }
             });
             news(of);
         }
@@ -157,10 +154,8 @@ mod tests {
     #[tokio::test]
     async fn what_waits_for_an_advertisement_is_bounded_for_each_publisher() {
         let due = Arc::new(PendingLatched::default());
-        let latched = LatchedRelay {
-            due: due.clone(),
-            task: tokio::spawn(std::future::pending::<()>()).abort_handle(),
-        };
+        let latched =
+            LatchedRelay { due: due.clone(), task: tokio::spawn(std::future::pending::<()>()).abort_handle() };
         let topic: Arc<str> = "/map".into();
         let [quiet, busy, left] = ["/quiet", "/busy", "/left"].map(PeerId::from);
         latched.push(&topic, &message(&quiet, 1));
@@ -169,17 +164,10 @@ mod tests {
             latched.push(&topic, &message(&left, number));
         }
         latched.remove_publisher(&topic, &left);
-        let numbers = |news: LatchedUpdate| {
-            news.messages
-                .map(|message| message.bytes[0])
-                .collect::<Vec<_>>()
-        };
+        let numbers = |news: LatchedUpdate| news.messages.map(|message| message.bytes[0]).collect::<Vec<_>>();
         // A publisher with many messages does not displace those of others.
         assert_eq!(numbers(due.next_update().await.1), [1]);
-        assert_eq!(
-            numbers(due.next_update().await.1),
-            (84..100).collect::<Vec<_>>()
-        );
+        assert_eq!(numbers(due.next_update().await.1), (84..100).collect::<Vec<_>>());
         let (key, news) = due.next_update().await;
         assert_eq!((&key.1, news.left, news.messages.len()), (&left, true, 0));
         assert!(due.state.lock().0.is_empty());

@@ -24,12 +24,7 @@ pub struct RobotLender {
 impl RobotLender {
     /// Creates a lender whose calls may take `limit`.
     pub fn new(node: &str, bus: &Arc<dyn Bus>, limit: Duration) -> Self {
-        Self {
-            bus: Arc::clone(bus),
-            node: node.to_owned(),
-            limit,
-            open: watch::Sender::new(false),
-        }
+        Self { bus: Arc::clone(bus), node: node.to_owned(), limit, open: watch::Sender::new(false) }
     }
 }
 
@@ -74,11 +69,7 @@ impl ServiceHandler for ForwardedService {
 
 /// Returns the time limit for a call of a robot's service. The result of a goal (ROS 2) may take as long as the goal.
 pub fn call_limit_for(service: &str, limit: Duration) -> Duration {
-    if service.ends_with("/_action/get_result") {
-        limit.max(GOAL)
-    } else {
-        limit
-    }
+    if service.ends_with("/_action/get_result") { limit.max(GOAL) } else { limit }
 }
 
 /// Returns the reason for the failed call of a robot's service that its caller is given. Logs it if the service has not

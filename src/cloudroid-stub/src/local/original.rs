@@ -18,8 +18,8 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Failure, LocalState};
 use ros::bus::{
-    Bus, BusError, MatchedPeers, ParamValue, PeerId, Publisher, QosProfile, QosReliability,
-    SerializedMessage, WireType, wait_for_connected,
+    Bus, BusError, MatchedPeers, ParamValue, PeerId, Publisher, QosProfile, QosReliability, SerializedMessage,
+    WireType, wait_for_connected,
 };
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
@@ -161,25 +161,16 @@ impl Original {
             let subscription = self
                 .system
                 .bus()
-                .subscribe(
-                    &output,
-                    WireType::any(),
-                    QosProfile::keep_last(QUEUE).latching(true),
-                )
+                .subscribe(&output, WireType::any(), QosProfile::keep_last(QUEUE).latching(true))
                 .await?;
-            self.sources
-                .lock()
-                .insert(output.clone(), subscription.matched.clone());
+            self.sources.lock().insert(output.clone(), subscription.matched.clone());
             let (topic, news): (Arc<str>, _) = (output.into(), self.news.clone());
             let task = tokio::spawn(async move {
                 // Capture the whole subscription: a part of it would leave its guard behind, which would end the
                 // subscription.
                 let subscription = &mut { subscription };
                 while let Some(message) = subscription.messages.recv().await {
-                    if news
-                        .send(OriginalEvent::Output(topic.clone(), message))
-                        .is_err()
-                    {
+                    if news.send(OriginalEvent::Output(topic.clone(), message)).is_err() {
                         return;
                     }
                 }
@@ -216,10 +207,7 @@ impl Original {
     pub async fn wait_connected(&self) {
         let ends: Vec<_> = {
             let inputs = self.publishers.lock();
-            inputs
-                .values()
-                .map(|input| input.matched_subscribers())
-                .collect()
+            inputs.values().map(|input| input.matched_subscribers()).collect()
         };
         let all = async {
             for end in ends {
@@ -319,9 +307,5 @@ fn accepts_volatile(asked: Option<&QosProfile>) -> bool {
 /// publisher; deadlines and the like must match what a ROS 2 node requests.
 fn offered_qos(asked: Option<&QosProfile>) -> QosProfile {
     let plain = QosProfile::keep_last(QUEUE);
-    asked.map_or(plain, |asked| QosProfile {
-        reliability: QosReliability::Reliable,
-        depth: QUEUE,
-        ..*asked
-    })
+    asked.map_or(plain, |asked| QosProfile { reliability: QosReliability::Reliable, depth: QUEUE, ..*asked })
 }

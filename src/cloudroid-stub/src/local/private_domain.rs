@@ -52,10 +52,7 @@ impl PrivateDomain {
         let options = JoinOptions {
             distribution: std::env::var("ROS_DISTRO").unwrap_or_default(),
             // Nodes that look on this machine only send to the ports of its first participants.
-            network: DiscoveryNetwork {
-                well_known: true,
-                ..DiscoveryNetwork::default()
-            },
+            network: DiscoveryNetwork { well_known: true, ..DiscoveryNetwork::default() },
             ..JoinOptions::in_domain(domain.id, NODE)
         };
         let joined = ros::connect(RosVersion::Two, Arc::new(HostSockets), options).await;

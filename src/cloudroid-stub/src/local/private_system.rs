@@ -7,9 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ros::bus::{
-    Bus, BusError, Graph, NodeNames, ParamValue, QosProfile, RosVersion, ServiceType, WireType,
-};
+use ros::bus::{Bus, BusError, Graph, NodeNames, ParamValue, QosProfile, RosVersion, ServiceType, WireType};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -106,12 +104,7 @@ impl PrivateSystem {
     }
 
     /// Lends `node` the services that it calls and that others offer on the robot.
-    pub async fn lend(
-        &self,
-        node: &str,
-        robot: &Arc<dyn Bus>,
-        limit: Duration,
-    ) -> anyhow::Result<()> {
+    pub async fn lend(&self, node: &str, robot: &Arc<dyn Bus>, limit: Duration) -> anyhow::Result<()> {
         let lender = Arc::new(RobotLender::new(node, robot, limit));
         let lent = async { self.bus.lending()?.lend(lender).await };
         lent.await.context("lending services to the local original")
@@ -126,11 +119,7 @@ impl PrivateSystem {
     }
 
     /// Changes or deletes a parameter that nodes of the robot share.
-    pub async fn change_parameter(
-        &self,
-        name: &str,
-        value: Option<ParamValue>,
-    ) -> Result<(), BusError> {
+    pub async fn change_parameter(&self, name: &str, value: Option<ParamValue>) -> Result<(), BusError> {
         let parameters = self.bus.parameters()?;
         match value {
             Some(value) => parameters.set(name, value).await,
@@ -181,8 +170,7 @@ impl PrivateSystem {
 
     /// Waits until the process of `node` has registered the whole interface.
     pub async fn wait_for_interface(&self, node: &str, all: &ExpectedInterface) {
-        self.wait_until(|graph| has_interface(graph, &self.nodes_of(graph, node), all))
-            .await;
+        self.wait_until(|graph| has_interface(graph, &self.nodes_of(graph, node), all)).await;
     }
 
     /// Returns the registered interface of the process of `node`, as far as its types are known.
@@ -243,9 +231,7 @@ fn has_interface(graph: &Graph, nodes: &BTreeSet<String>, all: &ExpectedInterfac
     let listens = |topic: &String| any(seen::subscribes, topic);
     let says = |topic: &String| any(seen::publishes, topic);
     let serves = |service: &String| any(seen::serves, service);
-    all.inputs.keys().all(listens)
-        && all.outputs.iter().all(says)
-        && all.services.iter().all(serves)
+    all.inputs.keys().all(listens) && all.outputs.iter().all(says) && all.services.iter().all(serves)
 }
 
 /// Returns the interface of the process of `node` from its ROS 2 endpoints. Parameter events are left out: every node
@@ -258,25 +244,14 @@ fn interface_from_ends(graph: &Graph, node: &str, nodes: &BTreeSet<String>) -> R
         Some((node.clone(), names))
     });
     let names: BTreeMap<String, NodeNames> = names.collect();
-    let topic = |(topic, (of, qos)): (&String, &(WireType, QosProfile))| {
-        (topic.clone(), of.clone(), Some(*qos))
-    };
+    let topic = |(topic, (of, qos)): (&String, &(WireType, QosProfile))| (topic.clone(), of.clone(), Some(*qos));
     let inputs = ends.subscribers.iter();
     let services = ends.services.iter();
     RegisteredInterface {
         outputs: ends.publishers.iter().map(topic).collect(),
-        inputs: inputs
-            .filter(|(topic, _)| *topic != EVENTS)
-            .map(topic)
-            .collect(),
-        services: services
-            .map(|(service, of)| (service.clone(), of.clone()))
-            .collect(),
-        nodes: if names.keys().all(|name| name == node) {
-            BTreeMap::new()
-        } else {
-            names
-        },
+        inputs: inputs.filter(|(topic, _)| *topic != EVENTS).map(topic).collect(),
+        services: services.map(|(service, of)| (service.clone(), of.clone())).collect(),
+        nodes: if names.keys().all(|name| name == node) { BTreeMap::new() } else { names },
     }
 }
 
@@ -288,15 +263,10 @@ mod tests {
     fn what_has_a_name_of_one_life_is_not_waited_for() {
         let served = ["/see/set", "/tf_2/get_type_description"];
         let served = served.map(|name| (name.to_owned(), "/see".to_owned()));
-        let graph = Graph {
-            services: served.into(),
-            ..Graph::default()
-        };
+        let graph = Graph { services: served.into(), ..Graph::default() };
         let nodes = BTreeSet::from(["/see".to_owned()]);
         let mut all = ExpectedInterface {
-            services: ["/see/set", "/tf_1/get_type_description"]
-                .map(str::to_owned)
-                .into(),
+            services: ["/see/set", "/tf_1/get_type_description"].map(str::to_owned).into(),
             ..ExpectedInterface::default()
         };
         assert!(!has_interface(&graph, &nodes, &all));

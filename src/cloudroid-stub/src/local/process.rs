@@ -13,10 +13,8 @@ use tokio::time::timeout;
 use super::private_system::Variables;
 
 /// Signals and waiting times as in roslaunch, but shorter: the robot's application does not depend on it any more.
-const ESCALATION: [(Signal, Duration); 2] = [
-    (Signal::SIGINT, Duration::from_secs(5)),
-    (Signal::SIGTERM, Duration::from_secs(2)),
-];
+const ESCALATION: [(Signal, Duration); 2] =
+    [(Signal::SIGINT, Duration::from_secs(5)), (Signal::SIGTERM, Duration::from_secs(2))];
 
 /// Program of the original.
 #[derive(Debug, Clone)]
@@ -53,19 +51,10 @@ impl OriginalProgram {
             command.pre_exec(move || {
                 nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
                 // The stub may have ended before the death signal was set.
-                if nix::unistd::getppid() == stub {
-                    Ok(())
-                } else {
-                    Err(std::io::ErrorKind::Interrupted.into())
-                }
+                if nix::unistd::getppid() == stub { Ok(()) } else { Err(std::io::ErrorKind::Interrupted.into()) }
             });
         }
-        command.spawn().with_context(|| {
-            format!(
-                "the local original {} cannot be executed",
-                self.path.display()
-            )
-        })
+        command.spawn().with_context(|| format!("the local original {} cannot be executed", self.path.display()))
     }
 }
 

@@ -65,10 +65,7 @@ mod tests {
     fn the_same_parameters_have_the_same_names_whatever_their_values() {
         let whole = request(1.0, "map");
         assert_eq!(parameter_names(&whole).unwrap(), b"frame\0speed\0");
-        assert_eq!(
-            parameter_names(&request(2.0, "odom")),
-            parameter_names(&whole)
-        );
+        assert_eq!(parameter_names(&request(2.0, "odom")), parameter_names(&whole));
         // A truncated or longer message is no request.
         for end in 0..whole.len() {
             assert_eq!(parameter_names(&whole[..end]), None, "{end}");

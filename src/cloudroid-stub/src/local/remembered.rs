@@ -91,26 +91,16 @@ impl RememberedSettings {
         match what {
             ServiceUse::Set => {
                 let target = set_target(request);
-                all.sets
-                    .retain(|known| known.service != service || known.target != target);
+                all.sets.retain(|known| known.service != service || known.target != target);
                 if all.sets.len() == MOST {
                     all.sets.remove(0);
                 }
                 all.told += 1;
-                all.sets.push(RememberedSet {
-                    number: all.told,
-                    service,
-                    target,
-                    request: request.clone(),
-                });
+                all.sets.push(RememberedSet { number: all.told, service, target, request: request.clone() });
             }
             ServiceUse::Transition => {
                 let transition = Transition::parse(request);
-                let step = LifecycleStep {
-                    service,
-                    transition,
-                    request: request.clone(),
-                };
+                let step = LifecycleStep { service, transition, request: request.clone() };
                 match transition {
                     Transition::Configure => all.way = vec![step],
                     Transition::Activate => {
@@ -137,24 +127,17 @@ impl RememberedSettings {
     /// Replays the settings to a new node, which is called by `ask`. A request that it refuses would have been refused
     /// before.
     pub async fn replay(&self, ask: impl Fn(&str, Bytes) -> PendingAnswer) {
-        let told =
-            async |service: &str, request: Bytes| match timeout(PATIENCE, ask(service, request))
-                .await
-            {
-                Ok(Ok(answer)) => Some(answer),
-                Ok(Err(failure)) => {
-                    tracing::debug!(
-                        service,
-                        reason = failure.text(),
-                        "cannot repeat a request to a restarted node"
-                    );
-                    None
-                }
-                Err(_) => {
-                    tracing::warn!(service, "a restarted node does not answer");
-                    None
-                }
-            };
+        let told = async |service: &str, request: Bytes| match timeout(PATIENCE, ask(service, request)).await {
+            Ok(Ok(answer)) => Some(answer),
+            Ok(Err(failure)) => {
+                tracing::debug!(service, reason = failure.text(), "cannot repeat a request to a restarted node");
+                None
+            }
+            Err(_) => {
+                tracing::warn!(service, "a restarted node does not answer");
+                None
+            }
+        };
         // Settings that are made meanwhile have higher numbers, so the node receives them last: one request may set
         // what others do.
         let mut last = 0;
@@ -277,12 +260,7 @@ mod tests {
         for (name, value) in [("max", 1), ("min", 2), ("max", 3)] {
             all.record("/n/set_parameters", &ServiceUse::Set, &set(name, value));
         }
-        let steps = [
-            change(1, ""),
-            change(0, "activate"),
-            change(4, ""),
-            change(3, ""),
-        ];
+        let steps = [change(1, ""), change(0, "activate"), change(4, ""), change(3, "")];
         for step in &steps {
             all.record("/n/change_state", &ServiceUse::Transition, step);
         }
@@ -292,11 +270,7 @@ mod tests {
         assert_eq!(everything, [&sets[..], &way[..]].concat());
         // Another client has already advanced the state.
         assert_eq!(replayed_requests(&all, 3).await, sets);
-        all.record(
-            "/n/change_state",
-            &ServiceUse::Transition,
-            &change(2, "cleanup"),
-        );
+        all.record("/n/change_state", &ServiceUse::Transition, &change(2, "cleanup"));
         assert_eq!(replayed_requests(&all, UNCONFIGURED).await, sets);
         for number in 0..1000 {
             let name = format!("p{number}");
@@ -309,15 +283,8 @@ mod tests {
     async fn what_is_set_while_a_node_is_told_anew_holds_in_the_end() {
         let all = Arc::new(RememberedSettings::default());
         let service = "/n/set_parameters";
-        let note = |all: &RememberedSettings, request: &Bytes| {
-            all.record(service, &ServiceUse::Set, request)
-        };
-        let [speed, both, faster, slow] = [
-            set("speed", 1),
-            change(7, "both"),
-            set("speed", 2),
-            set("slow", 1),
-        ];
+        let note = |all: &RememberedSettings, request: &Bytes| all.record(service, &ServiceUse::Set, request);
+        let [speed, both, faster, slow] = [set("speed", 1), change(7, "both"), set("speed", 2), set("slow", 1)];
         note(&all, &speed);
         note(&all, &both);
         note(&all, &slow);

@@ -71,11 +71,8 @@ mod tests {
     #[test]
     fn what_manages_a_node_is_no_request_of_its_application() {
         let of = |name: &str, type_name: &str, version| {
-            let served = ServiceChannel {
-                name: name.to_owned(),
-                type_name: type_name.to_owned(),
-                ..ServiceChannel::default()
-            };
+            let served =
+                ServiceChannel { name: name.to_owned(), type_name: type_name.to_owned(), ..ServiceChannel::default() };
             ServiceUse::classify(&served, version)
         };
         let two = |name, type_name| of(name, type_name, RosVersion::Two);

@@ -21,14 +21,9 @@ impl Default for StampReader {
     fn default() -> Self {
         let header = |version| {
             let header = Registry::for_version(version).message("std_msgs/Header");
-            header
-                .map(|header| codec::Stamps::for_type(&header))
-                .unwrap_or_default()
+            header.map(|header| codec::Stamps::for_type(&header)).unwrap_or_default()
         };
-        Self {
-            headers: [RosVersion::One, RosVersion::Two].map(header),
-            stamped: HashMap::new(),
-        }
+        Self { headers: [RosVersion::One, RosVersion::Two].map(header), stamped: HashMap::new() }
     }
 }
 
@@ -43,9 +38,7 @@ impl StampReader {
 
     /// Returns the goal id for goals, results and feedback of ROS 1 actions, otherwise the stamp.
     pub fn key(&mut self, message: &SerializedMessage) -> Option<CorrelationKey> {
-        if message.wire_type.format == WireFormat::Ros1
-            && actions::carries_goal_id(&message.wire_type.name)
-        {
+        if message.wire_type.format == WireFormat::Ros1 && actions::carries_goal_id(&message.wire_type.name) {
             let id = actions::messages::goal_id(&message.bytes)?;
             return Some(CorrelationKey::Goal(id.into()));
         }
@@ -68,10 +61,7 @@ impl StampReader {
             WireFormat::Cdr => &self.headers[1],
         };
         let found = header.first(&message.bytes).filter(|_| stamped)?;
-        Some(Stamp {
-            secs: found.secs,
-            nsecs: found.nsecs,
-        })
+        Some(Stamp { secs: found.secs, nsecs: found.nsecs })
     }
 }
 
@@ -81,28 +71,19 @@ pub fn is_stamped(wire_type: &WireType) -> bool {
         let (package, name) = wire_type.name.split_once('/').unwrap_or_default();
         return name.ends_with("Stamped") || matches!(package, "sensor_msgs" | "stereo_msgs");
     }
-    let fields = wire_type
-        .definition
-        .lines()
-        .map(|line| line.split('#').next().unwrap_or_default().trim());
+    let fields = wire_type.definition.lines().map(|line| line.split('#').next().unwrap_or_default().trim());
     let first = fields
         .filter(|line| !line.is_empty())
         // Constants are not fields; the `<=` of a bound (ROS 2) does not make a constant.
         .find(|line| !line.replace("<=", "").contains('='));
     let kind = first.and_then(|line| line.split_whitespace().next());
-    matches!(
-        kind,
-        Some("Header" | "std_msgs/Header" | "std_msgs/msg/Header")
-    )
+    matches!(kind, Some("Header" | "std_msgs/Header" | "std_msgs/msg/Header"))
 }
 
 /// Returns the age of a stamp by this machine's clock; zero for stamps in the future.
 pub fn age(stamp: Stamp) -> Duration {
     let now = Duration::from_nanos(u64::try_from(link::clock::now()).unwrap_or_default());
-    now.saturating_sub(Duration::new(
-        u64::from(stamp.secs),
-        stamp.nsecs.min(999_999_999),
-    ))
+    now.saturating_sub(Duration::new(u64::from(stamp.secs), stamp.nsecs.min(999_999_999)))
 }
 
 #[cfg(test)]
@@ -140,11 +121,7 @@ mod tests {
         assert_eq!(stamp(&mut stamps, &untold), Some(expected.clone()));
         let image = ros2_type("sensor_msgs/msg/Image", "RIHS01_2", "");
         assert_eq!(stamp(&mut stamps, &image), Some(expected));
-        let named = ros2_type(
-            "p/msg/Named",
-            "RIHS01_3",
-            "string<=8 name\nstd_msgs/Header h\n",
-        );
+        let named = ros2_type("p/msg/Named", "RIHS01_3", "string<=8 name\nstd_msgs/Header h\n");
         assert!(!is_stamped(&named));
         let cut = message(&image, &STAMPED[..8]);
         assert_eq!(stamps.key(&cut), None);

@@ -9,21 +9,14 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{HandOver, LocalState, QosEvent, QosSla, RequestId, RequestOutcome, SafeStop};
-use ros::bus::{
-    Bus, FailureReason, ParamValue, RosVersion, SerializedMessage, ServiceHandler, ServiceType,
-    WireType,
-};
+use ros::bus::{Bus, FailureReason, ParamValue, RosVersion, SerializedMessage, ServiceHandler, ServiceType, WireType};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use super::original::OriginalEvent;
 use super::process::OriginalProgram;
-use super::{
-    Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer,
-};
-use crate::testing::{
-    SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type,
-};
+use super::{Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer};
+use crate::testing::{SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type};
 
 stories! {
     of_ros_1 = One:
@@ -71,11 +64,7 @@ pub async fn robot(ros: RosVersion) -> TestRobot {
 fn relay() -> PathBuf {
     let tests = std::env::current_exe().unwrap();
     let path = tests.ancestors().nth(2).unwrap().join("examples/relay");
-    assert!(
-        path.is_file(),
-        "{} is missing: build it with cargo test -p cloudroid-stub, all targets",
-        path.display()
-    );
+    assert!(path.is_file(), "{} is missing: build it with cargo test -p cloudroid-stub, all targets", path.display());
     path
 }
 
@@ -83,9 +72,7 @@ fn relay() -> PathBuf {
 pub fn relay_setup(world: &World, argv: &[&str]) -> OriginalSetup {
     let names = match world.domain() {
         None => "in:=/ns/in out:=/absolute/out __name:=relay",
-        Some(_) => {
-            "--ros-args -r in:=/ns/in -r out:=/absolute/out -r count:=/count -r __ns:=/ns -r __node:=relay"
-        }
+        Some(_) => "--ros-args -r in:=/ns/in -r out:=/absolute/out -r count:=/count -r __ns:=/ns -r __node:=relay",
     };
     let names = names.split(' ');
     let argv = argv.iter().copied().chain(names).map(str::to_owned);
@@ -95,21 +82,14 @@ pub fn relay_setup(world: &World, argv: &[&str]) -> OriginalSetup {
         Some(_) => argv.extend(["-p", "greeting:=hello "].map(str::to_owned)),
     }
     OriginalSetup {
-        program: Some(OriginalProgram {
-            path: relay(),
-            argv,
-            environment,
-        }),
+        program: Some(OriginalProgram { path: relay(), argv, environment }),
         node: "/ns/relay".into(),
         domain: world.domain(),
         patience: SOON,
     }
 }
 
-async fn new_original(
-    robot: &TestRobot,
-    setting: OriginalSetup,
-) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
+async fn new_original(robot: &TestRobot, setting: OriginalSetup) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
     let string = string_type(robot.bus.version());
     let input = |topic: &str| (topic.to_owned(), string.clone());
     let interface = ExpectedInterface {
@@ -118,16 +98,11 @@ async fn new_original(
         outputs: vec!["/absolute/out".into()],
         ..ExpectedInterface::default()
     };
-    Original::new(setting, interface, robot.bus.clone(), SOON)
-        .await
-        .unwrap()
+    Original::new(setting, interface, robot.bus.clone(), SOON).await.unwrap()
 }
 
 /// Creates an original that runs the relay with these arguments.
-pub async fn new_relay(
-    robot: &TestRobot,
-    argv: &[&str],
-) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
+pub async fn new_relay(robot: &TestRobot, argv: &[&str]) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
     new_original(robot, relay_setup(&robot.world, argv)).await
 }
 
@@ -163,30 +138,13 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it(ros: Ro
     original.start();
     wait_for_state(&mut news, LocalState::Ready).await;
     original.feed("/ns/in", &string_message(ros, "world"));
-    assert_eq!(
-        next_output(&mut news).await,
-        "hello world",
-        "it has its parameters"
-    );
+    assert_eq!(next_output(&mut news).await, "hello world", "it has its parameters");
     let graph = robot.bus.graph().borrow().clone();
-    assert_eq!(
-        graph.nodes.keys().filter(|name| *name != "/robot").count(),
-        0,
-        "{graph:?}"
-    );
-    assert!(
-        graph
-            .topics
-            .keys()
-            .all(|name| name != "/absolute/out" && name != "/ns/in"),
-        "{graph:?}"
-    );
+    assert_eq!(graph.nodes.keys().filter(|name| *name != "/robot").count(), 0, "{graph:?}");
+    assert!(graph.topics.keys().all(|name| name != "/absolute/out" && name != "/ns/in"), "{graph:?}");
     if let Ok(parameters) = robot.bus.parameters() {
         let names = parameters.names().await.unwrap();
-        assert!(
-            names.iter().all(|name| name != "/ns/relay/seen"),
-            "what it writes stays with it: {names:?}"
-        );
+        assert!(names.iter().all(|name| name != "/ns/relay/seen"), "what it writes stays with it: {names:?}");
     }
     original.stop();
     wait_for_state(&mut news, LocalState::Stopped).await;
@@ -198,30 +156,20 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it(ros: Ro
 
 /// Returns a string message of a publisher that latches.
 fn latched_message(ros: RosVersion, publisher: &str, text: &str) -> SerializedMessage {
-    SerializedMessage {
-        publisher: publisher.into(),
-        latching: true,
-        ..string_message(ros, text)
-    }
+    SerializedMessage { publisher: publisher.into(), latching: true, ..string_message(ros, text) }
 }
 
 async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(ros: RosVersion) {
     let robot = robot(ros).await;
     let (original, mut news) = new_relay(&robot, &["patient", "keeps"]).await;
     let topic: Arc<str> = "/ns/in".into();
-    for (publisher, said) in [
-        ("/one", "old"),
-        ("/one", "map"),
-        ("/two", "frames"),
-        ("/gone", "lost"),
-    ] {
+    for (publisher, said) in [("/one", "old"), ("/one", "map"), ("/two", "frames"), ("/gone", "lost")] {
         original.latch(&topic, &latched_message(ros, publisher, said));
     }
     original.unlatch(&topic, &"/gone".into());
-    for (left, wanted) in [
-        (None, BTreeSet::from(["hello map", "hello frames"])),
-        (Some("/two"), BTreeSet::from(["hello map"])),
-    ] {
+    for (left, wanted) in
+        [(None, BTreeSet::from(["hello map", "hello frames"])), (Some("/two"), BTreeSet::from(["hello map"]))]
+    {
         if let Some(left) = left {
             original.unlatch(&topic, &left.into());
         }
@@ -279,11 +227,7 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides(ros: RosVersi
         }
     }
     let sent: Vec<String> = cloud.inputs.lock().iter().map(message_text).collect();
-    assert_eq!(
-        sent,
-        ["map", "scan", "another map"],
-        "the cloud will need the map, too"
-    );
+    assert_eq!(sent, ["map", "scan", "another map"], "the cloud will need the map, too");
     keeper.link_up(true);
     while heard.last().map(String::as_str) != Some("stop") {
         heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
@@ -293,8 +237,7 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides(ros: RosVersi
 
 async fn what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests(ros: RosVersion) {
     let robot = robot(ros).await;
-    let sla =
-        serde_json::json!({"t_desire": 0.02, "t_max": 60, "local": "cold", "unreached": 0.05});
+    let sla = serde_json::json!({"t_desire": 0.02, "t_max": 60, "local": "cold", "unreached": 0.05});
     let (told, mut hears) = mpsc::unbounded_channel();
     let waits = ["awaits=/pose", "awaits-latched=/map"];
     let keeper = Keeper::start(
@@ -361,10 +304,7 @@ async fn a_stateful_hand_over_says_what_is_lost() {
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
     // Latched messages reach both sides, so none is lost.
-    keeper.on_input(
-        &topic,
-        latched_message(RosVersion::One, "/map_server", "map"),
-    );
+    keeper.on_input(&topic, latched_message(RosVersion::One, "/map_server", "map"));
     for _ in 0..3 {
         keeper.on_input(&topic, string_message(RosVersion::One, "scan"));
     }
@@ -377,10 +317,7 @@ async fn a_stateful_hand_over_says_what_is_lost() {
     keeper.link_down();
     until("local lacks 3 of /ns/in").await;
     let lost = keeper.report().lost.unwrap().1;
-    assert!(
-        lost.contains("the local original takes over without"),
-        "{lost}"
-    );
+    assert!(lost.contains("the local original takes over without"), "{lost}");
     for _ in 0..2 {
         keeper.on_input(&topic, string_message(RosVersion::One, "another scan"));
     }
@@ -423,10 +360,7 @@ async fn a_hand_over_names_calls_and_goals_that_the_other_side_was_given() {
     // A goal without an id is not a request, but the cloud receives it all the same. Plain messages are not listed in
     // the hand-over.
     let goal = WireType::with_name("mux_msgs/SwitchActionGoal");
-    let goal = SerializedMessage {
-        wire_type: Arc::new(goal),
-        ..string_message(RosVersion::One, "")
-    };
+    let goal = SerializedMessage { wire_type: Arc::new(goal), ..string_message(RosVersion::One, "") };
     keeper.on_input(&"/mux/goal".into(), goal);
     keeper.on_input(&"/ns/in".into(), string_message(RosVersion::One, "scan"));
     keeper.link_down();
@@ -435,11 +369,7 @@ async fn a_hand_over_names_calls_and_goals_that_the_other_side_was_given() {
         heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
     }
     assert_eq!(heard, "local lacks 1 of /mux/goal, 1 of /mux/select");
-    assert_eq!(
-        keeper.report().lost,
-        None,
-        "its state is not said to be lost"
-    );
+    assert_eq!(keeper.report().lost, None, "its state is not said to be lost");
 }
 
 #[tokio::test]
@@ -464,31 +394,17 @@ async fn where_nothing_is_promised_a_missing_original_is_told_when_it_is_needed(
 async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over(ros: RosVersion) {
     let robot = robot(ros).await;
     let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
-    let _hangs = robot
-        .bus
-        .serve("/hangs", of, Arc::new(Hangs))
-        .await
-        .unwrap();
+    let _hangs = robot.bus.serve("/hangs", of, Arc::new(Hangs)).await.unwrap();
     let limit = Duration::from_millis(100);
     let relay = relay_setup(&robot.world, &["patient"]);
     let original = Original::new(relay, ExpectedInterface::default(), robot.bus, limit);
     let (original, mut news) = original.await.unwrap();
-    let interface = ExpectedInterface {
-        outputs: vec!["/absolute/out".into()],
-        ..ExpectedInterface::default()
-    };
+    let interface = ExpectedInterface { outputs: vec!["/absolute/out".into()], ..ExpectedInterface::default() };
     original.adapt(interface).await.unwrap();
-    original.latch(
-        &"/ns/in".into(),
-        &latched_message(ros, "/app", "ask /hangs"),
-    );
+    original.latch(&"/ns/in".into(), &latched_message(ros, "/app", "ask /hangs"));
     original.start();
     let answer = next_output(&mut news).await;
-    assert!(
-        answer.contains("service /hangs did not answer within 100ms")
-            && answer.contains("call_limit"),
-        "{answer}"
-    );
+    assert!(answer.contains("service /hangs did not answer within 100ms") && answer.contains("call_limit"), "{answer}");
 }
 
 /// Accepts a call and never answers.
@@ -522,11 +438,9 @@ async fn it_calls_what_the_robot_serves(ros: RosVersion) {
         let serving = robot.bus.serve(name, of, Arc::new(Says(says))).await;
         served.push(serving.unwrap());
     }
-    for (asked, wanted) in [
-        ("ask /secret", "42"),
-        ("ask /silent", "it is a secret"),
-        ("ask /nobody", "service /nobody has no server"),
-    ] {
+    for (asked, wanted) in
+        [("ask /secret", "42"), ("ask /silent", "it is a secret"), ("ask /nobody", "service /nobody has no server")]
+    {
         original.feed("/ns/in", &string_message(ros, asked));
         let answer = next_output(&mut news).await;
         assert!(answer.contains(wanted), "{answer}");
@@ -647,9 +561,7 @@ impl Application for RecordingApplication {
     fn on_outcome(&self, _: &RequestOutcome) {}
 }
 
-async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again(
-    ros: RosVersion,
-) {
+async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again(ros: RosVersion) {
     let robot = robot(ros).await;
     let sla = serde_json::json!({
         "t_desire": 0.02, "t_max": 0.05, "local": "cold", "initial": 5,
@@ -676,11 +588,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     while heard != "hello world" {
         heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
     }
-    assert_eq!(
-        cloud.inputs.lock().len(),
-        2,
-        "the cloud is asked all the time"
-    );
+    assert_eq!(cloud.inputs.lock().len(), 2, "the cloud is asked all the time");
     // The cloud answers in time again, until Q is above its threshold.
     let stopped = async {
         while heard != "stop" {
@@ -698,11 +606,7 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
     };
     timeout(SOON, stopped).await.unwrap();
     let report = keeper.report();
-    assert!(
-        report.summary.contains("the cloud answers"),
-        "{}",
-        report.summary
-    );
+    assert!(report.summary.contains("the cloud answers"), "{}", report.summary);
 }
 
 async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost(ros: RosVersion) {
@@ -747,11 +651,7 @@ async fn without_a_local_original_a_call_fails_with_the_reason() {
         Arc::new(SilentCloud::default()),
         Arc::new(RecordingApplication(told)),
     );
-    let error = timeout(SOON, keeper.call(&"/add".into(), Bytes::new()))
-        .await
-        .unwrap()
-        .unwrap_err()
-        .to_string();
+    let error = timeout(SOON, keeper.call(&"/add".into(), Bytes::new())).await.unwrap().unwrap_err().to_string();
     assert!(error.contains("the link is down"), "{error}");
     assert!(error.contains("there is no local original"), "{error}");
     assert_eq!(hears.recv().await.unwrap(), "saidoncemissing");

@@ -27,8 +27,7 @@ impl Calls {
         let kept = self.kept.lock().remove(&id);
         if let (Some(keeper), Some((request, asked))) = (mirror.keeper(), kept) {
             let clock = mirror.session().clock();
-            let phases = clock
-                .map(|clock| reports::call_phases([asked, taken, given, arrived], clock.offset));
+            let phases = clock.map(|clock| reports::call_phases([asked, taken, given, arrived], clock.offset));
             keeper.on_cloud_answer(request, response, phases);
             return;
         }
@@ -61,13 +60,7 @@ impl Calls {
     }
 
     /// Makes a call on behalf of the keeper.
-    pub fn call_for_keeper(
-        &self,
-        mirror: &Mirror,
-        request: RequestId,
-        service: &str,
-        bytes: Bytes,
-    ) {
+    pub fn call_for_keeper(&self, mirror: &Mirror, request: RequestId, service: &str, bytes: Bytes) {
         let services = self.services.lock();
         let Some(known) = services.get(service) else {
             drop(services);
@@ -104,20 +97,14 @@ impl Calls {
 
     /// Serves new services and stops serving those that are not listed, unless `keeps` is set. `told` is set if the
     /// channels are the cloud's; otherwise the cloud knows of none yet.
-    pub async fn apply(
-        &self,
-        mirror: &Arc<Mirror>,
-        services: &[ServiceChannel],
-        (told, keeps): (bool, bool),
-    ) {
+    pub async fn apply(&self, mirror: &Arc<Mirror>, services: &[ServiceChannel], (told, keeps): (bool, bool)) {
         let version = mirror.bus.version();
         self.services.lock().retain(|name, service| {
             let listed = services.iter().find(|served| served.name == *name);
             // More of a type may have become known.
             let same = |served: &ServiceChannel| {
                 let of = |served: &ServiceChannel| served.service_type(version);
-                served.type_name == service.told.type_name
-                    && of(served).is_compatible_with(&of(&service.told))
+                served.type_name == service.told.type_name && of(served).is_compatible_with(&of(&service.told))
             };
             listed.map_or(keeps, same)
         });
@@ -136,11 +123,7 @@ impl Calls {
             let service_type = served.service_type(version);
             match mirror.bus.serve(&served.name, service_type, handler).await {
                 Ok(serving) => {
-                    let service = MirroredService {
-                        told: served.clone(),
-                        channel,
-                        _serving: serving,
-                    };
+                    let service = MirroredService { told: served.clone(), channel, _serving: serving };
                     self.services.lock().insert(served.name.clone(), service);
                 }
                 Err(error) => {
@@ -206,9 +189,7 @@ impl ServiceHandler for ForwardingHandler {
         match &self.what {
             ServiceUse::Request => keeper.call(&self.name, request).await,
             ServiceUse::Look => keeper.forward(&self.name, request).await,
-            ServiceUse::Set | ServiceUse::Transition => {
-                keeper.manage(&self.name, &self.what, request).await
-            }
+            ServiceUse::Set | ServiceUse::Transition => keeper.manage(&self.name, &self.what, request).await,
             ServiceUse::SendGoal(action) => keeper.send_goal(action, request).await,
             ServiceUse::GetResult(action) => keeper.get_result(action, request).await,
             ServiceUse::CancelGoal(action) => keeper.cancel_goal(action, request).await,

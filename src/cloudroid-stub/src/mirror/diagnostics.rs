@@ -20,10 +20,7 @@ const ERROR: u8 = 2;
 
 /// Message definitions, the same in ROS 1 and 2 except for the header, which each version defines itself.
 const DEFINITIONS: [(&str, &str); 3] = [
-    (
-        "diagnostic_msgs/msg/DiagnosticArray",
-        "std_msgs/Header header\nDiagnosticStatus[] status\n",
-    ),
+    ("diagnostic_msgs/msg/DiagnosticArray", "std_msgs/Header header\nDiagnosticStatus[] status\n"),
     (
         "diagnostic_msgs/msg/DiagnosticStatus",
         "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n\
@@ -82,8 +79,7 @@ fn schema(version: RosVersion) -> Arc<MessageType> {
 fn level(report: &QosReport) -> u8 {
     let unpromised = report.fallback_after.is_some();
     let wished_for = report.link && (unpromised || report.q >= report.threshold);
-    let in_its_place =
-        report.local != LocalPolicy::None && report.local_state != LocalState::Missing;
+    let in_its_place = report.local != LocalPolicy::None && report.local_state != LocalState::Missing;
     if wished_for {
         OK
     } else if report.link || report.fed || in_its_place {
@@ -106,33 +102,23 @@ fn values(report: &QosReport) -> Vec<(String, String)> {
         ],
     };
     let standing = [
-        (
-            "local original",
-            format!("{:?}", report.local_state).to_lowercase(),
-        ),
+        ("local original", format!("{:?}", report.local_state).to_lowercase()),
         ("local original is asked", yes(report.fed)),
         ("requests", counts.requests.to_string()),
         ("answered by the cloud", counts.from_cloud.to_string()),
-        (
-            "answered by the local original",
-            counts.from_local.to_string(),
-        ),
+        ("answered by the local original", counts.from_local.to_string()),
         ("failed", counts.failed.to_string()),
     ];
     let late = [
         ("later than T_max by the cloud", counts.late.to_string()),
         ("left out by the cloud's node", counts.left_out.to_string()),
-        (
-            "later than T_max by both",
-            counts.unanswered_in_time.to_string(),
-        ),
+        ("later than T_max by both", counts.unanswered_in_time.to_string()),
         ("safe stops", counts.safe_stops.to_string()),
     ];
     let late = late.into_iter().filter(|_| report.fallback_after.is_none());
     let all = std::iter::once(("link is up", yes(report.link)));
     let all = all.chain(promise).chain(standing).chain(late);
-    let mut values: Vec<(String, String)> =
-        all.map(|(key, value)| (key.to_owned(), value)).collect();
+    let mut values: Vec<(String, String)> = all.map(|(key, value)| (key.to_owned(), value)).collect();
     if let Some((ago, lost)) = &report.lost {
         let key = format!("lost at the last hand-over, {ago:.0} s ago");
         values.push((key, lost.clone()));
@@ -149,13 +135,7 @@ fn values(report: &QosReport) -> Vec<(String, String)> {
     values
 }
 
-fn encode_array(
-    of: &MessageType,
-    sequence: u32,
-    name: &str,
-    robot: &str,
-    report: &QosReport,
-) -> Bytes {
+fn encode_array(of: &MessageType, sequence: u32, name: &str, robot: &str, report: &QosReport) -> Bytes {
     let Time { secs, nsecs } = Time::now();
     let value = |(key, value)| json!({ "key": key, "value": value });
     let header = match of.version() {
@@ -193,11 +173,7 @@ mod tests {
         let known = schema(RosVersion::Two);
         assert_eq!(known.name(), "diagnostic_msgs/msg/DiagnosticArray");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
-        let governor = Governor::<()>::new(
-            QosSla::parse(sla).unwrap(),
-            vec![],
-            RetentionLimits::default(),
-        );
+        let governor = Governor::<()>::new(QosSla::parse(sla).unwrap(), vec![], RetentionLimits::default());
         let report = governor.report(Instant::now());
         let told = encode_array(&known, 1, "detect: cloudroid", "rover1", &report);
         assert_eq!(told[..4], [0, 1, 0, 0]);
@@ -213,19 +189,9 @@ mod tests {
         let known = schema(RosVersion::One);
         assert_eq!(known.md5(), "60810da900de1dd6ddd437c3503511da");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
-        let mut governor = Governor::<()>::new(
-            QosSla::parse(sla).unwrap(),
-            vec![],
-            RetentionLimits::default(),
-        );
+        let mut governor = Governor::<()>::new(QosSla::parse(sla).unwrap(), vec![], RetentionLimits::default());
         let now = Instant::now();
-        let down = encode_array(
-            &known,
-            7,
-            "detect: cloudroid",
-            "rover1",
-            &governor.report(now),
-        );
+        let down = encode_array(&known, 7, "detect: cloudroid", "rover1", &governor.report(now));
         let mut json = Vec::new();
         ros::codec::to_json(&known, &down, &mut json, &Default::default()).unwrap();
         let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
@@ -239,17 +205,10 @@ mod tests {
         governor.link_up(now, false);
         assert_eq!(level(&governor.report(now)), OK);
         let sla = serde_json::json!({"measure": {"link": {"after": 3}}, "initial": 1});
-        let mut governor = Governor::<()>::new(
-            QosSla::parse(sla).unwrap(),
-            vec![],
-            RetentionLimits::default(),
-        );
+        let mut governor = Governor::<()>::new(QosSla::parse(sla).unwrap(), vec![], RetentionLimits::default());
         governor.begin(now);
         let down = governor.report(now);
-        let after = (
-            "local original stands in after [s]".to_owned(),
-            "3".to_owned(),
-        );
+        let after = ("local original stands in after [s]".to_owned(), "3".to_owned());
         assert!(super::values(&down).contains(&after));
         assert!(super::values(&down).iter().all(|(key, _)| key != "Q"));
         assert_eq!(level(&down), WARN);

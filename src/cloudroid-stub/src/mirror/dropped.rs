@@ -16,9 +16,7 @@ impl Mirror {
     fn collect_drops(&self) -> Vec<TopicDropCount> {
         let mut all = self.drops.snapshot();
         for drop in self.session().drops() {
-            let same = |known: &&mut TopicDropCount| {
-                known.topic == drop.topic && known.cause == drop.cause
-            };
+            let same = |known: &&mut TopicDropCount| known.topic == drop.topic && known.cause == drop.cause;
             match all.iter_mut().find(same) {
                 Some(known) => known.count += drop.count,
                 None => all.push(drop),

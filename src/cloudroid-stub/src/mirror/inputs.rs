@@ -57,11 +57,8 @@ impl Inputs {
                 None => {
                     let feed = Arc::new(AtomicBool::new(wanted.feed));
                     let reading = read_input(Arc::downgrade(mirror), wanted.clone(), feed.clone());
-                    let topic = InputTopic {
-                        wanted: wanted.clone(),
-                        feed,
-                        reading: tokio::spawn(reading).abort_handle(),
-                    };
+                    let topic =
+                        InputTopic { wanted: wanted.clone(), feed, reading: tokio::spawn(reading).abort_handle() };
                     topics.insert(wanted.topic.clone(), topic);
                 }
             }
@@ -92,12 +89,7 @@ impl Inputs {
                 let publisher = message.publisher.clone();
                 channels.latched.insert(publisher, message.clone());
             }
-            channels.channel_for(
-                mirror,
-                topic,
-                (&message.publisher, message.latching),
-                &message.wire_type,
-            )
+            channels.channel_for(mirror, topic, (&message.publisher, message.latching), &message.wire_type)
         };
         let quality = DeliveryMode::for_type(&message.wire_type.name, message.latching);
         let data = Data {
@@ -178,8 +170,7 @@ impl Inputs {
 fn satisfies(made: &RequestedInput, wanted: &RequestedInput) -> bool {
     let enough = match (&made.qos, &wanted.qos) {
         (Some(made), Some(wanted)) => {
-            (made.transient_local || !wanted.transient_local)
-                && (!made.best_effort || wanted.best_effort)
+            (made.transient_local || !wanted.transient_local) && (!made.best_effort || wanted.best_effort)
         }
         (None, _) => true,
         (Some(_), None) => false,
@@ -187,11 +178,7 @@ fn satisfies(made: &RequestedInput, wanted: &RequestedInput) -> bool {
     made.md5 == wanted.md5 && enough
 }
 
-async fn read_input(
-    mirror: std::sync::Weak<Mirror>,
-    wanted: RequestedInput,
-    feed: Arc<AtomicBool>,
-) {
+async fn read_input(mirror: std::sync::Weak<Mirror>, wanted: RequestedInput, feed: Arc<AtomicBool>) {
     let Some(bus) = mirror.upgrade().map(|mirror| mirror.bus.clone()) else {
         return;
     };
@@ -325,23 +312,18 @@ impl TopicChannels {
             } else {
                 of.definition.clone()
             };
-            mirror
-                .session()
-                .send_control(&FromRobot::Open(InputChannel {
-                    channel,
-                    topic: topic.to_owned(),
-                    type_name: of.name.clone(),
-                    md5: of.digest.to_string(),
-                    definition,
-                    latching,
-                    qos: None,
-                }));
+            mirror.session().send_control(&FromRobot::Open(InputChannel {
+                channel,
+                topic: topic.to_owned(),
+                type_name: of.name.clone(),
+                md5: of.digest.to_string(),
+                definition,
+                latching,
+                qos: None,
+            }));
             let schema = codec::Schema::for_type(&of.name, of.digest.as_str());
             mirror.session().open_channel(channel, topic, schema);
-            OpenChannel {
-                number: channel,
-                publishers: BTreeSet::new(),
-            }
+            OpenChannel { number: channel, publishers: BTreeSet::new() }
         });
         if !known.publishers.contains(publisher) {
             known.publishers.insert(publisher.clone());

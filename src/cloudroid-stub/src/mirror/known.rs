@@ -76,9 +76,7 @@ impl KnownInterface {
                 // Several nodes of one program may answer the same input.
                 Some(pair) => {
                     let outputs = found.outputs.into_iter();
-                    let new: Vec<_> = outputs
-                        .filter(|name| !pair.outputs.contains(name))
-                        .collect();
+                    let new: Vec<_> = outputs.filter(|name| !pair.outputs.contains(name)).collect();
                     pair.outputs.extend(new);
                 }
                 None => pairs.push(found),
@@ -95,8 +93,7 @@ impl KnownInterface {
 
 /// Returns whether the name is a private one of the node (`~/get_parameters`).
 fn is_private_name(name: &str, node: &str) -> bool {
-    name.strip_prefix(node)
-        .is_some_and(|rest| rest.starts_with('/'))
+    name.strip_prefix(node).is_some_and(|rest| rest.starts_with('/'))
 }
 
 #[cfg(test)]
@@ -115,10 +112,7 @@ mod tests {
                 feed: true,
                 ..RequestedInput::default()
             };
-            let output = |topic| OutputChannel {
-                topic,
-                ..OutputChannel::default()
-            };
+            let output = |topic| OutputChannel { topic, ..OutputChannel::default() };
             let service = |name: String| ServiceChannel {
                 name: format!("{name}/get_type_description"),
                 ..ServiceChannel::default()
@@ -138,21 +132,9 @@ mod tests {
             known.add_graph(&graph(nodes, lies), "/see", settled, of);
             let topics: Vec<_> = known.outputs.keys().cloned().collect();
             assert_eq!(topics, known.inputs.keys().cloned().collect::<Vec<_>>());
-            (
-                topics.join(" "),
-                known
-                    .of_others
-                    .keys()
-                    .cloned()
-                    .collect::<Vec<_>>()
-                    .join(" "),
-            )
+            (topics.join(" "), known.of_others.keys().cloned().collect::<Vec<_>>().join(" "))
         };
-        let found = note(
-            &["/see", "/see/eye", "/tf_1"],
-            &["/see/eye/scan", "/tf", "/tf_1/x"],
-            true,
-        );
+        let found = note(&["/see", "/see/eye", "/tf_1"], &["/see/eye/scan", "/tf", "/tf_1/x"], true);
         let others = "/tf_1/x /tf_1/x/get_type_description".to_owned();
         assert_eq!(found, ("/see/eye/scan /tf /tf_1/x".to_owned(), others));
         // Nothing is removed before all nodes had time to register again; lazy names stay.

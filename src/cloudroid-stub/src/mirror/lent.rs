@@ -60,13 +60,7 @@ impl LentServices {
         });
     }
 
-    fn report(
-        &self,
-        mirror: &Mirror,
-        session: &Arc<RobotSession>,
-        service: String,
-        provider: Option<ServiceProvider>,
-    ) {
+    fn report(&self, mirror: &Mirror, session: &Arc<RobotSession>, service: String, provider: Option<ServiceProvider>) {
         let mut services = self.services.lock();
         // Another session has begun, and with it another numbering.
         if !Arc::ptr_eq(session, &mirror.session()) {
@@ -79,11 +73,8 @@ impl LentServices {
             let channel = same.map(|known| known.channel);
             let channel = channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed));
             let served = ServiceChannel::new(channel, &service, &provider.service_type);
-            let known = LentEntry {
-                channel: served.channel,
-                node: provider.node,
-                digest: provider.service_type.digest,
-            };
+            let known =
+                LentEntry { channel: served.channel, node: provider.node, digest: provider.service_type.digest };
             services.insert(service.clone(), known);
             served
         });
@@ -95,13 +86,7 @@ impl LentServices {
 
     /// Makes a call on behalf of the cloud; until it is answered, the request counts against the cloud's budget.
     pub fn call(&self, mirror: &Mirror, call: ReceivedCall) {
-        let ReceivedCall {
-            id,
-            service: channel,
-            request,
-            held,
-            taken: arrived,
-        } = call;
+        let ReceivedCall { id, service: channel, request, held, taken: arrived } = call;
         let session = mirror.session();
         let known = {
             let services = self.services.lock();
@@ -123,9 +108,7 @@ impl LentServices {
             let limit = local::call_limit_for(&name, mirror.call_limit);
             let called = mirror.bus.call_typed(&name, &digest, request, limit).await;
             if called.as_ref().is_err_and(is_provider_failure) {
-                mirror
-                    .lent
-                    .withdraw(&mirror, |service| service.channel == channel);
+                mirror.lent.withdraw(&mirror, |service| service.channel == channel);
             }
             let called = called.map_err(local::describe_failure);
             // Answered on the session that the call came from: in another one its id means another call.
@@ -141,10 +124,7 @@ impl LentServices {
         services.retain(|name, service| {
             let gone = gone(service);
             if gone {
-                mirror.session().send_control(&FromRobot::Lent {
-                    service: name.clone(),
-                    of: None,
-                });
+                mirror.session().send_control(&FromRobot::Lent { service: name.clone(), of: None });
             }
             !gone
         });
@@ -152,13 +132,8 @@ impl LentServices {
 
     fn withdraw_missing(&self, mirror: &Mirror, graph: &Graph) {
         let services = self.services.lock();
-        let elsewhere =
-            |(name, service): &(&String, &LentEntry)| !seen::serves(graph, &service.node, name);
-        let gone: Vec<u32> = services
-            .iter()
-            .filter(elsewhere)
-            .map(|(_, service)| service.channel)
-            .collect();
+        let elsewhere = |(name, service): &(&String, &LentEntry)| !seen::serves(graph, &service.node, name);
+        let gone: Vec<u32> = services.iter().filter(elsewhere).map(|(_, service)| service.channel).collect();
         drop(services);
         if !gone.is_empty() {
             self.withdraw(mirror, |service| gone.contains(&service.channel));
@@ -168,21 +143,14 @@ impl LentServices {
 
 impl Mirror {
     /// Returns an error for a service of the servant itself, which must not be lent back to it.
-    fn check_lendable(
-        &self,
-        service: &str,
-        provider: ServiceProvider,
-    ) -> Result<ServiceProvider, NotLendable> {
+    fn check_lendable(&self, service: &str, provider: ServiceProvider) -> Result<ServiceProvider, NotLendable> {
         let own = provider.node == self.bus.node();
         if own || provider.label.as_ref() == Some(&self.label) {
             return Err(NotLendable::OwnServant(service.to_owned()));
         }
         // Stubs of an earlier version send no label.
         if self.siblings.read().contains(&provider.node) {
-            return Err(NotLendable::OtherStub {
-                service: service.to_owned(),
-                stub: provider.node,
-            });
+            return Err(NotLendable::OtherStub { service: service.to_owned(), stub: provider.node });
         }
         Ok(provider)
     }
@@ -237,11 +205,7 @@ mod tests {
 
     #[test]
     fn a_service_is_taken_back_when_its_node_does_not_answer_any_more() {
-        let failed = |fate| BusError::CallFailed {
-            service: "/map".to_owned(),
-            reason: "no".to_owned(),
-            fate,
-        };
+        let failed = |fate| BusError::CallFailed { service: "/map".to_owned(), reason: "no".to_owned(), fate };
         for (error, taken_back) in [
             (failed(CallFate::Answered), false),
             (failed(CallFate::NotTaken), true),

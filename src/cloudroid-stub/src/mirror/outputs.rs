@@ -42,10 +42,8 @@ impl Outputs {
                 publisher: topic.cloud.clone(),
                 latching: data.latching,
             };
-            let phases = mirror
-                .session()
-                .clock()
-                .and_then(|clock| reports::output_phases(&data, arrived, clock.offset));
+            let phases =
+                mirror.session().clock().and_then(|clock| reports::output_phases(&data, arrived, clock.offset));
             heard = keeper.on_cloud_output(&topic.name, &message, phases);
         }
         topic.on_message(Responder::Cloud, data.message, data.latching, heard);
@@ -121,28 +119,17 @@ impl Outputs {
         *self.channels.lock() = channels;
     }
 
-    async fn advertise(
-        &self,
-        mirror: &Arc<Mirror>,
-        output: &OutputChannel,
-    ) -> Option<Arc<OutputTopic>> {
+    async fn advertise(&self, mirror: &Arc<Mirror>, output: &OutputChannel) -> Option<Arc<OutputTopic>> {
         let of = mirror.wire_type(&output.type_name, &output.md5);
         match OutputTopic::advertise(&*mirror.bus, output, of).await {
             Ok(topic) => {
                 let topic = Arc::new(topic);
                 let counted = Arc::downgrade(&topic);
-                mirror
-                    .drops
-                    .watch_with(&output.topic, Cause::Slow, move || {
-                        let topic = counted.upgrade();
-                        (
-                            topic.as_ref().map_or(0, |it| it.dropped_count()),
-                            topic.is_none(),
-                        )
-                    });
-                self.topics
-                    .lock()
-                    .insert(output.topic.clone(), topic.clone());
+                mirror.drops.watch_with(&output.topic, Cause::Slow, move || {
+                    let topic = counted.upgrade();
+                    (topic.as_ref().map_or(0, |it| it.dropped_count()), topic.is_none())
+                });
+                self.topics.lock().insert(output.topic.clone(), topic.clone());
                 Some(topic)
             }
             Err(error) => {
@@ -157,9 +144,7 @@ impl Outputs {
 fn watch_listeners(mirror: &Arc<Mirror>, topic: &Arc<OutputTopic>) {
     let (mirror, of) = (Arc::downgrade(mirror), Arc::downgrade(topic));
     let mut subscribers = topic.publisher().matched_subscribers();
-    let refused = mirror
-        .upgrade()
-        .map(|mirror| mirror.refusals.register_end(&topic.name));
+    let refused = mirror.upgrade().map(|mirror| mirror.refusals.register_end(&topic.name));
     // The task must not hold the topic itself, which is removed when only this task would still hold it.
     let news = Arc::clone(&topic.news);
     let task = tokio::spawn(async move {
@@ -184,15 +169,11 @@ fn watch_listeners(mirror: &Arc<Mirror>, topic: &Arc<OutputTopic>) {
                         keeper.set_wanted(&topic.name, count > 0);
                     }
                     if count == 0 {
-                        topic.on_no_subscribers(
-                            mirror.keeper().is_some_and(|keeper| keeper.is_local_fed()),
-                        );
+                        topic.on_no_subscribers(mirror.keeper().is_some_and(|keeper| keeper.is_local_fed()));
                     }
                     let channel = *topic.channel.lock();
                     if channel != NOWHERE {
-                        mirror
-                            .session()
-                            .send_control(&FromRobot::Listeners { channel, count });
+                        mirror.session().send_control(&FromRobot::Listeners { channel, count });
                     }
                 }
                 if topic.advertise_pending(&*mirror.bus).await {

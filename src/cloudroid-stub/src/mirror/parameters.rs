@@ -40,9 +40,7 @@ pub async fn start_sync(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                         && parameters::make_transferable(key.trim_end_matches('/'), &mut value)
                     {
                         let changes = vec![(key, value)];
-                        mirror
-                            .session()
-                            .send_control(&FromRobot::Parameters(changes));
+                        mirror.session().send_control(&FromRobot::Parameters(changes));
                     }
                 }
             });

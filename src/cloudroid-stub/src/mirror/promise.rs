@@ -8,8 +8,8 @@ use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
-    Correlation, Failure, HandOver, LocalPolicy, Mode, QosEvent, QosSla, RequestId, RequestOutcome,
-    Responder, SafeStop, TopicPair, WarmStart,
+    Correlation, Failure, HandOver, LocalPolicy, Mode, QosEvent, QosSla, RequestId, RequestOutcome, Responder,
+    SafeStop, TopicPair, WarmStart,
 };
 use ros::bus::{Bus, SerializedMessage};
 use serde_json::json;
@@ -21,9 +21,7 @@ use super::requests::RequestPattern;
 use super::safe_stop::{self, SafeStopPublisher};
 use super::state::Mirror;
 use crate::config::{self, Config, OUTPUT_MEASURES};
-use crate::local::{
-    Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer,
-};
+use crate::local::{Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer};
 
 /// Returns the SLA that a configuration states. If it promises nothing, the local original runs while the link is down;
 /// if it excludes a local original as well, returns `None`.
@@ -46,9 +44,7 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
         [measure] if config.desire.or(config.max).is_none() => {
             sla.insert("measure".into(), measure.clone());
         }
-        [_] => bail!(
-            "desire and max are about response times; remove them, or what is set of an output"
-        ),
+        [_] => bail!("desire and max are about response times; remove them, or what is set of an output"),
         _ => {
             let keys = OUTPUT_MEASURES.each_ref().map(|measure| measure.key);
             bail!("{} are both given; remove one", keys.join(" and "))
@@ -56,26 +52,16 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
     }
     // JSON has no infinity.
     let cap = config.cap.filter(|cap| cap.is_finite());
-    for (name, value) in [
-        ("threshold", config.threshold),
-        ("initial", config.initial),
-        ("cap", cap),
-    ] {
+    for (name, value) in [("threshold", config.threshold), ("initial", config.initial), ("cap", cap)] {
         if let Some(value) = value {
             sla.insert(name.into(), value.into());
         }
     }
     if config.has_promise() {
-        let unreached = config
-            .fallback_after
-            .max(config.promise_timeout().unwrap_or(0.0));
+        let unreached = config.fallback_after.max(config.promise_timeout().unwrap_or(0.0));
         sla.insert("unreached".into(), unreached.into());
     }
-    let mode = if config.stateful {
-        Mode::Stateful
-    } else {
-        Mode::Stateless
-    };
+    let mode = if config.stateful { Mode::Stateful } else { Mode::Stateless };
     let local = match config.local {
         config::LocalMode::Cold => LocalPolicy::Cold,
         config::LocalMode::Warm => LocalPolicy::Warm,
@@ -87,11 +73,7 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
     };
     sla.insert("mode".into(), json!(mode));
     sla.insert("local".into(), json!(local));
-    if let Some(request) = config
-        .request
-        .as_deref()
-        .filter(|request| *request != "auto")
-    {
+    if let Some(request) = config.request.as_deref().filter(|request| *request != "auto") {
         sla.insert("answers".into(), json!([request]));
     }
     if let Some(requests) = &config.requests {
@@ -100,9 +82,7 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
             sla.insert("answers".into(), json!(answers));
         }
         let times = meaning.times.into_iter();
-        let times = times
-            .map(|(name, (desire, max))| (name, json!({"t_desire": desire, "t_max": max})))
-            .collect();
+        let times = times.map(|(name, (desire, max))| (name, json!({"t_desire": desire, "t_max": max}))).collect();
         sla.insert("requests".into(), serde_json::Value::Object(times));
     }
     let mut sla = QosSla::parse(serde_json::Value::Object(sla))?;
@@ -112,11 +92,9 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
     sla.safe_stop = config.safe_stop.as_ref().map(|stop| match stop {
         config::SafeStopConfig::Message(stop) => stop.clone(),
         // Its type becomes known when the node advertises it.
-        config::SafeStopConfig::Output(topic) => SafeStop {
-            topic: topic.clone(),
-            type_name: String::new(),
-            message: serde_json::Map::new(),
-        },
+        config::SafeStopConfig::Output(topic) => {
+            SafeStop { topic: topic.clone(), type_name: String::new(), message: serde_json::Map::new() }
+        }
     });
     Ok(Some(sla))
 }
@@ -135,8 +113,7 @@ impl Mirror {
         watcher: &Arc<dyn Bus>,
     ) -> anyhow::Result<()> {
         // If nothing is promised, an original that is not installed is not reported before it is needed.
-        let useless =
-            sla.local == LocalPolicy::None || (sla.is_link_based() && setting.program.is_none());
+        let useless = sla.local == LocalPolicy::None || (sla.is_link_based() && setting.program.is_none());
         let original = if useless {
             None
         } else {
@@ -152,9 +129,7 @@ impl Mirror {
         let sla_stop = sla.safe_stop.clone();
         let keeper = Keeper::start(sla, Vec::new(), original, way.clone(), way);
         let stop = match sla_stop {
-            Some(stop) if !stop.type_name.is_empty() => {
-                Some(SafeStopPublisher::new(&stop, watcher).await?)
-            }
+            Some(stop) if !stop.type_name.is_empty() => Some(SafeStopPublisher::new(&stop, watcher).await?),
             _ => None,
         };
         let _ = self.promise.set(Promise {
@@ -166,10 +141,7 @@ impl Mirror {
             stop,
         });
         let mirror = Arc::downgrade(self);
-        tokio::spawn(super::stand_in::run_stand_in(
-            mirror.clone(),
-            Arc::downgrade(&keeper),
-        ));
+        tokio::spawn(super::stand_in::run_stand_in(mirror.clone(), Arc::downgrade(&keeper)));
         tokio::spawn(watch_link(mirror.clone(), keeper));
         tokio::spawn(reports::report_loop(mirror, diagnostics));
         Ok(())
@@ -193,11 +165,7 @@ impl Mirror {
             let types = known.inputs.values().chain(known.outputs.values());
             promise.keeper.learn_types(types);
             let mut pairs = known.pairs(&promise.requests);
-            if settled
-                && pairs.is_empty()
-                && !promise.requests.is_empty()
-                && known.told.insert(String::new())
-            {
+            if settled && pairs.is_empty() && !promise.requests.is_empty() && known.told.insert(String::new()) {
                 tracing::warn!(
                     "this node has none of the request topics that the push found, so response times are not measured; \
                         name them with request = \"/INPUT -> /OUTPUT\" in stub.toml"
@@ -219,11 +187,7 @@ impl Mirror {
                 asked: known.asked.clone(),
                 awaited: known.inputs.keys().filter(answered).cloned().collect(),
                 outputs: known.outputs.keys().cloned().collect(),
-                services: graph
-                    .services
-                    .iter()
-                    .map(|service| service.name.clone())
-                    .collect(),
+                services: graph.services.iter().map(|service| service.name.clone()).collect(),
                 of_others: known.of_others.keys().cloned().collect(),
             };
             (pairs, interface)
@@ -293,9 +257,7 @@ impl Cloud for MirrorAdapter {
 
     fn call(&self, request: RequestId, service: &str, bytes: Bytes) {
         if let Some(mirror) = self.0.upgrade() {
-            mirror
-                .calls
-                .call_for_keeper(&mirror, request, service, bytes);
+            mirror.calls.call_for_keeper(&mirror, request, service, bytes);
         }
     }
 
@@ -327,19 +289,12 @@ impl Application for MirrorAdapter {
         let Some(mirror) = self.0.upgrade() else {
             return;
         };
-        let ready = mirror
-            .promise
-            .get()
-            .and_then(|promise| promise.stop.as_ref());
+        let ready = mirror.promise.get().and_then(|promise| promise.stop.as_ref());
         if let Some(ready) = ready {
             tracing::warn!("no answer in time: safe stop on {}", stop.topic);
             return ready.publish();
         }
-        match mirror
-            .outputs
-            .wire_type(&stop.topic)
-            .map(|of| safe_stop::zero_message(&of))
-        {
+        match mirror.outputs.wire_type(&stop.topic).map(|of| safe_stop::zero_message(&of)) {
             Some(Ok(bytes)) => {
                 tracing::warn!("no answer in time: safe stop on {}", stop.topic);
                 mirror.outputs.publish(&stop.topic, bytes);
@@ -350,12 +305,7 @@ impl Application for MirrorAdapter {
     }
 
     fn on_outcome(&self, outcome: &RequestOutcome) {
-        if let Some(promise) = self
-            .0
-            .upgrade()
-            .as_ref()
-            .and_then(|mirror| mirror.promise.get())
-        {
+        if let Some(promise) = self.0.upgrade().as_ref().and_then(|mirror| mirror.promise.get()) {
             promise.reports.record_outcome(outcome);
         }
     }
@@ -397,9 +347,7 @@ impl Application for MirrorAdapter {
             }
             QosEvent::Crashed(reason) => tracing::warn!("the local original ended: {reason}"),
             QosEvent::Uncorrelated(input) => {
-                tracing::warn!(
-                    "no output carries the stamps of {input}: the next output counts as the answer"
-                );
+                tracing::warn!("no output carries the stamps of {input}: the next output counts as the answer");
             }
         }
     }
@@ -421,20 +369,13 @@ mod tests {
         let nothing = parse_sla("").unwrap().unwrap();
         let after = std::time::Duration::from_secs(3);
         assert_eq!(nothing.measure, Measure::Link { after });
-        let own = parse_sla("fallback_after = 0.5\nlocal = 'warm'")
-            .unwrap()
-            .unwrap();
+        let own = parse_sla("fallback_after = 0.5\nlocal = 'warm'").unwrap().unwrap();
         let after = std::time::Duration::from_millis(500);
-        assert_eq!(
-            (own.measure, own.local),
-            (Measure::Link { after }, LocalPolicy::Warm)
-        );
+        assert_eq!((own.measure, own.local), (Measure::Link { after }, LocalPolicy::Warm));
         let sign = parse_sla("desire = 0.1\nmax = 0.3\nlocal = 'first-sign'").unwrap();
         let sign = sign.map(|sla| (sla.local, sla.warm));
         assert_eq!(sign, Some((LocalPolicy::Warm, WarmStart::FirstSign)));
-        let times = parse_sla("desire = 0.1\nmax = 0.3\nstateful = true")
-            .unwrap()
-            .unwrap();
+        let times = parse_sla("desire = 0.1\nmax = 0.3\nstateful = true").unwrap().unwrap();
         assert_eq!((times.measure, times.mode), (Measure::Rrt, Mode::Stateful));
         let frames = parse_sla("frames_per_second = 4.0").unwrap().unwrap();
         assert_eq!(frames.t_max.as_millis(), 250);
@@ -475,10 +416,7 @@ mod tests {
         let shown: Vec<String> = answers.iter().map(ToString::to_string).collect();
         assert_eq!(shown, ["/a -> /b", "/c -> /d"]);
         let max = |name: &str| sla.times(name).t_max.as_millis();
-        assert_eq!(
-            (max("/a"), max("/c"), max("/s"), max("/else")),
-            (300, 2000, 4000, 300)
-        );
+        assert_eq!((max("/a"), max("/c"), max("/s"), max("/else")), (300, 2000, 4000, 300));
         let swapped = own("requests = [{ request = '/s', desire = 4, max = 3 }]").unwrap_err();
         let swapped = format!("{swapped:#}");
         assert!(swapped.contains("requests./s.t_max"), "{swapped}");

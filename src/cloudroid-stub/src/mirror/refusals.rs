@@ -98,10 +98,7 @@ mod tests {
 
     fn refusing(node: &str) -> MatchedPeers {
         MatchedPeers {
-            refused: vec![IncompatiblePeer {
-                peer: PeerId::new(node, 1),
-                why: "reliability".to_owned(),
-            }],
+            refused: vec![IncompatiblePeer { peer: PeerId::new(node, 1), why: "reliability".to_owned() }],
             ..MatchedPeers::default()
         }
     }
@@ -114,13 +111,8 @@ mod tests {
         for end in [&seen, &scan, &again] {
             end.update(&refusing("/viewer"));
         }
-        let told = |refusals: &Refusals| -> Vec<String> {
-            refusals
-                .current()
-                .into_iter()
-                .map(|one| one.topic)
-                .collect()
-        };
+        let told =
+            |refusals: &Refusals| -> Vec<String> { refusals.current().into_iter().map(|one| one.topic).collect() };
         assert_eq!(told(&refusals), ["/scan", "/seen"]);
         scan.update(&MatchedPeers::default());
         drop(seen);

@@ -33,16 +33,13 @@ impl Reports {
     pub fn record_outcome(&self, outcome: &RequestOutcome) {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
         let (RequestChannel::Call(name) | RequestChannel::Topic(name)) = &outcome.channel;
-        let answer = outcome
-            .answer
-            .map(|(side, after)| (side, milliseconds(after)));
+        let answer = outcome.answer.map(|(side, after)| (side, milliseconds(after)));
         let id = outcome.request.0;
         let stamp = outcome.stamp.map(|stamp| (stamp.secs, stamp.nsecs));
         let cloud = outcome.cloud.map(milliseconds);
         let (q, phases) = (outcome.q, outcome.phases);
         tracing::debug!(target: "requests", id, %name, ?stamp, ?answer, ?cloud, q, ?phases);
-        let part =
-            |of: fn(&Phases) -> Duration| phases.as_ref().map_or(0.0, |all| milliseconds(of(all)));
+        let part = |of: fn(&Phases) -> Duration| phases.as_ref().map_or(0.0, |all| milliseconds(of(all)));
         let request = RequestTiming {
             id,
             name: name.to_string(),
@@ -75,12 +72,7 @@ impl Reports {
 
     /// Records a hand-over in which the continuing side did not receive some of the messages.
     pub fn record_hand_over(&self, over: &HandOver) {
-        self.push_decision(Decision {
-            kind: "state-lost".to_owned(),
-            warning: true,
-            text: over.to_string(),
-            ago: 0.0,
-        });
+        self.push_decision(Decision { kind: "state-lost".to_owned(), warning: true, text: over.to_string(), ago: 0.0 });
     }
 
     fn push_decision(&self, decision: Decision) {
@@ -94,10 +86,7 @@ impl Reports {
     /// Returns the decisions that were not reported yet.
     fn take_decisions(&self) -> Vec<Decision> {
         let decisions = std::mem::take(&mut *self.decisions.lock());
-        let told = |(at, decision): (Instant, Decision)| Decision {
-            ago: at.elapsed().as_secs_f64(),
-            ..decision
-        };
+        let told = |(at, decision): (Instant, Decision)| Decision { ago: at.elapsed().as_secs_f64(), ..decision };
         decisions.into_iter().map(told).collect()
     }
 }
@@ -105,44 +94,25 @@ impl Reports {
 /// Returns the decision if it is relevant for the cloud; starts and stops of the process are internal to the robot.
 fn to_decision(event: &QosEvent) -> Option<Decision> {
     let (kind, warning, text) = match event {
-        QosEvent::Feed(DecisionReason::LinkDown) => (
-            "local-takes-over",
-            true,
-            "the local original takes over: the link is down".to_owned(),
-        ),
-        QosEvent::StopFeeding(DecisionReason::LinkUp) => (
-            "local-hands-back",
-            false,
-            "the local original hands back: the link is up again".to_owned(),
-        ),
-        QosEvent::Feed(DecisionReason::Satisfaction { q }) => (
-            "local-answers-too",
-            true,
-            format!("the local original answers, too: Q has fallen to {q:.1}"),
-        ),
-        QosEvent::StopFeeding(DecisionReason::Satisfaction { q }) => (
-            "cloud-answers-alone",
-            false,
-            format!("the cloud answers alone again: Q has risen to {q:.1}"),
-        ),
-        QosEvent::SaidOnceMissing => (
-            "local-missing",
-            true,
-            "there is no local original: only the cloud answers".to_owned(),
-        ),
-        QosEvent::Crashed(reason) => (
-            "local-crashed",
-            true,
-            format!("the local original ended: {reason}"),
-        ),
+        QosEvent::Feed(DecisionReason::LinkDown) => {
+            ("local-takes-over", true, "the local original takes over: the link is down".to_owned())
+        }
+        QosEvent::StopFeeding(DecisionReason::LinkUp) => {
+            ("local-hands-back", false, "the local original hands back: the link is up again".to_owned())
+        }
+        QosEvent::Feed(DecisionReason::Satisfaction { q }) => {
+            ("local-answers-too", true, format!("the local original answers, too: Q has fallen to {q:.1}"))
+        }
+        QosEvent::StopFeeding(DecisionReason::Satisfaction { q }) => {
+            ("cloud-answers-alone", false, format!("the cloud answers alone again: Q has risen to {q:.1}"))
+        }
+        QosEvent::SaidOnceMissing => {
+            ("local-missing", true, "there is no local original: only the cloud answers".to_owned())
+        }
+        QosEvent::Crashed(reason) => ("local-crashed", true, format!("the local original ended: {reason}")),
         _ => return None,
     };
-    Some(Decision {
-        kind: kind.to_owned(),
-        warning,
-        text,
-        ago: 0.0,
-    })
+    Some(Decision { kind: kind.to_owned(), warning, text, ago: 0.0 })
 }
 
 /// Reports until the node ends.
@@ -171,10 +141,7 @@ pub async fn report_loop(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
             }
             if told.1 != dropped {
                 told.1 = dropped;
-                session.send_control(&FromRobot::Unsent {
-                    replaced: dropped.replaced,
-                    stale: dropped.stale,
-                });
+                session.send_control(&FromRobot::Unsent { replaced: dropped.replaced, stale: dropped.stale });
             }
             let decisions = promise.reports.take_decisions();
             if !decisions.is_empty() {
@@ -196,8 +163,7 @@ pub fn output_phases(data: &Data, arrived: i64, offset: i64) -> Option<Phases> {
     let input = data.answered?;
     let encoding = |microseconds: u32| Duration::from_micros(microseconds.into());
     let waited = elapsed_between(input.born, input.left).saturating_sub(encoding(input.serialise));
-    let waited_there =
-        elapsed_between(data.born, data.left).saturating_sub(encoding(data.serialise));
+    let waited_there = elapsed_between(data.born, data.left).saturating_sub(encoding(data.serialise));
     Some(Phases {
         serialise: encoding(input.serialise) + encoding(data.serialise),
         up: elapsed_between(input.left, input.taken - offset),
@@ -266,13 +232,7 @@ mod tests {
         let ms = Duration::from_millis;
         assert_eq!(
             phases,
-            Phases {
-                serialise: ms(5),
-                up: ms(20),
-                queue: ms(2 + 1 + 3),
-                compute: ms(104),
-                down: ms(5),
-            }
+            Phases { serialise: ms(5), up: ms(20), queue: ms(2 + 1 + 3), compute: ms(104), down: ms(5) }
         );
         assert_eq!(phases.total(), ms(140));
         let call = call_phases([0, offset + 2 * MS, offset + 9 * MS, 10 * MS], offset);

@@ -11,14 +11,8 @@ use ros::schema::{MessageType, Registry, SchemaError};
 
 /// The usual type, built in because robots without development packages have no definitions.
 const TWIST: [(&str, &str); 2] = [
-    (
-        "geometry_msgs/msg/Twist",
-        "Vector3 linear\nVector3 angular\n",
-    ),
-    (
-        "geometry_msgs/msg/Vector3",
-        "float64 x\nfloat64 y\nfloat64 z\n",
-    ),
+    ("geometry_msgs/msg/Twist", "Vector3 linear\nVector3 angular\n"),
+    ("geometry_msgs/msg/Vector3", "float64 x\nfloat64 y\nfloat64 z\n"),
 ];
 
 /// Publisher of the safe-stop message, advertised and serialized in advance so that subscribers are connected when it
@@ -39,13 +33,7 @@ impl SafeStopPublisher {
         ros::codec::from_json(&of, &json, &mut bytes, &Default::default())
             .with_context(|| format!("safe_stop: its message is not a {}", stop.type_name))?;
         Ok(Self {
-            publisher: bus
-                .advertise(
-                    &stop.topic,
-                    WireType::from_message(&of),
-                    QosProfile::keep_last(1),
-                )
-                .await?,
+            publisher: bus.advertise(&stop.topic, WireType::from_message(&of), QosProfile::keep_last(1)).await?,
             bytes: bytes.into(),
         })
     }
@@ -83,11 +71,7 @@ fn share_directories(version: RosVersion) -> Vec<PathBuf> {
 }
 
 /// Finds a type and all that it contains in the robot's packages.
-fn find_type(
-    version: RosVersion,
-    type_name: &str,
-    shares: &[PathBuf],
-) -> anyhow::Result<Arc<MessageType>> {
+fn find_type(version: RosVersion, type_name: &str, shares: &[PathBuf]) -> anyhow::Result<Arc<MessageType>> {
     let registry = Registry::for_version(version);
     for (key, text) in TWIST {
         registry.insert(key, text)?;
@@ -133,10 +117,7 @@ mod tests {
     fn types_are_found_with_what_they_contain() {
         let place = tempfile::tempdir().unwrap();
         for (name, text) in [
-            (
-                "a_msgs/msg/Halt.msg",
-                "b_msgs/Why why\ngeometry_msgs/Twist twist\n",
-            ),
+            ("a_msgs/msg/Halt.msg", "b_msgs/Why why\ngeometry_msgs/Twist twist\n"),
             ("b_msgs/msg/Why.msg", "uint8 code\n"),
         ] {
             let path = place.path().join(name);
@@ -153,10 +134,7 @@ mod tests {
         let of_two = |name: &str| find_type(RosVersion::Two, name, &shares).unwrap();
         assert_eq!(of_two("a_msgs/Halt").name(), "a_msgs/msg/Halt");
         let twist = of_two("geometry_msgs/msg/Twist");
-        assert_eq!(
-            twist.digest(),
-            "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
-        );
+        assert_eq!(twist.digest(), "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a");
     }
 
     #[test]
@@ -164,9 +142,6 @@ mod tests {
         let of = find_type(RosVersion::Two, "geometry_msgs/Twist", &[]).unwrap();
         let zeros = zero_message(&WireType::from_message(&of)).unwrap();
         assert_eq!(zeros.len(), 4 + 6 * 8);
-        assert_eq!(
-            (&zeros[..4], zeros[4..].iter().max()),
-            (&[0, 1, 0, 0][..], Some(&0))
-        );
+        assert_eq!((&zeros[..4], zeros[4..].iter().max()), (&[0, 1, 0, 0][..], Some(&0)));
     }
 }

@@ -32,11 +32,7 @@ pub async fn run_stand_in(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
 impl Mirror {
     /// Registers this in place of the cloud's interface; returns false once the cloud has sent its own. Nothing is
     /// unregistered: the original may have ended because the cloud was reached, and its interface follows.
-    async fn stand_in(
-        self: &Arc<Self>,
-        original: &Original,
-        registered: RegisteredInterface,
-    ) -> bool {
+    async fn stand_in(self: &Arc<Self>, original: &Original, registered: RegisteredInterface) -> bool {
         let mut applied = self.applied.lock().await;
         if applied.graph.is_some() {
             return false;
@@ -68,9 +64,7 @@ impl Mirror {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),
             services: registered.services.into_iter().map(serves).collect(),
-            nodes: (registered.nodes.iter())
-                .map(|(node, names)| (node.clone(), names.clone().into()))
-                .collect(),
+            nodes: (registered.nodes.iter()).map(|(node, names)| (node.clone(), names.clone().into())).collect(),
             ..Graph::default()
         };
         applied.nodes = registered.nodes;

@@ -18,8 +18,7 @@ use link::{MAX_FRAME, MAX_RECORD};
 use qos::{QosSla, Responder};
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
 use ros::bus::{
-    FailureReason, Graph as Seen, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType,
-    Subscription,
+    FailureReason, Graph as Seen, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
 };
 use ros::schema::Registry;
 use tokio::task::JoinHandle;
@@ -30,9 +29,7 @@ use super::diagnostics::Diagnostics;
 use super::*;
 use crate::farewell;
 use crate::local::tests::relay_setup;
-use crate::testing::{
-    SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type,
-};
+use crate::testing::{SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type};
 
 stories! {
     of_ros_1 = One:
@@ -98,9 +95,7 @@ async fn next_text(subscription: &mut Subscription) -> String {
 
 async fn wait_for_graph(node: &Arc<dyn Bus>, what: &str, wanted: impl Fn(&Seen) -> bool) {
     let mut graph = node.graph();
-    let seen = timeout(SOON, graph.wait_for(|graph| wanted(graph)))
-        .await
-        .is_ok();
+    let seen = timeout(SOON, graph.wait_for(|graph| wanted(graph))).await.is_ok();
     assert!(seen, "{what}: {:#?}", node.graph().borrow());
 }
 
@@ -158,24 +153,13 @@ impl Scene {
             run: "run".to_owned(),
             ros: self.ros.number(),
             next,
-            node: NodeLaunch {
-                name: self.name.to_owned(),
-                ..NodeLaunch::default()
-            },
+            node: NodeLaunch { name: self.name.to_owned(), ..NodeLaunch::default() },
             ..Hello::default()
         };
         send_open(&mut socket, &hello).await.unwrap();
         let mut held = Budget::without_limit().permit();
-        let welcome = receive_open(&mut socket, "welcome", &mut held)
-            .await
-            .unwrap();
-        let Welcome::Accepted {
-            received,
-            ahead,
-            next,
-            ..
-        } = welcome
-        else {
+        let welcome = receive_open(&mut socket, "welcome", &mut held).await.unwrap();
+        let Welcome::Accepted { received, ahead, next, .. } = welcome else {
             panic!("{welcome:?}");
         };
         let mirror = self.mirror.clone();
@@ -199,18 +183,11 @@ async fn who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before(ros:
     let _link = scene.connect().await;
     let newcomer = scene.servant.node("/newcomer").await;
     // One that latches, one that does not, and one that ends without unregistering.
-    for (name, latch, ends_well) in [
-        ("/map_server", true, true),
-        ("/mapper", false, true),
-        ("/crashed", true, false),
-    ] {
+    for (name, latch, ends_well) in [("/map_server", true, true), ("/mapper", false, true), ("/crashed", true, false)] {
         let publisher = scene.robot.node(name).await;
         let map = advertise(&publisher, "/map", latch).await;
         let mut count = map.matched_subscribers();
-        count
-            .wait_for(|now| now.connected_count() > 0)
-            .await
-            .unwrap();
+        count.wait_for(|now| now.connected_count() > 0).await.unwrap();
         for number in 0..20 {
             map.publish(scene.bytes(&format!("{name} {number}")));
         }
@@ -253,19 +230,13 @@ async fn the_node_is_connected_before_the_first_message_comes(ros: RosVersion) {
     assert!(timeout(SOON, connected).await.is_ok(), "nobody publishes");
     let _other = subscribe(&scene.real, "/camera").await;
     let camera = advertise(&robot, "/camera", false).await;
-    wait_for_graph(&scene.real, "the camera", |graph| {
-        is_published(graph, "/camera")
-    })
-    .await;
+    wait_for_graph(&scene.real, "the camera", |graph| is_published(graph, "/camera")).await;
     early.publish(scene.bytes("first"));
     assert_eq!(next_text(&mut heard).await, "first");
     assert_eq!(scene.mirror.inputs.counts(), (2, 0));
     // A publisher that leaves without having published leaves the cloud, too.
     drop(camera);
-    wait_for_graph(&scene.real, "no camera", |graph| {
-        !is_published(graph, "/camera")
-    })
-    .await;
+    wait_for_graph(&scene.real, "no camera", |graph| !is_published(graph, "/camera")).await;
 }
 
 async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node(ros: RosVersion) {
@@ -276,24 +247,16 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node(ros: RosVe
         type_name: string_type(ros).name,
         md5: string_type(ros).digest.to_string(),
         // In ROS 1 nothing announces it beforehand.
-        qos: (ros == RosVersion::Two)
-            .then(|| control::WireQos::from_bus(&QosProfile::keep_last(1).latching(true))),
+        qos: (ros == RosVersion::Two).then(|| control::WireQos::from_bus(&QosProfile::keep_last(1).latching(true))),
     };
     let key = (output.type_name.clone(), output.md5.clone());
     let (of, _held) = (string_type(ros), None);
-    scene
-        .mirror
-        .types
-        .lock()
-        .insert(key, KnownType { of, _held });
+    scene.mirror.types.lock().insert(key, KnownType { of, _held });
     let outputs = &scene.mirror.outputs;
     outputs.apply(&scene.mirror, &[output], false).await;
     let app = scene.robot.node("/app").await;
     let mut map = subscribe(&app, "/map").await;
-    map.matched
-        .wait_for(|now| now.connected_count() > 0)
-        .await
-        .unwrap();
+    map.matched.wait_for(|now| now.connected_count() > 0).await.unwrap();
     let cloud = Data {
         channel: 1,
         encoded: false,
@@ -304,10 +267,7 @@ async fn newcomers_are_given_the_last_word_of_who_speaks_for_the_node(ros: RosVe
         answered: None,
         message: scene.bytes("the cloud's"),
     };
-    let local = ros::bus::SerializedMessage {
-        latching: true,
-        ..string_message(ros, "the original's")
-    };
+    let local = ros::bus::SerializedMessage { latching: true, ..string_message(ros, "the original's") };
     let newcomer = async |name: &str| {
         let newcomer = scene.robot.node(name).await;
         next_text(&mut subscribe(&newcomer, "/map").await).await
@@ -349,52 +309,28 @@ async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_bac
     let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
     let sla = QosSla::parse(sla).unwrap();
     let relay = relay_setup(&scene.robot, &["patient"]);
-    let promised =
-        scene
-            .mirror
-            .start_promise(sla, relay, Vec::new(), diagnostics.unwrap(), &watcher);
+    let promised = scene.mirror.start_promise(sla, relay, Vec::new(), diagnostics.unwrap(), &watcher);
     promised.await.unwrap();
     let app = scene.robot.node("/app").await;
-    let (input, mut out) = (
-        advertise(&app, "/ns/in", false).await,
-        subscribe(&app, "/absolute/out").await,
-    );
+    let (input, mut out) = (advertise(&app, "/ns/in", false).await, subscribe(&app, "/absolute/out").await);
     let echo = "/ns/relay/echo";
-    wait_for_graph(&app, "its services", |graph| {
-        graph.services.contains_key(echo)
-    })
-    .await;
+    wait_for_graph(&app, "its services", |graph| graph.services.contains_key(echo)).await;
     let echoed = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
-    assert_eq!(
-        decode_string(ros, &echoed),
-        "hello",
-        "the original's own answer"
-    );
+    assert_eq!(decode_string(ros, &echoed), "hello", "the original's own answer");
     let mut count = input.matched_subscribers();
-    count
-        .wait_for(|now| now.connected_count() > 0)
-        .await
-        .unwrap();
-    out.matched
-        .wait_for(|now| now.connected_count() > 0)
-        .await
-        .unwrap();
+    count.wait_for(|now| now.connected_count() > 0).await.unwrap();
+    out.matched.wait_for(|now| now.connected_count() > 0).await.unwrap();
     input.publish(scene.bytes("scan"));
     assert!(next_text(&mut out).await.ends_with("scan"));
     // The cloud is reached for the first time.
     let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
-    let serving = scene
-        .real
-        .serve(echo, of, Arc::new(Says(scene.bytes("cloud"))));
+    let serving = scene.real.serve(echo, of, Arc::new(Says(scene.bytes("cloud"))));
     let _serving = serving.await.unwrap();
     let _link = scene.connect().await;
     let deadline = tokio::time::Instant::now() + SOON;
     let keeper = scene.mirror.keeper().unwrap();
     while keeper.is_local_fed() {
-        assert!(
-            tokio::time::Instant::now() < deadline,
-            "it should hand back"
-        );
+        assert!(tokio::time::Instant::now() < deadline, "it should hand back");
         tokio::task::yield_now().await;
     }
     let answer = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
@@ -418,14 +354,9 @@ async fn a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other(ro
     assert!(timeout(SOON, waiting).await.expect("an end").is_none());
     // The cloud is informed that the robot does not come back.
     let linked = link.fuse();
-    timeout(SOON, farewell::close_all(mirror, linked, &[]))
-        .await
-        .expect("an end");
+    timeout(SOON, farewell::close_all(mirror, linked, &[])).await.expect("an end");
     let lost = timeout(SOON, left).await.expect("an end").unwrap();
-    assert!(
-        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
-        "{lost}"
-    );
+    assert!(matches!(lost, DisconnectReason::Closed { code: 1000, .. }), "{lost}");
 
     let scene = Scene::new(ros, "/frozen").await;
     let (_frozen, ours) = tokio::io::duplex(1 << 16);

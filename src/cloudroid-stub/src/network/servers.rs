@@ -22,9 +22,7 @@ pub(super) async fn resolve_servers(list: &str) -> anyhow::Result<Vec<DiscoveryS
         if entry.is_empty() {
             continue;
         }
-        let at = resolve_entry(entry)
-            .await
-            .with_context(|| format!("{SERVERS} has {entry:?}"))?;
+        let at = resolve_entry(entry).await.with_context(|| format!("{SERVERS} has {entry:?}"))?;
         let Ok(place) = u8::try_from(place) else {
             bail!("{SERVERS} has more than 256 entries: name fewer servers");
         };
@@ -80,8 +78,7 @@ mod tests {
     async fn good(list: &str) -> Vec<(u8, String)> {
         let found = resolve_servers(list).await.expect("servers");
         let told = found.iter();
-        told.map(|server| (server.place, server.at.to_string()))
-            .collect()
+        told.map(|server| (server.place, server.at.to_string())).collect()
     }
 
     async fn bad(list: &str) -> String {
@@ -105,10 +102,7 @@ mod tests {
         assert_eq!(found, expected);
         assert_eq!(good("").await, []);
         assert_eq!(good(";;").await, []);
-        assert_eq!(
-            good(";0.0.0.0:11888").await,
-            [server_at(1, "127.0.0.1:11888")]
-        );
+        assert_eq!(good(";0.0.0.0:11888").await, [server_at(1, "127.0.0.1:11888")]);
         let last = format!("{}10.0.0.7", ";".repeat(255));
         assert_eq!(good(&last).await, [server_at(255, "10.0.0.7:11811")]);
     }
@@ -117,26 +111,14 @@ mod tests {
     async fn what_is_no_server_is_named() {
         for (list, entry, reason) in [
             ("10.0.0.7:0", "10.0.0.7:0", "give 1 to 65535"),
-            (
-                "10.0.0.7;10.0.0.8:70000",
-                "10.0.0.8:70000",
-                "give 1 to 65535",
-            ),
+            ("10.0.0.7;10.0.0.8:70000", "10.0.0.8:70000", "give 1 to 65535"),
             ("10.0.0.7:x", "10.0.0.7:x", "give 1 to 65535"),
             (":11811", ":11811", "no host"),
-            (
-                "TCPv4:[10.0.0.7]:42100",
-                "TCPv4:[10.0.0.7]:42100",
-                "uses TCP",
-            ),
+            ("TCPv4:[10.0.0.7]:42100", "TCPv4:[10.0.0.7]:42100", "uses TCP"),
             ("UDPv6:[::1]:11811", "UDPv6:[::1]:11811", "only IPv4"),
             ("[::1]:11811", "[::1]:11811", "only IPv4"),
             ("::1", "::1", "only IPv4"),
-            (
-                "239.255.0.1:11811",
-                "239.255.0.1:11811",
-                "a multicast address",
-            ),
+            ("239.255.0.1:11811", "239.255.0.1:11811", "a multicast address"),
             ("a..b:11811", "a..b:11811", "a..b"),
         ] {
             let told = bad(list).await;

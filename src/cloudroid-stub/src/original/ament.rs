@@ -37,12 +37,8 @@ mod tests {
     fn the_next_install_space_is_found_and_the_stub_is_not() {
         let root = tempfile::tempdir().unwrap();
         let root = root.path();
-        let (stub, other, merged, isolated) = (
-            root.join("stub"),
-            root.join("other"),
-            root.join("merged"),
-            root.join("isolated"),
-        );
+        let (stub, other, merged, isolated) =
+            (root.join("stub"), root.join("other"), root.join("merged"), root.join("isolated"));
         executable(&stub.join("lib/p/node"));
         executable(&merged.join("lib/p/node"));
         executable(&isolated.join("p/lib/p/node"));
@@ -53,11 +49,7 @@ mod tests {
         std::fs::create_dir_all(&share).unwrap();
         std::fs::write(share.join("revision.toml"), "ros = 2\n").unwrap();
         let found = |node: &str, ament: &[&std::path::Path], colcon: &[&std::path::Path]| {
-            let node = NodeArgs {
-                package: "p".into(),
-                node: node.into(),
-                share: share.clone(),
-            };
+            let node = NodeArgs { package: "p".into(), node: node.into(), share: share.clone() };
             let list = |paths: &[&std::path::Path]| {
                 let list = std::env::join_paths(paths).unwrap();
                 Some(list.into_string().unwrap())
@@ -70,22 +62,10 @@ mod tests {
                 _ => None,
             })
         };
-        assert_eq!(
-            found("node", &[&stub, &other, &merged], &[]),
-            Some(merged.join("lib/p/node"))
-        );
-        assert_eq!(
-            found("node", &[&stub], &[&isolated]),
-            Some(isolated.join("p/lib/p/node"))
-        );
-        assert_eq!(
-            found("node", &[&stub], &[&merged]),
-            Some(merged.join("lib/p/node"))
-        );
-        assert_eq!(
-            found("shared", &[&stub, &merged], &[]),
-            Some(merged.join("share/p/tools/shared"))
-        );
+        assert_eq!(found("node", &[&stub, &other, &merged], &[]), Some(merged.join("lib/p/node")));
+        assert_eq!(found("node", &[&stub], &[&isolated]), Some(isolated.join("p/lib/p/node")));
+        assert_eq!(found("node", &[&stub], &[&merged]), Some(merged.join("lib/p/node")));
+        assert_eq!(found("shared", &[&stub, &merged], &[]), Some(merged.join("share/p/tools/shared")));
         assert_eq!(found("node", &[&stub, &other], &[]), None);
         let left = std::env::join_paths([&stub, &merged]).unwrap();
         assert_eq!(without_overlay(&left, &stub), Some(merged.into_os_string()));

@@ -18,11 +18,7 @@ pub fn find(search: &OriginalSearch<'_>) -> Option<PathBuf> {
             return Some(direct);
         }
         let mut below = vec![prefix.join("share").join(&node.package)];
-        below.extend(
-            sources(prefix)
-                .into_iter()
-                .flat_map(|source| packages(&source, &node.package)),
-        );
+        below.extend(sources(prefix).into_iter().flat_map(|source| packages(&source, &node.package)));
         below.iter().find_map(|place| find_below(place, &node.node))
     });
     in_prefixes.or_else(|| {
@@ -37,12 +33,7 @@ pub fn find(search: &OriginalSearch<'_>) -> Option<PathBuf> {
 /// Returns the source spaces of a development space.
 fn sources(prefix: &Path) -> Vec<PathBuf> {
     let listed = std::fs::read_to_string(prefix.join(".catkin")).unwrap_or_default();
-    listed
-        .trim()
-        .split(';')
-        .filter(|path| !path.is_empty())
-        .map(PathBuf::from)
-        .collect()
+    listed.trim().split(';').filter(|path| !path.is_empty()).map(PathBuf::from).collect()
 }
 
 /// Returns the directories at or below `root` that contain the package.
@@ -58,11 +49,7 @@ fn packages(root: &Path, package: &str) -> Vec<PathBuf> {
             continue;
         }
         if depth < DEPTH && !directory.join("CATKIN_IGNORE").exists() {
-            open.extend(
-                children(&directory)
-                    .into_iter()
-                    .map(|child| (child, depth + 1)),
-            );
+            open.extend(children(&directory).into_iter().map(|child| (child, depth + 1)));
         }
     }
     found
@@ -89,13 +76,9 @@ mod tests {
             share: stub.join("share/a_package_of_the_test"),
         };
         let paths = format!("{}:{}", stub.display(), next.display());
-        let found = find(&node, &|name| {
-            (name == "CMAKE_PREFIX_PATH").then(|| paths.clone())
-        });
+        let found = find(&node, &|name| (name == "CMAKE_PREFIX_PATH").then(|| paths.clone()));
         assert_eq!(found, Some(next.join("lib/a_package_of_the_test/node")));
-        let alone = find(&node, &|name| {
-            (name == "CMAKE_PREFIX_PATH").then(|| stub.display().to_string())
-        });
+        let alone = find(&node, &|name| (name == "CMAKE_PREFIX_PATH").then(|| stub.display().to_string()));
         assert_eq!(alone, None);
     }
 
@@ -104,20 +87,14 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let place = root.path().join("src/meta/a_package_of_the_test");
         executable(&place.join("scripts/node.py"));
-        std::fs::write(
-            place.join("package.xml"),
-            "<package><name>a_package_of_the_test</name></package>",
-        )
-        .unwrap();
+        std::fs::write(place.join("package.xml"), "<package><name>a_package_of_the_test</name></package>").unwrap();
         let node = NodeArgs {
             package: "a_package_of_the_test".into(),
             node: "node.py".into(),
             share: root.path().join("stub/share/a_package_of_the_test"),
         };
         let paths = root.path().join("src").display().to_string();
-        let found = find(&node, &|name| {
-            (name == "ROS_PACKAGE_PATH").then(|| paths.clone())
-        });
+        let found = find(&node, &|name| (name == "ROS_PACKAGE_PATH").then(|| paths.clone()));
         assert_eq!(found, Some(place.join("scripts/node.py")));
     }
 }

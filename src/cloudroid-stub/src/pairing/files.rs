@@ -14,17 +14,11 @@ pub(super) fn write_atomically(path: &Path, text: &str) -> anyhow::Result<()> {
     let directory = path.parent().unwrap_or(Path::new("."));
     let mut making = std::fs::DirBuilder::new();
     making.recursive(true).mode(0o700);
-    making
-        .create(directory)
-        .map_err(|error| file_error(directory, error))?;
+    making.create(directory).map_err(|error| file_error(directory, error))?;
     let half = temporary_path(path);
     let _ = std::fs::remove_file(&half);
     let written = || -> std::io::Result<()> {
-        let mut file = std::fs::OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .mode(0o600)
-            .open(&half)?;
+        let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&half)?;
         file.write_all(text.as_bytes())?;
         file.sync_all()?;
         std::fs::rename(&half, path)

@@ -31,32 +31,27 @@ impl RobotKey {
                 "this user cannot read this robot's key; run the nodes as the user who paired the robot, or pair it as \
                     this user: cloudroid-stub pair 'LINE'",
             ),
-            _ => file_error(path, format!("cannot read this robot's key: {error}; pair the robot again: cloudroid-stub \
-                pair 'LINE'")),
+            _ => file_error(
+                path,
+                format!(
+                    "cannot read this robot's key: {error}; pair the robot again: cloudroid-stub \
+                pair 'LINE'"
+                ),
+            ),
         })?;
-        let mode = file
-            .metadata()
-            .map_err(|error| file_error(path, error))?
-            .permissions()
-            .mode();
+        let mode = file.metadata().map_err(|error| file_error(path, error))?.permissions().mode();
         if mode & 0o077 != 0 {
             return Err(file_error(
                 path,
-                format!(
-                    "other users can read this robot's key; restrict it with: chmod 600 {}",
-                    path.display()
-                ),
+                format!("other users can read this robot's key; restrict it with: chmod 600 {}", path.display()),
             ));
         }
         let mut text = String::new();
-        file.read_to_string(&mut text)
-            .map_err(|error| file_error(path, error))?;
+        file.read_to_string(&mut text).map_err(|error| file_error(path, error))?;
         let invalid = |error: &dyn std::fmt::Display| {
             file_error(
                 path,
-                format!(
-                    "not a valid key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"
-                ),
+                format!("not a valid key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"),
             )
         };
         let read = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes());

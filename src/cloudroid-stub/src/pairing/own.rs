@@ -43,9 +43,7 @@ struct CertificateAnswer {
 }
 
 pub fn now() -> u64 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |since| since.as_millis() as u64)
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
 impl PairedCertificate {
@@ -94,9 +92,7 @@ impl IdentityDirectory {
 
     /// Returns the path of the certificate for a server.
     fn certificate_path(&self, address: &Address) -> PathBuf {
-        self.0
-            .join("paired")
-            .join(format!("{}.toml", address.known_server_name()))
+        self.0.join("paired").join(format!("{}.toml", address.known_server_name()))
     }
 
     /// Returns the servers whose certificates are known.
@@ -129,24 +125,15 @@ impl IdentityDirectory {
             }
         };
         toml::from_str(&text).map(Some).map_err(|error| {
-            let words = format!(
-                "not a certificate file of cloudroid-stub pair ({}); pair the robot again",
-                error.message()
-            );
+            let words =
+                format!("not a certificate file of cloudroid-stub pair ({}); pair the robot again", error.message());
             file_error(&path, words)
         })
     }
 
     /// Stores a certificate, replacing the previous one atomically.
-    pub fn store_certificate(
-        &self,
-        address: &Address,
-        certificate: &PairedCertificate,
-    ) -> anyhow::Result<()> {
-        write_atomically(
-            &self.certificate_path(address),
-            &toml::to_string(certificate)?,
-        )
+    pub fn store_certificate(&self, address: &Address, certificate: &PairedCertificate) -> anyhow::Result<()> {
+        write_atomically(&self.certificate_path(address), &toml::to_string(certificate)?)
     }
 
     /// Adds the key that a server signs stubs with to the file that install.sh reads.
@@ -169,12 +156,7 @@ impl IdentityDirectory {
     /// Acquires the lock to renew the certificate for a server; `None` while another stub holds it.
     pub fn lock_renewal(&self, address: &Address) -> Option<Flock<std::fs::File>> {
         let path = self.certificate_path(address).with_extension("lock");
-        let file = std::fs::OpenOptions::new()
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .open(path)
-            .ok()?;
+        let file = std::fs::OpenOptions::new().write(true).create(true).truncate(false).open(path).ok()?;
         Flock::lock(file, FlockArg::LockExclusiveNonblock).ok()
     }
 }

@@ -45,10 +45,7 @@ pub async fn run_renewal(config: Config) {
             Ok(renewed) => {
                 told.clear();
                 if renewed {
-                    tracing::info!(
-                        "the certificate of this robot was renewed by {}",
-                        config.server
-                    );
+                    tracing::info!("the certificate of this robot was renewed by {}", config.server);
                 }
             }
             Err(error) => {
@@ -91,12 +88,7 @@ async fn renew(
         None => error.into(),
     })?;
     if answer.status != 200 {
-        bail!(
-            "{} answers {}: {}",
-            config.server,
-            answer.status,
-            answer.problem_text()
-        );
+        bail!("{} answers {}: {}", config.server, answer.status, answer.problem_text());
     }
     let new = PairedCertificate::read(&answer.body)
         .with_context(|| format!("the response of {} is not a certificate", config.server))?;

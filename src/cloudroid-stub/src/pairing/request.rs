@@ -59,10 +59,7 @@ pub fn request(key: &EcdsaKeyPair, name: &str) -> Result<String, Unspecified> {
     let of_curve = element(SEQUENCE, &[&identifier(EC_PUBLIC_KEY), &identifier(P256)]);
     let public = element(SEQUENCE, &[&of_curve, &bits(key.public_key().as_ref())]);
     let version = element(INTEGER, &[&[0]]);
-    let asked = element(
-        SEQUENCE,
-        &[&version, &subject, &public, &element(ATTRIBUTES, &[])],
-    );
+    let asked = element(SEQUENCE, &[&version, &subject, &public, &element(ATTRIBUTES, &[])]);
     let signature = key.sign(&SystemRandom::new(), &asked)?;
     let by = element(SEQUENCE, &[&identifier(ECDSA_WITH_SHA256)]);
     let signed = element(SEQUENCE, &[&asked, &by, &bits(signature.as_ref())]);
@@ -99,9 +96,7 @@ mod tests {
             // Reading verifies the signature, too.
             let read = CertificateSigningRequestParams::from_pem(&text).expect("read");
             let names: Vec<_> = read.params.distinguished_name.iter().collect();
-            let [(DnType::CommonName, rcgen::DnValue::Utf8String(found))] = names[..] else {
-                panic!("{names:?}")
-            };
+            let [(DnType::CommonName, rcgen::DnValue::Utf8String(found))] = names[..] else { panic!("{names:?}") };
             assert_eq!(*found, name);
         }
         assert!(text_is_wrapped(&pem("X", &[7; 100])));

@@ -15,10 +15,7 @@ pub struct Problem {
 impl Problem {
     /// Creates an error for this line and reason.
     pub fn new(line: usize, reason: impl Into<String>) -> Problem {
-        Problem {
-            line,
-            reason: reason.into(),
-        }
+        Problem { line, reason: reason.into() }
     }
 }
 

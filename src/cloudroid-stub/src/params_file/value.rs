@@ -5,12 +5,8 @@ use saphyr_parser::{Event, ScalarStyle, Tag};
 
 use super::events::{Problem, YamlEvents};
 
-const TRUE: [&str; 11] = [
-    "Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON",
-];
-const FALSE: [&str; 11] = [
-    "N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF",
-];
+const TRUE: [&str; 11] = ["Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"];
+const FALSE: [&str; 11] = ["N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"];
 
 /// Parses the value of an argument `-p NAME:=VALUE`.
 ///
@@ -38,22 +34,12 @@ pub fn parse_text(text: &str) -> Result<ParamValue, Problem> {
 pub const NO_VALUE: &str = "the value is missing; write an empty string as \"\"";
 
 /// Parses the value that begins with this event.
-pub fn parse_event(
-    event: Event<'_>,
-    line: usize,
-    events: &mut YamlEvents<'_>,
-) -> Result<ParamValue, Problem> {
+pub fn parse_event(event: Event<'_>, line: usize, events: &mut YamlEvents<'_>) -> Result<ParamValue, Problem> {
     match event {
         Event::Scalar(text, style, _, tag) => scalar(&text, style, tag.as_deref(), line),
         Event::SequenceStart(..) => list(events),
-        Event::Alias(_) => Err(Problem::new(
-            line,
-            "ROS 2 does not support aliases: write the value",
-        )),
-        _ => Err(Problem::new(
-            line,
-            "expected a number, a boolean, a string, or a list of these",
-        )),
+        Event::Alias(_) => Err(Problem::new(line, "ROS 2 does not support aliases: write the value")),
+        _ => Err(Problem::new(line, "expected a number, a boolean, a string, or a list of these")),
     }
 }
 
@@ -68,8 +54,7 @@ fn list(events: &mut YamlEvents<'_>) -> Result<ParamValue, Problem> {
                 return Err(Problem::new(line, "a list cannot contain lists or groups"));
             }
         };
-        let same =
-            |first: &ParamValue| std::mem::discriminant(first) == std::mem::discriminant(&item);
+        let same = |first: &ParamValue| std::mem::discriminant(first) == std::mem::discriminant(&item);
         if !items.first().is_none_or(same) {
             return Err(Problem::new(
                 line,
@@ -80,12 +65,7 @@ fn list(events: &mut YamlEvents<'_>) -> Result<ParamValue, Problem> {
     }
 }
 
-fn scalar(
-    text: &str,
-    style: ScalarStyle,
-    tag: Option<&Tag>,
-    line: usize,
-) -> Result<ParamValue, Problem> {
+fn scalar(text: &str, style: ScalarStyle, tag: Option<&Tag>, line: usize) -> Result<ParamValue, Problem> {
     let quoted = matches!(style, ScalarStyle::SingleQuoted | ScalarStyle::DoubleQuoted);
     let is_text = tag.is_some_and(|tag| tag.is_yaml_core_schema() && tag.suffix == "str");
     if quoted || is_text {
@@ -117,9 +97,7 @@ fn split_sign(text: &str) -> (bool, &str) {
 /// Parses an integer as C does (`strtol` with base 0): `0x10` is 16 and `010` is 8.
 fn parse_integer(text: &str) -> Option<i64> {
     let (negative, digits) = split_sign(text);
-    let hexadecimal = digits
-        .strip_prefix("0x")
-        .or_else(|| digits.strip_prefix("0X"));
+    let hexadecimal = digits.strip_prefix("0x").or_else(|| digits.strip_prefix("0X"));
     let (digits, base) = match (hexadecimal, digits.strip_prefix('0')) {
         (Some(digits), _) => (digits, 16),
         (None, Some(octal)) if !octal.is_empty() => (octal, 8),

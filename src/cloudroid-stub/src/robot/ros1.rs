@@ -43,11 +43,7 @@ pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Res
     original_argv.push(format!("__name:={name}"));
     Ok(LaunchedNode {
         ros: RosVersion::One,
-        place: RosLocation::Master {
-            host: place.host,
-            port: place.port,
-            own,
-        },
+        place: RosLocation::Master { host: place.host, port: place.port, own },
         node,
         argv: passed,
         original_argv,
@@ -73,46 +69,23 @@ mod tests {
     #[test]
     fn roslaunch_s_arguments_are_understood() {
         let robot = read(
-            &[
-                "3",
-                "image:=/camera/image",
-                "_threshold:=2",
-                "__name:=people",
-                "__log:=/x/y.log",
-            ],
-            &[
-                ("ROS_NAMESPACE", "/front/"),
-                ("ROS_MASTER_URI", "http://brain:1234/"),
-            ],
+            &["3", "image:=/camera/image", "_threshold:=2", "__name:=people", "__log:=/x/y.log"],
+            &[("ROS_NAMESPACE", "/front/"), ("ROS_MASTER_URI", "http://brain:1234/")],
         )
         .unwrap();
         assert_eq!(robot.node, "/front/people");
         assert_eq!(robot.argv, ["3", "image:=/camera/image", "_threshold:=2"]);
         assert_eq!(robot.original_argv[3..], ["__name:=people"]);
-        let place = RosLocation::Master {
-            host: "brain".into(),
-            port: 1234,
-            own: None,
-        };
+        let place = RosLocation::Master { host: "brain".into(), port: 1234, own: None };
         assert_eq!(robot.place, place);
-        assert_eq!(
-            robot.to_cloud_node("p", "x", Path::new("")).namespace,
-            "/front"
-        );
+        assert_eq!(robot.to_cloud_node("p", "x", Path::new("")).namespace, "/front");
     }
 
     #[test]
     fn without_any_the_usual_ones_hold() {
         let robot = read(&[], &[("ROS_IP", "10.0.0.2")]).unwrap();
-        let place = RosLocation::Master {
-            host: "localhost".into(),
-            port: 11311,
-            own: Some("10.0.0.2".into()),
-        };
-        assert_eq!(
-            (robot.node.as_str(), robot.place.clone()),
-            ("/usual", place)
-        );
+        let place = RosLocation::Master { host: "localhost".into(), port: 11311, own: Some("10.0.0.2".into()) };
+        assert_eq!((robot.node.as_str(), robot.place.clone()), ("/usual", place));
         assert_eq!(robot.to_cloud_node("p", "x", Path::new("")).namespace, "");
     }
 
@@ -123,10 +96,7 @@ mod tests {
             (vec!["__name:=ä"], vec![]),
             (vec![], vec![("ROS_MASTER_URI", "localhost:11311")]),
         ] {
-            assert!(
-                read(&argv, &environment).is_err(),
-                "{argv:?} {environment:?}"
-            );
+            assert!(read(&argv, &environment).is_err(), "{argv:?} {environment:?}");
         }
     }
 }

@@ -21,11 +21,7 @@ const LOG_CONFIG_FILE: &str = "--log-config-file";
 
 /// Implements [`LaunchedNode::read`] for ROS 2. The default name has a namespace (`/camera/detector`) if the program
 /// sets one. For a program with several nodes it is the name of the first.
-pub async fn read(
-    argv: &[String],
-    usual: DefaultName<'_>,
-    variable: Variable<'_>,
-) -> anyhow::Result<LaunchedNode> {
+pub async fn read(argv: &[String], usual: DefaultName<'_>, variable: Variable<'_>) -> anyhow::Result<LaunchedNode> {
     let parts = arguments::parse(argv)?;
     let (above, name) = usual.name.rsplit_once('/').unwrap_or(("", usual.name));
     let node = node_name(&parts, above, name)?;
@@ -81,8 +77,7 @@ fn read_sections(parts: &[CommandLinePart]) -> anyhow::Result<Sections> {
                     None => ALL.to_owned(),
                 };
                 let value = value::parse_text(&given.value);
-                let value = value
-                    .map_err(|problem| arguments::invalid_value(&part.words, &problem.reason))?;
+                let value = value.map_err(|problem| arguments::invalid_value(&part.words, &problem.reason))?;
                 sections.set(&nodes, given.name.clone(), value);
             }
             Kind::File(path) => sections.read(Path::new(path))?,
@@ -179,10 +174,7 @@ mod tests {
             "ROS_NAMESPACE" => Some("/ignored".to_owned()),
             _ => None,
         };
-        let usual = DefaultName {
-            name: usual,
-            by_program: true,
-        };
+        let usual = DefaultName { name: usual, by_program: true };
         super::read(&argv, usual, &variable).await
     }
 
@@ -194,19 +186,13 @@ mod tests {
             ("--ros-args -r __ns:=/x/y", "/x/y/usual"),
             ("--ros-args -r __ns:=/", "/usual"),
             ("--ros-args -r other:__node:=a", "/usual"),
-            (
-                "--ros-args -r usual:__node:=a -r a:__ns:=/q -r usual:__ns:=/w",
-                "/q/a",
-            ),
+            ("--ros-args -r usual:__node:=a -r a:__ns:=/q -r usual:__ns:=/w", "/q/a"),
             ("__node:=old __ns:=/way", "/way/old"),
         ] {
             assert_eq!(read(line).await.expect(line).node, node, "{line}");
         }
         let robot = read("").await.expect("a robot");
-        assert!(
-            matches!(robot.place, RosLocation::Domain { id: 7, .. }),
-            "{robot:?}"
-        );
+        assert!(matches!(robot.place, RosLocation::Domain { id: 7, .. }), "{robot:?}");
         assert!(robot.argv.is_empty() && robot.original_argv.is_empty());
     }
 
@@ -236,20 +222,11 @@ mod tests {
     async fn a_program_is_told_a_name_that_it_is_not_known_to_say() {
         for (line, argv) in [
             ("", "--ros-args -r __node:=guess -r __ns:=/ --"),
-            (
-                "--ros-args -r __ns:=/front",
-                "--ros-args -r __ns:=/front -r __node:=guess -r __ns:=/front --",
-            ),
-            (
-                "__node:=a",
-                "__node:=a --ros-args -r __node:=a -r __ns:=/ --",
-            ),
+            ("--ros-args -r __ns:=/front", "--ros-args -r __ns:=/front -r __node:=guess -r __ns:=/front --"),
+            ("__node:=a", "__node:=a --ros-args -r __node:=a -r __ns:=/ --"),
         ] {
             let words: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
-            let usual = DefaultName {
-                name: "guess",
-                by_program: false,
-            };
+            let usual = DefaultName { name: "guess", by_program: false };
             let robot = super::read(&words, usual, &|_| None).await.expect(line);
             assert_eq!(robot.argv.join(" "), argv, "{line}");
         }
@@ -260,8 +237,7 @@ mod tests {
         let line = "--ros-args -p tenor:high:=true -p rate:=1 -p alto:rate:=2 --param tenor:cloudroid.max:=0.5";
         let robot = read_with_name("alto", line).await.expect("a robot");
         // A setting of the first node, which applies to all, does not override a node's own.
-        let expected =
-            "--ros-args -p rate:=2 -p tenor:high:=true --param tenor:cloudroid.max:=0.5 --";
+        let expected = "--ros-args -p rate:=2 -p tenor:high:=true --param tenor:cloudroid.max:=0.5 --";
         assert_eq!(robot.argv.join(" "), expected);
         assert!(robot.settings().is_empty());
     }
@@ -325,43 +301,25 @@ people:
         let line = format!("--ros-args -r __node:=people --params-file {file}");
         let robot = read(&line).await.expect("a robot");
         assert_eq!(robot.parameters["rate"], ParamValue::Int(2));
-        assert!(
-            robot.argv.contains(&r#"labels:=["1", "two"]"#.to_owned()),
-            "{:?}",
-            robot.argv
-        );
+        assert!(robot.argv.contains(&r#"labels:=["1", "two"]"#.to_owned()), "{:?}", robot.argv);
     }
 
     #[tokio::test]
     async fn what_cannot_be_is_said() {
         for (line, said) in [
             ("--ros-args -r __node:=a/b", "-r __node:=a/b"),
-            (
-                "--ros-args --params-file /nowhere/p.yaml",
-                "/nowhere/p.yaml",
-            ),
+            ("--ros-args --params-file /nowhere/p.yaml", "/nowhere/p.yaml"),
             ("--ros-args -p a", "-p a"),
             ("--ros-args -p a:=", "-p a:=: the value is missing"),
             ("--ros-args -p a:={b:1}", "-p a:={b:1}"),
-            (
-                "--ros-args -p a:=[1,x]",
-                "-p a:=[1,x]: the values of a list must have one type",
-            ),
+            ("--ros-args -p a:=[1,x]", "-p a:=[1,x]: the values of a list must have one type"),
         ] {
             let error = format!("{:#}", read(line).await.expect_err(line));
             assert!(error.contains(said), "{line}: {error}");
         }
         let argv = ["--ros-args".to_owned()];
-        let usual = DefaultName {
-            name: "9",
-            by_program: false,
-        };
-        let error = super::read(&argv, usual, &|_| None)
-            .await
-            .expect_err("no name");
-        assert!(
-            error.to_string().contains("\"/9\" is not a valid"),
-            "{error}"
-        );
+        let usual = DefaultName { name: "9", by_program: false };
+        let error = super::read(&argv, usual, &|_| None).await.expect_err("no name");
+        assert!(error.to_string().contains("\"/9\" is not a valid"), "{error}");
     }
 }

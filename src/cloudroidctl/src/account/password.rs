@@ -52,9 +52,7 @@ pub fn read_password(stdin: bool) -> anyhow::Result<String> {
         .read(true)
         .write(true)
         .open("/dev/tty")
-        .context(
-            "no terminal to ask for a password; give it on standard input with --password-stdin",
-        )?;
+        .context("no terminal to ask for a password; give it on standard input with --password-stdin")?;
     let silent = EchoGuard::new(&terminal).context("cannot turn off the terminal's echo")?;
     let asks = |words: &str| -> anyhow::Result<String> {
         (&terminal).write_all(words.as_bytes())?;

@@ -27,20 +27,10 @@ impl Axis {
     /// Creates an axis that covers all positive `values` with some margin.
     pub(crate) fn from_values(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Axis {
         let positive = values.filter(|value| value.is_finite() && *value > 0.0);
-        let (least, most) = positive.fold((f64::INFINITY, 0.0f64), |(least, most), value| {
-            (least.min(value), most.max(value))
-        });
-        let (least, most) = if least <= most {
-            (least, most)
-        } else {
-            (1.0, 1.0)
-        };
-        Axis {
-            from: least / 1.3,
-            to: most * 1.3,
-            start,
-            end,
-        }
+        let (least, most) =
+            positive.fold((f64::INFINITY, 0.0f64), |(least, most), value| (least.min(value), most.max(value)));
+        let (least, most) = if least <= most { (least, most) } else { (1.0, 1.0) };
+        Axis { from: least / 1.3, to: most * 1.3, start, end }
     }
 
     /// Returns the coordinate of a value.
@@ -72,9 +62,7 @@ impl Axis {
         let step = steps.into_iter().find(|step| span / step >= 4.0);
         let step = step.unwrap_or(power);
         let (first, last) = ((self.from / step).ceil(), (self.to / step).floor());
-        (first as i64..=last as i64)
-            .map(|number| number as f64 * step)
-            .collect()
+        (first as i64..=last as i64).map(|number| number as f64 * step).collect()
     }
 }
 
@@ -100,19 +88,12 @@ pub fn draw(calibration: &Calibration) -> String {
         .iter()
         .filter_map(|point| Some((point, add_network(point.compute?, calibration.network))))
         .collect();
-    let x = Axis::from_values(
-        calibration.points.iter().map(|point| point.cpus),
-        LEFT,
-        LEFT + WIDTH,
-    );
+    let x = Axis::from_values(calibration.points.iter().map(|point| point.cpus), LEFT, LEFT + WIDTH);
     let times = measured.iter().flat_map(|(_, time)| [time.p50, time.p95]);
     let y = Axis::from_values(times, TOP + HEIGHT, TOP);
     let height = TOP + HEIGHT + BOTTOM;
     let mut out = begin_svg(height);
-    let title = format!(
-        "{}, revision {}: response time by CPU cores",
-        calibration.service, calibration.revision
-    );
+    let title = format!("{}, revision {}: response time by CPU cores", calibration.service, calibration.revision);
     push_text(&mut out, (LEFT, 20.0), "start", &title);
     draw_grid(&mut out, &x, &y);
     draw_band(&mut out, &x, &y, &measured);
@@ -129,10 +110,7 @@ pub fn draw(calibration: &Calibration) -> String {
     }
     for row in &calibration.rows {
         let p95 = row.spread.map_or(row.value, |spread| spread.p95);
-        let (cx, cy) = (
-            x.position(row.limits.cpus.unwrap_or(0.0)),
-            y.position(p95 * 1000.0),
-        );
+        let (cx, cy) = (x.position(row.limits.cpus.unwrap_or(0.0)), y.position(p95 * 1000.0));
         push_line(
             &mut out,
             format_args!(
@@ -140,32 +118,18 @@ pub fn draw(calibration: &Calibration) -> String {
                  stroke-width=\"2\"/>"
             ),
         );
-        push_text(
-            &mut out,
-            (cx + 9.0, cy - 6.0),
-            "start",
-            &row.measure.format_value(row.value),
-        );
+        push_text(&mut out, (cx + 9.0, cy - 6.0), "start", &row.measure.format_value(row.value));
     }
     let legend = "line: p95; shaded: p50 to p95; ringed: proposed entries";
     push_text(&mut out, (LEFT, 38.0), "start", legend);
-    push_text(
-        &mut out,
-        (LEFT + WIDTH / 2.0, height - 12.0),
-        "middle",
-        "cores",
-    );
+    push_text(&mut out, (LEFT + WIDTH / 2.0, height - 12.0), "middle", "cores");
     push_text(&mut out, (8.0, TOP - 8.0), "start", "ms");
     out + "</svg>\n"
 }
 
 fn add_network(compute: TimeSpread, network: Option<TimeSpread>) -> TimeSpread {
     let network = network.unwrap_or_default();
-    TimeSpread {
-        p50: compute.p50 + network.p50,
-        p95: compute.p95 + network.p95,
-        max: compute.max + network.max,
-    }
+    TimeSpread { p50: compute.p50 + network.p50, p95: compute.p95 + network.p95, max: compute.max + network.max }
 }
 
 fn draw_grid(out: &mut String, x: &Axis, y: &Axis) {
@@ -181,12 +145,7 @@ fn draw_grid(out: &mut String, x: &Axis, y: &Axis) {
     for tick in x.ticks() {
         let at = x.position(tick);
         line(out, (at, TOP), (at, TOP + HEIGHT));
-        push_text(
-            out,
-            (at, TOP + HEIGHT + 16.0),
-            "middle",
-            &format_number(tick),
-        );
+        push_text(out, (at, TOP + HEIGHT + 16.0), "middle", &format_number(tick));
     }
     for tick in y.ticks() {
         let at = y.position(tick);
@@ -198,14 +157,9 @@ fn draw_grid(out: &mut String, x: &Axis, y: &Axis) {
 /// Draws the range from the median to the 95th percentile, and the line of the latter.
 fn draw_band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)]) {
     let at = |cpus: f64, time: f64| format!("{:.1},{:.1}", x.position(cpus), y.position(time));
-    let above: Vec<String> = measured
-        .iter()
-        .map(|(point, time)| at(point.cpus, time.p95))
-        .collect();
+    let above: Vec<String> = measured.iter().map(|(point, time)| at(point.cpus, time.p95)).collect();
     let below = measured.iter().rev();
-    let below: Vec<String> = below
-        .map(|(point, time)| at(point.cpus, time.p50))
-        .collect();
+    let below: Vec<String> = below.map(|(point, time)| at(point.cpus, time.p50)).collect();
     push_line(
         out,
         format_args!(
@@ -225,14 +179,8 @@ pub(crate) fn format_number(value: f64) -> String {
 
 /// Adds a text at a position; `anchor` is a value of SVG's text-anchor.
 pub(crate) fn push_text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
-    let words = words
-        .replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;");
-    push_line(
-        out,
-        format_args!("<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{words}</text>"),
-    );
+    let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
+    push_line(out, format_args!("<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{words}</text>"));
 }
 
 /// Adds a line to the document.
@@ -251,18 +199,12 @@ mod tests {
     use super::*;
 
     fn calibration() -> Calibration {
-        let point = |cpus, p50, p95| Point {
-            cpus,
-            compute: Some(TimeSpread { p50, p95, max: p95 }),
-            ..Point::default()
-        };
+        let point =
+            |cpus, p50, p95| Point { cpus, compute: Some(TimeSpread { p50, p95, max: p95 }), ..Point::default() };
         Calibration {
             service: "<people> & dogs".into(),
             points: vec![
-                Point {
-                    cpus: 0.1,
-                    ..Point::default()
-                },
+                Point { cpus: 0.1, ..Point::default() },
                 point(0.25, 400.0, 480.0),
                 point(0.5, 200.0, 230.0),
                 point(1.0, 100.0, 110.0),
@@ -272,10 +214,7 @@ mod tests {
                 measure: Measure::Rrt,
                 value: 0.11,
                 aux: BTreeMap::new(),
-                limits: Limits {
-                    cpus: Some(1.0),
-                    ..Limits::default()
-                },
+                limits: Limits { cpus: Some(1.0), ..Limits::default() },
                 spread: None,
                 revision: None,
                 written: 0,
@@ -304,8 +243,7 @@ mod tests {
         assert_eq!((x.len(), y.len()), (4, 4), "{svg}");
         assert!(x[..3].is_sorted() && y[..3].is_sorted(), "{x:?} {y:?}");
         assert_eq!((x[2], y[2]), (x[3], y[3]));
-        let within =
-            |values: &[f64], from: f64, to: f64| values.iter().all(|at| (from..=to).contains(at));
+        let within = |values: &[f64], from: f64, to: f64| values.iter().all(|at| (from..=to).contains(at));
         assert!(within(&x, LEFT, LEFT + WIDTH), "{x:?}");
         assert!(within(&y, TOP, TOP + HEIGHT), "{y:?}");
         for label in [">0.1<", ">0.5<", ">100<", ">500<", ">110ms<"] {
@@ -315,14 +253,7 @@ mod tests {
 
     #[test]
     fn a_network_lifts_the_curve() {
-        let lifted = Calibration {
-            network: Some(TimeSpread {
-                p50: 50.0,
-                p95: 90.0,
-                max: 900.0,
-            }),
-            ..calibration()
-        };
+        let lifted = Calibration { network: Some(TimeSpread { p50: 50.0, p95: 90.0, max: 900.0 }), ..calibration() };
         let svg = draw(&lifted);
         assert!(svg.contains("p50 150.0 ms, p95 200.0 ms"), "{svg}");
     }
@@ -330,9 +261,6 @@ mod tests {
     #[test]
     fn nothing_that_was_measured_is_a_curve_too() {
         let svg = draw(&Calibration::default());
-        assert!(
-            svg.ends_with("</svg>\n") && !svg.contains("NaN") && !svg.contains("inf"),
-            "{svg}"
-        );
+        assert!(svg.ends_with("</svg>\n") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }

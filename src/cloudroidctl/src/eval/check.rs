@@ -15,16 +15,10 @@ impl EvalArgs {
     pub(super) async fn check_capacity(&self, client: &DaemonClient) -> anyhow::Result<()> {
         for (flag, cpus) in [("--robot-cpus", self.robot_cpus), ("--cpus", self.cpus)] {
             let Some(cpus) = cpus else { continue };
-            let path = format!(
-                "/api/v1/services/{}/fit?cpus={cpus}",
-                percent_encode(&self.service)
-            );
+            let path = format!("/api/v1/services/{}/fit?cpus={cpus}", percent_encode(&self.service));
             // Caps for robots do not apply here; any other error is reported by the measurement itself.
             let fit = client.get::<api::Fit>(&path).await;
-            let never = fit
-                .ok()
-                .and_then(|fit| fit.never)
-                .filter(|why| exceeds_machine(why));
+            let never = fit.ok().and_then(|fit| fit.never).filter(|why| exceeds_machine(why));
             if let Some(why) = never {
                 return Err(Problem {
                     status: 422,
@@ -90,12 +84,7 @@ impl EvalArgs {
 
 /// Returns the problem for invalid input.
 pub(super) fn invalid_input(detail: String) -> anyhow::Error {
-    Problem {
-        status: 400,
-        detail,
-        ..Problem::default()
-    }
-    .into()
+    Problem { status: 400, detail, ..Problem::default() }.into()
 }
 
 /// Returns whether a servant is never admitted because the machine is too small.
@@ -104,10 +93,7 @@ fn exceeds_machine(why: &str) -> bool {
 }
 
 /// Returns a function that adds advice to the error about an unknown service.
-fn explain_not_found(
-    name: &str,
-    is_directory: bool,
-) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
+fn explain_not_found(name: &str, is_directory: bool) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
     let next = if is_directory {
         format!(
             "{name} is a directory here, not a service: publish it first with: cloudroidctl push {name}; or name one \
@@ -120,11 +106,7 @@ fn explain_not_found(
         )
     };
     move |error| match error.downcast::<Problem>() {
-        Ok(problem) if problem.status == 404 => Problem {
-            next: Some(next),
-            ..problem
-        }
-        .into(),
+        Ok(problem) if problem.status == 404 => Problem { next: Some(next), ..problem }.into(),
         Ok(problem) => problem.into(),
         Err(error) => error,
     }
@@ -137,16 +119,9 @@ mod tests {
     #[test]
     fn an_unknown_service_is_to_be_pushed() {
         let of = |status, is_directory| {
-            let problem = Problem {
-                status,
-                next: Some("see the list".to_owned()),
-                ..Problem::default()
-            };
+            let problem = Problem { status, next: Some("see the list".to_owned()), ..Problem::default() };
             let told = explain_not_found("people", is_directory)(problem.into());
-            told.downcast::<Problem>()
-                .expect("a problem")
-                .next
-                .unwrap_or_default()
+            told.downcast::<Problem>().expect("a problem").next.unwrap_or_default()
         };
         assert!(of(404, false).contains("cloudroidctl push DIRECTORY --name people"));
         assert!(of(404, true).contains("people is a directory here"));

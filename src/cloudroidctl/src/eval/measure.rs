@@ -42,21 +42,10 @@ impl EvalArgs {
             OutputFormat::Table => output::line(words),
         };
         tell(&format!("== native: as on {robot}"))?;
-        let options = CalibrationOptions {
-            cpus: vec![robot.cpus],
-            memory: Some(robot.memory),
-            ..self.options()
-        };
-        let native = match self
-            .run_calibration(client, options, file.clone(), &tell)
-            .await
-        {
-            Ok(measured) => {
-                SideResult::from_calibration(&measured.calibration, measured.times, &robot)
-            }
-            Err(error) => {
-                SideResult::out_of_memory(&robot, out_of_memory_reason(rename_robot_flags(error))?)
-            }
+        let options = CalibrationOptions { cpus: vec![robot.cpus], memory: Some(robot.memory), ..self.options() };
+        let native = match self.run_calibration(client, options, file.clone(), &tell).await {
+            Ok(measured) => SideResult::from_calibration(&measured.calibration, measured.times, &robot),
+            Err(error) => SideResult::out_of_memory(&robot, out_of_memory_reason(rename_robot_flags(error))?),
         };
         tell("== outsourced")?;
         let options = CalibrationOptions {
@@ -103,22 +92,12 @@ impl EvalArgs {
             ))?;
         }
         // The next evaluation needs this servant's capacity.
-        let MeasuredCalibration {
-            calibration,
-            events,
-            ..
-        } = measured;
+        let MeasuredCalibration { calibration, events, .. } = measured;
         drop(events);
         if let Some(place) = &place {
             wait_until_gone(client, place).await;
         }
-        Ok(Evaluation::new(
-            &calibration,
-            self.bag.display().to_string(),
-            robot,
-            (native, outsourced),
-            self.network,
-        ))
+        Ok(Evaluation::new(&calibration, self.bag.display().to_string(), robot, (native, outsourced), self.network))
     }
 
     fn options(&self) -> CalibrationOptions {
@@ -145,19 +124,14 @@ impl EvalArgs {
             percent_encode(&self.service),
             percent_encode(&serde_json::to_string(&options)?)
         );
-        let body = Full::new(file)
-            .map_err(|never| match never {})
-            .boxed_unsync();
+        let body = Full::new(file).map_err(|never| match never {}).boxed_unsync();
         let answer = client.send(Method::POST, &path, body).await?;
         let mut events = Box::pin(client::json_lines(answer));
         let mut measured = Vec::new();
         while let Some(event) = events.next().await {
             let (calibration, servant) = match event? {
                 CalibrationEvent::Done { calibration } => (calibration, None),
-                CalibrationEvent::Kept {
-                    servant,
-                    calibration,
-                } => (calibration, Some(servant)),
+                CalibrationEvent::Kept { servant, calibration } => (calibration, Some(servant)),
                 CalibrationEvent::Error { problem } => return Err(problem.into()),
                 CalibrationEvent::Step { title } => {
                     tell(&format!("   {title}"))?;
@@ -169,12 +143,7 @@ impl EvalArgs {
                     continue;
                 }
             };
-            return Ok(MeasuredCalibration {
-                calibration: *calibration,
-                times: measured,
-                servant,
-                events,
-            });
+            return Ok(MeasuredCalibration { calibration: *calibration, times: measured, servant, events });
         }
         bail!("the daemon aborted the measurement; nothing was written")
     }
@@ -210,12 +179,7 @@ async fn wait_until_gone(client: &DaemonClient, place: &str) {
 fn rename_robot_flags(error: anyhow::Error) -> anyhow::Error {
     let named = |words: String| words.replace(" --cpus", " --robot-cpus");
     match error.downcast::<Problem>() {
-        Ok(problem) => Problem {
-            detail: named(problem.detail),
-            next: problem.next.map(named),
-            ..problem
-        }
-        .into(),
+        Ok(problem) => Problem { detail: named(problem.detail), next: problem.next.map(named), ..problem }.into(),
         Err(error) => error,
     }
 }
@@ -260,9 +224,6 @@ mod tests {
         let told = rename_robot_flags(problem.into());
         let told = told.downcast::<Problem>().expect("a problem");
         assert!(told.detail.ends_with("with --robot-cpus"), "{told}");
-        assert_eq!(
-            told.next.as_deref(),
-            Some("push it with smaller --robot-cpus")
-        );
+        assert_eq!(told.next.as_deref(), Some("push it with smaller --robot-cpus"));
     }
 }

@@ -35,10 +35,7 @@ impl FromStr for AddedNetwork {
 
     /// Parses `lan`, `wan` (the networks of docs/evaluation.md) or a number of milliseconds for both ways together.
     fn from_str(text: &str) -> anyhow::Result<AddedNetwork> {
-        let of = |each_way, mbits| AddedNetwork {
-            each_way,
-            mbits: Some(mbits),
-        };
+        let of = |each_way, mbits| AddedNetwork { each_way, mbits: Some(mbits) };
         match text {
             "lan" => return Ok(of(1.0, 100.0)),
             "wan" => return Ok(of(30.0, 20.0)),
@@ -47,14 +44,8 @@ impl FromStr for AddedNetwork {
         let Ok(both) = text.parse::<f64>() else {
             bail!("expected lan, wan, or milliseconds per request");
         };
-        ensure!(
-            (0.0..=3_600_000.0).contains(&both),
-            "expected 0 to 3600000 milliseconds"
-        );
-        Ok(AddedNetwork {
-            each_way: both / 2.0,
-            mbits: None,
-        })
+        ensure!((0.0..=3_600_000.0).contains(&both), "expected 0 to 3600000 milliseconds");
+        Ok(AddedNetwork { each_way: both / 2.0, mbits: None })
     }
 }
 
@@ -82,9 +73,7 @@ mod tests {
         let given = read("25").expect("a number");
         assert_eq!(given.one_way_millis(1 << 30) * 2.0, 25.0);
         assert_eq!(given.to_string(), "25 ms per request");
-        assert!(
-            given.has_effect() && lan.has_effect() && !read("0").expect("a number").has_effect()
-        );
+        assert!(given.has_effect() && lan.has_effect() && !read("0").expect("a number").has_effect());
         for wrong in ["wifi", "-1", "nan", ""] {
             read(wrong).expect_err(wrong);
         }

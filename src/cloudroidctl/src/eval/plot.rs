@@ -21,17 +21,13 @@ pub fn draw(of: &Evaluation) -> String {
     let x = Axis::from_values(times.copied(), LEFT, LEFT + WIDTH);
     let height = TOP + HEIGHT + BOTTOM;
     let mut out = begin_svg(height);
-    let title = format!(
-        "{}, revision {}: fraction of requests answered within a time",
-        of.service, of.revision
-    );
+    let title = format!("{}, revision {}: fraction of requests answered within a time", of.service, of.revision);
     push_text(&mut out, (LEFT, 20.0), "start", &title);
     push_text(&mut out, (LEFT, 38.0), "start", &conditions(of));
     draw_grid(&mut out, &x);
-    for (side, colour, class, legend) in [
-        (&of.native, ORANGE, "native", 60.0),
-        (&of.outsourced, BLUE, "outsourced", 78.0),
-    ] {
+    for (side, colour, class, legend) in
+        [(&of.native, ORANGE, "native", 60.0), (&of.outsourced, BLUE, "outsourced", 78.0)]
+    {
         draw_distribution(&mut out, &x, side, colour, class);
         push_line(
             &mut out,
@@ -40,12 +36,7 @@ pub fn draw(of: &Evaluation) -> String {
                 legend - 9.0
             ),
         );
-        push_text(
-            &mut out,
-            (LEFT + 15.0, legend),
-            "start",
-            &legend_text(class, side),
-        );
+        push_text(&mut out, (LEFT + 15.0, legend), "start", &legend_text(class, side));
     }
     let (middle, below) = (LEFT + WIDTH / 2.0, height - 12.0);
     push_text(&mut out, (middle, below), "middle", "response time, ms");
@@ -55,13 +46,8 @@ pub fn draw(of: &Evaluation) -> String {
 /// Returns the conditions of the measurement, for the title.
 fn conditions(of: &Evaluation) -> String {
     let bag = Path::new(&of.bag).file_name();
-    let bag: String = bag.map_or(String::new(), |name| {
-        name.to_string_lossy().chars().take(LONGEST).collect()
-    });
-    let robot = of
-        .robot
-        .map(|robot| format!("{robot}; "))
-        .unwrap_or_default();
+    let bag: String = bag.map_or(String::new(), |name| name.to_string_lossy().chars().take(LONGEST).collect());
+    let robot = of.robot.map(|robot| format!("{robot}; ")).unwrap_or_default();
     let network = match of.network.filter(|network| network.has_effect()) {
         Some(network) => format!("added network: {network}"),
         None => "no network added".to_owned(),
@@ -74,10 +60,7 @@ fn legend_text(name: &str, side: &SideResult) -> String {
     match (&side.out_of_memory, side.rrt) {
         (Some(_), _) => format!("{name}: out of memory"),
         (None, None) => format!("{name}: none of {} answered", side.requests),
-        (None, Some(rrt)) => format!(
-            "{name}, {} cores: p50 {:.1} ms, p95 {:.1} ms",
-            side.cpus, rrt.p50, rrt.p95
-        ),
+        (None, Some(rrt)) => format!("{name}, {} cores: p50 {:.1} ms, p95 {:.1} ms", side.cpus, rrt.p50, rrt.p95),
     }
 }
 
@@ -90,9 +73,7 @@ fn draw_grid(out: &mut String, x: &Axis) {
     let mut line = |x1: f64, y1: f64, x2: f64, y2: f64| {
         push_line(
             out,
-            format_args!(
-                "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"#ddd\"/>"
-            ),
+            format_args!("<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"#ddd\"/>"),
         );
     };
     let shares = [0.0, 0.25, 0.5, 0.75, 0.95, 1.0];
@@ -152,16 +133,11 @@ mod tests {
     }
 
     fn points(svg: &str, class: &str) -> Vec<(f64, f64)> {
-        let line = svg
-            .lines()
-            .find(|line| line.contains(&format!("class=\"{class}\"")))
-            .expect("a line");
+        let line = svg.lines().find(|line| line.contains(&format!("class=\"{class}\""))).expect("a line");
         let points = line.split("points=\"").nth(1).expect("points");
         let points = points.split('"').next().expect("points");
         let pairs = points.split(' ').filter_map(|pair| pair.split_once(','));
-        pairs
-            .map(|(x, y)| (x.parse().expect("x"), y.parse().expect("y")))
-            .collect()
+        pairs.map(|(x, y)| (x.parse().expect("x"), y.parse().expect("y"))).collect()
     }
 
     #[test]
@@ -172,17 +148,11 @@ mod tests {
             outsourced: side(&[40.0, 50.0], 2),
             ..Evaluation::default()
         });
-        assert!(
-            svg.contains("&lt;people&gt;") && svg.ends_with("</svg>\n"),
-            "{svg}"
-        );
+        assert!(svg.contains("&lt;people&gt;") && svg.ends_with("</svg>\n"), "{svg}");
         let (native, outsourced) = (points(&svg, "native"), points(&svg, "outsourced"));
         assert_eq!((native.len(), outsourced.len()), (6, 4));
         for line in [&native, &outsourced] {
-            assert!(
-                line.windows(2)
-                    .all(|pair| pair[0].0 <= pair[1].0 && pair[0].1 >= pair[1].1)
-            );
+            assert!(line.windows(2).all(|pair| pair[0].0 <= pair[1].0 && pair[0].1 >= pair[1].1));
         }
         assert!(outsourced[3].0 < native[0].0, "it is faster: {svg}");
         // Three of four requests, and all of them.
@@ -196,13 +166,8 @@ mod tests {
         let line = svg.lines().find(|line| line.contains(words));
         let line = line.unwrap_or_else(|| panic!("{words}: {svg}"));
         let part = |name: &str| {
-            let value = line
-                .split(name)
-                .nth(1)
-                .and_then(|rest| rest.split('"').next());
-            value
-                .and_then(|value| value.parse().ok())
-                .expect("a number")
+            let value = line.split(name).nth(1).and_then(|rest| rest.split('"').next());
+            value.and_then(|value| value.parse().ok()).expect("a number")
         };
         (part(" x=\""), part(" y=\""))
     }
@@ -218,35 +183,21 @@ mod tests {
             outsourced: side(&[193.0, 201.0], 2),
             ..Evaluation::default()
         });
-        let (native, outsourced) = (
-            text_position(&svg, ">native, "),
-            text_position(&svg, ">outsourced, "),
-        );
-        assert!(
-            native.0 == outsourced.0 && native.1 + 12.0 <= outsourced.1,
-            "{svg}"
-        );
+        let (native, outsourced) = (text_position(&svg, ">native, "), text_position(&svg, ">outsourced, "));
+        assert!(native.0 == outsourced.0 && native.1 + 12.0 <= outsourced.1, "{svg}");
         assert!(outsourced.1 < TOP, "above the panel: {svg}");
-        for words in [
-            "a robot with 0.25 cores and 1G",
-            "corridor.bag, 2 requests",
-            "1 ms each way",
-        ] {
+        for words in ["a robot with 0.25 cores and 1G", "corridor.bag, 2 requests", "1 ms each way"] {
             assert!(svg.contains(words), "{words}: {svg}");
         }
-        let ticks = svg.lines().filter(|line| {
-            line.contains("text-anchor=\"middle\"") && !line.contains("response time")
-        });
+        let ticks =
+            svg.lines().filter(|line| line.contains("text-anchor=\"middle\"") && !line.contains("response time"));
         assert!(ticks.count() >= 4, "{svg}");
     }
 
     #[test]
     fn a_side_without_answers_is_told_and_not_drawn() {
         let svg = draw(&Evaluation {
-            native: SideResult {
-                out_of_memory: Some("x".into()),
-                ..SideResult::default()
-            },
+            native: SideResult { out_of_memory: Some("x".into()), ..SideResult::default() },
             outsourced: side(&[], 3),
             ..Evaluation::default()
         });

@@ -60,18 +60,12 @@ pub struct ProbeOutcome {
 impl ProbeOutcome {
     /// Creates the outcome of requests of which none was answered.
     pub fn without_answers(requests: usize) -> ProbeOutcome {
-        ProbeOutcome {
-            times: vec![None; requests],
-            ..ProbeOutcome::default()
-        }
+        ProbeOutcome { times: vec![None; requests], ..ProbeOutcome::default() }
     }
 
     /// Creates the outcome of a probe that failed before its first request.
     pub fn from_failure(why: String) -> ProbeOutcome {
-        ProbeOutcome {
-            broken: Some(why),
-            ..ProbeOutcome::default()
-        }
+        ProbeOutcome { broken: Some(why), ..ProbeOutcome::default() }
     }
 
     /// Records a request. Until one was answered (`warm`), topics are still being connected.
@@ -114,16 +108,11 @@ impl NetworkProbe<'_> {
         let name = percent_encode(&self.calibration.service);
         let path = format!("/api/v1/services/{name}/interface");
         let Definitions { definitions } = client.get(&path).await?;
-        let registry = Registry::from_definitions(&definitions).with_context(|| {
-            format!("invalid message definition of {}", self.calibration.service)
-        })?;
-        let round =
-            ReplayRound::from_recording(self.calibration, self.recorded, self.input, self.fast);
+        let registry = Registry::from_definitions(&definitions)
+            .with_context(|| format!("invalid message definition of {}", self.calibration.service))?;
+        let round = ReplayRound::from_recording(self.calibration, self.recorded, self.input, self.fast);
         if round.items.is_empty() {
-            bail!(
-                "the recording has no messages for an input of {}",
-                self.calibration.service
-            );
+            bail!("the recording has no messages for an input of {}", self.calibration.service);
         }
         let mut line = ProbeConnection {
             inside: FoxgloveSession::attach(client, servant, DEPTH).await?,
@@ -135,10 +124,7 @@ impl NetworkProbe<'_> {
         };
         line.open(self.calibration).await?;
         let input = self.calibration.inputs.get(round.request);
-        let mut asked = ProbeOutcome {
-            asked: input.map(|input| input.topic.clone()),
-            ..ProbeOutcome::default()
-        };
+        let mut asked = ProbeOutcome { asked: input.map(|input| input.topic.clone()), ..ProbeOutcome::default() };
         // Requests that were answered before an error stay in the outcome.
         if let Err(error) = self.send_requests(&mut line, &round, &mut asked).await {
             asked.broken = Some(format!("{error:#}"));
@@ -164,9 +150,7 @@ impl NetworkProbe<'_> {
             let lap = u32::try_from(turn / round.items.len())?;
             let due = began + round.length * lap + item.at;
             // Lost time is made up for by at most one interval between requests.
-            began += now
-                .saturating_duration_since(due)
-                .saturating_sub(round.request_interval());
+            began += now.saturating_duration_since(due).saturating_sub(round.request_interval());
             line.drain_until(due).await?;
             let mut since = Instant::now();
             let given_up = since + ANSWER;
@@ -177,11 +161,7 @@ impl NetworkProbe<'_> {
             asked.request = asked.request.max(item.bytes.len());
             let stamp = line.stamp(&self.calibration.inputs[item.input].type_name, &item.bytes);
             let answer = loop {
-                let patience = if warm {
-                    ANSWER
-                } else {
-                    retry_interval(self.calibration)
-                };
+                let patience = if warm { ANSWER } else { retry_interval(self.calibration) };
                 let until = given_up.min(since + patience);
                 let answer = line.wait_for_answer(stamp, until).await?;
                 if answer.is_some() || until >= given_up {
@@ -243,9 +223,7 @@ impl ReplayRound {
         let inputs = &calibration.inputs;
         let mut round = ReplayRound {
             items: Vec::new(),
-            request: request
-                .and_then(|named| inputs.iter().position(|input| input.topic == named))
-                .unwrap_or_default(),
+            request: request.and_then(|named| inputs.iter().position(|input| input.topic == named)).unwrap_or_default(),
             length: Duration::ZERO,
         };
         let mut before = None;
@@ -261,11 +239,7 @@ impl ReplayRound {
                 round.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
                 before = Some(message.time.max(before.unwrap_or(0)));
             }
-            round.items.push(ReplayMessage {
-                input,
-                at: round.length,
-                bytes: message.bytes.clone(),
-            });
+            round.items.push(ReplayMessage { input, at: round.length, bytes: message.bytes.clone() });
         }
         if let Some(pauses) = u32::try_from(round.items.len()).ok().filter(|n| *n > 1) {
             round.length += round.length / (pauses - 1);
@@ -323,11 +297,9 @@ impl ProbeConnection<'_> {
         match timeout_at(deadline, self.inside.send(&message)).await {
             Ok(sent) => sent,
             // The message may have been sent in part.
-            Err(_) => bail!(
-                "a request of {} was not sent within {} s",
-                Size(item.bytes.len() as u64),
-                ANSWER.as_secs()
-            ),
+            Err(_) => {
+                bail!("a request of {} was not sent within {} s", Size(item.bytes.len() as u64), ANSWER.as_secs())
+            }
         }
     }
 
@@ -347,11 +319,7 @@ impl ProbeConnection<'_> {
 
     /// Waits for the answer to a request: the first output with the request's stamp, or, if either has no stamp, the
     /// next message on the topic that answered the first request.
-    async fn wait_for_answer(
-        &mut self,
-        asked: Option<Time>,
-        deadline: Instant,
-    ) -> anyhow::Result<Option<ProbeAnswer>> {
+    async fn wait_for_answer(&mut self, asked: Option<Time>, deadline: Instant) -> anyhow::Result<Option<ProbeAnswer>> {
         loop {
             let Some(heard) = self.next_message(deadline).await? else {
                 return Ok(None);
@@ -366,11 +334,7 @@ impl ProbeConnection<'_> {
                 _ => *self.answering.get_or_insert(number) == number,
             };
             if answers {
-                return Ok(Some(ProbeAnswer {
-                    at,
-                    output: number,
-                    bytes: bytes.len(),
-                }));
+                return Ok(Some(ProbeAnswer { at, output: number, bytes: bytes.len() }));
             }
         }
     }
@@ -381,16 +345,11 @@ impl ProbeConnection<'_> {
 
     /// Returns the next event before the deadline, `None` at the deadline. The inner value is a message of an output,
     /// if the event is one.
-    async fn next_message(
-        &mut self,
-        deadline: Instant,
-    ) -> anyhow::Result<Option<Option<(u32, Instant, Vec<u8>)>>> {
+    async fn next_message(&mut self, deadline: Instant) -> anyhow::Result<Option<Option<(u32, Instant, Vec<u8>)>>> {
         let Ok(message) = timeout_at(deadline, self.inside.next_timed()).await else {
             return Ok(None);
         };
-        let Some((at, message)) = message? else {
-            bail!("the servant ended during the measurement over the network")
-        };
+        let Some((at, message)) = message? else { bail!("the servant ended during the measurement over the network") };
         match inside::parse_message(&message) {
             Some(ServerMessage::MessageData(told)) => {
                 return Ok(Some(Some((told.subscription_id, at, told.data.to_vec()))));
@@ -415,8 +374,7 @@ impl ProbeConnection<'_> {
         });
         let Some(output) = output else { return Ok(()) };
         let number = u32::try_from(self.outputs.len())? + 1;
-        self.outputs
-            .insert(number, (output.name.clone(), output.type_name.clone()));
+        self.outputs.insert(number, (output.name.clone(), output.type_name.clone()));
         let wanted = Subscribe::new([Subscription::new(number, channel)]);
         self.inside.send(&wanted).await
     }
@@ -457,17 +415,13 @@ mod tests {
             asked.times
         };
         assert_eq!(noted(&[None; 3]), [None; 3]);
-        assert_eq!(
-            noted(&[None, Some(9.0), Some(2.0), None]),
-            [Some(2.0), None]
-        );
+        assert_eq!(noted(&[None, Some(9.0), Some(2.0), None]), [Some(2.0), None]);
         assert_eq!(noted(&[Some(9.0), None]), [None]);
     }
 
     #[test]
     fn the_first_request_is_made_again_soon_but_not_before_a_slow_node_can_answer() {
-        let again =
-            |compute: f64| retry_interval(&crate::eval::side::tests::calibration(1.0, compute, 20));
+        let again = |compute: f64| retry_interval(&crate::eval::side::tests::calibration(1.0, compute, 20));
         assert_eq!(again(24.0), AGAIN + Duration::from_millis(48));
         assert!(again(4000.0) > Duration::from_secs(8));
     }
@@ -489,11 +443,7 @@ mod tests {
             recorded_message("/chatter", "std_msgs/String", 61_100),
         ];
         let round = ReplayRound::from_recording(&calibration, &bag, Some("/count"), false);
-        let told: Vec<(usize, u128)> = round
-            .items
-            .iter()
-            .map(|item| (item.input, item.at.as_millis()))
-            .collect();
+        let told: Vec<(usize, u128)> = round.items.iter().map(|item| (item.input, item.at.as_millis())).collect();
         assert_eq!(told, [(0, 0), (1, 100), (0, 1100)]);
         assert_eq!((round.request, round.length.as_millis()), (1, 1650));
         assert_eq!(round.request_interval().as_millis(), 1650);

@@ -21,20 +21,14 @@ pub fn cores(text: &str) -> anyhow::Result<f64> {
     let Ok(cores) = text.parse::<f64>() else {
         bail!("not a number of cores");
     };
-    ensure!(
-        (0.01..=4096.0).contains(&cores),
-        "expected 0.01 to 4096 cores"
-    );
+    ensure!((0.01..=4096.0).contains(&cores), "expected 0.01 to 4096 cores");
     Ok(cores)
 }
 
 /// Parses an amount of memory that is large enough for a measurement.
 pub fn memory(text: &str) -> anyhow::Result<Size> {
     let memory: Size = text.parse()?;
-    ensure!(
-        memory >= Size(16 << 20),
-        "expected at least 16M, such as 512M"
-    );
+    ensure!(memory >= Size(16 << 20), "expected at least 16M, such as 512M");
     Ok(memory)
 }
 
@@ -75,11 +69,7 @@ impl RobotResources {
 
 impl fmt::Display for RobotResources {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            out,
-            "a robot with {} cores and {} of memory",
-            self.cpus, self.memory
-        )
+        write!(out, "a robot with {} cores and {} of memory", self.cpus, self.memory)
     }
 }
 

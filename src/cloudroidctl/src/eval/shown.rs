@@ -21,9 +21,7 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
         output::line(&words)?;
     }
     if let Some(network) = of.network.filter(|network| network.has_effect()) {
-        output::line(&format!(
-            "UP and DOWN are calculated, not measured: a network of {network} is added"
-        ))?;
+        output::line(&format!("UP and DOWN are calculated, not measured: a network of {network} is added"))?;
     }
     for words in describe_renamed_topics(&of.inputs) {
         output::line(&words)?;
@@ -66,9 +64,7 @@ fn sides(of: &Evaluation) -> [(&'static str, &SideResult); 2] {
 }
 
 fn response_times(of: &Evaluation) -> anyhow::Result<()> {
-    let mut table = Table::new(&[
-        "", "CPUS", "MEMORY", "USED", "ANSWERED", "P50 MS", "P95 MS", "MAX MS",
-    ]);
+    let mut table = Table::new(&["", "CPUS", "MEMORY", "USED", "ANSWERED", "P50 MS", "P95 MS", "MAX MS"]);
     for (name, side) in sides(of) {
         let time = |of: fn(&TimeSpread) -> f64| {
             let shown = side.rrt.as_ref().map(|rrt| format!("{:.1}", of(rrt)));
@@ -98,26 +94,11 @@ fn response_times(of: &Evaluation) -> anyhow::Result<()> {
 }
 
 fn phases(of: &Evaluation) -> anyhow::Result<()> {
-    let mut table = Table::new(&[
-        "",
-        "UP MS",
-        "TRANSPORT MS",
-        "DOWN MS",
-        "COMPUTE MS",
-        "RUNNING MS",
-        "THROTTLED MS",
-    ]);
+    let mut table = Table::new(&["", "UP MS", "TRANSPORT MS", "DOWN MS", "COMPUTE MS", "RUNNING MS", "THROTTLED MS"]);
     for (name, side) in sides(of) {
         let cells = side.phases.map(|phases| {
-            [
-                phases.up,
-                phases.transport,
-                phases.down,
-                Some(phases.compute),
-                Some(phases.running),
-                Some(phases.held_up),
-            ]
-            .map(|time| time.map_or("-".to_owned(), |time| format!("{time:.1}")))
+            [phases.up, phases.transport, phases.down, Some(phases.compute), Some(phases.running), Some(phases.held_up)]
+                .map(|time| time.map_or("-".to_owned(), |time| format!("{time:.1}")))
         });
         let cells = cells.unwrap_or_else(|| std::array::from_fn(|_| "-".to_owned()));
         table.row(std::iter::once(name.to_owned()).chain(cells));

@@ -79,11 +79,7 @@ pub struct Phases {
 
 impl SideResult {
     /// Returns the result of a measurement with the robot's resources. Its requests cross no network.
-    pub fn from_calibration(
-        calibration: &Calibration,
-        times: Vec<f64>,
-        robot: &RobotResources,
-    ) -> SideResult {
+    pub fn from_calibration(calibration: &Calibration, times: Vec<f64>, robot: &RobotResources) -> SideResult {
         let point = only_point(calibration);
         SideResult {
             cpus: point.cpus,
@@ -116,26 +112,17 @@ impl SideResult {
     }
 
     /// Returns the result as seen over the network, plus the delays of `network`.
-    pub fn from_probe(
-        calibration: &Calibration,
-        asked: &ProbeOutcome,
-        network: Option<AddedNetwork>,
-    ) -> SideResult {
+    pub fn from_probe(calibration: &Calibration, asked: &ProbeOutcome, network: Option<AddedNetwork>) -> SideResult {
         let point = only_point(calibration);
         let (up, down) = network.map_or((0.0, 0.0), |network| {
-            (
-                network.one_way_millis(asked.request),
-                network.one_way_millis(asked.answer),
-            )
+            (network.one_way_millis(asked.request), network.one_way_millis(asked.answer))
         });
         let heard: Vec<f64> = asked.times.iter().flatten().copied().collect();
         let seen = TimeSpread::from_samples(heard.clone());
         let times: Vec<f64> = heard.iter().map(|time| time + up + down).collect();
         let phases = point.compute.map(|compute| Phases {
             up: seen.and(Some(up)),
-            transport: seen
-                .map(|seen| seen.p50 - compute.p50)
-                .filter(|over| *over > 0.0),
+            transport: seen.map(|seen| seen.p50 - compute.p50).filter(|over| *over > 0.0),
             down: seen.and(Some(down)),
             compute: compute.p50,
             running: point.running,
@@ -189,11 +176,7 @@ pub(super) mod tests {
 
     /// Returns a calibration of twenty requests with this response time at the node, in milliseconds.
     pub(in crate::eval) fn calibration(cpus: f64, compute: f64, answered: usize) -> Calibration {
-        let spread = TimeSpread {
-            p50: compute,
-            p95: compute,
-            max: compute,
-        };
+        let spread = TimeSpread { p50: compute, p95: compute, max: compute };
         Calibration {
             service: "people".into(),
             points: vec![Point {
@@ -210,11 +193,7 @@ pub(super) mod tests {
                 measure: Measure::Rrt,
                 value: 0.001,
                 aux: BTreeMap::new(),
-                limits: Limits {
-                    cpus: Some(cpus),
-                    memory: Some(Size(64 << 20)),
-                    ..Limits::default()
-                },
+                limits: Limits { cpus: Some(cpus), memory: Some(Size(64 << 20)), ..Limits::default() },
                 spread: None,
                 revision: None,
                 written: 0,
@@ -224,29 +203,18 @@ pub(super) mod tests {
     }
 
     pub(in crate::eval) fn probe_outcome(time: f64) -> ProbeOutcome {
-        ProbeOutcome {
-            times: vec![Some(time); 20],
-            request: 125_000,
-            ..ProbeOutcome::default()
-        }
+        ProbeOutcome { times: vec![Some(time); 20], request: 125_000, ..ProbeOutcome::default() }
     }
 
     #[test]
     fn a_network_is_added_to_what_was_measured_and_told_apart_from_it() {
-        let side = SideResult::from_probe(
-            &calibration(1.0, 40.0, 20),
-            &probe_outcome(45.0),
-            "lan".parse().ok(),
-        );
+        let side = SideResult::from_probe(&calibration(1.0, 40.0, 20), &probe_outcome(45.0), "lan".parse().ok());
         // 1 ms plus 10 ms for a megabit up; 1 ms down.
         let phases = side.phases.expect("phases");
         let is = |part: Option<f64>, time: f64| part.is_some_and(|part| (part - time).abs() < 1e-9);
         assert!(is(phases.up, 11.0) && is(phases.down, 1.0), "{phases:?}");
         assert!(is(phases.transport, 5.0), "{phases:?}");
-        assert_eq!(
-            (phases.compute, phases.running, phases.held_up),
-            (40.0, 40.0, 7.0)
-        );
+        assert_eq!((phases.compute, phases.running, phases.held_up), (40.0, 40.0, 7.0));
         assert!((side.rrt.expect("times").p50 - 57.0).abs() < 1e-9);
         assert_eq!(side.times.len(), 20);
     }
@@ -259,13 +227,9 @@ pub(super) mod tests {
         let told = serde_json::to_value(phases).expect("plain data");
         assert!(told["transport"].is_null(), "{told}");
         // Native requests cross no network.
-        let native =
-            SideResult::from_calibration(&calibration(0.25, 40.0, 20), vec![40.0; 20], &robot());
+        let native = SideResult::from_calibration(&calibration(0.25, 40.0, 20), vec![40.0; 20], &robot());
         let phases = native.phases.expect("phases");
-        assert_eq!(
-            (phases.up, phases.transport, phases.down),
-            (None, None, None)
-        );
+        assert_eq!((phases.up, phases.transport, phases.down), (None, None, None));
     }
 
     #[test]

@@ -89,9 +89,7 @@ impl fmt::Display for NoSuggestion {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
             NoSuggestion::Aborted => "the measurement over the network was aborted",
-            NoSuggestion::TooFewAnswers => {
-                "outsourced, too few requests were answered, or not at the recording's rate"
-            }
+            NoSuggestion::TooFewAnswers => "outsourced, too few requests were answered, or not at the recording's rate",
             NoSuggestion::FasterOnRobot => "it is faster on the robot",
         })
     }
@@ -133,10 +131,7 @@ impl Evaluation {
         let (native, outsourced) = (&self.native, &self.outsourced);
         if let Some(why) = &outsourced.broken {
             let at_the_node = outsourced.phases.map_or(String::new(), |phases| {
-                format!(
-                    "; at the node a request takes {:.1} ms (p50)",
-                    phases.compute
-                )
+                format!("; at the node a request takes {:.1} ms (p50)", phases.compute)
             });
             return format!(
                 "no verdict: sending requests over the network from here failed: {why}{at_the_node}; evaluate again; \
@@ -196,10 +191,7 @@ impl Evaluation {
         if !self.outsourced.has_enough_answers() || !self.outsourced.keeps_pace(self.pace) {
             return Err(NoSuggestion::TooFewAnswers);
         }
-        if self
-            .times_as_fast
-            .is_some_and(|factor| factor <= 1.0 / WORTH)
-        {
+        if self.times_as_fast.is_some_and(|factor| factor <= 1.0 / WORTH) {
             return Err(NoSuggestion::FasterOnRobot);
         }
         let phases = self.outsourced.phases.unwrap_or_default();
@@ -256,10 +248,7 @@ impl SuggestedSla {
 
     /// Returns the lines for `stub.toml`.
     pub fn stub_toml(&self) -> Vec<String> {
-        let mut lines = vec![
-            format!("desire = {}", self.desire),
-            format!("max = {}", self.max),
-        ];
+        let mut lines = vec![format!("desire = {}", self.desire), format!("max = {}", self.max)];
         if !self.has_local {
             lines.push("local = \"none\"    # the robot has too little memory for it".to_owned());
         }
@@ -308,11 +297,7 @@ mod tests {
                 probe_outcome(50.0),
                 "on the robot none of 20 requests was answered within 10 s",
             ),
-            (
-                native(25.0),
-                ProbeOutcome::without_answers(3),
-                "outsourced, none of 3 requests was answered within 10 s",
-            ),
+            (native(25.0), ProbeOutcome::without_answers(3), "outsourced, none of 3 requests was answered within 10 s"),
         ] {
             let verdict = evaluate(native, &cloud, &asked).verdict;
             assert!(verdict.contains(words), "{words}: {verdict}");
@@ -321,16 +306,10 @@ mod tests {
 
     #[test]
     fn a_pace_that_only_one_keeps_is_told() {
-        let cloud = Calibration {
-            pace: Some(10.0),
-            ..calibration(1.0, 40.0, 20)
-        };
+        let cloud = Calibration { pace: Some(10.0), ..calibration(1.0, 40.0, 20) };
         let verdict = |native| evaluate(native, &cloud, &probe_outcome(50.0)).verdict;
         let told = verdict(native(200.0));
-        assert!(
-            told.contains("10.0 requests per second, which only the outsourced"),
-            "{told}"
-        );
+        assert!(told.contains("10.0 requests per second, which only the outsourced"), "{told}");
         let told = verdict(native(80.0));
         assert!(!told.contains("requests per second"), "{told}");
     }
@@ -338,17 +317,13 @@ mod tests {
     #[test]
     fn the_suggested_sla_is_the_outsourced_95th_percentile_as_it_was_seen_from_the_robot() {
         let cloud = calibration(1.0, 40.0, 20);
-        let sla = evaluate(native(200.0), &cloud, &probe_outcome(51.2))
-            .sla
-            .expect("an SLA");
+        let sla = evaluate(native(200.0), &cloud, &probe_outcome(51.2)).sla.expect("an SLA");
         assert_eq!((sla.desire, sla.max), (0.052, 0.11));
         assert_eq!((sla.row.value, sla.row.limits.cpus), (0.052, Some(1.0)));
         assert_eq!(sla.row.spread.map(|spread| spread.requests), Some(20));
         assert_eq!(sla.stub_toml(), ["desire = 0.052", "max = 0.11"]);
         let starved = SideResult::out_of_memory(&robot(), "x".into());
-        let sla = evaluate(starved, &cloud, &probe_outcome(51.2))
-            .sla
-            .expect("an SLA");
+        let sla = evaluate(starved, &cloud, &probe_outcome(51.2)).sla.expect("an SLA");
         assert!(sla.stub_toml()[2].starts_with("local = \"none\""));
     }
 
@@ -364,16 +339,8 @@ mod tests {
     #[test]
     fn what_failed_on_the_way_is_told_with_what_was_measured_before() {
         let cloud = calibration(1.0, 40.0, 20);
-        let found = evaluate(
-            native(200.0),
-            &cloud,
-            &ProbeOutcome::from_failure("no bytes came".into()),
-        );
-        for words in [
-            "over the network from here failed: no bytes came",
-            "40.0 ms",
-            "again",
-        ] {
+        let found = evaluate(native(200.0), &cloud, &ProbeOutcome::from_failure("no bytes came".into()));
+        for words in ["over the network from here failed: no bytes came", "40.0 ms", "again"] {
             assert!(found.verdict.contains(words), "{}", found.verdict);
         }
         assert_eq!(found.native.rrt.map(|rrt| rrt.p50), Some(200.0));
@@ -385,28 +352,11 @@ mod tests {
         let cloud = calibration(1.0, 40.0, 20);
         let network: Option<AddedNetwork> = "20".parse().ok();
         let side = SideResult::from_probe(&cloud, &probe_outcome(50.0), network);
-        let found = Evaluation::new(
-            &cloud,
-            "x.bag".into(),
-            robot(),
-            (native(200.0), side),
-            network,
-        );
+        let found = Evaluation::new(&cloud, "x.bag".into(), robot(), (native(200.0), side), network);
         let mut sla = found.sla.expect("an SLA");
         assert_eq!(sla.network_added, 20.0);
-        assert!(
-            sla.reason.contains("20.0 ms of it added for the network"),
-            "{}",
-            sla.reason
-        );
-        let row = |id, cpus| Row {
-            id,
-            limits: api::Limits {
-                cpus: Some(cpus),
-                ..sla.row.limits
-            },
-            ..sla.row.clone()
-        };
+        assert!(sla.reason.contains("20.0 ms of it added for the network"), "{}", sla.reason);
+        let row = |id, cpus| Row { id, limits: api::Limits { cpus: Some(cpus), ..sla.row.limits }, ..sla.row.clone() };
         let rows = [row(3, 1.0), row(5, 1.0), row(4, 2.0)];
         assert_eq!(sla.mark_written(&rows), [3]);
         assert!(sla.written && sla.row.id == 5);
@@ -415,32 +365,15 @@ mod tests {
     #[test]
     fn nothing_is_suggested_of_what_answers_too_little_or_too_late() {
         let cloud = calibration(1.0, 40.0, 20);
-        let few = ProbeOutcome {
-            times: vec![Some(50.0); 9],
-            ..probe_outcome(50.0)
-        };
+        let few = ProbeOutcome { times: vec![Some(50.0); 9], ..probe_outcome(50.0) };
         assert!(evaluate(native(200.0), &cloud, &few).sla.is_none());
         let mut lost = probe_outcome(50.0);
         lost.times[0] = None;
         lost.times[1] = None;
         assert!(evaluate(native(200.0), &cloud, &lost).sla.is_none());
-        let late = Calibration {
-            pace: Some(30.0),
-            ..cloud.clone()
-        };
-        assert!(
-            evaluate(native(200.0), &late, &probe_outcome(50.0))
-                .sla
-                .is_none()
-        );
-        let unproposed = Calibration {
-            rows: vec![],
-            ..cloud
-        };
-        assert!(
-            evaluate(native(200.0), &unproposed, &probe_outcome(50.0))
-                .sla
-                .is_none()
-        );
+        let late = Calibration { pace: Some(30.0), ..cloud.clone() };
+        assert!(evaluate(native(200.0), &late, &probe_outcome(50.0)).sla.is_none());
+        let unproposed = Calibration { rows: vec![], ..cloud };
+        assert!(evaluate(native(200.0), &unproposed, &probe_outcome(50.0)).sla.is_none());
     }
 }

@@ -40,15 +40,12 @@ impl Packing {
 
 /// Returns an empty body, for `--apt`.
 pub fn empty_body() -> RequestBody {
-    Full::default()
-        .map_err(|never| match never {})
-        .boxed_unsync()
+    Full::default().map_err(|never| match never {}).boxed_unsync()
 }
 
 /// Returns the archive of a directory, or an existing archive, as a body.
 pub fn request_body(path: &Path) -> anyhow::Result<(RequestBody, Packing)> {
-    let metadata =
-        std::fs::metadata(path).with_context(|| format!("cannot push {}", path.display()))?;
+    let metadata = std::fs::metadata(path).with_context(|| format!("cannot push {}", path.display()))?;
     if metadata.is_dir() && !holds_package(path, DEPTH)? {
         bail!(
             "{} contains no package.xml; push the directory of a ROS package, a workspace or an install space, or a \
@@ -60,11 +57,7 @@ pub fn request_body(path: &Path) -> anyhow::Result<(RequestBody, Packing)> {
     let (failed, failure) = sync_channel(1);
     let source = path.to_owned();
     std::thread::spawn(move || {
-        let outcome = if metadata.is_dir() {
-            pack(&source, &chunks)
-        } else {
-            copy(&source, &chunks)
-        };
+        let outcome = if metadata.is_dir() { pack(&source, &chunks) } else { copy(&source, &chunks) };
         if let Err(error) = outcome {
             let error = error.context(format!("cannot pack {}", source.display()));
             let torn = io::Error::other(error.to_string());
@@ -73,9 +66,8 @@ pub fn request_body(path: &Path) -> anyhow::Result<(RequestBody, Packing)> {
             let _ = chunks.blocking_send(Err(torn));
         }
     });
-    let frames = futures_util::stream::unfold(received, |mut received| async move {
-        Some((received.recv().await?, received))
-    });
+    let frames =
+        futures_util::stream::unfold(received, |mut received| async move { Some((received.recv().await?, received)) });
     let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
     Ok((body.boxed_unsync(), Packing { failure }))
 }
@@ -89,8 +81,7 @@ fn holds_package(directory: &Path, depth: usize) -> anyhow::Result<bool> {
     if depth == 0 {
         return Ok(false);
     }
-    let entries = std::fs::read_dir(directory)
-        .with_context(|| format!("cannot read {}", directory.display()))?;
+    let entries = std::fs::read_dir(directory).with_context(|| format!("cannot read {}", directory.display()))?;
     for entry in entries {
         let entry = entry?;
         let skipped = LEFT_OUT.iter().any(|name| entry.file_name() == *name);
@@ -144,9 +135,7 @@ fn add_directory(
         if kind.is_symlink() && is_catkins_toplevel(&path) {
             continue;
         }
-        archive
-            .append_path_with_name(&path, &inside)
-            .with_context(|| format!("{}", path.display()))?;
+        archive.append_path_with_name(&path, &inside).with_context(|| format!("{}", path.display()))?;
         if kind.is_dir() {
             add_directory(archive, root, &inside, false)?;
         }
@@ -157,8 +146,7 @@ fn add_directory(
 /// Returns whether a link is `src/CMakeLists.txt` of `catkin_init_workspace`, which points to a file of catkin outside
 /// of the workspace and contains nothing of the package.
 fn is_catkins_toplevel(link: &Path) -> bool {
-    std::fs::read_link(link)
-        .is_ok_and(|target| target.is_absolute() && target.ends_with("catkin/cmake/toplevel.cmake"))
+    std::fs::read_link(link).is_ok_and(|target| target.is_absolute() && target.ends_with("catkin/cmake/toplevel.cmake"))
 }
 
 /// Collects writes into chunks and sends them; blocks while too many are pending.
@@ -169,10 +157,7 @@ struct ChunkWriter<'a> {
 
 impl<'a> ChunkWriter<'a> {
     fn new(chunks: &'a Chunks) -> Self {
-        ChunkWriter {
-            chunks,
-            pending: Vec::with_capacity(CHUNK),
-        }
+        ChunkWriter { chunks, pending: Vec::with_capacity(CHUNK) }
     }
 }
 

@@ -29,12 +29,7 @@ impl PushProgress {
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
         });
-        PushProgress {
-            format,
-            began: Instant::now(),
-            bar,
-            said: Instant::now(),
-        }
+        PushProgress { format, began: Instant::now(), bar, said: Instant::now() }
     }
 
     /// Prints an event.
@@ -51,11 +46,7 @@ impl PushProgress {
                 self.finish();
                 for layer in layers {
                     let how = if layer.cached { "unchanged" } else { "new" };
-                    output::line(&format!(
-                        "   layer {:<14} {:>8}  {how}",
-                        layer.name,
-                        Size(layer.size).to_string()
-                    ))?;
+                    output::line(&format!("   layer {:<14} {:>8}  {how}", layer.name, Size(layer.size).to_string()))?;
                 }
                 output::line(&format!("== published in {:.1} s\n", *took as f64 / 1000.0))
             }
@@ -80,11 +71,7 @@ impl PushProgress {
 
     fn progress(&mut self, unit: &str, done: u64, total: Option<u64>) -> anyhow::Result<()> {
         let amount = |number: u64| {
-            if unit == "bytes" {
-                Size(number).to_string()
-            } else {
-                number.to_string()
-            }
+            if unit == "bytes" { Size(number).to_string() } else { number.to_string() }
         };
         let text = match total {
             Some(total) => format!("{} of {} {unit}", amount(done), amount(total)),
@@ -93,9 +80,7 @@ impl PushProgress {
         match &self.bar {
             Some(bar) => {
                 if let Some(total) = total {
-                    bar.set_style(ProgressStyle::with_template(
-                        "{spinner} [{bar:30}] {msg} {elapsed}",
-                    )?);
+                    bar.set_style(ProgressStyle::with_template("{spinner} [{bar:30}] {msg} {elapsed}")?);
                     bar.set_length(total);
                     bar.set_position(done);
                 }

@@ -29,10 +29,7 @@ const LOOK: Duration = Duration::from_secs(3600);
 const LONGEST_RETRY: Duration = Duration::from_secs(6 * 3600);
 
 /// Loads the certificate of the home with the path of its file, if it is valid now and covers all names.
-pub fn load_certificate(
-    acme: &config::AcmeConfig,
-    directory: &Path,
-) -> Option<(PathBuf, ChainAndKey)> {
+pub fn load_certificate(acme: &config::AcmeConfig, directory: &Path) -> Option<(PathBuf, ChainAndKey)> {
     let path = directory.join(CERTIFICATE);
     if !path.exists() {
         return None;
@@ -45,27 +42,22 @@ pub fn load_certificate(
         }
     };
     let certificate = pair.0.first()?;
-    let good =
-        authority::read_validity(certificate).is_ok_and(|period| store::now() < period.until);
+    let good = authority::read_validity(certificate).is_ok_and(|period| store::now() < period.until);
     (good && covers_all(certificate, &acme.names)).then_some((path, pair))
 }
 
 fn covers_all(certificate: &CertificateDer<'_>, names: &[String]) -> bool {
-    names
-        .iter()
-        .all(|name| tls::is_valid_for_host(certificate, name))
+    names.iter().all(|name| tls::is_valid_for_host(certificate, name))
 }
 
 /// Binds the address that the authority connects to, if that is not the portal's own port.
-pub async fn listen_for_challenges(
-    acme: Option<&config::AcmeConfig>,
-) -> anyhow::Result<Option<TcpListener>> {
+pub async fn listen_for_challenges(acme: Option<&config::AcmeConfig>) -> anyhow::Result<Option<TcpListener>> {
     let Some(address) = acme.and_then(|acme| acme.challenge_listen) else {
         return Ok(None);
     };
-    let listener = TcpListener::bind(address).await.with_context(|| {
-        format!("cannot listen on {address}, which is challenge_listen in [tls.acme]")
-    })?;
+    let listener = TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}, which is challenge_listen in [tls.acme]"))?;
     Ok(Some(listener))
 }
 
@@ -79,19 +71,9 @@ pub struct Renewal {
 
 impl Renewal {
     /// Creates the renewal for a daemon that listens at `listen`.
-    pub fn new(
-        app: Arc<App>,
-        acme: config::AcmeConfig,
-        home: &Home,
-        listen: SocketAddr,
-    ) -> Renewal {
+    pub fn new(app: Arc<App>, acme: config::AcmeConfig, home: &Home, listen: SocketAddr) -> Renewal {
         let looked_at = acme.challenge_listen.unwrap_or(listen);
-        Renewal {
-            app,
-            acme,
-            directory: home.path().join(DIRECTORY),
-            looked_at,
-        }
+        Renewal { app, acme, directory: home.path().join(DIRECTORY), looked_at }
     }
 
     /// Requests a certificate whenever one is due, until the daemon ends.
@@ -201,10 +183,7 @@ mod tests {
     }
 
     fn acme() -> config::AcmeConfig {
-        config::AcmeConfig {
-            names: vec![NAME.to_owned()],
-            ..config::AcmeConfig::default()
-        }
+        config::AcmeConfig { names: vec![NAME.to_owned()], ..config::AcmeConfig::default() }
     }
 
     #[test]
@@ -226,11 +205,7 @@ mod tests {
     fn it_is_renewed_when_two_thirds_of_its_time_are_over() {
         let home = tempfile::tempdir().expect("a directory");
         write_certificate(home.path(), NAME, (2000, 2003));
-        let pair = read_chain_and_key(
-            &home.path().join(CERTIFICATE),
-            &home.path().join(CERTIFICATE),
-        )
-        .expect("a pair");
+        let pair = read_chain_and_key(&home.path().join(CERTIFICATE), &home.path().join(CERTIFICATE)).expect("a pair");
         let due = renewal_time(pair.0.first().expect("a certificate")).expect("a time");
         let year = 365 * 86_400_000;
         let begin = 946_684_800_000;

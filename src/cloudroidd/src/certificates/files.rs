@@ -38,11 +38,7 @@ struct WatchedFiles {
 impl WatchedFiles {
     fn new(paths: Vec<PathBuf>) -> WatchedFiles {
         let now = versions(&paths);
-        WatchedFiles {
-            paths,
-            read: now.clone(),
-            before: now,
-        }
+        WatchedFiles { paths, read: now.clone(), before: now }
     }
 
     /// Returns when the files have changed and have then stayed the same for one interval: they are not written
@@ -73,26 +69,16 @@ pub async fn watch_certificate(app: Arc<App>, certificate: PathBuf, key: PathBuf
     loop {
         files.wait_for_change().await;
         let shown = read_chain_and_key(&certificate, &key).and_then(|(chain, key)| {
-            tls.replace_certificate(chain, key)
-                .map_err(|source| Error::Unusable {
-                    path: certificate.clone(),
-                    source,
-                })
+            tls.replace_certificate(chain, key).map_err(|source| Error::Unusable { path: certificate.clone(), source })
         });
         let about = NewEvent::default();
         match shown {
             Ok(()) => {
-                let message = format!(
-                    "the portal now uses another certificate: {}",
-                    tls.fingerprint()
-                );
+                let message = format!("the portal now uses another certificate: {}", tls.fingerprint());
                 journal.info("certificate-shown", &message, &about);
             }
             Err(error) => {
-                let message = format!(
-                    "{error}; the portal still uses the previous certificate: {}",
-                    tls.fingerprint()
-                );
+                let message = format!("{error}; the portal still uses the previous certificate: {}", tls.fingerprint());
                 journal.warning("certificate-refused", &message, &about);
             }
         }

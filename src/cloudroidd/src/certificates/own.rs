@@ -31,11 +31,7 @@ pub fn load_or_create(
 /// fingerprint.
 pub fn warn_of_missing_names(tls: &Tls, configured: &[String]) {
     let is_other = |name: &&str| !tls.is_valid_for_host(name);
-    let others: Vec<&str> = configured
-        .iter()
-        .map(String::as_str)
-        .filter(is_other)
-        .collect();
+    let others: Vec<&str> = configured.iter().map(String::as_str).filter(is_other).collect();
     if !others.is_empty() {
         tracing::warn!(
             "the daemon's certificate lacks {}, which names in [tls] has now: clients that trust its fingerprint are \
@@ -77,8 +73,5 @@ fn create(path: &Path, names: Vec<String>) -> Result<(), Error> {
         Ok(certificate.pem() + &key.serialize_pem())
     };
     let text = made().map_err(unmade)?;
-    private::write_atomically(path, text.as_bytes()).map_err(|source| Error::Unkept {
-        path: path.to_owned(),
-        source,
-    })
+    private::write_atomically(path, text.as_bytes()).map_err(|source| Error::Unkept { path: path.to_owned(), source })
 }

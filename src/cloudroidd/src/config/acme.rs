@@ -60,19 +60,10 @@ impl AcmeConfig {
             uri.scheme_str() == Some("https") || here && uri.scheme_str() == Some("http")
         });
         if !usable {
-            bail!(
-                "directory = {:?} is not the URL of an ACME directory; write https://HOST/PATH",
-                self.directory
-            );
+            bail!("directory = {:?} is not the URL of an ACME directory; write https://HOST/PATH", self.directory);
         }
-        if let Some(contact) = self
-            .contact
-            .iter()
-            .find(|contact| !contact.starts_with("mailto:"))
-        {
-            bail!(
-                "contact has {contact:?}, which is not a mail address; write \"mailto:NAME@HOST\""
-            );
+        if let Some(contact) = self.contact.iter().find(|contact| !contact.starts_with("mailto:")) {
+            bail!("contact has {contact:?}, which is not a mail address; write \"mailto:NAME@HOST\"");
         }
         if !self.accept_terms {
             bail!(
@@ -101,9 +92,7 @@ fn is_name(name: &str) -> bool {
     name.len() <= 253
         && labels.len() > 1
         && labels.iter().all(is_label)
-        && labels
-            .last()
-            .is_some_and(|last| last.parse::<u64>().is_err())
+        && labels.last().is_some_and(|last| last.parse::<u64>().is_err())
 }
 
 #[cfg(test)]
@@ -119,22 +108,13 @@ mod tests {
     fn what_no_authority_could_sign_is_refused() {
         for (text, words) in [
             ("accept_terms = true", "names is missing"),
-            (
-                "accept_terms = true\nnames = [\"*.lab.example\"]",
-                "wildcards",
-            ),
+            ("accept_terms = true\nnames = [\"*.lab.example\"]", "wildcards"),
             ("accept_terms = true\nnames = [\"192.0.2.1\"]", "192.0.2.1"),
             ("accept_terms = true\nnames = [\"robots\"]", "without a dot"),
             ("accept_terms = true\nnames = [\"a..b\"]", "a..b"),
             ("names = [\"robots.lab.example\"]", "terms of service"),
-            (
-                "accept_terms = true\nnames = [\"a.b\"]\ndirectory = \"http://ca.lab.example/\"",
-                "https://",
-            ),
-            (
-                "accept_terms = true\nnames = [\"a.b\"]\ncontact = [\"me@lab.example\"]",
-                "mailto:",
-            ),
+            ("accept_terms = true\nnames = [\"a.b\"]\ndirectory = \"http://ca.lab.example/\"", "https://"),
+            ("accept_terms = true\nnames = [\"a.b\"]\ncontact = [\"me@lab.example\"]", "mailto:"),
             ("accept_terms = true\nnames = [\"a.b\"]\nretry = 0", "retry"),
         ] {
             let refused = refusal(text);
@@ -144,8 +124,7 @@ mod tests {
 
     #[test]
     fn names_and_agreement_are_enough() {
-        let acme: AcmeConfig =
-            toml::from_str("names = [\"robots.lab.example\"]\naccept_terms = true").expect("read");
+        let acme: AcmeConfig = toml::from_str("names = [\"robots.lab.example\"]\naccept_terms = true").expect("read");
         acme.check().expect("complete");
         assert!(acme.directory.starts_with("https://"));
     }

@@ -11,12 +11,7 @@ use serde::Deserialize;
 pub struct ArchivesConfig(BTreeMap<String, Vec<String>>);
 
 /// Options that would make apt accept packages that are unsigned or signed by a weak key.
-const UNSIGNED: [&str; 4] = [
-    "trusted=",
-    "allow-insecure=",
-    "allow-weak=",
-    "allow-downgrade-to-insecure=",
-];
+const UNSIGNED: [&str; 4] = ["trusted=", "allow-insecure=", "allow-weak=", "allow-downgrade-to-insecure="];
 
 impl ArchivesConfig {
     pub fn check(&self) -> anyhow::Result<()> {
@@ -36,9 +31,7 @@ impl ArchivesConfig {
                     );
                 }
                 if let Some(option) = UNSIGNED.iter().find(|option| line.contains(*option)) {
-                    bail!(
-                        "{option} for {base} would accept unsigned packages; name the key ring with signed-by=FILE"
-                    );
+                    bail!("{option} for {base} would accept unsigned packages; name the key ring with signed-by=FILE");
                 }
             }
         }
@@ -72,22 +65,10 @@ mod tests {
     fn what_would_be_taken_without_a_signature_is_refused() {
         for (text, words) in [
             ("a = []", "omit it"),
-            (
-                "a = [\"http://mirror.example noble main\"]",
-                "signed-by=FILE",
-            ),
-            (
-                "a = [\"deb http://x noble main\\ndeb [trusted=yes] http://y noble main\"]",
-                "not a line",
-            ),
-            (
-                "a = [\"deb [arch=amd64 trusted=yes] http://mirror.example noble main\"]",
-                "trusted=",
-            ),
-            (
-                "a = [\"deb [allow-insecure=yes] http://mirror.example noble main\"]",
-                "allow-insecure=",
-            ),
+            ("a = [\"http://mirror.example noble main\"]", "signed-by=FILE"),
+            ("a = [\"deb http://x noble main\\ndeb [trusted=yes] http://y noble main\"]", "not a line"),
+            ("a = [\"deb [arch=amd64 trusted=yes] http://mirror.example noble main\"]", "trusted="),
+            ("a = [\"deb [allow-insecure=yes] http://mirror.example noble main\"]", "allow-insecure="),
         ] {
             let error = read(text).expect_err(text).to_string();
             assert!(error.contains(words), "{error}");

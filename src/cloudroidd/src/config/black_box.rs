@@ -55,14 +55,10 @@ impl BlackBoxConfig {
     /// Checks the values. `servant` is the memory limit of one servant's messages.
     pub(super) fn check(&self, servant: Size) -> anyhow::Result<()> {
         if self.seconds.0 > LONGEST {
-            bail!(
-                "seconds is more than an hour; for longer recordings use cloudroidctl record SERVANT -o FILE"
-            );
+            bail!("seconds is more than an hour; for longer recordings use cloudroidctl record SERVANT -o FILE");
         }
         if self.memory.0 == 0 || self.files == 0 || self.disk.0 == 0 {
-            bail!(
-                "memory, files or disk of 0 would record nothing; to turn recording off, write seconds = 0"
-            );
+            bail!("memory, files or disk of 0 would record nothing; to turn recording off, write seconds = 0");
         }
         if self.memory.0 > servant.0 {
             bail!(
@@ -94,14 +90,10 @@ mod tests {
     fn what_makes_no_sense_is_refused() {
         let check = |text: &str| {
             let read = toml::from_str::<BlackBoxConfig>(text).expect("well-formed");
-            read.check(Size(256 << 20))
-                .map_err(|refused| refused.to_string())
+            read.check(Size(256 << 20)).map_err(|refused| refused.to_string())
         };
         assert_eq!(check(""), Ok(()));
-        assert_eq!(
-            check("seconds = \"30s\"\ntopics = [\"/tf\", \"/camera/*\"]"),
-            Ok(())
-        );
+        assert_eq!(check("seconds = \"30s\"\ntopics = [\"/tf\", \"/camera/*\"]"), Ok(()));
         for (text, expected) in [
             ("seconds = \"2h\"", "more than an hour"),
             ("memory = 0", "record nothing"),

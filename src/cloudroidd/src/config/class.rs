@@ -31,16 +31,9 @@ impl ClassConfig {
         }
         let most = Self::PRIORITIES;
         if !(-most..=most).contains(&self.priority) {
-            bail!(
-                "priority = {} is not between -{most} and {most}",
-                self.priority
-            );
+            bail!("priority = {} is not between -{most} and {most}", self.priority);
         }
-        let caps = Limits {
-            cpus: self.max_cpus,
-            memory: self.max_memory,
-            ..Limits::default()
-        };
+        let caps = Limits { cpus: self.max_cpus, memory: self.max_memory, ..Limits::default() };
         if let Err(error) = caps.check() {
             bail!("max_{error}");
         }
@@ -50,16 +43,12 @@ impl ClassConfig {
         if let (Some(has), Some(most)) = (limits.cpus, self.max_cpus)
             && has > most
         {
-            bail!(
-                "limits: cpus = {has} is more than max_cpus = {most}; lower it, or raise max_cpus"
-            );
+            bail!("limits: cpus = {has} is more than max_cpus = {most}; lower it, or raise max_cpus");
         }
         if let (Some(has), Some(most)) = (limits.memory, self.max_memory)
             && has > most
         {
-            bail!(
-                "limits: memory = {has} is more than max_memory = {most}; lower it, or raise max_memory"
-            );
+            bail!("limits: memory = {has} is more than max_memory = {most}; lower it, or raise max_memory");
         }
         Ok(())
     }
@@ -85,19 +74,10 @@ mod tests {
         assert_eq!(urgent.sla.max_rrt, api::Span::from_millis(300));
         for (text, words) in [
             ("[class.\"a b\"]", &["[class.a b]", "is not a name"][..]),
-            (
-                "[class.a]\npriority = 2000",
-                &["[class.a]", "between -1000 and 1000"],
-            ),
+            ("[class.a]\npriority = 2000", &["[class.a]", "between -1000 and 1000"]),
             ("[class.a]\nmax_cpus = 0", &["max_cpus = 0 is not between"]),
-            (
-                "[class.a]\nmax_memory = \"1K\"",
-                &["max_memory = 1K is too little"],
-            ),
-            (
-                "[class.a]\nsla = { rrt = 2, max_rrt = 1 }",
-                &["sla", "rrt (2s) is greater than max_rrt (1s)"],
-            ),
+            ("[class.a]\nmax_memory = \"1K\"", &["max_memory = 1K is too little"]),
+            ("[class.a]\nsla = { rrt = 2, max_rrt = 1 }", &["sla", "rrt (2s) is greater than max_rrt (1s)"]),
             ("[class.a]\nlimits = { pids = 1 }", &["limits", "pids = 1"]),
             (
                 "[class.a]\nmax_cpus = 1\nlimits = { cpus = 2 }",
@@ -117,10 +97,7 @@ mod tests {
         for (text, words) in [
             ("[class.a]\nprio = 1", "prio"),
             ("[class.a]\nsla = { rtt = 1 }", "rtt"),
-            (
-                "[class.a]\nsla = { rrt = \"soon\" }",
-                "\"soon\" is not a time",
-            ),
+            ("[class.a]\nsla = { rrt = \"soon\" }", "\"soon\" is not a time"),
         ] {
             let refused = format!("{:#}", Config::parse(text).expect_err(text));
             assert!(refused.contains(words), "{refused}");

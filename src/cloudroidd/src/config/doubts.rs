@@ -25,9 +25,7 @@ impl Config {
             ));
         }
         if let Some(cpus) = self.limits.cpus.filter(|cpus| *cpus > cores) {
-            doubts.push(format!(
-                "[limits] cpus = {cpus} has no effect: this machine has {cores} cores"
-            ));
+            doubts.push(format!("[limits] cpus = {cpus} has no effect: this machine has {cores} cores"));
         }
         let promised = capacity.cpus.unwrap_or(cores) * capacity.overcommit;
         let reserve = self.servant.reserve_cpus;
@@ -47,10 +45,7 @@ mod tests {
 
     #[test]
     fn what_is_beyond_the_machine_is_named() {
-        let has = MachineResources {
-            cores: 2.0,
-            memory: 16 << 30,
-        };
+        let has = MachineResources { cores: 2.0, memory: 16 << 30 };
         let doubts = |text: &str| Config::parse(text).expect("valid").machine_warnings(has);
         for fits in [
             "",
@@ -59,14 +54,8 @@ mod tests {
             assert_eq!(doubts(fits), Vec::<String>::new(), "{fits}");
         }
         for (text, words) in [
-            (
-                "[capacity]\ncpus = 64",
-                "[capacity] cpus = 64 is more than the 2 cores",
-            ),
-            (
-                "[capacity]\nmemory = \"1T\"",
-                "is more than the 16G of this machine",
-            ),
+            ("[capacity]\ncpus = 64", "[capacity] cpus = 64 is more than the 2 cores"),
+            ("[capacity]\nmemory = \"1T\"", "is more than the 16G of this machine"),
             ("[limits]\ncpus = 99", "[limits] cpus = 99 has no effect"),
             (
                 "[capacity]\ncpus = 1\n[servant]\nreserve_cpus = 1.5",

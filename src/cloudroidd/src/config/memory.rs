@@ -53,16 +53,11 @@ impl MemoryConfig {
             ("shim", self.shim, least),
         ] {
             if size.0 < least {
-                bail!(
-                    "{name} = {size} is too little; write at least {}",
-                    Size(least)
-                );
+                bail!("{name} = {size} is too little; write at least {}", Size(least));
             }
         }
         if self.unfinished.0.is_zero() {
-            bail!(
-                "unfinished = 0 would refuse every message that arrives in parts; write a time such as \"5m\""
-            );
+            bail!("unfinished = 0 would refuse every message that arrives in parts; write a time such as \"5m\"");
         }
         if !(self.shim_cpus.is_finite() && (0.1..=64.0).contains(&self.shim_cpus)) {
             bail!("shim_cpus = {} is not between 0.1 and 64", self.shim_cpus);

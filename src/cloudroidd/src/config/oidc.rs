@@ -92,17 +92,17 @@ impl RoleGrant {
                 "the role {role} needs a list of services: write {group:?} = {{ role = \"{role}\", services = \
                     [\"lab_*\"] }}, or \"*\" for all"
             ),
-            (false, false) => bail!(
-                "the role {role} is for all services: write {group:?} = \"{role}\", or choose another role"
-            ),
+            (false, false) => {
+                bail!("the role {role} is for all services: write {group:?} = \"{role}\", or choose another role")
+            }
             _ => Ok(()),
         }
     }
 }
 
 fn read_secret(path: &Path) -> anyhow::Result<String> {
-    let file = std::fs::File::open(path)
-        .with_context(|| format!("cannot read client_secret_file {}", path.display()))?;
+    let file =
+        std::fs::File::open(path).with_context(|| format!("cannot read client_secret_file {}", path.display()))?;
     let mode = file.metadata()?.permissions().mode();
     ensure!(
         mode & 0o007 == 0,
@@ -131,11 +131,7 @@ impl OidcConfig {
     fn roles(&self) -> oidc::Roles {
         let groups = self.roles.iter().map(|(name, given)| {
             let (role, services) = given.parts();
-            oidc::RoleGroup {
-                name: name.clone(),
-                role,
-                services: services.to_vec(),
-            }
+            oidc::RoleGroup { name: name.clone(), role, services: services.to_vec() }
         });
         oidc::Roles(groups.collect())
     }
@@ -161,10 +157,7 @@ impl OidcConfig {
             "redirect = {:?} must be only the portal's address as used in browsers: \"https://HOST:PORT\"",
             self.redirect
         );
-        ensure!(
-            !self.client_id.is_empty(),
-            "client_id is empty; write the client ID of this server at the provider"
-        );
+        ensure!(!self.client_id.is_empty(), "client_id is empty; write the client ID of this server at the provider");
         ensure!(
             !self.roles.is_empty(),
             "roles is empty, so nobody could sign in; name a group: roles = {{ \"robot-admins\" = \"admin\" }}"
@@ -181,11 +174,7 @@ impl OidcConfig {
     /// Returns the provider with its secret, as the portal takes it.
     pub fn identity_provider(&self) -> anyhow::Result<IdentityProvider> {
         let mut settings = self.settings();
-        settings.client_secret = self
-            .client_secret_file
-            .as_deref()
-            .map(read_secret)
-            .transpose()?;
+        settings.client_secret = self.client_secret_file.as_deref().map(read_secret).transpose()?;
         let host = self.issuer.split("://").nth(1).unwrap_or(&self.issuer);
         let host = host.split('/').next().unwrap_or(host);
         Ok(IdentityProvider {
@@ -211,9 +200,8 @@ mod tests {
 
     #[test]
     fn groups_have_roles_and_services() {
-        let read = read(
-            "roles = { admins = \"admin\", students = { role = \"viewer\", services = [\"lab_*\", \"demo\"] } }",
-        );
+        let read =
+            read("roles = { admins = \"admin\", students = { role = \"viewer\", services = [\"lab_*\", \"demo\"] } }");
         read.check().expect("good");
         let made = read.identity_provider().expect("good");
         assert_eq!(made.name, "id.lab.example");
@@ -226,14 +214,10 @@ mod tests {
 
     #[test]
     fn with_a_provider_the_network_is_let_in_by_nobody_else() {
-        let text =
-            format!("listen = \"0.0.0.0:9090\"\n[oidc]\n{GOOD}roles = {{ admins = \"admin\" }}\n");
+        let text = format!("listen = \"0.0.0.0:9090\"\n[oidc]\n{GOOD}roles = {{ admins = \"admin\" }}\n");
         let config = super::super::Config::parse(&text).expect("well-formed");
         config.check().expect("people sign in");
-        let without = super::super::Config {
-            oidc: None,
-            ..config
-        };
+        let without = super::super::Config { oidc: None, ..config };
         without.check().expect_err("nobody is asked");
     }
 
@@ -245,10 +229,7 @@ mod tests {
             ("roles = { a = \"viewer\" }", "services = "),
             ("roles = { a = { role = \"deployer\" } }", "services = "),
             ("roles = { a = \"robot\" }", "cannot have the role robot"),
-            (
-                "roles = { a = { role = \"admin\", services = [\"x\"] } }",
-                "for all services",
-            ),
+            ("roles = { a = { role = \"admin\", services = [\"x\"] } }", "for all services"),
         ] {
             let refused = format!("{:#}", read(text).check().expect_err(text));
             assert!(refused.contains(words), "{text}: {refused}");
@@ -266,11 +247,7 @@ mod tests {
             let refused = format!("{:#}", read.check().expect_err(to));
             assert!(refused.contains(words), "{to}: {refused}");
         }
-        for text in [
-            "",
-            "roles = { a = \"king\" }",
-            "roles = { a = { role = \"admin\", x = 1 } }",
-        ] {
+        for text in ["", "roles = { a = \"king\" }", "roles = { a = { role = \"admin\", x = 1 } }"] {
             toml::from_str::<OidcConfig>(&format!("{GOOD}{text}")).expect_err(text);
         }
     }

@@ -18,11 +18,7 @@ impl Config {
         let daemon = memory.daemon.map(|size| size.0);
         choreographer::Options {
             limits: self.limits,
-            classes: self
-                .class
-                .iter()
-                .map(|(name, class)| (name.clone(), to_choreographer_class(class)))
-                .collect(),
+            classes: self.class.iter().map(|(name, class)| (name.clone(), to_choreographer_class(class))).collect(),
             cores: self.capacity.cores().min(machine::cores()),
             controller: self.capacity.controller == Controller::On,
             reserve_cpus: servant.reserve_cpus,
@@ -88,22 +84,14 @@ impl Config {
 impl PushConfig {
     /// Returns the limits of each container of a build.
     pub fn limits(&self) -> api::Limits {
-        api::Limits {
-            cpus: self.cpus,
-            memory: self.memory,
-            pids: Some(self.pids),
-            ..api::Limits::default()
-        }
+        api::Limits { cpus: self.cpus, memory: self.memory, pids: Some(self.pids), ..api::Limits::default() }
     }
 }
 
 fn to_choreographer_class(class: &ClassConfig) -> choreographer::ClassOptions {
     choreographer::ClassOptions {
         priority: class.priority,
-        caps: Caps {
-            cpus: class.max_cpus,
-            memory: class.max_memory,
-        },
+        caps: Caps { cpus: class.max_cpus, memory: class.max_memory },
         sla: class.sla,
         limits: class.limits,
     }

@@ -26,20 +26,14 @@ pub struct PeopleConfig {
 impl Default for PeopleConfig {
     fn default() -> Self {
         let SessionLifetimes { most, idle } = SessionLifetimes::default();
-        PeopleConfig {
-            session: Time(most),
-            idle: Time(idle),
-        }
+        PeopleConfig { session: Time(most), idle: Time(idle) }
     }
 }
 
 impl PeopleConfig {
     /// Returns the lifetimes as the portal takes them.
     pub fn session_lifetimes(&self) -> SessionLifetimes {
-        SessionLifetimes {
-            most: self.session.0,
-            idle: self.idle.0,
-        }
+        SessionLifetimes { most: self.session.0, idle: self.idle.0 }
     }
 
     pub(super) fn check(&self) -> anyhow::Result<()> {
@@ -59,9 +53,7 @@ mod tests {
     #[test]
     fn times_that_make_no_sense_are_refused() {
         let read = |text: &str| toml::from_str::<PeopleConfig>(text).expect("well-formed");
-        read("session = \"8h\"\nidle = \"10m\"")
-            .check()
-            .expect("good");
+        read("session = \"8h\"\nidle = \"10m\"").check().expect("good");
         read("").check().expect("the default");
         for text in ["session = 0", "idle = \"1s\"", "session = \"20000h\""] {
             let refused = read(text).check().expect_err(text).to_string();

@@ -82,10 +82,7 @@ impl ServantConfig {
             );
         }
         // The kernel takes 0 for "no limit".
-        if self.scratch.is_some_and(|scratch| scratch.0 < 1 << 20)
-            || self.inodes < 256
-            || self.log_rate.0 < 1 << 10
-        {
+        if self.scratch.is_some_and(|scratch| scratch.0 < 1 << 20) || self.inodes < 256 || self.log_rate.0 < 1 << 10 {
             bail!(
                 "[servant] of the configuration: scratch must be at least 1M, inodes at least 256, and log_rate at \
                     least 1K"

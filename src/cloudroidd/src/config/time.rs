@@ -15,9 +15,7 @@ impl Time {
 
     fn parse(text: &str) -> Option<Time> {
         let text = text.trim();
-        let number_ends = text
-            .find(|c: char| !c.is_ascii_digit() && c != '.')
-            .unwrap_or(text.len());
+        let number_ends = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
         let (number, unit) = text.split_at(number_ends);
         let number: f64 = number.parse().ok()?;
         let factor = match unit.trim() {
@@ -60,14 +58,11 @@ mod tests {
     #[test]
     fn durations_are_read_as_people_write_them() {
         let config =
-            Config::parse("[servant]\ngrace = \"500ms\"\nstart = 5\n[portal]\ndrain = \"1.5m\"")
-                .expect("valid");
+            Config::parse("[servant]\ngrace = \"500ms\"\nstart = 5\n[portal]\ndrain = \"1.5m\"").expect("valid");
         assert_eq!(config.servant.grace.0, Duration::from_millis(500));
         assert_eq!(config.servant.start.0, Duration::from_secs(5));
         assert_eq!(config.portal.drain.0, Duration::from_secs(90));
-        let refused = Config::parse("[servant]\ngrace = \"soon\"")
-            .expect_err("no duration")
-            .to_string();
+        let refused = Config::parse("[servant]\ngrace = \"soon\"").expect_err("no duration").to_string();
         assert!(refused.contains("\"soon\" is not a duration"), "{refused}");
         Config::parse("[servant]\ngrace = \"-1s\"").expect_err("negative");
     }

@@ -100,19 +100,13 @@ impl TlsConfig {
             }
         }
         if self.serve == TlsMode::PlainTextBeyondLoopback && self.has_certificate() {
-            bail!(
-                "serve = \"plain-text-beyond-loopback\" does not use the certificate; remove one of them"
-            );
+            bail!("serve = \"plain-text-beyond-loopback\" does not use the certificate; remove one of them");
         }
         if self.has_certificate() && !self.names.is_empty() {
-            bail!(
-                "names is only for the daemon's own certificate, but another one is set; remove one of them"
-            );
+            bail!("names is only for the daemon's own certificate, but another one is set; remove one of them");
         }
         if self.client_revocations.is_some() && self.client_authorities.is_none() {
-            bail!(
-                "client_revocations needs client_authorities; set it to the authorities of those lists"
-            );
+            bail!("client_revocations needs client_authorities; set it to the authorities of those lists");
         }
         if self.robot_certificates.0 < SHORTEST {
             bail!(
@@ -165,23 +159,11 @@ mod tests {
             ("certificate = \"c\"", "set key to the file"),
             ("key = \"k\"", "file of its certificate"),
             ("client_revocations = \"r\"", "client_authorities"),
-            (
-                "serve = \"plain-text-beyond-loopback\"\ncertificate = \"c\"\nkey = \"k\"",
-                "remove one",
-            ),
-            (
-                "certificate = \"c\"\nkey = \"k\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true",
-                "remove one",
-            ),
-            (
-                "serve = \"plain-text-beyond-loopback\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true",
-                "remove one",
-            ),
+            ("serve = \"plain-text-beyond-loopback\"\ncertificate = \"c\"\nkey = \"k\"", "remove one"),
+            ("certificate = \"c\"\nkey = \"k\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true", "remove one"),
+            ("serve = \"plain-text-beyond-loopback\"\n[acme]\nnames = [\"a.b\"]\naccept_terms = true", "remove one"),
             ("[acme]\nnames = [\"a.b\"]", "[tls.acme]"),
-            (
-                "names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"",
-                "remove one",
-            ),
+            ("names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"", "remove one"),
             ("robot_certificates = \"500ms\"", "at least 1s"),
         ] {
             let refused = format!("{:#}", read(text).check().expect_err(text));

@@ -10,17 +10,11 @@ const WORDS: [(&str, &str); 14] = [
     ("expected i64", "expected a whole number"),
     ("expected f64", "expected a number"),
     ("expected a boolean", "expected true or false"),
-    (
-        "expected a sequence",
-        "expected a list, such as [\"one\", \"two\"]",
-    ),
+    ("expected a sequence", "expected a list, such as [\"one\", \"two\"]"),
     ("expected a map", "expected a table, such as [limits]"),
     ("wanted string or table", "expected a string in quotes"),
     ("invalid type: ", ""),
-    (
-        "data did not match any variant of untagged enum Written",
-        "expected a number or a string in quotes",
-    ),
+    ("data did not match any variant of untagged enum Written", "expected a number or a string in quotes"),
     ("unit variant", "a plain string"),
 ];
 
@@ -47,35 +41,21 @@ mod tests {
     #[test]
     fn no_error_names_types_of_this_program() {
         for (text, words) in [
-            (
-                "[capacity]\nqueue = \"many\"",
-                "expected a whole number, 0 or greater",
-            ),
-            (
-                "[capacity]\nqueue = -1",
-                "expected a whole number, 0 or greater",
-            ),
-            (
-                "[capacity]\ncontroller = true",
-                "expected a string in quotes",
-            ),
+            ("[capacity]\nqueue = \"many\"", "expected a whole number, 0 or greater"),
+            ("[capacity]\nqueue = -1", "expected a whole number, 0 or greater"),
+            ("[capacity]\ncontroller = true", "expected a string in quotes"),
             ("[capacity]\novercommit = \"two\"", "expected a number"),
             ("[class]\nurgent = 3", "expected a table"),
             ("class = 3", "expected a table"),
             ("limits = 3", "expected a table"),
             ("tokens = 3", "expected a list"),
-            (
-                "[servant]\ngrace = true",
-                "expected a number or a string in quotes",
-            ),
+            ("[servant]\ngrace = true", "expected a number or a string in quotes"),
             ("[class.urgent]\npriority = 1.5", "expected a whole number"),
         ] {
             let error = Config::parse(text).expect_err(text);
             let message = format!("{error:#}");
             assert!(message.contains(words), "{text}: {message}");
-            for theirs in [
-                "usize", "u64", "i32", "f64", "struct", "untagged", "variant", "wanted",
-            ] {
+            for theirs in ["usize", "u64", "i32", "f64", "struct", "untagged", "variant", "wanted"] {
                 assert!(!message.contains(theirs), "{text}: {message}");
             }
             // The message still names the line.

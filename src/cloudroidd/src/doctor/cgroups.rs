@@ -38,29 +38,17 @@ pub fn check() -> Check {
         _ => CheckStatus::Warning,
     };
     let text = match (found.version, found.missing.is_empty()) {
-        (0, _) => format!(
-            "no controller is usable, servants are not limited: {}",
-            found.why
-        ),
+        (0, _) => format!("no controller is usable, servants are not limited: {}", found.why),
         (1, true) => {
             "version 1: cpu, memory and pids can be limited, socket buffers separately from memory; memory.high is not \
                 available"
                 .to_owned()
         }
         (version, true) => format!("version {version}: cpu, memory and pids can be limited"),
-        (version, false) => format!(
-            "version {version}, without {}: {}",
-            found.missing.join(", "),
-            found.why
-        ),
+        (version, false) => format!("version {version}, without {}: {}", found.missing.join(", "), found.why),
     };
     let fix = (status != CheckStatus::Ok).then(|| FIX.to_owned());
-    Check {
-        name: NAME.to_owned(),
-        status,
-        found: text,
-        fix,
-    }
+    Check { name: NAME.to_owned(), status, found: text, fix }
 }
 
 /// Returns whether socket buffers can be limited, on version 1 beside memory.
@@ -77,10 +65,7 @@ fn memory_hierarchy(mounts: &str) -> Option<&str> {
         let [_, place, "cgroup", options, ..] = fields[..] else {
             return None;
         };
-        options
-            .split(',')
-            .any(|option| option == "memory")
-            .then_some(place)
+        options.split(',').any(|option| option == "memory").then_some(place)
     })
 }
 
@@ -107,46 +92,21 @@ fn classify(mounts: &str, unified: Option<&str>) -> CgroupSupport {
         .lines()
         .filter_map(|line| {
             let mut fields = line.split(' ');
-            let (_, _, kind, options) = (
-                fields.next()?,
-                fields.next()?,
-                fields.next()?,
-                fields.next()?,
-            );
+            let (_, _, kind, options) = (fields.next()?, fields.next()?, fields.next()?, fields.next()?);
             (kind == "cgroup" && options.split(',').any(|option| option == "rw")).then_some(options)
         })
         .collect();
-    let mounted = |limit: &str| {
-        hierarchies
-            .iter()
-            .any(|options| options.split(',').any(|option| option == limit))
-    };
+    let mounted = |limit: &str| hierarchies.iter().any(|options| options.split(',').any(|option| option == limit));
     if LIMITS.iter().any(|limit| mounted(limit)) {
         return build_support(1, mounted, "the controller's hierarchy is not mounted");
     }
-    build_support(
-        0,
-        |_| false,
-        "no usable hierarchy in /sys/fs/cgroup, of version 1 or 2",
-    )
+    build_support(0, |_| false, "no usable hierarchy in /sys/fs/cgroup, of version 1 or 2")
 }
 
 fn build_support(version: u8, there: impl Fn(&str) -> bool, why: &str) -> CgroupSupport {
-    let missing: Vec<String> = LIMITS
-        .iter()
-        .filter(|limit| !there(limit))
-        .map(|limit| (*limit).to_owned())
-        .collect();
-    let why = if missing.is_empty() {
-        String::new()
-    } else {
-        why.to_owned()
-    };
-    CgroupSupport {
-        version,
-        missing,
-        why,
-    }
+    let missing: Vec<String> = LIMITS.iter().filter(|limit| !there(limit)).map(|limit| (*limit).to_owned()).collect();
+    let why = if missing.is_empty() { String::new() } else { why.to_owned() };
+    CgroupSupport { version, missing, why }
 }
 
 #[cfg(test)]
@@ -160,16 +120,10 @@ mod tests {
                       cgroup /sys/fs/cgroup/pids cgroup ro,relatime,pids 0 0\n\
                       cgroup2 /sys/fs/cgroup/unified cgroup2 rw 0 0\n";
         assert_eq!(memory_hierarchy(hybrid), Some("/sys/fs/cgroup/memory"));
-        assert_eq!(
-            memory_hierarchy("cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n"),
-            None
-        );
+        assert_eq!(memory_hierarchy("cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n"), None);
         let v1 = classify(hybrid, None);
         assert_eq!((v1.version, v1.missing), (1, vec!["pids".to_owned()]));
-        let v2 = classify(
-            "cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n",
-            Some("cpuset cpu io memory pids\n"),
-        );
+        let v2 = classify("cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n", Some("cpuset cpu io memory pids\n"));
         assert_eq!((v2.version, v2.missing.len()), (2, 0));
         let none = classify("proc /proc proc rw 0 0\n", None);
         assert_eq!((none.version, none.missing.len()), (0, 3));

@@ -15,16 +15,11 @@ const TABLE: &str = "/proc/thread-self/mountinfo";
 
 /// Detaches everything that is mounted below `directory`, but not what is mounted at `directory` itself.
 pub(super) fn detach_below(directory: &Path) -> Result<(), HomeError> {
-    let directory = directory
-        .canonicalize()
-        .map_err(io_error("resolve", directory))?;
+    let directory = directory.canonicalize().map_err(io_error("resolve", directory))?;
     let table = std::fs::read(TABLE).map_err(io_error("read", Path::new(TABLE)))?;
     // In reverse order: a mount on another mount comes after it in the table.
     for point in mount_points_below(&table, &directory).into_iter().rev() {
-        tracing::warn!(
-            "detaching the mount of a previous daemon at {}",
-            point.display()
-        );
+        tracing::warn!("detaching the mount of a previous daemon at {}", point.display());
         let flags = MntFlags::MNT_DETACH | MntFlags::UMOUNT_NOFOLLOW;
         umount2(&point, flags).map_err(|errno| io_error("detach", &point)(errno.into()))?;
     }
@@ -36,10 +31,7 @@ pub(super) fn detach_below(directory: &Path) -> Result<(), HomeError> {
 fn mount_points_below(table: &[u8], directory: &Path) -> Vec<PathBuf> {
     let lines = table.split(|&byte| byte == b'\n');
     let points = lines.filter_map(|line| line.split(|&byte| byte == b' ').nth(4));
-    points
-        .map(unescape)
-        .filter(|point| point != directory && point.starts_with(directory))
-        .collect()
+    points.map(unescape).filter(|point| point != directory && point.starts_with(directory)).collect()
 }
 
 /// Decodes a path of the table: spaces, tabs, newlines and backslashes are written as `\NNN`, in octal.

@@ -35,8 +35,7 @@ fn character_length(text: &str) -> usize {
 
 fn word_length(text: &str) -> usize {
     let is_of_word = |character: char| character.is_alphanumeric() || character == '_';
-    text.find(|character| !is_of_word(character))
-        .unwrap_or(text.len())
+    text.find(|character| !is_of_word(character)).unwrap_or(text.len())
 }
 
 /// Returns the length of a comment at the beginning of `text`, which may contain others.
@@ -222,11 +221,7 @@ fn read_use(tokens: &[&str], before: &[String], is_reexport: bool, into: &mut Ve
         (_, Some(alias)) => (*alias).to_owned(),
         _ => last,
     };
-    into.push(Import {
-        path,
-        name,
-        is_reexport,
-    });
+    into.push(Import { path, name, is_reexport });
 }
 
 impl Modules {
@@ -236,25 +231,14 @@ impl Modules {
         self.read_module(&tokens(&text), file, below, parent)
     }
 
-    fn read_module(
-        &mut self,
-        tokens: &[&str],
-        file: &Path,
-        below: &Path,
-        parent: Option<usize>,
-    ) -> usize {
+    fn read_module(&mut self, tokens: &[&str], file: &Path, below: &Path, parent: Option<usize>) -> usize {
         let number = self.0.len();
-        self.0.push(Module {
-            file: file.to_owned(),
-            parent,
-            ..Module::default()
-        });
+        self.0.push(Module { file: file.to_owned(), parent, ..Module::default() });
         let mut at = 0;
         while at < tokens.len() {
             let rest = &tokens[at..];
             at += match rest {
-                ["#", "[", "cfg", "(", "test", ..]
-                | ["#", "[", "cfg", "(", "all", "(", "test", ..] => {
+                ["#", "[", "cfg", "(", "test", ..] | ["#", "[", "cfg", "(", "all", "(", "test", ..] => {
                     item_length_after_attribute(rest)
                 }
                 ["mod", name, ";", ..] => {
@@ -274,19 +258,14 @@ impl Modules {
                 }
                 // `use<…>` names captured lifetimes, and `use ::a` another crate.
                 ["use", next, ..] if !matches!(*next, "<" | "::") => {
-                    let end = rest
-                        .iter()
-                        .position(|token| *token == ";")
-                        .unwrap_or(rest.len());
+                    let end = rest.iter().position(|token| *token == ";").unwrap_or(rest.len());
                     let is_reexport = at > 0 && matches!(tokens[at - 1], "pub" | ")");
                     read_use(&rest[1..end], &[], is_reexport, &mut self.0[number].imports);
                     end
                 }
-                [
-                    "fn" | "struct" | "enum" | "trait" | "type" | "const" | "static" | "union",
-                    name,
-                    ..,
-                ] if is_word(name) => {
+                ["fn" | "struct" | "enum" | "trait" | "type" | "const" | "static" | "union", name, ..]
+                    if is_word(name) =>
+                {
                     self.0[number].definitions.insert((*name).to_owned());
                     1
                 }
@@ -294,9 +273,7 @@ impl Modules {
                     self.0[number].definitions.insert((*name).to_owned());
                     3
                 }
-                [word, "::", next, ..]
-                    if is_word(word) && is_word(next) && (at == 0 || tokens[at - 1] != "::") =>
-                {
+                [word, "::", next, ..] if is_word(word) && is_word(next) && (at == 0 || tokens[at - 1] != "::") => {
                     let words = rest.chunks(2).take_while(|pair| is_word(pair[0]));
                     let mut path = Vec::new();
                     for pair in words {
@@ -331,13 +308,7 @@ impl Modules {
     }
 
     /// Returns the module that defines what an import names, or what `rest` names in it.
-    fn follow(
-        &self,
-        module: usize,
-        import: &Import,
-        rest: &[String],
-        steps: usize,
-    ) -> Option<usize> {
+    fn follow(&self, module: usize, import: &Import, rest: &[String], steps: usize) -> Option<usize> {
         let first = import.path.first()?;
         // Names of other crates look like those of modules.
         let is_own = matches!(first.as_str(), "crate" | "self" | "super")
@@ -389,10 +360,7 @@ impl Modules {
             let from = used.filter_map(|path| self.resolve(number, path, 0));
             let files = from.map(|from| &self.0[from].file);
             let files = files.filter(|file| **file != module.file).cloned();
-            imports
-                .entry(module.file.clone())
-                .or_default()
-                .extend(files);
+            imports.entry(module.file.clone()).or_default().extend(files);
         }
         imports
     }
@@ -400,10 +368,7 @@ impl Modules {
 
 /// Returns the number of tokens of an attribute and of what it stands before.
 fn item_length_after_attribute(tokens: &[&str]) -> usize {
-    let end = tokens
-        .iter()
-        .position(|token| *token == "]")
-        .unwrap_or(tokens.len() - 1);
+    let end = tokens.iter().position(|token| *token == "]").unwrap_or(tokens.len() - 1);
     let attribute = end + 1;
     attribute + item_length(&tokens[attribute..])
 }
@@ -419,11 +384,7 @@ pub fn read_imports(root: &Path) -> Imports {
 }
 
 /// Returns the shortest way along imports from a file to itself through files of `within`.
-fn shortest_cycle_of(
-    file: &Path,
-    imports: &Imports,
-    within: &BTreeSet<PathBuf>,
-) -> Option<Vec<PathBuf>> {
+fn shortest_cycle_of(file: &Path, imports: &Imports, within: &BTreeSet<PathBuf>) -> Option<Vec<PathBuf>> {
     let mut ways = VecDeque::from([vec![file.to_owned()]]);
     let mut seen = BTreeSet::new();
     while let Some(way) = ways.pop_front() {
@@ -443,12 +404,8 @@ fn shortest_cycle_of(
 
 /// Returns the shortest circle among these files; among those, one that no folder holds if there is one.
 pub fn shortest_cycle(files: &BTreeSet<PathBuf>, imports: &Imports) -> Vec<PathBuf> {
-    let cycles = files
-        .iter()
-        .filter_map(|file| shortest_cycle_of(file, imports, files));
-    cycles
-        .min_by_key(|cycle| (is_in_one_folder(cycle), cycle.len()))
-        .unwrap_or_default()
+    let cycles = files.iter().filter_map(|file| shortest_cycle_of(file, imports, files));
+    cycles.min_by_key(|cycle| (is_in_one_folder(cycle), cycle.len())).unwrap_or_default()
 }
 
 fn reachable(file: &Path, imports: &Imports) -> BTreeSet<PathBuf> {
@@ -466,20 +423,13 @@ fn reachable(file: &Path, imports: &Imports) -> BTreeSet<PathBuf> {
 
 /// Returns the sets of several files that all import one another, directly or through others.
 pub fn find_circles(imports: &Imports) -> BTreeSet<BTreeSet<PathBuf>> {
-    let reached: BTreeMap<&PathBuf, BTreeSet<PathBuf>> = imports
-        .keys()
-        .map(|file| (file, reachable(file, imports)))
-        .collect();
+    let reached: BTreeMap<&PathBuf, BTreeSet<PathBuf>> =
+        imports.keys().map(|file| (file, reachable(file, imports))).collect();
     let circle = |file: &PathBuf| -> BTreeSet<PathBuf> {
-        let reaches_back =
-            |other: &&PathBuf| reached.get(other).is_some_and(|back| back.contains(file));
+        let reaches_back = |other: &&PathBuf| reached.get(other).is_some_and(|back| back.contains(file));
         reached[file].iter().filter(reaches_back).cloned().collect()
     };
-    imports
-        .keys()
-        .map(circle)
-        .filter(|circle| circle.len() > 1)
-        .collect()
+    imports.keys().map(circle).filter(|circle| circle.len() > 1).collect()
 }
 
 /// Returns true if one folder holds all files. The file of a module with a folder, such as `local.rs` beside `local/`,
@@ -488,15 +438,9 @@ pub fn is_in_one_folder<'a>(files: impl IntoIterator<Item = &'a PathBuf>) -> boo
     let folders = files.into_iter().map(|file| {
         let of_module = file.with_extension("");
         let parent = file.parent().map(Path::to_owned);
-        BTreeSet::from_iter(
-            parent
-                .into_iter()
-                .chain(of_module.is_dir().then_some(of_module)),
-        )
+        BTreeSet::from_iter(parent.into_iter().chain(of_module.is_dir().then_some(of_module)))
     });
-    folders
-        .reduce(|all, folders| &all & &folders)
-        .is_none_or(|common| !common.is_empty())
+    folders.reduce(|all, folders| &all & &folders).is_none_or(|common| !common.is_empty())
 }
 
 #[cfg(test)]
@@ -516,10 +460,7 @@ mod tests {
             inside.display().to_string()
         };
         let circles = find_circles(&imports);
-        circles
-            .iter()
-            .map(|circle| circle.iter().map(name).collect())
-            .collect()
+        circles.iter().map(|circle| circle.iter().map(name).collect()).collect()
     }
 
     #[test]
@@ -528,14 +469,8 @@ mod tests {
             ("lib.rs", "mod a;\nmod b;\nmod c;\npub use a::A;\n"),
             ("a.rs", "use crate::b::{self, B};\npub struct A(B);"),
             // The root re-exports A, which is in a.rs.
-            (
-                "b.rs",
-                "pub struct B;\nfn f() { let _ = crate::A::default(); }",
-            ),
-            (
-                "c.rs",
-                "use crate::a::A;\n/* use crate::d; */ const TEXT: &str = \"crate::c::D\";",
-            ),
+            ("b.rs", "pub struct B;\nfn f() { let _ = crate::A::default(); }"),
+            ("c.rs", "use crate::a::A;\n/* use crate::d; */ const TEXT: &str = \"crate::c::D\";"),
         ]);
         assert_eq!(circles, [["a.rs", "b.rs"]]);
     }
@@ -544,14 +479,8 @@ mod tests {
     fn tests_and_declarations_are_no_imports() {
         let circles = circles_of(&[
             ("lib.rs", "mod a;\npub(crate) use a::A;\npub struct B;"),
-            (
-                "a.rs",
-                "use super::B;\npub struct A(B, char);\nfn f() -> char { '\"' }\nfn g<'a>(_: &'a str) {}\nmod b;",
-            ),
-            (
-                "a/b.rs",
-                "#[cfg(test)]\nmod tests { use super::super::A; }\n#[cfg(test)]\nuse crate::a::A;\nfn f() {}",
-            ),
+            ("a.rs", "use super::B;\npub struct A(B, char);\nfn f() -> char { '\"' }\nfn g<'a>(_: &'a str) {}\nmod b;"),
+            ("a/b.rs", "#[cfg(test)]\nmod tests { use super::super::A; }\n#[cfg(test)]\nuse crate::a::A;\nfn f() {}"),
         ]);
         assert_eq!(circles, Vec::<Vec<String>>::new());
     }

@@ -49,21 +49,14 @@ pub(super) struct CoordinatePredictor {
     sharing: Sharing,
 }
 
-const REFERENCES: [Reference; 4] = [
-    Reference::Last,
-    Reference::First,
-    Reference::Second,
-    Reference::Both,
-];
+const REFERENCES: [Reference; 4] = [Reference::Last, Reference::First, Reference::Second, Reference::Both];
 const SHARINGS: [Sharing; 4] = [Sharing::All, Sharing::Column, Sharing::Row, Sharing::Ring];
 
 impl CoordinatePredictor {
     fn all() -> impl Iterator<Item = Self> {
-        REFERENCES.into_iter().flat_map(|reference| {
-            SHARINGS
-                .into_iter()
-                .map(move |sharing| Self { reference, sharing })
-        })
+        REFERENCES
+            .into_iter()
+            .flat_map(|reference| SHARINGS.into_iter().map(move |sharing| Self { reference, sharing }))
     }
 
     /// Returns true if the predictor can be useful with the known columns.
@@ -167,11 +160,7 @@ impl<'a> Tracker<'a> {
             Sharing::All => 0,
             Sharing::Column => index % self.width,
             Sharing::Row => index / self.width,
-            Sharing::Ring => self
-                .known
-                .ring
-                .as_ref()
-                .map_or(0, |ring| usize::from(ring[index]) % RINGS),
+            Sharing::Ring => self.known.ring.as_ref().map_or(0, |ring| usize::from(ring[index]) % RINGS),
         }
     }
 
@@ -187,11 +176,7 @@ impl<'a> Tracker<'a> {
         let usable = reference.is_finite() && reference != 0.0;
         let product = (learned.quotient * reference) as f32;
         // The bits of NaN differ between processors.
-        let guessed = if usable && !product.is_nan() {
-            product.to_bits()
-        } else {
-            bits
-        };
+        let guessed = if usable && !product.is_nan() { product.to_bits() } else { bits };
         let truth = f64::from(f32::from_bits(tell(guessed)));
         if usable && truth.is_finite() {
             learned.points = (learned.points + 1).min(self.memory);
@@ -213,9 +198,7 @@ pub(super) fn differences(
     let mut differences = Vec::with_capacity(bits.len());
     for (index, &bits) in bits.iter().enumerate() {
         tracker.next(index, |guessed| {
-            differences.push(zigzag(
-                to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)) as i32,
-            ));
+            differences.push(zigzag(to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)) as i32));
             bits
         });
     }
@@ -233,9 +216,7 @@ pub(super) fn restore(
     let mut bits = Vec::with_capacity(differences.len());
     for (index, &difference) in differences.iter().enumerate() {
         tracker.next(index, |guessed| {
-            let truth = from_ordered_bits(
-                to_ordered_bits(guessed).wrapping_add(unzigzag(difference) as u32),
-            );
+            let truth = from_ordered_bits(to_ordered_bits(guessed).wrapping_add(unzigzag(difference) as u32));
             bits.push(truth);
             truth
         });
@@ -253,11 +234,7 @@ fn sample_size(bits: &[u32], shape: Shape) -> usize {
 }
 
 /// Returns the predictor that leaves less than the column's own neighbours do; `None` if none does.
-pub(super) fn choose(
-    bits: &[u32],
-    known: &ReferenceColumns,
-    shape: Shape,
-) -> Option<CoordinatePredictor> {
+pub(super) fn choose(bits: &[u32], known: &ReferenceColumns, shape: Shape) -> Option<CoordinatePredictor> {
     let some = sample_size(bits, shape);
     let mut best = (plain_cost(&bits[..some], shape), None);
     for guess in CoordinatePredictor::all().filter(|guess| guess.is_applicable(known, shape)) {
@@ -267,8 +244,7 @@ pub(super) fn choose(
             tracker.next(index, |guessed| {
                 // The first half is for learning.
                 let counts = u64::from(index >= some / 2);
-                cost += counts
-                    * bit_length(to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)));
+                cost += counts * bit_length(to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)));
                 bits
             });
         }
@@ -288,11 +264,7 @@ fn plain_cost(sample: &[u32], shape: Shape) -> u64 {
     let half = (sample.len() / 2).max(1);
     if let Some(scale) = crate::scale::Scale::find(sample) {
         let multiples = sample.windows(2).skip(half - 1);
-        let step = |pair: &[u32]| {
-            scale
-                .multiple(pair[1])
-                .wrapping_sub(scale.multiple(pair[0]))
-        };
+        let step = |pair: &[u32]| scale.multiple(pair[1]).wrapping_sub(scale.multiple(pair[0]));
         return multiples.map(|pair| bit_length(step(pair) as u32)).sum();
     }
     let above = match shape {
@@ -305,9 +277,7 @@ fn plain_cost(sample: &[u32], shape: Shape) -> u64 {
         if index <= above {
             return west;
         }
-        let plane = order(index - 1)
-            .wrapping_add(order(index - above))
-            .wrapping_sub(order(index - above - 1));
+        let plane = order(index - 1).wrapping_add(order(index - above)).wrapping_sub(order(index - above - 1));
         west.min(bit_length(order(index).wrapping_sub(plane)))
     };
     (half..sample.len()).map(cost).sum()

@@ -19,11 +19,7 @@ const SLOW: u32 = 7;
 
 impl Default for AdaptiveBit {
     fn default() -> Self {
-        Self {
-            fast: 1 << 15,
-            slow: 1 << 15,
-            seen: 0,
-        }
+        Self { fast: 1 << 15, slow: 1 << 15, seen: 0 }
     }
 }
 
@@ -58,11 +54,7 @@ pub(crate) struct BinaryEncoder {
 
 impl BinaryEncoder {
     pub(crate) fn new() -> Self {
-        Self {
-            low: 0,
-            range: u32::MAX,
-            out: Vec::new(),
-        }
+        Self { low: 0, range: u32::MAX, out: Vec::new() }
     }
 
     #[inline]
@@ -125,12 +117,7 @@ pub(crate) struct BinaryDecoder<'a> {
 
 impl<'a> BinaryDecoder<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        let mut this = Self {
-            code: 0,
-            range: u32::MAX,
-            bytes,
-            missing: 0,
-        };
+        let mut this = Self { code: 0, range: u32::MAX, bytes, missing: 0 };
         for _ in 0..4 {
             this.code = this.code << 8 | this.next_byte();
         }
@@ -176,11 +163,7 @@ impl<'a> BinaryDecoder<'a> {
     }
 
     pub(crate) fn finish(self) -> Result<(), Error> {
-        if self.bytes.is_empty() {
-            Ok(())
-        } else {
-            Err(Error::Corrupt("bytes after the last decision"))
-        }
+        if self.bytes.is_empty() { Ok(()) } else { Err(Error::Corrupt("bytes after the last decision")) }
     }
 }
 

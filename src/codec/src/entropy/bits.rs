@@ -11,10 +11,7 @@ pub(crate) struct BitWriter {
 impl BitWriter {
     /// Creates a writer with capacity for `bytes` bytes.
     pub(crate) fn with_capacity(bytes: usize) -> Self {
-        Self {
-            bytes: Vec::with_capacity(bytes),
-            ..Self::default()
-        }
+        Self { bytes: Vec::with_capacity(bytes), ..Self::default() }
     }
 
     /// Appends the low `count` bits of `value`, at most 32; the rest of `value` must be zero.
@@ -24,8 +21,7 @@ impl BitWriter {
         self.pending |= u64::from(value) << self.count;
         self.count += count;
         if self.count >= 32 {
-            self.bytes
-                .extend_from_slice(&(self.pending as u32).to_le_bytes());
+            self.bytes.extend_from_slice(&(self.pending as u32).to_le_bytes());
             self.pending >>= 32;
             self.count -= 32;
         }
@@ -86,8 +82,7 @@ impl BitWriter {
 
     pub(crate) fn finish(mut self) -> Vec<u8> {
         let left = self.count.div_ceil(8) as usize;
-        self.bytes
-            .extend_from_slice(&self.pending.to_le_bytes()[..left]);
+        self.bytes.extend_from_slice(&self.pending.to_le_bytes()[..left]);
         self.bytes
     }
 }
@@ -104,10 +99,7 @@ pub(crate) struct BitReader<'a> {
 
 impl<'a> BitReader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self {
-            bytes,
-            ..Self::default()
-        }
+        Self { bytes, ..Self::default() }
     }
 
     #[inline]

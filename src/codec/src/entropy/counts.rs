@@ -82,10 +82,7 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> SymbolCounts {
 #[cold]
 fn remove_excess(counts: &mut SymbolCounts, mut left: i32) {
     // From each symbol in proportion to its count above one.
-    let above: i32 = counts
-        .iter()
-        .map(|&count| i32::from(count.saturating_sub(1)))
-        .sum();
+    let above: i32 = counts.iter().map(|&count| i32::from(count.saturating_sub(1))).sum();
     let owed = -left;
     for count in counts.iter_mut().filter(|count| **count > 1) {
         let share = ((i32::from(*count) - 1) * owed / above.max(1)).min(-left.min(0));
@@ -93,9 +90,7 @@ fn remove_excess(counts: &mut SymbolCounts, mut left: i32) {
         left += share;
     }
     while left < 0 {
-        let richest = (0..SYMBOLS)
-            .max_by_key(|&symbol| counts[symbol])
-            .unwrap_or(0);
+        let richest = (0..SYMBOLS).max_by_key(|&symbol| counts[symbol]).unwrap_or(0);
         counts[richest] -= 1;
         left += 1;
     }
@@ -119,9 +114,7 @@ pub(crate) fn write(counts: &SymbolCounts, order: SymbolOrder, log: u32, out: &m
         left -= count;
         rank += 1;
         if count == 0 {
-            let zeros = (rank..SYMBOLS)
-                .take_while(|&rank| counts[order.symbol(rank)] == 0)
-                .count();
+            let zeros = (rank..SYMBOLS).take_while(|&rank| counts[order.symbol(rank)] == 0).count();
             out.put_gamma(zeros as u32 + 1);
             rank += zeros;
         }
@@ -129,11 +122,7 @@ pub(crate) fn write(counts: &SymbolCounts, order: SymbolOrder, log: u32, out: &m
 }
 
 /// Reads what [`write`] wrote.
-pub(crate) fn read(
-    order: SymbolOrder,
-    log: u32,
-    input: &mut BitReader<'_>,
-) -> Result<SymbolCounts, Error> {
+pub(crate) fn read(order: SymbolOrder, log: u32, input: &mut BitReader<'_>) -> Result<SymbolCounts, Error> {
     const BAD: Error = Error::Corrupt("a table of counts that does not add up");
     let mut counts = [0u16; SYMBOLS];
     if input.take(1) == 0 {
@@ -146,10 +135,7 @@ pub(crate) fn read(
         if rank >= SYMBOLS || input.has_overrun() {
             return Err(BAD);
         }
-        let count = input
-            .take_rice(rice_parameter(average), left)
-            .filter(|&count| count <= left)
-            .ok_or(BAD)?;
+        let count = input.take_rice(rice_parameter(average), left).filter(|&count| count <= left).ok_or(BAD)?;
         counts[order.symbol(rank)] = count as u16;
         average = (average + count).div_ceil(2);
         left -= count;
@@ -167,11 +153,7 @@ pub(crate) fn read(
 
 fn rice_parameter(average: u32) -> u32 {
     let half = average / 2;
-    if half == 0 {
-        0
-    } else {
-        32 - half.leading_zeros() - 1
-    }
+    if half == 0 { 0 } else { 32 - half.leading_zeros() - 1 }
 }
 
 #[cfg(test)]
@@ -195,10 +177,7 @@ mod tests {
         for log in [8, 9, 11] {
             let counts = round_trip(&histogram, log, SymbolOrder::Natural);
             assert!(counts.iter().all(|&count| count > 0));
-            assert_eq!(
-                counts.iter().map(|&count| u32::from(count)).sum::<u32>(),
-                1 << log
-            );
+            assert_eq!(counts.iter().map(|&count| u32::from(count)).sum::<u32>(), 1 << log);
         }
     }
 
@@ -217,9 +196,6 @@ mod tests {
             seen[SymbolOrder::Signed.symbol(rank)] = true;
         }
         assert!(seen.iter().all(|&seen| seen));
-        assert_eq!(
-            [0, 1, 2].map(|rank| SymbolOrder::Signed.symbol(rank)),
-            [0, 255, 1]
-        );
+        assert_eq!([0, 1, 2].map(|rank| SymbolOrder::Signed.symbol(rank)), [0, 255, 1]);
     }
 }

@@ -23,10 +23,7 @@ impl Histogram {
     pub(crate) fn add(&mut self, keys: &[u16]) {
         let [even, odd] = &mut self.0;
         let pairs = keys.chunks_exact(2);
-        pairs
-            .remainder()
-            .iter()
-            .for_each(|&key| even[usize::from(key)] += 1);
+        pairs.remainder().iter().for_each(|&key| even[usize::from(key)] += 1);
         for pair in pairs {
             even[usize::from(pair[0])] += 1;
             odd[usize::from(pair[1])] += 1;
@@ -35,9 +32,7 @@ impl Histogram {
 
     fn counts(self) -> Vec<u32> {
         let [mut even, odd] = self.0;
-        even.iter_mut()
-            .zip(odd)
-            .for_each(|(even, odd)| *even += odd);
+        even.iter_mut().zip(odd).for_each(|(even, odd)| *even += odd);
         even
     }
 }
@@ -76,11 +71,7 @@ impl TansEncoder {
         let contexts = histogram.len() / SYMBOLS;
         let mut description = BitWriter::default();
         description.put(log - 8, 2);
-        let mut this = Self {
-            log,
-            shed: vec![(0, 0); histogram.len()],
-            next: vec![0; contexts << log],
-        };
+        let mut this = Self { log, shed: vec![(0, 0); histogram.len()], next: vec![0; contexts << log] };
         for (context, histogram) in histogram.chunks_exact(SYMBOLS).enumerate() {
             let counts = counts::normalise(histogram, log);
             counts::write(&counts, order, log, &mut description);
@@ -99,11 +90,7 @@ impl TansEncoder {
         let counts = &counts[..used.map_or(0, |last| last + 1)];
         for (symbol, &count) in counts.iter().enumerate().filter(|&(_, &count)| count > 0) {
             // A state sheds `most` or `most - 1` bits to land in count..2·count.
-            let most = if count == 1 {
-                self.log
-            } else {
-                self.log - (count - 1).ilog2()
-            };
+            let most = if count == 1 { self.log } else { self.log - (count - 1).ilog2() };
             let adder = (most << 16).wrapping_sub(u32::from(count) << most);
             self.shed[context * SYMBOLS + symbol] = (adder, start as i32 - i32::from(count));
             starts[symbol] = start;
@@ -136,27 +123,13 @@ impl TansEncoder {
             if left - first == BATCH {
                 for index in (0..BATCH).rev() {
                     for (lane, batch) in batch.iter().enumerate() {
-                        step(
-                            batch[index],
-                            shed,
-                            next,
-                            &mut state[lane],
-                            &mut pending[lane],
-                            &mut count[lane],
-                        );
+                        step(batch[index], shed, next, &mut state[lane], &mut pending[lane], &mut count[lane]);
                     }
                 }
             } else {
                 for (lane, batch) in batch.iter().enumerate() {
                     for &key in batch.iter().rev() {
-                        step(
-                            key,
-                            shed,
-                            next,
-                            &mut state[lane],
-                            &mut pending[lane],
-                            &mut count[lane],
-                        );
+                        step(key, shed, next, &mut state[lane], &mut pending[lane], &mut count[lane]);
                     }
                 }
             }
@@ -165,8 +138,7 @@ impl TansEncoder {
                 if written[lane] + 8 > out[lane].len() {
                     grow(&mut out[lane]);
                 }
-                out[lane][written[lane]..written[lane] + 8]
-                    .copy_from_slice(&pending[lane].to_le_bytes());
+                out[lane][written[lane]..written[lane] + 8].copy_from_slice(&pending[lane].to_le_bytes());
                 written[lane] += (count[lane] >> 3) as usize;
                 pending[lane] >>= count[lane] & !7;
                 count[lane] &= 7;
@@ -185,14 +157,7 @@ impl TansEncoder {
 
 /// Encodes one symbol into a state, shedding bits.
 #[inline(always)]
-fn step(
-    key: u16,
-    shed: &[(u32, i32)],
-    next: &[u16],
-    state: &mut u32,
-    pending: &mut u64,
-    count: &mut u32,
-) {
+fn step(key: u16, shed: &[(u32, i32)], next: &[u16], state: &mut u32, pending: &mut u64, count: &mut u32) {
     let (adder, start) = shed[usize::from(key)];
     let bits = state.wrapping_add(adder) >> 16;
     *pending |= u64::from(*state & !(u32::MAX << bits)) << *count;
@@ -214,17 +179,10 @@ pub(crate) struct TansDecoder {
 
 impl TansDecoder {
     /// Reads the description of a model of `contexts` contexts; returns the number of bytes read as well.
-    pub(crate) fn read(
-        bytes: &[u8],
-        contexts: usize,
-        order: SymbolOrder,
-    ) -> Result<(Self, usize), Error> {
+    pub(crate) fn read(bytes: &[u8], contexts: usize, order: SymbolOrder) -> Result<(Self, usize), Error> {
         let mut input = BitReader::new(bytes);
         let log = input.take(2) + 8;
-        let mut this = Self {
-            log,
-            entries: vec![0; contexts << log],
-        };
+        let mut this = Self { log, entries: vec![0; contexts << log] };
         for context in 0..contexts {
             let counts = counts::read(order, log, &mut input)?;
             this.fill(context, &counts);
@@ -301,14 +259,7 @@ impl<'a> LaneReader<'a> {
             return Err(Error::Corrupt("a lane without its end mark"));
         }
         let end = ((bytes.len() - 1) * 8 + last.ilog2() as usize) as isize;
-        let mut lane = Self {
-            bytes,
-            below: end,
-            window: Window {
-                state: 0,
-                bits: 1 << 63,
-            },
-        };
+        let mut lane = Self { bytes, below: end, window: Window { state: 0, bits: 1 << 63 } };
         let mut window = lane.refill(lane.window);
         window.state = (window.bits >> (64 - log)) as u32;
         window.bits <<= log;
@@ -331,19 +282,13 @@ impl<'a> LaneReader<'a> {
     pub(crate) fn refill(&mut self, window: Window) -> Window {
         let end = self.below + 63 - window.bits.trailing_zeros() as isize;
         let last = (end + 7) >> 3;
-        let word = match usize::try_from(last - 8)
-            .ok()
-            .and_then(|first| self.bytes.get(first..)?.first_chunk())
-        {
+        let word = match usize::try_from(last - 8).ok().and_then(|first| self.bytes.get(first..)?.first_chunk()) {
             Some(word) => u64::from_le_bytes(*word),
             None => self.read_front(last),
         };
         self.below = end - FILLED;
         let spare = (last * 8 - end) as u32;
-        Window {
-            state: window.state,
-            bits: (word << spare) & !0xff | 0x80,
-        }
+        Window { state: window.state, bits: (word << spare) & !0xff | 0x80 }
     }
 
     /// Reads the word at the front, padded with zeros; [`LaneReader::finish`] reports whether they were used.
@@ -359,11 +304,7 @@ impl<'a> LaneReader<'a> {
     /// Checks that the lane ended where its encoder began, with every bit read and none invented.
     pub(crate) fn finish(&self) -> Result<(), Error> {
         let end = self.below + 63 - self.window.bits.trailing_zeros() as isize;
-        if self.window.state == 0 && end == 0 {
-            Ok(())
-        } else {
-            Err(Error::Corrupt("a lane that does not end well"))
-        }
+        if self.window.state == 0 && end == 0 { Ok(()) } else { Err(Error::Corrupt("a lane that does not end well")) }
     }
 }
 
@@ -412,9 +353,7 @@ mod tests {
         let mut state = seed;
         (0..count)
             .map(|index| {
-                state = state
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1_442_695_040_888_963_407);
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 let context = (index % 5) as u16;
                 context << 8 | ((state >> 33).trailing_zeros() as u16)
             })
@@ -424,17 +363,10 @@ mod tests {
     #[test]
     fn lanes_come_back() {
         for count in [0, 1, 2, 3, 100, 5000, 40_000] {
-            let lanes = [
-                skewed_keys(count, 1),
-                skewed_keys(count, 2),
-                skewed_keys(count, 3),
-            ];
+            let lanes = [skewed_keys(count, 1), skewed_keys(count, 2), skewed_keys(count, 3)];
             let size = round_trip([&lanes[0], &lanes[1], &lanes[2]], 5, SymbolOrder::Natural);
             // The symbols hold two bits each.
-            assert!(
-                size < 3 * count / 4 + count / 50 + 300,
-                "{count} symbols took {size} bytes"
-            );
+            assert!(size < 3 * count / 4 + count / 50 + 300, "{count} symbols took {size} bytes");
         }
     }
 

@@ -36,11 +36,7 @@ impl CellPosition {
     #[inline(always)]
     pub(super) fn neighbour(self, cells: &[u8], left: isize, up: usize) -> u8 {
         let column = self.x.wrapping_add_signed(-left);
-        if column < self.width && up <= self.y {
-            cells[(self.y - up) * self.width + column]
-        } else {
-            self.background
-        }
+        if column < self.width && up <= self.y { cells[(self.y - up) * self.width + column] } else { self.background }
     }
 }
 
@@ -118,10 +114,7 @@ pub(super) fn encode<T: CellModel>(
     tell: T,
     out: &mut Vec<u8>,
 ) -> usize {
-    let side = CellEncoder {
-        coder: BinaryEncoder::new(),
-        cells,
-    };
+    let side = CellEncoder { coder: BinaryEncoder::new(), cells };
     let walk = walk_grid(side, layout, background, tell);
     out.extend_from_slice(&walk.side.coder.finish());
     walk.told
@@ -135,22 +128,11 @@ pub(super) fn decode<T: CellModel>(
     tell: T,
     cells: &mut [u8],
 ) -> Result<(), Error> {
-    let side = CellDecoder {
-        coder: BinaryDecoder::new(bytes),
-        cells,
-    };
-    walk_grid(side, layout, background, tell)
-        .side
-        .coder
-        .finish()
+    let side = CellDecoder { coder: BinaryDecoder::new(bytes), cells };
+    walk_grid(side, layout, background, tell).side.coder.finish()
 }
 
-fn walk_grid<S: CellCoder, T: CellModel>(
-    side: S,
-    layout: &GridLayout,
-    background: u8,
-    tell: T,
-) -> GridWalk<S, T> {
+fn walk_grid<S: CellCoder, T: CellModel>(side: S, layout: &GridLayout, background: u8, tell: T) -> GridWalk<S, T> {
     let (width, height) = (layout.width, layout.height);
     let mut walk = GridWalk {
         side,
@@ -217,10 +199,7 @@ impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
             for y in rows {
                 let (new, old) = (self.row_cells(y), &self.plain[..]);
                 if new != old {
-                    for (tile, (new, old)) in changed
-                        .iter_mut()
-                        .zip(new.chunks(TILE).zip(old.chunks(TILE)))
-                    {
+                    for (tile, (new, old)) in changed.iter_mut().zip(new.chunks(TILE).zip(old.chunks(TILE))) {
                         *tile = *tile || new != old;
                     }
                 }
@@ -249,13 +228,7 @@ impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
         }
     }
 
-    fn code_block(
-        &mut self,
-        columns: Range<usize>,
-        rows: Range<usize>,
-        left: State,
-        above: State,
-    ) -> State {
+    fn code_block(&mut self, columns: Range<usize>, rows: Range<usize>, left: State, above: State) -> State {
         let at = rows.start * self.width + columns.start;
         let (mut differs, mut uniform) = (false, true);
         if S::ENCODES {
@@ -267,17 +240,11 @@ impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
             }
         }
         let context = |state: State| usize::from(left == state) + 2 * usize::from(above == state);
-        if !self
-            .side
-            .bit(&mut self.bits.differs[context(State::Same)], differs)
-        {
+        if !self.side.bit(&mut self.bits.differs[context(State::Same)], differs) {
             return State::Same;
         }
         self.told += columns.len() * rows.len();
-        if !self
-            .side
-            .bit(&mut self.bits.uniform[context(State::Uniform)], uniform)
-        {
+        if !self.side.bit(&mut self.bits.uniform[context(State::Uniform)], uniform) {
             return State::Mixed;
         }
         // The cells of a mixed block to the left are coded only later.
@@ -289,10 +256,7 @@ impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
         let known = self.side.cells()[at];
         let value = self.tell.uniform(&mut self.side, guess, known);
         for y in rows {
-            self.side.set(
-                y * self.width + columns.start..y * self.width + columns.end,
-                value,
-            );
+            self.side.set(y * self.width + columns.start..y * self.width + columns.end, value);
         }
         State::Uniform
     }
@@ -310,12 +274,7 @@ impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
     #[inline(always)]
     fn code_cell(&mut self, x: usize, y: usize) {
         let at = y * self.width + x;
-        let place = CellPosition {
-            x,
-            y,
-            width: self.width,
-            background: self.background,
-        };
+        let place = CellPosition { x, y, width: self.width, background: self.background };
         let known = self.side.cells()[at];
         let value = self.tell.cell(&mut self.side, place, known);
         self.side.set(at..at + 1, value);

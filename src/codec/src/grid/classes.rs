@@ -76,9 +76,7 @@ impl CellModel for ClassModel {
 
 #[inline(always)]
 fn context<const N: usize>(neighbours: [u8; N]) -> usize {
-    neighbours.into_iter().fold(0, |context, cell| {
-        context << 2 | usize::from(CLASSES[usize::from(cell)])
-    })
+    neighbours.into_iter().fold(0, |context, cell| context << 2 | usize::from(CLASSES[usize::from(cell)]))
 }
 
 /// Codes a cell: as predicted, one of the known values, or any other.
@@ -97,10 +95,7 @@ fn code_value<S: CellCoder>(
         return code_full_value(side, values, known);
     }
     let mut candidates = KNOWN.into_iter().filter(|&value| value != guess);
-    let (first, second) = (
-        candidates.next().unwrap_or(0),
-        candidates.next().unwrap_or(0),
-    );
+    let (first, second) = (candidates.next().unwrap_or(0), candidates.next().unwrap_or(0));
     if !side.bit(&mut bits[2], known != first) {
         return first;
     }

@@ -31,17 +31,12 @@ impl LadderValues {
         counts[usize::from(background)] = 1;
         for chunk in cells.chunks(STEP) {
             if *chunk != [background; STEP][..chunk.len()] {
-                chunk
-                    .iter()
-                    .for_each(|&cell| counts[usize::from(cell)] += 1);
+                chunk.iter().for_each(|&cell| counts[usize::from(cell)] += 1);
             }
         }
         let ladder = (i8::MIN..=i8::MAX).map(|value| value as u8);
         let seen = ladder.filter(|&value| counts[usize::from(value)] > 0);
-        Self(
-            seen.map(|value| (value, weight(counts[usize::from(value)])))
-                .collect(),
-        )
+        Self(seen.map(|value| (value, weight(counts[usize::from(value)]))).collect())
     }
 
     pub(super) fn count(&self) -> usize {
@@ -50,9 +45,7 @@ impl LadderValues {
 
     pub(super) fn write(&self, out: &mut Vec<u8>) {
         out.push(self.0.len() as u8);
-        self.0
-            .iter()
-            .for_each(|&(value, weight)| out.extend_from_slice(&[value, weight]));
+        self.0.iter().for_each(|&(value, weight)| out.extend_from_slice(&[value, weight]));
     }
 
     pub(super) fn read(input: &mut FrameCursor<'_>) -> Result<Self, Error> {
@@ -65,9 +58,7 @@ impl LadderValues {
         if values.is_sorted_by(|a, b| (a.0 as i8) < (b.0 as i8)) {
             Ok(Self(values))
         } else {
-            Err(Error::Corrupt(
-                "values of a grid that are not in their order",
-            ))
+            Err(Error::Corrupt("values of a grid that are not in their order"))
         }
     }
 }
@@ -105,12 +96,8 @@ fn build_tree(weights: &[u64], first: usize, end: usize, nodes: &mut Vec<TreeNod
         }
     }
     let node = nodes.len();
-    nodes.push(TreeNode {
-        from: from as u8,
-        next: [0; 2],
-    });
-    let next =
-        [(first, from), (from, end)].map(|(first, end)| build_tree(weights, first, end, nodes));
+    nodes.push(TreeNode { from: from as u8, next: [0; 2] });
+    let next = [(first, from), (from, end)].map(|(first, end)| build_tree(weights, first, end, nodes));
     nodes[node].next = next;
     node as u16
 }
@@ -141,11 +128,7 @@ fn corner_count(roughs: usize) -> usize {
 impl LadderModel {
     pub(super) fn new(values: &LadderValues) -> Self {
         let count = values.count();
-        let weights: Vec<u64> = values
-            .0
-            .iter()
-            .map(|&(_, weight)| weight_value(weight))
-            .collect();
+        let weights: Vec<u64> = values.0.iter().map(|&(_, weight)| weight_value(weight)).collect();
         let mut nodes = Vec::with_capacity(count);
         let root = build_tree(&weights, 0, count, &mut nodes);
         let mut roughs = count;
@@ -197,11 +180,9 @@ impl CellModel for LadderModel {
     #[inline(always)]
     fn cell<S: CellCoder>(&mut self, side: &mut S, place: CellPosition, known: u8) -> u8 {
         let cells = side.cells();
-        let rough =
-            |left, up| usize::from(self.rough[usize::from(place.neighbour(cells, left, up))]);
+        let rough = |left, up| usize::from(self.rough[usize::from(place.neighbour(cells, left, up))]);
         let corners = (rough(1, 1) + rough(-1, 1)) / 4;
-        let context =
-            (rough(1, 0) * self.roughs + rough(0, 1)) * corner_count(self.roughs) + corners;
+        let context = (rough(1, 0) * self.roughs + rough(0, 1)) * corner_count(self.roughs) + corners;
         self.code_value(side, context, known)
     }
 }
@@ -225,10 +206,7 @@ mod tests {
         values.write(&mut bytes);
         let back = LadderValues::read(&mut FrameCursor::new(&bytes)).unwrap();
         assert_eq!(back.0, values.0);
-        assert_eq!(
-            back.0.iter().map(|pair| pair.0).collect::<Vec<u8>>(),
-            [255, 1, 13, 35]
-        );
+        assert_eq!(back.0.iter().map(|pair| pair.0).collect::<Vec<u8>>(), [255, 1, 13, 35]);
         let ladder = LadderModel::new(&back);
         // Unknown or above, then 1 or above, then the others.
         assert_eq!(ladder.nodes[usize::from(ladder.root)].next[0] & LEAF, 0);
@@ -254,10 +232,7 @@ mod tests {
         for count in 1..=MOST {
             let values = LadderValues((0..count).map(|at| (at as u8, 4)).collect());
             let ladder = LadderModel::new(&values);
-            assert!(
-                ladder.bits.len() * size_of::<AdaptiveBit>() < (2 << 20) - (1 << 16),
-                "{count}"
-            );
+            assert!(ladder.bits.len() * size_of::<AdaptiveBit>() < (2 << 20) - (1 << 16), "{count}");
             assert!(ladder.roughs >= count.min(16), "{count}: {}", ladder.roughs);
         }
     }

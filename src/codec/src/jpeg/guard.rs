@@ -15,12 +15,7 @@ const JFIF: u8 = 0xe0;
 const BAD: Error = Error::Corrupt("a JPEG that our encoder does not write");
 
 /// Fails unless `stream` is one baseline picture of `width` by `height` pixels with `colours` components in one scan.
-pub(super) fn check(
-    stream: &[u8],
-    width: usize,
-    height: usize,
-    colours: usize,
-) -> Result<(), Error> {
+pub(super) fn check(stream: &[u8], width: usize, height: usize, colours: usize) -> Result<(), Error> {
     let mut input = FrameCursor::new(stream);
     if input.take(2)? != [0xff, START] {
         return Err(BAD);
@@ -68,11 +63,7 @@ fn check_scan(samples: &[u8]) -> Result<(), Error> {
             return Err(BAD);
         }
     }
-    if *end == [0xff, END] {
-        Ok(())
-    } else {
-        Err(BAD)
-    }
+    if *end == [0xff, END] { Ok(()) } else { Err(BAD) }
 }
 
 /// Reads two bytes, big endian.

@@ -33,18 +33,10 @@ pub(super) struct FieldReader<'a> {
 }
 
 /// Returns the result of `read` in the first format in which it succeeds.
-pub(super) fn read_in_either_format<T>(
-    head: &[u8],
-    read: impl Fn(FieldReader<'_>) -> Option<T>,
-) -> Option<T> {
-    let fields = |format| FieldReader {
-        input: FrameCursor::new(head),
-        length: head.len(),
-        format,
-    };
+pub(super) fn read_in_either_format<T>(head: &[u8], read: impl Fn(FieldReader<'_>) -> Option<T>) -> Option<T> {
+    let fields = |format| FieldReader { input: FrameCursor::new(head), length: head.len(), format };
     let is_cdr = head.starts_with(&CDR_LITTLE_ENDIAN);
-    read(fields(SerializationFormat::Ros1))
-        .or_else(|| is_cdr.then(|| read(fields(SerializationFormat::Cdr)))?)
+    read(fields(SerializationFormat::Ros1)).or_else(|| is_cdr.then(|| read(fields(SerializationFormat::Cdr)))?)
 }
 
 impl<'a> FieldReader<'a> {

@@ -62,22 +62,12 @@ impl Planes {
 }
 
 /// Splits one row: luma, and chroma summed over pairs.
-fn split_row<const C: usize, const RED_FIRST: bool>(
-    row: &[u8],
-    luma: &mut [u8],
-    sums: &mut [[i32; 2]],
-) {
+fn split_row<const C: usize, const RED_FIRST: bool>(row: &[u8], luma: &mut [u8], sums: &mut [[i32; 2]]) {
     let colours = |pixel: &[u8]| {
         let [first, green, last] = [pixel[0], pixel[1], pixel[2]].map(i32::from);
-        if RED_FIRST {
-            [first, green, last]
-        } else {
-            [last, green, first]
-        }
+        if RED_FIRST { [first, green, last] } else { [last, green, first] }
     };
-    let value = |[red, green, blue]: [i32; 3]| {
-        ((19_595 * red + 38_470 * green + 7_471 * blue + 32_768) >> 16) as u8
-    };
+    let value = |[red, green, blue]: [i32; 3]| ((19_595 * red + 38_470 * green + 7_471 * blue + 32_768) >> 16) as u8;
     let add = |sum: &mut [i32; 2], [red, green, blue]: [i32; 3], times: i32| {
         sum[0] += times * (-11_059 * red - 21_709 * green + 32_768 * blue);
         sum[1] += times * (32_768 * red - 27_439 * green - 5_329 * blue);
@@ -102,13 +92,7 @@ fn split_row<const C: usize, const RED_FIRST: bool>(
 }
 
 /// Writes one row of pixels from planes; alpha is unchanged.
-pub(super) fn join_row_pair(
-    luma: &[u8],
-    blue: &[u8],
-    red: &[u8],
-    order: ChannelOrder,
-    row: &mut [u8],
-) {
+pub(super) fn join_row_pair(luma: &[u8], blue: &[u8], red: &[u8], order: ChannelOrder, row: &mut [u8]) {
     match (order.channels, order.red_first) {
         (3, true) => join_row::<3, true>(luma, blue, red, row),
         (3, false) => join_row::<3, false>(luma, blue, red, row),
@@ -117,15 +101,8 @@ pub(super) fn join_row_pair(
     }
 }
 
-fn join_row<const C: usize, const RED_FIRST: bool>(
-    luma: &[u8],
-    blue: &[u8],
-    red: &[u8],
-    row: &mut [u8],
-) {
-    for (((pixels, luma), &blue), &red) in
-        row.chunks_mut(2 * C).zip(luma.chunks(2)).zip(blue).zip(red)
-    {
+fn join_row<const C: usize, const RED_FIRST: bool>(luma: &[u8], blue: &[u8], red: &[u8], row: &mut [u8]) {
+    for (((pixels, luma), &blue), &red) in row.chunks_mut(2 * C).zip(luma.chunks(2)).zip(blue).zip(red) {
         let (blue, red) = (i32::from(blue) - 128, i32::from(red) - 128);
         let add = [
             (91_881 * red + 32_768) >> 16,
@@ -134,11 +111,7 @@ fn join_row<const C: usize, const RED_FIRST: bool>(
         ];
         for (pixel, &luma) in pixels.chunks_exact_mut(C).zip(luma) {
             let [red, green, blue] = add.map(|add| (i32::from(luma) + add).clamp(0, 255) as u8);
-            pixel[..3].copy_from_slice(&if RED_FIRST {
-                [red, green, blue]
-            } else {
-                [blue, green, red]
-            });
+            pixel[..3].copy_from_slice(&if RED_FIRST { [red, green, blue] } else { [blue, green, red] });
         }
     }
 }
@@ -151,12 +124,8 @@ mod tests {
     fn smooth_colours_come_back_nearly() {
         for (channels, red_first) in [(3, true), (3, false), (4, true), (4, false)] {
             for (width, height) in [(16, 8), (15, 7), (1, 1)] {
-                let order = ChannelOrder {
-                    channels,
-                    red_first,
-                };
-                let pixel =
-                    |x: usize, y: usize, channel: usize| (x * 3 + y * 5 + channel * 40 + 30) as u8;
+                let order = ChannelOrder { channels, red_first };
+                let pixel = |x: usize, y: usize, channel: usize| (x * 3 + y * 5 + channel * 40 + 30) as u8;
                 let data: Vec<u8> = (0..height * width * channels)
                     .map(|at| pixel(at / channels % width, at / channels / width, at % channels))
                     .collect();
@@ -184,19 +153,10 @@ mod tests {
     #[test]
     fn grey_is_exact() {
         let data: Vec<u8> = (0..=255).flat_map(|value| [value; 3]).collect();
-        let order = ChannelOrder {
-            channels: 3,
-            red_first: true,
-        };
+        let order = ChannelOrder { channels: 3, red_first: true };
         let mut planes = Planes::default();
         planes.fill(256, 1, order, data.chunks_exact(768));
         assert_eq!(planes.luma[..256], (0..=255).collect::<Vec<u8>>());
-        assert!(
-            planes
-                .blue
-                .iter()
-                .chain(&planes.red)
-                .all(|&chroma| chroma == 128)
-        );
+        assert!(planes.blue.iter().chain(&planes.red).all(|&chroma| chroma == 128));
     }
 }

@@ -12,16 +12,12 @@ const BAD: Error = Error::Corrupt("an H.264 stream of another kind than ours");
 pub(super) fn check(stream: &[u8], width: usize, height: usize) -> Result<(), Error> {
     let mut rest = stream.strip_prefix(&[0, 0, 0, 1]).ok_or(BAD)?;
     loop {
-        let end = rest
-            .windows(3)
-            .position(|bytes| bytes == [0, 0, 1])
-            .unwrap_or(rest.len());
+        let end = rest.windows(3).position(|bytes| bytes == [0, 0, 1]).unwrap_or(rest.len());
         let unit = &rest[..end];
         match unit.first().ok_or(BAD)? & 0x1f {
             // Slices; picture parameter sets.
             1 | 5 | 8 => {}
-            7 if picture_size(&unit[1..]).ok_or(BAD)?
-                == (width.div_ceil(16), height.div_ceil(16)) => {}
+            7 if picture_size(&unit[1..]).ok_or(BAD)? == (width.div_ceil(16), height.div_ceil(16)) => {}
             _ => return Err(BAD),
         }
         match rest.get(end + 3..) {
@@ -91,8 +87,7 @@ fn picture_size(set: &[u8]) -> Option<(usize, usize)> {
     bits.bit();
     let (width, height) = (bits.exp_golomb()? + 1, bits.exp_golomb()? + 1);
     // Frames only, no fields.
-    (bits.bit() == 1 && references <= 4 && !bits.0.has_overrun())
-        .then_some((width as usize, height as usize))
+    (bits.bit() == 1 && references <= 4 && !bits.0.has_overrun()).then_some((width as usize, height as usize))
 }
 
 #[cfg(test)]
@@ -114,17 +109,11 @@ mod tests {
         while text.len() % 8 != 0 {
             text.push('0');
         }
-        text.as_bytes()
-            .chunks(8)
-            .map(|bits| bits.iter().fold(0, |byte, &bit| byte << 1 | (bit & 1)))
-            .collect()
+        text.as_bytes().chunks(8).map(|bits| bits.iter().fold(0, |byte, &bit| byte << 1 | (bit & 1))).collect()
     }
 
     fn stream(units: &[&[u8]]) -> Vec<u8> {
-        units
-            .iter()
-            .flat_map(|unit| [&[0, 0, 0, 1], *unit].concat())
-            .collect()
+        units.iter().flat_map(|unit| [&[0, 0, 0, 1], *unit].concat()).collect()
     }
 
     #[test]
@@ -143,10 +132,7 @@ mod tests {
         assert_eq!(check(&stream(&[&[]]), 16, 16), Err(BAD));
         assert_eq!(check(&[1, 2, 3], 16, 16), Err(BAD));
         assert_eq!(check(&stream(&[&[0x67, 66]]), 16, 16), Err(BAD));
-        assert_eq!(
-            check(&stream(&[&[0x67, 100, 0, 0, 0xff, 0xff]]), 16, 16),
-            Err(BAD)
-        );
+        assert_eq!(check(&stream(&[&[0x67, 100, 0, 0, 0xff, 0xff]]), 16, 16), Err(BAD));
         check(&stream(&[&[0x41, 9, 9]]), 16, 16).unwrap();
     }
 }

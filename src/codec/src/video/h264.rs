@@ -10,8 +10,7 @@ use crate::wire::{FrameCursor, MessageEnds, put_varint};
 use openh264::OpenH264API;
 use openh264::decoder::{Decoder, DecoderConfig};
 use openh264::encoder::{
-    BitRate, Complexity, Encoder, EncoderConfig, FrameRate, FrameType, Profile, QpRange,
-    RateControlMode, UsageType,
+    BitRate, Complexity, Encoder, EncoderConfig, FrameRate, FrameType, Profile, QpRange, RateControlMode, UsageType,
 };
 use openh264::formats::{YUVSlices, YUVSource};
 use std::fmt;
@@ -27,17 +26,9 @@ fn channel_order(layout: &ImageLayout) -> Option<ChannelOrder> {
     let Pixel::Bytes(channels @ 3..=4) = layout.pixel else {
         return None;
     };
-    let (width, height) = (
-        layout.width.next_multiple_of(2),
-        layout.height.next_multiple_of(2),
-    );
-    let fits = width.max(height) <= LONG_SIDE
-        && width.min(height) <= SHORT_SIDE
-        && width.min(height) >= SMALLEST;
-    fits.then_some(ChannelOrder {
-        channels,
-        red_first: layout.red_first,
-    })
+    let (width, height) = (layout.width.next_multiple_of(2), layout.height.next_multiple_of(2));
+    let fits = width.max(height) <= LONG_SIDE && width.min(height) <= SHORT_SIDE && width.min(height) >= SMALLEST;
+    fits.then_some(ChannelOrder { channels, red_first: layout.red_first })
 }
 
 pub(super) struct VideoEncoder {
@@ -50,13 +41,7 @@ pub(super) struct VideoEncoder {
 
 impl VideoEncoder {
     pub(super) fn new(options: VideoOptions) -> Self {
-        Self {
-            options,
-            encoder: None,
-            size: (0, 0),
-            planes: Planes::default(),
-            number: 0,
-        }
+        Self { options, encoder: None, size: (0, 0), planes: Planes::default(), number: 0 }
     }
 
     pub(super) fn request_keyframe(&mut self) {
@@ -65,18 +50,10 @@ impl VideoEncoder {
         }
     }
 
-    pub(super) fn encode(
-        &mut self,
-        message: &[u8],
-        layout: &ImageLayout,
-        out: &mut Vec<u8>,
-    ) -> Option<()> {
+    pub(super) fn encode(&mut self, message: &[u8], layout: &ImageLayout, out: &mut Vec<u8>) -> Option<()> {
         let order = channel_order(layout)?;
         let data = layout.data(message);
-        let rows = || {
-            data.chunks_exact(layout.step)
-                .map(|line| &line[..layout.row_bytes()])
-        };
+        let rows = || data.chunks_exact(layout.step).map(|line| &line[..layout.row_bytes()]);
         self.planes.fill(layout.width, layout.height, order, rows());
         if self.size != (self.planes.width, self.planes.height) {
             self.size = (self.planes.width, self.planes.height);
@@ -133,11 +110,7 @@ fn open_encoder(options: VideoOptions) -> Option<Encoder> {
 
 impl fmt::Debug for VideoEncoder {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("VideoEncoder")
-            .field("size", &self.size)
-            .field("number", &self.number)
-            .finish()
+        formatter.debug_struct("VideoEncoder").field("size", &self.size).field("number", &self.number).finish()
     }
 }
 
@@ -150,15 +123,9 @@ pub(super) struct VideoDecoder {
 }
 
 impl VideoDecoder {
-    pub(super) fn decode(
-        &mut self,
-        input: &mut FrameCursor<'_>,
-        total: usize,
-        out: &mut Vec<u8>,
-    ) -> Result<(), Error> {
+    pub(super) fn decode(&mut self, input: &mut FrameCursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
         let (layout, ends) = ImageLayout::take(input, total)?;
-        let order =
-            channel_order(&layout).ok_or(Error::Corrupt("a video of pictures that are none"))?;
+        let order = channel_order(&layout).ok_or(Error::Corrupt("a video of pictures that are none"))?;
         let data = ends.restore(layout.step * layout.height, out);
         take_padding(input, data, layout.row_bytes(), layout.step)?;
         let number = input.varint()?;
@@ -167,16 +134,12 @@ impl VideoDecoder {
             take_alpha(input, data, &layout)?;
         }
         let stream = input.take_rest();
-        let size = (
-            layout.width.next_multiple_of(2),
-            layout.height.next_multiple_of(2),
-        );
+        let size = (layout.width.next_multiple_of(2), layout.height.next_multiple_of(2));
         guard::check(stream, size.0, size.1)?;
         if key {
             // Every keyframe starts afresh: nothing that a lost or hostile frame left behind can matter.
             self.decoder = None;
-        } else if self.last != number.checked_sub(1) || self.size != size || self.decoder.is_none()
-        {
+        } else if self.last != number.checked_sub(1) || self.size != size || self.decoder.is_none() {
             return Err(Error::KeyframeNeeded(number));
         }
         self.last = None;
@@ -213,10 +176,6 @@ impl VideoDecoder {
 
 impl fmt::Debug for VideoDecoder {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("VideoDecoder")
-            .field("size", &self.size)
-            .field("last", &self.last)
-            .finish()
+        formatter.debug_struct("VideoDecoder").field("size", &self.size).field("last", &self.last).finish()
     }
 }

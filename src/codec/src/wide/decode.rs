@@ -18,23 +18,17 @@ impl<T: PlaneSample> Wide<T> {
         let kind = Kind::read(input.byte()?)?;
         let shift = merge_shift(self.samples.count());
         let mut rest = *input;
-        let (tables, used) =
-            TansDecoder::read(rest.take_rest(), CONTEXTS >> shift, SymbolOrder::Natural)?;
+        let (tables, used) = TansDecoder::read(rest.take_rest(), CONTEXTS >> shift, SymbolOrder::Natural)?;
         input.take(used)?;
         let bases = std::array::from_fn(|context| tables.base(context >> shift));
         let model = Model { bases, tables };
         for group in self.samples.groups() {
-            let gaps = self
-                .missing
-                .as_mut()
-                .map(|missing| &mut missing.lanes[group.clone()]);
+            let gaps = self.missing.as_mut().map(|missing| &mut missing.lanes[group.clone()]);
             let planes = &mut self.samples.lanes[group];
             match (planes, gaps) {
                 ([a], None) => model.decode_group::<T, 1>(kind, [a], None, input)?,
                 ([a], Some([x])) => model.decode_group(kind, [a], Some([x]), input)?,
-                ([a, b, c, d], None) => {
-                    model.decode_group::<T, 4>(kind, [a, b, c, d], None, input)?
-                }
+                ([a, b, c, d], None) => model.decode_group::<T, 4>(kind, [a, b, c, d], None, input)?,
                 ([a, b, c, d], Some([x, y, z, w])) => {
                     model.decode_group(kind, [a, b, c, d], Some([x, y, z, w]), input)?;
                 }
@@ -70,31 +64,18 @@ impl Model {
             lanes.push(self.tables.lane(input.block()?)?);
             *plain = BitReader::new(input.block()?);
         }
-        let Ok(lanes) = lanes.try_into() else {
-            unreachable!("N lanes were pushed")
-        };
+        let Ok(lanes) = lanes.try_into() else { unreachable!("N lanes were pushed") };
         let mut streams = Streams { lanes, plain };
         match gaps {
             None => {
                 // Never read.
                 let mut none: [Padded<u8>; N] = std::array::from_fn(|_| Padded::sequence(0));
-                self.decode_rows::<T, N, false>(
-                    kind,
-                    &mut planes,
-                    &mut none.each_mut(),
-                    &mut streams,
-                );
+                self.decode_rows::<T, N, false>(kind, &mut planes, &mut none.each_mut(), &mut streams);
             }
-            Some(mut gaps) => {
-                self.decode_rows::<T, N, true>(kind, &mut planes, &mut gaps, &mut streams)
-            }
+            Some(mut gaps) => self.decode_rows::<T, N, true>(kind, &mut planes, &mut gaps, &mut streams),
         }
         streams.lanes.iter().try_for_each(LaneReader::finish)?;
-        if streams.plain.iter().any(BitReader::has_overrun) {
-            Err(Error::Truncated)
-        } else {
-            Ok(())
-        }
+        if streams.plain.iter().any(BitReader::has_overrun) { Err(Error::Truncated) } else { Ok(()) }
     }
 
     fn decode_rows<T: PlaneSample, const N: usize, const GAPS: bool>(
@@ -106,15 +87,9 @@ impl Model {
     ) {
         if planes[0].is_sequence() {
             match kind {
-                Kind::Zero => {
-                    decode_sequence::<crate::predict::Zero, T, N, GAPS>(self, planes, gaps, streams)
-                }
-                Kind::Line => {
-                    decode_sequence::<crate::predict::Line, T, N, GAPS>(self, planes, gaps, streams)
-                }
-                _ => {
-                    decode_sequence::<crate::predict::West, T, N, GAPS>(self, planes, gaps, streams)
-                }
+                Kind::Zero => decode_sequence::<crate::predict::Zero, T, N, GAPS>(self, planes, gaps, streams),
+                Kind::Line => decode_sequence::<crate::predict::Line, T, N, GAPS>(self, planes, gaps, streams),
+                _ => decode_sequence::<crate::predict::West, T, N, GAPS>(self, planes, gaps, streams),
             }
             return;
         }
@@ -140,13 +115,7 @@ struct WideRowAbove<T> {
 impl<T: PlaneSample> WideRowAbove<T> {
     fn new() -> Self {
         let none = [T::default(); CHUNK];
-        Self {
-            ease: [0; CHUNK],
-            corner: none,
-            north: none,
-            east: none,
-            gaps: [0; CHUNK],
-        }
+        Self { ease: [0; CHUNK], corner: none, north: none, east: none, gaps: [0; CHUNK] }
     }
 
     /// Loads the row above; `row` begins one sample left of the chunk and ends one to the right.
@@ -215,11 +184,7 @@ fn row<P: Predictor, T: PlaneSample, const N: usize, const GAPS: bool>(
                     let absent = GAPS && token == MISSING;
                     let (smallest, bits) = RESIDUALS[usize::from(token)];
                     let residual = smallest | plain[lane].take(bits);
-                    let value = if absent {
-                        a
-                    } else {
-                        T::restore::<P>(residual, a, b, c, d)
-                    };
+                    let value = if absent { a } else { T::restore::<P>(residual, a, b, c, d) };
                     here[lane][at] = value;
                     west[lane] = value;
                     if GAPS {
@@ -274,11 +239,7 @@ fn decode_sequence<P: Predictor, T: PlaneSample, const N: usize, const GAPS: boo
             let absent = GAPS && token == MISSING;
             let (smallest, bits) = RESIDUALS[usize::from(token)];
             let residual = smallest | plain[lane].take(bits);
-            let value = if absent {
-                a
-            } else {
-                T::restore::<P>(residual, a, b, c, a)
-            };
+            let value = if absent { a } else { T::restore::<P>(residual, a, b, c, a) };
             planes[lane].samples[start + at] = value;
             last[lane] = [value, a, b];
             if GAPS {

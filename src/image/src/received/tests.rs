@@ -63,9 +63,7 @@ fn an_image_of_another_store_is_the_same_here() {
     let place = new_fixture();
     let other = store(place.root.path(), "other");
     assert!(is_layout(&place.layout()));
-    let received = other
-        .receive(&place.layout(), &Limits::default())
-        .expect("good");
+    let received = other.receive(&place.layout(), &Limits::default()).expect("good");
     assert_eq!(received.image.digest, place.image.digest);
     assert_eq!(received.image.spec, place.image.spec);
     assert_eq!(received.known, [false, false]);
@@ -74,9 +72,7 @@ fn an_image_of_another_store_is_the_same_here() {
         let tree = other.ensure_extracted(&layer.diff_id).expect("extracted");
         assert!(tree.join("opt").is_dir());
     }
-    let again = other
-        .receive(&place.layout(), &Limits::default())
-        .expect("good");
+    let again = other.receive(&place.layout(), &Limits::default()).expect("good");
     assert_eq!(again.known, [true, true]);
     // A layer in the store may not be used by those who do not send it.
     std::fs::remove_file(place.upper()).expect("removed");
@@ -125,15 +121,9 @@ fn layers_hold_no_more_than_is_allowed() {
         Error::Archive { problem, .. } => problem,
         other => panic!("{other}"),
     };
-    let few = Limits {
-        entries: 3,
-        ..Limits::default()
-    };
+    let few = Limits { entries: 3, ..Limits::default() };
     assert!(matches!(of(few), Refusal::TooManyEntries { .. }));
-    let small = Limits {
-        bytes: 4096,
-        ..Limits::default()
-    };
+    let small = Limits { bytes: 4096, ..Limits::default() };
     assert!(matches!(of(small), Refusal::TooLarge { .. }));
 }
 
@@ -171,10 +161,7 @@ fn the_same_layer_twice_is_refused() {
     std::fs::create_dir_all(tree.join("opt")).expect("made");
     let layer = store.layer_from_tree(&tree, &TreeOptions::default());
     let layer = layer.expect("a layer");
-    let twice = ImageSpec {
-        layers: vec![layer, layer],
-        ..ImageSpec::default()
-    };
+    let twice = ImageSpec { layers: vec![layer, layer], ..ImageSpec::default() };
     let digest = store.put_image(&twice).expect("an image");
     let image = store.image(&digest).expect("it is there");
     let place = ReceiveFixture { root, image, store };
@@ -185,9 +172,7 @@ fn the_same_layer_twice_is_refused() {
 #[test]
 fn what_is_refused_leaves_no_layer() {
     let place = new_fixture();
-    let [lower, upper] = place.image.spec.layers[..] else {
-        panic!("two layers")
-    };
+    let [lower, upper] = place.image.spec.layers[..] else { panic!("two layers") };
     let of = |layer: &LayerInfo| place.store.images_dir().join(blob_path(&layer.digest));
     std::fs::copy(of(&lower), of(&upper)).expect("another content under its name");
     let other = store(place.root.path(), "other");
@@ -203,11 +188,7 @@ fn a_layer_in_another_blob_changes_no_image_of_this_store() {
     let path = place.store.images_dir().join(blob_path(&lower.digest));
     let mut content = Vec::new();
     let archive = std::fs::read(path).expect("a blob");
-    io::Read::read_to_end(
-        &mut flate2::read::GzDecoder::new(&archive[..]),
-        &mut content,
-    )
-    .expect("a gzip file");
+    io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&archive[..]), &mut content).expect("a gzip file");
     let again = place.root.path().join("again.tar.gz");
     let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::none());
     io::Write::write_all(&mut packed, &content).expect("packed");

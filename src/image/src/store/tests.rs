@@ -33,42 +33,23 @@ impl StoreFixture {
     fn layer(&self, entries: &[(Entry, &str)]) -> LayerInfo {
         let mut writer = TarWriter::new(Vec::new());
         for (entry, content) in entries {
-            let entry = Entry {
-                size: content.len() as u64,
-                ..entry.clone()
-            };
-            writer
-                .write_file(&entry, content.as_bytes(), &mut [0; 64])
-                .unwrap();
+            let entry = Entry { size: content.len() as u64, ..entry.clone() };
+            writer.write_file(&entry, content.as_bytes(), &mut [0; 64]).unwrap();
         }
         let path = self.path("imported.tar.gz");
-        let mut encoder = flate2::write::GzEncoder::new(
-            File::create(&path).unwrap(),
-            flate2::Compression::fast(),
-        );
+        let mut encoder = flate2::write::GzEncoder::new(File::create(&path).unwrap(), flate2::Compression::fast());
         encoder.write_all(&writer.finish().unwrap()).unwrap();
         encoder.finish().unwrap();
         let file = File::open(&path).unwrap();
-        self.store
-            .copy_layer(
-                file,
-                &path,
-                |copy| Ok(gunzip_and_hash(copy).unwrap()),
-                |_| Ok(()),
-            )
-            .unwrap()
+        self.store.copy_layer(file, &path, |copy| Ok(gunzip_and_hash(copy).unwrap()), |_| Ok(())).unwrap()
     }
 
     /// Returns the names of files in the store that do not belong there.
     fn leftovers(&self) -> Vec<String> {
         let both = [self.store.images_dir(), self.store.layers_dir()];
-        let names = both
-            .into_iter()
-            .flat_map(|directory| files::list(directory).unwrap());
+        let names = both.into_iter().flat_map(|directory| files::list(directory).unwrap());
         let names = names.map(|entry| entry.file_name().into_string().unwrap());
-        names
-            .filter(|name| name.starts_with(files::HALF_MADE))
-            .collect()
+        names.filter(|name| name.starts_with(files::HALF_MADE)).collect()
     }
 }
 
@@ -90,10 +71,7 @@ fn file(name: &str) -> Entry {
 }
 
 fn link(name: &str, kind: Kind, target: &str) -> Entry {
-    Entry {
-        link: target.into(),
-        ..Entry::new(name, kind, 0o777)
-    }
+    Entry { link: target.into(), ..Entry::new(name, kind, 0o777) }
 }
 
 /// Returns names, kinds and links in a layer's blob.
@@ -109,29 +87,15 @@ fn entries(store: &Store, layer: &LayerInfo) -> Vec<Entry> {
 }
 
 fn names(entries: &[Entry]) -> Vec<&str> {
-    entries
-        .iter()
-        .map(|entry| std::str::from_utf8(&entry.name).unwrap())
-        .collect()
+    entries.iter().map(|entry| std::str::from_utf8(&entry.name).unwrap()).collect()
 }
 
 /// Writes a tree with files of all kinds, created in the order of `seed`.
 fn write_sample_tree(tree: &Path, seed: usize) {
     let mut steps: Vec<Box<dyn Fn()>> = Vec::new();
-    for name in [
-        "usr/bin/b",
-        "usr/bin/a",
-        "usr/lib/python3/x.py",
-        "etc/passwd",
-        "z",
-    ] {
+    for name in ["usr/bin/b", "usr/bin/a", "usr/lib/python3/x.py", "etc/passwd", "z"] {
         let path = tree.join(name);
-        steps.push(Box::new(move || {
-            write(
-                &path,
-                &format!("content of {}", path.file_name().unwrap().display()),
-            )
-        }));
+        steps.push(Box::new(move || write(&path, &format!("content of {}", path.file_name().unwrap().display()))));
     }
     let long = tree.join("d".repeat(120)).join("n".repeat(200));
     steps.push(Box::new(move || write(&long, "long")));
@@ -155,10 +119,7 @@ fn the_same_tree_gives_the_same_layer() {
             let tree = world.path(&format!("tree{seed}"));
             std::fs::create_dir(&tree).unwrap();
             write_sample_tree(&tree, seed);
-            world
-                .store
-                .layer_from_tree(&tree, &TreeOptions::default())
-                .unwrap()
+            world.store.layer_from_tree(&tree, &TreeOptions::default()).unwrap()
         })
         .collect();
     assert_eq!(layers[0], layers[1]);
@@ -170,14 +131,8 @@ fn the_same_tree_gives_the_same_layer() {
     assert!(found.iter().all(|entry| entry.mtime == 0));
     assert!(!names(&found).contains(&"socket"));
     // The first path in order is the file, whichever was created first.
-    let same = found
-        .iter()
-        .find(|entry| entry.name == b"usr/bin/a")
-        .unwrap();
-    assert_eq!(
-        (same.kind, &same.link[..]),
-        (Kind::Hardlink, &b"etc/same"[..])
-    );
+    let same = found.iter().find(|entry| entry.name == b"usr/bin/a").unwrap();
+    assert_eq!((same.kind, &same.link[..]), (Kind::Hardlink, &b"etc/same"[..]));
     assert!(world.leftovers().is_empty());
 }
 
@@ -186,69 +141,31 @@ fn a_layer_comes_back_as_the_tree_it_was() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
     write_sample_tree(&tree, 1);
-    let options = TreeOptions {
-        mtime: Mtime::Fixed(1_700_000_000),
-        ..TreeOptions::default()
-    };
+    let options = TreeOptions { mtime: Mtime::Fixed(1_700_000_000), ..TreeOptions::default() };
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
     let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
-    assert_eq!(
-        extracted,
-        world.store.layers_dir().join(layer.diff_id.hex())
-    );
+    assert_eq!(extracted, world.store.layers_dir().join(layer.diff_id.hex()));
     let a = extracted.join("usr/bin/a").metadata().unwrap();
-    assert_eq!(
-        (a.permissions().mode() & 0o7777, a.nlink(), a.mtime()),
-        (0o4755, 2, 1_700_000_000)
-    );
-    assert_eq!(
-        extracted.join("usr").metadata().unwrap().mtime(),
-        1_700_000_000
-    );
-    assert_eq!(
-        std::fs::read_link(extracted.join("dangling")).unwrap(),
-        Path::new("/nowhere/at/all")
-    );
+    assert_eq!((a.permissions().mode() & 0o7777, a.nlink(), a.mtime()), (0o4755, 2, 1_700_000_000));
+    assert_eq!(extracted.join("usr").metadata().unwrap().mtime(), 1_700_000_000);
+    assert_eq!(std::fs::read_link(extracted.join("dangling")).unwrap(), Path::new("/nowhere/at/all"));
     let long = extracted.join("d".repeat(120)).join("n".repeat(200));
     assert_eq!(std::fs::read_to_string(long).unwrap(), "long");
     // Packed again, it gives the same layer.
-    assert_eq!(
-        world.store.layer_from_tree(&extracted, &options).unwrap(),
-        layer
-    );
+    assert_eq!(world.store.layer_from_tree(&extracted, &options).unwrap(), layer);
 }
 
 #[test]
 fn what_is_excluded_is_not_in_the_layer() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
-    for name in [
-        "var/log/dpkg.log",
-        "var/cache/apt/x",
-        "usr/a.pyc",
-        "usr/a.py",
-        "tmp/x",
-    ] {
+    for name in ["var/log/dpkg.log", "var/cache/apt/x", "usr/a.pyc", "usr/a.py", "tmp/x"] {
         write(&tree.join(name), "x");
     }
-    let exclude = ["var/log/*", "/var/cache/apt", "*.pyc", "/tmp/**"]
-        .map(str::to_owned)
-        .to_vec();
-    let layer = world
-        .store
-        .layer_from_tree(
-            &tree,
-            &TreeOptions {
-                exclude,
-                ..TreeOptions::default()
-            },
-        )
-        .unwrap();
+    let exclude = ["var/log/*", "/var/cache/apt", "*.pyc", "/tmp/**"].map(str::to_owned).to_vec();
+    let layer = world.store.layer_from_tree(&tree, &TreeOptions { exclude, ..TreeOptions::default() }).unwrap();
     let found = entries(&world.store, &layer);
-    assert_eq!(
-        names(&found),
-        ["tmp/", "usr/", "usr/a.py", "var/", "var/cache/", "var/log/"]
-    );
+    assert_eq!(names(&found), ["tmp/", "usr/", "usr/a.py", "var/", "var/cache/", "var/log/"]);
 }
 
 #[test]
@@ -258,21 +175,10 @@ fn times_can_be_kept_up_to_a_date() {
     write(&tree.join("old"), "x");
     write(&tree.join("new"), "x");
     let old = std::time::UNIX_EPOCH + std::time::Duration::from_secs(1_000_000);
-    File::options()
-        .write(true)
-        .open(tree.join("old"))
-        .unwrap()
-        .set_modified(old)
-        .unwrap();
-    let options = TreeOptions {
-        mtime: Mtime::Clamp(2_000_000),
-        ..TreeOptions::default()
-    };
+    File::options().write(true).open(tree.join("old")).unwrap().set_modified(old).unwrap();
+    let options = TreeOptions { mtime: Mtime::Clamp(2_000_000), ..TreeOptions::default() };
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
-    let times: Vec<u64> = entries(&world.store, &layer)
-        .iter()
-        .map(|entry| entry.mtime)
-        .collect();
+    let times: Vec<u64> = entries(&world.store, &layer).iter().map(|entry| entry.mtime).collect();
     assert_eq!(times, [2_000_000, 1_000_000]);
 }
 
@@ -282,11 +188,7 @@ fn upper(tree: &Path) {
     write(&tree.join("fresh/inside"), "x");
     let here = File::open(tree).unwrap();
     rustix::fs::mknodat(&here, "gone", FileType::CharacterDevice, Mode::empty(), 0).unwrap();
-    let opaque = if is_root() {
-        "trusted.overlay.opaque"
-    } else {
-        "user.overlay.opaque"
-    };
+    let opaque = if is_root() { "trusted.overlay.opaque" } else { "user.overlay.opaque" };
     rustix::fs::setxattr(tree.join("fresh"), opaque, b"y", XattrFlags::empty()).unwrap();
     rustix::fs::setxattr(tree.join("new"), "user.kept", b"v", XattrFlags::empty()).unwrap();
 }
@@ -297,32 +199,17 @@ fn deletions_in_an_overlay_become_whiteouts_and_back() {
     let tree = world.path("upper");
     std::fs::create_dir(&tree).unwrap();
     upper(&tree);
-    let options = TreeOptions {
-        overlay_upper: true,
-        ..TreeOptions::default()
-    };
+    let options = TreeOptions { overlay_upper: true, ..TreeOptions::default() };
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
     let found = entries(&world.store, &layer);
-    assert_eq!(
-        names(&found),
-        [
-            ".wh.gone",
-            "fresh/",
-            "fresh/.wh..wh..opq",
-            "fresh/inside",
-            "new"
-        ]
-    );
+    assert_eq!(names(&found), [".wh.gone", "fresh/", "fresh/.wh..wh..opq", "fresh/inside", "new"]);
     assert_eq!(found[4].xattrs, [(b"user.kept".to_vec(), b"v".to_vec())]);
     assert!(found[1].xattrs.is_empty());
 
     let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
     let gone = std::fs::symlink_metadata(extracted.join("gone")).unwrap();
     assert!(gone.file_type().is_char_device() && gone.rdev() == 0);
-    assert_eq!(
-        world.store.layer_from_tree(&extracted, &options).unwrap(),
-        layer
-    );
+    assert_eq!(world.store.layer_from_tree(&extracted, &options).unwrap(), layer);
 }
 
 #[test]
@@ -332,11 +219,7 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
     std::fs::create_dir(&tree).unwrap();
     upper(&tree);
     write(&tree.join("left/out"), "x");
-    let options = TreeOptions {
-        overlay_upper: true,
-        exclude: vec!["left".into()],
-        ..TreeOptions::default()
-    };
+    let options = TreeOptions { overlay_upper: true, exclude: vec!["left".into()], ..TreeOptions::default() };
     let (diff_id, bytes) = world.store.stage_tree(&tree, &options).unwrap();
     // It can be used before its blob exists.
     let staged = world.store.ensure_extracted(&diff_id).unwrap();
@@ -346,12 +229,7 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
         world
             .store
             .put_image(&ImageSpec {
-                layers: vec![LayerInfo {
-                    digest: diff_id,
-                    diff_id,
-                    size: 0,
-                    unpacked: bytes
-                }],
+                layers: vec![LayerInfo { digest: diff_id, diff_id, size: 0, unpacked: bytes }],
                 ..ImageSpec::default()
             })
             .is_err(),
@@ -362,19 +240,10 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
     // The blob contains what was staged: extracted from it, the tree packs to the same layer.
     world.store.discard_tree(&diff_id).unwrap();
     let extracted = world.store.ensure_extracted(&diff_id).unwrap();
-    let unchanged = TreeOptions {
-        overlay_upper: true,
-        ..TreeOptions::default()
-    };
-    assert_eq!(
-        world.store.layer_from_tree(&extracted, &unchanged).unwrap(),
-        layer
-    );
+    let unchanged = TreeOptions { overlay_upper: true, ..TreeOptions::default() };
+    assert_eq!(world.store.layer_from_tree(&extracted, &unchanged).unwrap(), layer);
     // Staging an existing layer changes nothing.
-    assert_eq!(
-        world.store.stage_tree(&extracted, &unchanged).unwrap(),
-        (diff_id, bytes)
-    );
+    assert_eq!(world.store.stage_tree(&extracted, &unchanged).unwrap(), (diff_id, bytes));
     assert_eq!(world.leftovers(), Vec::<String>::new());
 }
 
@@ -383,15 +252,8 @@ fn a_tree_that_cannot_be_packed_is_not_staged() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("usr/.wh.x"), "x");
-    let error = world
-        .store
-        .stage_tree(&tree, &TreeOptions::default())
-        .unwrap_err()
-        .to_string();
-    assert!(
-        error.contains("tree/usr/.wh.x cannot go into a layer"),
-        "{error}"
-    );
+    let error = world.store.stage_tree(&tree, &TreeOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("tree/usr/.wh.x cannot go into a layer"), "{error}");
     assert_eq!(files::list(world.store.layers_dir()).unwrap().len(), 0);
 }
 
@@ -400,22 +262,11 @@ fn a_tree_that_would_be_misread_is_refused() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("usr/.wh.x"), "x");
-    let error = world
-        .store
-        .layer_from_tree(&tree, &TreeOptions::default())
-        .unwrap_err()
-        .to_string();
-    assert!(
-        error.contains("tree/usr/.wh.x cannot go into a layer"),
-        "{error}"
-    );
+    let error = world.store.layer_from_tree(&tree, &TreeOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("tree/usr/.wh.x cannot go into a layer"), "{error}");
     let deep = world.path("deep").join("d/".repeat(300));
     std::fs::create_dir_all(deep).unwrap();
-    let error = world
-        .store
-        .layer_from_tree(&world.path("deep"), &TreeOptions::default())
-        .unwrap_err()
-        .to_string();
+    let error = world.store.layer_from_tree(&world.path("deep"), &TreeOptions::default()).unwrap_err().to_string();
     assert!(error.contains("more than 256 directories deep"), "{error}");
     assert!(world.leftovers().is_empty());
 }
@@ -437,17 +288,8 @@ fn owners_and_capabilities_leave_the_user_namespace() {
     capability.extend(0x2000_u32.to_le_bytes());
     capability.extend([0; 12]);
     capability.extend(100_000_u32.to_le_bytes());
-    rustix::fs::setxattr(
-        tree.join("mapped"),
-        "security.capability",
-        &capability,
-        XattrFlags::empty(),
-    )
-    .unwrap();
-    let options = TreeOptions {
-        uid_offset: 100_000,
-        ..TreeOptions::default()
-    };
+    rustix::fs::setxattr(tree.join("mapped"), "security.capability", &capability, XattrFlags::empty()).unwrap();
+    let options = TreeOptions { uid_offset: 100_000, ..TreeOptions::default() };
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
     let found = entries(&world.store, &layer);
     assert_eq!((found[0].uid, found[0].gid), (0, 0));
@@ -455,17 +297,10 @@ fn owners_and_capabilities_leave_the_user_namespace() {
     assert_eq!(found[1].xattrs.len(), 1);
     assert_eq!(found[1].xattrs[0].1[..4], 0x0200_0001_u32.to_le_bytes());
 
-    let extracted = world
-        .store
-        .ensure_extracted(&layer.diff_id)
-        .unwrap()
-        .join("mapped");
+    let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap().join("mapped");
     assert_eq!(extracted.metadata().unwrap().uid(), 1000);
     let mut value = [0; 64];
-    assert_eq!(
-        rustix::fs::getxattr(&extracted, "security.capability", &mut value[..]).unwrap(),
-        20
-    );
+    assert_eq!(rustix::fs::getxattr(&extracted, "security.capability", &mut value[..]).unwrap(), 20);
 }
 
 #[test]
@@ -485,13 +320,7 @@ fn a_hostile_layer_writes_only_into_its_own_tree() {
         (file("twice"), "2"),
         (Entry::new("twice-dir/sub/", Kind::Directory, 0o755), ""),
         (file("twice-dir"), "now a file"),
-        (
-            Entry {
-                device: (8, 0),
-                ..Entry::new("sda", Kind::Block, 0o666)
-            },
-            "",
-        ),
+        (Entry { device: (8, 0), ..Entry::new("sda", Kind::Block, 0o666) }, ""),
         (Entry::new("null", Kind::Character, 0o666), ""),
         (
             Entry {
@@ -503,25 +332,14 @@ fn a_hostile_layer_writes_only_into_its_own_tree() {
     ]);
     let tree = world.store.ensure_extracted(&layer.diff_id).unwrap();
     assert!(files::list(Path::new(outside)).unwrap().is_empty());
-    assert_eq!(
-        std::fs::read_to_string(tree.join(&outside[1..]).join("x")).unwrap(),
-        "caught"
-    );
-    assert_eq!(
-        std::fs::read_to_string(tree.join("y")).unwrap(),
-        "caught too"
-    );
+    assert_eq!(std::fs::read_to_string(tree.join(&outside[1..]).join("x")).unwrap(), "caught");
+    assert_eq!(std::fs::read_to_string(tree.join("y")).unwrap(), "caught too");
     assert_eq!(std::fs::read_to_string(tree.join("rooted")).unwrap(), "x");
     assert_eq!(std::fs::read_to_string(tree.join("twice")).unwrap(), "2");
-    assert_eq!(
-        std::fs::read_to_string(tree.join("twice-dir")).unwrap(),
-        "now a file"
-    );
+    assert_eq!(std::fs::read_to_string(tree.join("twice-dir")).unwrap(), "now a file");
     assert!(!tree.join("sda").exists() && !tree.join("null").exists());
     let mut value = [0; 64];
-    assert!(
-        rustix::fs::getxattr(tree.join("r"), "trusted.overlay.redirect", &mut value[..]).is_err()
-    );
+    assert!(rustix::fs::getxattr(tree.join("r"), "trusted.overlay.redirect", &mut value[..]).is_err());
 }
 
 #[test]
@@ -529,27 +347,14 @@ fn a_layer_that_cannot_be_extracted_leaves_nothing() {
     let world = StoreFixture::new();
     let bad = [
         (file("a/../../x"), "goes up with '..'"),
-        (
-            link("l", Kind::Hardlink, "../../etc/passwd"),
-            "goes up with '..'",
-        ),
+        (link("l", Kind::Hardlink, "../../etc/passwd"), "goes up with '..'"),
         (link("l", Kind::Hardlink, "not-there"), "not-there"),
         (file(&"d/".repeat(300)), "300 directories deep"),
-        (
-            Entry {
-                uid: u64::from(u32::MAX),
-                ..file("f")
-            },
-            "out of range",
-        ),
+        (Entry { uid: u64::from(u32::MAX), ..file("f") }, "out of range"),
     ];
     for (entry, problem) in bad {
         let layer = world.layer(&[(file("good"), "x"), (entry, "")]);
-        let error = world
-            .store
-            .ensure_extracted(&layer.diff_id)
-            .unwrap_err()
-            .to_string();
+        let error = world.store.ensure_extracted(&layer.diff_id).unwrap_err().to_string();
         assert!(error.contains(problem), "{error}");
         let archive = world.path("imported.tar.gz");
         let error = world.store.import_layer(&archive).unwrap_err().to_string();
@@ -574,22 +379,10 @@ fn whiteouts_meet_their_namesakes_in_one_layer() {
         (file(".wh.kept"), ""),
     ]);
     let tree = world.store.ensure_extracted(&layer.diff_id).unwrap();
-    let options = TreeOptions {
-        overlay_upper: true,
-        ..TreeOptions::default()
-    };
+    let options = TreeOptions { overlay_upper: true, ..TreeOptions::default() };
     let again = world.store.layer_from_tree(&tree, &options).unwrap();
     let found = entries(&world.store, &again);
-    assert_eq!(
-        names(&found),
-        [
-            "first/",
-            "first/.wh..wh..opq",
-            "kept",
-            "second/",
-            "second/.wh..wh..opq"
-        ]
-    );
+    assert_eq!(names(&found), ["first/", "first/.wh..wh..opq", "kept", "second/", "second/.wh..wh..opq"]);
 }
 
 #[test]
@@ -597,18 +390,9 @@ fn many_threads_ask_for_one_layer() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
     write_sample_tree(&tree, 2);
-    let made = || {
-        world
-            .store
-            .layer_from_tree(&tree, &TreeOptions::default())
-            .unwrap()
-    };
-    let layers: Vec<LayerInfo> = std::thread::scope(|scope| {
-        [(); 4]
-            .map(|()| scope.spawn(made))
-            .map(|made| made.join().unwrap())
-            .to_vec()
-    });
+    let made = || world.store.layer_from_tree(&tree, &TreeOptions::default()).unwrap();
+    let layers: Vec<LayerInfo> =
+        std::thread::scope(|scope| [(); 4].map(|()| scope.spawn(made)).map(|made| made.join().unwrap()).to_vec());
     assert!(layers.iter().all(|layer| layer == &layers[0]));
     // A second store represents a second process.
     let other = open(world.directory.path());
@@ -630,21 +414,10 @@ fn damaged_content_never_becomes_a_tree() {
     let layer = world.layer(&[(file("a"), "x")]);
     let other = world.layer(&[(file("b"), "x")]);
     // A record with another diff-id.
-    let wrong = LayerInfo {
-        digest: other.digest,
-        size: other.size,
-        ..layer
-    };
+    let wrong = LayerInfo { digest: other.digest, size: other.size, ..layer };
     files::write_atomically(&world.store.record_path(&layer.diff_id), &to_json(&wrong)).unwrap();
-    let error = world
-        .store
-        .ensure_extracted(&layer.diff_id)
-        .unwrap_err()
-        .to_string();
-    assert!(
-        error.contains("is damaged") && error.contains(&layer.diff_id.to_string()),
-        "{error}"
-    );
+    let error = world.store.ensure_extracted(&layer.diff_id).unwrap_err().to_string();
+    assert!(error.contains("is damaged") && error.contains(&layer.diff_id.to_string()), "{error}");
     assert!(!world.store.tree_path(&layer.diff_id).exists());
     assert!(world.leftovers().is_empty());
 }
@@ -659,18 +432,9 @@ fn layers_go_out_and_come_in_unchanged() {
     assert_eq!(second.store.layer(&layer.diff_id).unwrap(), None);
     assert_eq!(second.store.import_layer(&cached).unwrap(), layer);
     let tree = second.store.layers_dir().join(layer.diff_id.hex());
-    assert_eq!(
-        std::fs::read(tree.join("a")).unwrap(),
-        b"x",
-        "it is extracted at once"
-    );
+    assert_eq!(std::fs::read(tree.join("a")).unwrap(), b"x", "it is extracted at once");
     assert_eq!(second.store.layer(&layer.diff_id).unwrap(), Some(layer));
-    assert!(
-        files::list(world.directory.path())
-            .unwrap()
-            .iter()
-            .all(|e| e.file_name() != "tmp-")
-    );
+    assert!(files::list(world.directory.path()).unwrap().iter().all(|e| e.file_name() != "tmp-"));
 }
 
 #[test]
@@ -679,46 +443,19 @@ fn what_is_no_layer_is_not_imported() {
     let path = world.path("x.tar.gz");
     std::fs::write(&path, "plain").unwrap();
     let error = world.store.import_layer(&path).unwrap_err().to_string();
-    assert!(
-        error.contains("x.tar.gz") && error.contains("not gzip"),
-        "{error}"
-    );
+    assert!(error.contains("x.tar.gz") && error.contains("not gzip"), "{error}");
     let layer = world.layer(&[(file("a"), "x")]);
     let mut whole = Vec::new();
-    world
-        .store
-        .blob(&layer.digest)
-        .unwrap()
-        .unwrap()
-        .file
-        .read_to_end(&mut whole)
-        .unwrap();
+    world.store.blob(&layer.digest).unwrap().unwrap().file.read_to_end(&mut whole).unwrap();
     std::fs::write(&path, &whole[..whole.len() - 9]).unwrap();
     let error = world.store.import_layer(&path).unwrap_err().to_string();
-    assert!(
-        error.contains("x.tar.gz: the archive is truncated"),
-        "{error}"
-    );
-    let missing = world
-        .store
-        .import_layer(&world.path("missing"))
-        .unwrap_err()
-        .to_string();
-    assert!(
-        missing.starts_with("cannot open ") && missing.contains("missing"),
-        "{missing}"
-    );
+    assert!(error.contains("x.tar.gz: the archive is truncated"), "{error}");
+    let missing = world.store.import_layer(&world.path("missing")).unwrap_err().to_string();
+    assert!(missing.starts_with("cannot open ") && missing.contains("missing"), "{missing}");
     assert!(world.leftovers().is_empty());
     let unknown = Digest::compute("unknown");
-    let error = world
-        .store
-        .ensure_extracted(&unknown)
-        .unwrap_err()
-        .to_string();
-    assert!(
-        error.contains(&unknown.to_string()) && error.contains("is not in the store"),
-        "{error}"
-    );
+    let error = world.store.ensure_extracted(&unknown).unwrap_err().to_string();
+    assert!(error.contains(&unknown.to_string()) && error.contains("is not in the store"), "{error}");
 }
 
 fn spec(layers: &[LayerInfo]) -> ImageSpec {
@@ -736,10 +473,7 @@ fn spec(layers: &[LayerInfo]) -> ImageSpec {
 #[test]
 fn images_have_names_and_keep_them() {
     let world = StoreFixture::new();
-    let layers = [
-        world.layer(&[(file("a"), "x")]),
-        world.layer(&[(file("b"), "x")]),
-    ];
+    let layers = [world.layer(&[(file("a"), "x")]), world.layer(&[(file("b"), "x")])];
     let image = world.store.put_image(&spec(&layers)).unwrap();
     assert_eq!(world.store.put_image(&spec(&layers)).unwrap(), image);
     let other = world.store.put_image(&spec(&layers[..1])).unwrap();
@@ -749,11 +483,7 @@ fn images_have_names_and_keep_them() {
     world.store.tag("opencv_apps:latest", &other).unwrap();
     // Both tags of one image are recognised: the index is rewritten for neither.
     world.store.tag("opencv_apps:2", &image).unwrap();
-    let index = || {
-        std::fs::metadata(world.store.images_dir().join("index.json"))
-            .unwrap()
-            .ino()
-    };
+    let index = || std::fs::metadata(world.store.images_dir().join("index.json")).unwrap().ino();
     let written = index();
     for name in ["opencv_apps:1", "opencv_apps:2"] {
         world.store.tag(name, &image).unwrap();
@@ -764,25 +494,14 @@ fn images_have_names_and_keep_them() {
     let reopened = open(world.directory.path());
     let tags = reopened.tags().unwrap();
     let expected = [("opencv_apps:1", image), ("opencv_apps:latest", other)];
-    assert_eq!(
-        tags,
-        expected
-            .map(|(name, image)| (name.to_owned(), image))
-            .into()
-    );
+    assert_eq!(tags, expected.map(|(name, image)| (name.to_owned(), image)).into());
     assert_eq!(reopened.resolve("opencv_apps:latest").unwrap(), Some(other));
     assert_eq!(reopened.resolve(&image.to_string()).unwrap(), Some(image));
     assert_eq!(reopened.resolve("nothing").unwrap(), None);
-    assert_eq!(
-        reopened.resolve(&layers[0].digest.to_string()).unwrap(),
-        None
-    );
+    assert_eq!(reopened.resolve(&layers[0].digest.to_string()).unwrap(), None);
     assert_eq!(reopened.image(&image).unwrap().spec, spec(&layers));
     let manifest = reopened.manifest("opencv_apps:1").unwrap().unwrap();
-    assert_eq!(
-        (manifest.digest, &manifest.media_type[..]),
-        (image, oci::MEDIA_MANIFEST)
-    );
+    assert_eq!((manifest.digest, &manifest.media_type[..]), (image, oci::MEDIA_MANIFEST));
     assert_eq!(Digest::compute(&manifest.bytes), image);
 
     assert!(reopened.untag("opencv_apps:latest").unwrap());
@@ -803,31 +522,18 @@ fn bad_names_and_unknown_images_are_refused() {
     let error = world.store.tag("x:1", &unknown).unwrap_err().to_string();
     assert!(error.contains(&unknown.to_string()), "{error}");
     assert!(world.store.image(&unknown).is_err());
-    let absent = LayerInfo {
-        digest: unknown,
-        ..layer
-    };
-    assert!(matches!(
-        world.store.put_image(&spec(&[absent])),
-        Err(Error::UnknownLayer { .. })
-    ));
+    let absent = LayerInfo { digest: unknown, ..layer };
+    assert!(matches!(world.store.put_image(&spec(&[absent])), Err(Error::UnknownLayer { .. })));
 }
 
 #[test]
 fn many_threads_and_stores_tag_at_once() {
     let world = StoreFixture::new();
-    let image = world
-        .store
-        .put_image(&spec(&[world.layer(&[(file("a"), "x")])]))
-        .unwrap();
+    let image = world.store.put_image(&spec(&[world.layer(&[(file("a"), "x")])])).unwrap();
     let other = open(world.directory.path());
     std::thread::scope(|scope| {
         for number in 0..8 {
-            let store = if number % 2 == 0 {
-                &world.store
-            } else {
-                &other
-            };
+            let store = if number % 2 == 0 { &world.store } else { &other };
             scope.spawn(move || store.tag(&format!("service:{number}"), &image).unwrap());
         }
     });
@@ -854,11 +560,7 @@ fn what_nobody_needs_goes_and_the_rest_stays() {
 
     world.store.untag("s:1").unwrap();
     let both = BTreeSet::from([in_use.diff_id, first]);
-    assert_eq!(
-        world.store.gc(&both).unwrap().blobs,
-        0,
-        "a kept image stays without a tag"
-    );
+    assert_eq!(world.store.gc(&both).unwrap().blobs, 0, "a kept image stays without a tag");
     let hold = world.store.hold().unwrap();
     std::fs::write(world.store.images_dir().join("tmp-dead"), "x").unwrap();
     let swept = world.store.gc(&keep).unwrap();
@@ -885,20 +587,8 @@ fn images_outlive_the_directory_of_layers() {
     world.store.put_image(&spec(&[layer])).unwrap();
     std::fs::remove_dir_all(world.store.layers_dir()).unwrap();
     let store = open(world.directory.path());
-    assert_eq!(
-        store.layer(&layer.diff_id).unwrap(),
-        Some(LayerInfo {
-            unpacked: 0,
-            ..layer
-        })
-    );
-    assert!(
-        store
-            .ensure_extracted(&layer.diff_id)
-            .unwrap()
-            .join("a")
-            .exists()
-    );
+    assert_eq!(store.layer(&layer.diff_id).unwrap(), Some(LayerInfo { unpacked: 0, ..layer }));
+    assert!(store.ensure_extracted(&layer.diff_id).unwrap().join("a").exists());
 }
 
 #[test]
@@ -913,19 +603,10 @@ fn a_check_names_what_is_damaged_and_what_is_missing() {
     let problem = |digest: &Digest| {
         let path = world.store.blob_path(digest);
         let of_it = damages.iter().filter(|damage| damage.path == path);
-        of_it
-            .map(|damage| damage.problem.as_str())
-            .collect::<Vec<_>>()
-            .join("; ")
+        of_it.map(|damage| damage.problem.as_str()).collect::<Vec<_>>().join("; ")
     };
-    assert!(
-        problem(&damaged.digest).contains("its content is sha256:"),
-        "{damages:?}"
-    );
-    assert!(
-        problem(&missing.digest).contains(&format!("a layer of image {image} is missing")),
-        "{damages:?}"
-    );
+    assert!(problem(&damaged.digest).contains("its content is sha256:"), "{damages:?}");
+    assert!(problem(&missing.digest).contains(&format!("a layer of image {image} is missing")), "{damages:?}");
     std::fs::write(world.store.blob_path(&image), "{}").unwrap();
     let error = world.store.image(&image).unwrap_err().to_string();
     assert!(error.contains("is damaged"), "{error}");
@@ -941,10 +622,7 @@ fn a_start_sweeps_what_a_crash_or_power_failure_left() {
     // Marked by an earlier boot: its files may be empty now.
     let lost = Digest::compute("lost");
     write(&world.store.tree_path(&lost).join("empty"), "");
-    let mark = world
-        .store
-        .layers_dir()
-        .join(format!("{}.volatile", lost.hex()));
+    let mark = world.store.layers_dir().join(format!("{}.volatile", lost.hex()));
     std::fs::write(&mark, "another boot").unwrap();
     let store = open(world.directory.path());
     assert!(world.leftovers().is_empty());
@@ -955,29 +633,15 @@ fn a_start_sweeps_what_a_crash_or_power_failure_left() {
 #[test]
 fn strange_directories_are_left_alone() {
     let directory = tempfile::tempdir().unwrap();
-    let (images, layers) = (
-        directory.path().join("images"),
-        directory.path().join("layers"),
-    );
+    let (images, layers) = (directory.path().join("images"), directory.path().join("layers"));
     write(&images.join("holiday.jpg"), "x");
     let error = Store::open(&images, &layers).unwrap_err().to_string();
-    assert!(
-        error.contains("holiday.jpg") && error.contains("choose another directory"),
-        "{error}"
-    );
+    assert!(error.contains("holiday.jpg") && error.contains("choose another directory"), "{error}");
     std::fs::remove_file(images.join("holiday.jpg")).unwrap();
-    std::fs::write(
-        images.join("oci-layout"),
-        r#"{"imageLayoutVersion":"2.0.0"}"#,
-    )
-    .unwrap();
+    std::fs::write(images.join("oci-layout"), r#"{"imageLayoutVersion":"2.0.0"}"#).unwrap();
     let error = Store::open(&images, &layers).unwrap_err().to_string();
     assert!(error.contains("its version is \"2.0.0\""), "{error}");
-    std::fs::write(
-        images.join("oci-layout"),
-        r#"{"imageLayoutVersion":"1.0.0"}"#,
-    )
-    .unwrap();
+    std::fs::write(images.join("oci-layout"), r#"{"imageLayoutVersion":"1.0.0"}"#).unwrap();
     std::fs::write(images.join("index.json"), "{").unwrap();
     let error = Store::open(&images, &layers).unwrap_err().to_string();
     assert!(error.contains("index.json: "), "{error}");
@@ -987,10 +651,7 @@ fn strange_directories_are_left_alone() {
 fn nobody_else_may_enter() {
     let world = StoreFixture::new();
     for directory in [world.store.images_dir(), world.store.layers_dir()] {
-        assert_eq!(
-            directory.metadata().unwrap().permissions().mode() & 0o777,
-            0o700
-        );
+        assert_eq!(directory.metadata().unwrap().permissions().mode() & 0o777, 0o700);
     }
 }
 
@@ -1016,11 +677,7 @@ fn on_a_small_disk(name: &str) -> Option<PathBuf> {
         .output()
         .unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(
-        output.status.success() && text.contains("1 passed"),
-        "{text}{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    assert!(output.status.success() && text.contains("1 passed"), "{text}{}", String::from_utf8_lossy(&output.stderr));
     None
 }
 
@@ -1036,9 +693,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     let mut state = 1_u64;
     let noise: Vec<u8> = (0..6 << 20)
         .map(|_| {
-            state = state
-                .wrapping_mul(6_364_136_223_846_793_005)
-                .wrapping_add(1);
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             (state >> 56) as u8
         })
         .collect();
@@ -1047,71 +702,34 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     let told = |error: Error| {
         let text = error.to_string();
         assert!(matches!(error, Error::DiskFull { .. }), "{text}");
-        assert!(
-            text.contains(disk.to_str().unwrap()) && text.contains("free some space"),
-            "{text}"
-        );
+        assert!(text.contains(disk.to_str().unwrap()) && text.contains("free some space"), "{text}");
         for directory in [store.images_dir(), store.layers_dir()] {
             let names = files::list(directory).unwrap();
-            assert!(
-                names
-                    .iter()
-                    .all(|entry| !entry.file_name().to_string_lossy().starts_with("tmp-")),
-                "{names:?}"
-            );
+            assert!(names.iter().all(|entry| !entry.file_name().to_string_lossy().starts_with("tmp-")), "{names:?}");
         }
         assert!(files::list(&store.blobs_dir()).unwrap().is_empty());
         text
     };
-    told(
-        store
-            .layer_from_tree(&tree, &TreeOptions::default())
-            .unwrap_err(),
-    );
+    told(store.layer_from_tree(&tree, &TreeOptions::default()).unwrap_err());
 
-    let large = Store::open(
-        &elsewhere.path().join("images"),
-        &elsewhere.path().join("layers"),
-    )
-    .unwrap();
-    let layer = large
-        .layer_from_tree(&tree, &TreeOptions::default())
-        .unwrap();
+    let large = Store::open(&elsewhere.path().join("images"), &elsewhere.path().join("layers")).unwrap();
+    let layer = large.layer_from_tree(&tree, &TreeOptions::default()).unwrap();
     let archive = elsewhere.path().join("layer.tar.gz");
     large.export_layer(&layer.diff_id, &archive).unwrap();
     let text = told(store.import_layer(&archive).unwrap_err());
     assert!(text.contains("6293 kB are needed"), "{text}");
-    assert!(matches!(
-        large.export_layer(&layer.diff_id, &disk.join("x")),
-        Err(Error::DiskFull { .. })
-    ));
+    assert!(matches!(large.export_layer(&layer.diff_id, &disk.join("x")), Err(Error::DiskFull { .. })));
 
     // The blob fits, the tree does not.
     std::fs::write(tree.join("noise"), vec![0; 6 << 20]).unwrap();
-    let layer = store
-        .layer_from_tree(&tree, &TreeOptions::default())
-        .unwrap();
+    let layer = store.layer_from_tree(&tree, &TreeOptions::default()).unwrap();
     let error = store.ensure_extracted(&layer.diff_id).unwrap_err();
     let text = error.to_string();
-    assert!(
-        matches!(
-            error,
-            Error::DiskFull {
-                needed: Some(_),
-                ..
-            }
-        ) && text.contains("noise"),
-        "{text}"
-    );
+    assert!(matches!(error, Error::DiskFull { needed: Some(_), .. }) && text.contains("noise"), "{text}");
     assert!(!store.tree_path(&layer.diff_id).exists());
     assert!(
-        rustix::fs::accessat(
-            File::open(&disk).unwrap(),
-            "layers",
-            rustix::fs::Access::EXISTS,
-            AtFlags::empty()
-        )
-        .is_ok()
+        rustix::fs::accessat(File::open(&disk).unwrap(), "layers", rustix::fs::Access::EXISTS, AtFlags::empty())
+            .is_ok()
     );
     // There is room again for small files.
     files::write_atomically(&disk.join("small"), &[0; 4096]).unwrap();
@@ -1122,25 +740,16 @@ fn packing_and_extracting_end_when_they_are_cancelled() {
     let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("a/b"), "content");
-    let layer = world
-        .store
-        .layer_from_tree(&tree, &TreeOptions::default())
-        .unwrap();
+    let layer = world.store.layer_from_tree(&tree, &TreeOptions::default()).unwrap();
     let cancel = foreign::cancel::Cancel::default();
     cancel.cancel();
     write(&tree.join("a/c"), "more");
     cancel.run(|| {
-        world
-            .store
-            .layer_from_tree(&tree, &TreeOptions::default())
-            .unwrap_err();
+        world.store.layer_from_tree(&tree, &TreeOptions::default()).unwrap_err();
         world.store.ensure_extracted(&layer.diff_id).unwrap_err();
     });
     assert_eq!(world.leftovers(), Vec::<String>::new());
     // Cancelled work succeeds when it is requested again.
     let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
-    assert_eq!(
-        std::fs::read_to_string(extracted.join("a/b")).unwrap(),
-        "content"
-    );
+    assert_eq!(std::fs::read_to_string(extracted.join("a/b")).unwrap(), "content");
 }

@@ -38,10 +38,7 @@ fn refusal(archive: &[u8]) -> String {
     match TarReader::new(archive).next_entry() {
         Err(ReadStop::Refused(problem)) => problem.to_string(),
         Err(ReadStop::Source(error)) => panic!("{error}"),
-        Ok(entry) => panic!(
-            "it is read: {}",
-            entry.map_or(0, |entry| entry.xattrs.len())
-        ),
+        Ok(entry) => panic!("it is read: {}", entry.map_or(0, |entry| entry.xattrs.len())),
     }
 }
 
@@ -51,9 +48,7 @@ fn what_a_file_can_have_is_read() {
     let name = member(EntryType::GNULongName, "long", b"name\0");
     let archive = archive(&[name, extension(largest - 1)]);
     let mut reader = TarReader::new(&archive[..]);
-    let Ok(Some(entry)) = reader.next_entry() else {
-        panic!("it is a good entry")
-    };
+    let Ok(Some(entry)) = reader.next_entry() else { panic!("it is a good entry") };
     assert_eq!(entry.name, b"name");
     assert_eq!(entry.xattrs.len(), largest - 1);
     assert_eq!(reader.headers(), 3);
@@ -61,12 +56,7 @@ fn what_a_file_can_have_is_read() {
 
 #[test]
 fn extended_headers_of_one_entry_are_few() {
-    for kind in [
-        EntryType::XHeader,
-        EntryType::XGlobalHeader,
-        EntryType::GNULongName,
-        EntryType::GNULongLink,
-    ] {
+    for kind in [EntryType::XHeader, EntryType::XGlobalHeader, EntryType::GNULongName, EntryType::GNULongLink] {
         let one = member(kind, "extended", b"");
         let many = archive(&vec![one.clone(); 9]);
         let said = refusal(&many);

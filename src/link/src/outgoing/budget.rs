@@ -21,9 +21,7 @@ pub(super) fn has_room(kept: usize, out: &OutgoingRecord) -> bool {
 /// Returns the number of irreplaceable messages queued on a topic and their total size in bytes.
 fn required_load(waiting: &Ring<OutgoingRecord>) -> (usize, usize) {
     let all = waiting.iter().filter(|out| out.is_irreplaceable());
-    all.fold((0, 0), |(count, bytes), out| {
-        (count + 1, bytes + out.memory_size())
-    })
+    all.fold((0, 0), |(count, bytes), out| (count + 1, bytes + out.memory_size()))
 }
 
 impl OutgoingRecord {
@@ -60,10 +58,7 @@ impl Outgoing {
         let sending = self.sending.iter().map(|sending| &sending.out);
         // Records of other lanes are counted there until they are acknowledged.
         let sending = sending.filter(|out| out.lane == RecordLane::Data);
-        let under_way: usize = sending
-            .chain(self.encoding.messages())
-            .map(RingItem::memory_size)
-            .sum();
+        let under_way: usize = sending.chain(self.encoding.messages()).map(RingItem::memory_size).sum();
         let waiting = self.lanes.bytes() + self.lines.bytes() + topics;
         waiting + under_way + self.retransmit.bytes + self.retransmit.big
     }
@@ -84,9 +79,7 @@ impl Outgoing {
     pub(super) fn release_unused(&mut self) {
         if self.permit.bytes() > 0 {
             // A smaller amount always fits.
-            let _ = self
-                .permit
-                .count(self.buffered_bytes().min(self.permit.bytes()));
+            let _ = self.permit.count(self.buffered_bytes().min(self.permit.bytes()));
         }
     }
 
@@ -94,10 +87,7 @@ impl Outgoing {
     /// by newer ones, then any, each time from the topic with the most bytes. The newest message stays.
     pub(super) fn enforce_budget(&mut self, channel: u32) {
         loop {
-            let topics = self
-                .topics
-                .iter()
-                .map(|(of, waiting)| (*of, required_load(waiting)));
+            let topics = self.topics.iter().map(|(of, waiting)| (*of, required_load(waiting)));
             let topics: Vec<(u32, (usize, usize))> = topics.collect();
             let all: usize = topics.iter().map(|(_, (_, bytes))| bytes).sum();
             let last = self.topics.get(&channel).and_then(Ring::back);
@@ -105,11 +95,8 @@ impl Outgoing {
                 return;
             }
             // Topics with more than one message come first.
-            let others = topics
-                .iter()
-                .filter(|(of, (count, _))| *of != channel || *count > 1);
-            let biggest =
-                others.max_by_key(|(_, (count, bytes))| (*count > 1 && *bytes > LITTLE, *bytes));
+            let others = topics.iter().filter(|(of, (count, _))| *of != channel || *count > 1);
+            let biggest = others.max_by_key(|(_, (count, bytes))| (*count > 1 && *bytes > LITTLE, *bytes));
             let Some(&(of, _)) = biggest else { return };
             let Some(waiting) = self.topics.get_mut(&of) else {
                 return;

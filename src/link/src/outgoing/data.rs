@@ -27,8 +27,7 @@ impl Outgoing {
             let mut older = topic.iter().take(topic.len() - 1);
             topic.exceeds(limit).then(|| older.position(may))?
         });
-        self.dropped
-            .add(channel, Cause::Replaced, replaced.messages);
+        self.dropped.add(channel, Cause::Replaced, replaced.messages);
         self.turns.enqueue(channel);
         if each {
             self.enforce_budget(channel);
@@ -51,8 +50,7 @@ impl Outgoing {
     pub(crate) fn forget_channel(&mut self, channel: u32) {
         let waiting = self.topics.remove(&channel).map_or(0, |topic| topic.len());
         let encoded = self.encoding.forget(channel);
-        self.dropped
-            .add(channel, Cause::Gone, waiting as u64 + u64::from(encoded));
+        self.dropped.add(channel, Cause::Gone, waiting as u64 + u64::from(encoded));
         self.turns.forget(channel);
         self.openings.remove(&channel);
     }
@@ -75,9 +73,7 @@ impl Outgoing {
             first.is_none_or(|first| gate.allows(first) && !(busy && encoding.should_encode(first)))
         })?;
         let topic = topics.get_mut(&channel)?;
-        let is_stale = |first: &OutgoingRecord| {
-            !first.each && self.max_age.is_some_and(|age| now - first.born > age)
-        };
+        let is_stale = |first: &OutgoingRecord| !first.each && self.max_age.is_some_and(|age| now - first.born > age);
         let stale = topic.trim(|topic| {
             let stale = topic.len() > 1 && topic.front().is_some_and(is_stale);
             stale.then_some(0)
@@ -127,9 +123,6 @@ impl Outgoing {
 }
 
 /// Returns the queue of a channel. Only this module drops messages from it.
-pub(super) fn topic_queue(
-    topics: &mut BTreeMap<u32, Ring<OutgoingRecord>>,
-    channel: u32,
-) -> &mut Ring<OutgoingRecord> {
+pub(super) fn topic_queue(topics: &mut BTreeMap<u32, Ring<OutgoingRecord>>, channel: u32) -> &mut Ring<OutgoingRecord> {
     topics.entry(channel).or_insert_with(Ring::new_unbounded)
 }

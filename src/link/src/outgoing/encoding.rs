@@ -49,9 +49,7 @@ impl Encoding {
         self.pays
             && out.payload.len() >= WORTH_IT
             && flags.is_some_and(|flags| flags & ENCODED == 0)
-            && out
-                .channel
-                .is_some_and(|channel| self.channels.contains(&channel))
+            && out.channel.is_some_and(|channel| self.channels.contains(&channel))
     }
 
     pub(super) fn begin(&mut self, out: OutgoingRecord) {
@@ -88,10 +86,7 @@ impl Encoding {
     }
 
     /// Takes the encoded message, if it `may` be sent.
-    pub(super) fn take_encoded(
-        &mut self,
-        may: impl FnOnce(&mut OutgoingRecord) -> bool,
-    ) -> Option<OutgoingRecord> {
+    pub(super) fn take_encoded(&mut self, may: impl FnOnce(&mut OutgoingRecord) -> bool) -> Option<OutgoingRecord> {
         self.done.take_if(may)
     }
 

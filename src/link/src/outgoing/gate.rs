@@ -30,13 +30,7 @@ impl<'a> Gate<'a> {
         let started = sending.iter().map(|sending| &sending.out);
         let started = started.filter(|out| out.lane == RecordLane::Control);
         let untold = started.map(|out| out.order).chain(lanes.next_control());
-        Self {
-            sending,
-            lanes,
-            openings,
-            untold: untold.min(),
-            peer,
-        }
+        Self { sending, lanes, openings, untold: untold.min(), peer }
     }
 
     /// Returns whether a record may be sent: it overtakes none that it must not overtake, and the peer accepts one
@@ -58,8 +52,7 @@ impl<'a> Gate<'a> {
 
     fn has_goal(&self, channel: u32) -> bool {
         let mut started = self.sending.iter().map(|sending| &sending.out);
-        let is_goal =
-            |out: &OutgoingRecord| out.lane == RecordLane::Calls && out.channel == Some(channel);
+        let is_goal = |out: &OutgoingRecord| out.lane == RecordLane::Calls && out.channel == Some(channel);
         started.any(is_goal) || self.lanes.has_goal(channel)
     }
 

@@ -46,10 +46,7 @@ pub(super) struct RecordLanes {
 
 impl Default for RecordLanes {
     fn default() -> Self {
-        Self {
-            waiting: std::array::from_fn(|_| Ring::new_unbounded()),
-            loads: Default::default(),
-        }
+        Self { waiting: std::array::from_fn(|_| Ring::new_unbounded()), loads: Default::default() }
     }
 }
 
@@ -61,10 +58,7 @@ impl RecordLanes {
             RecordLane::Control => (control, "orders", CONTROL),
             RecordLane::Calls => (calls, "calls", CALLS),
             _ => {
-                let both = LaneLoad {
-                    records: short.records + long.records,
-                    bytes: short.bytes + long.bytes,
-                };
+                let both = LaneLoad { records: short.records + long.records, bytes: short.bytes + long.bytes };
                 (both, "answers", ANSWERS)
             }
         }
@@ -73,8 +67,7 @@ impl RecordLanes {
     /// Returns why another record of this size may not be kept in a lane.
     pub(super) fn overflow_reason(&self, lane: RecordLane, bytes: usize) -> Option<String> {
         let (load, what, bounds) = self.load(lane);
-        let is_full = load.records >= bounds.messages
-            || (load.records > 0 && load.bytes + bytes > bounds.bytes);
+        let is_full = load.records >= bounds.messages || (load.records > 0 && load.bytes + bytes > bounds.bytes);
         is_full.then(|| {
             let LaneLoad { records, bytes } = load;
             format!("{records} {what} of {bytes} bytes wait for it or are not acknowledged")
@@ -146,10 +139,7 @@ pub(super) struct LineQueue {
 
 impl Default for LineQueue {
     fn default() -> Self {
-        Self {
-            waiting: Ring::new_unbounded(),
-            credit: 0,
-        }
+        Self { waiting: Ring::new_unbounded(), credit: 0 }
     }
 }
 
@@ -171,14 +161,10 @@ impl LineQueue {
     /// Notes that lines in front of the queue are omitted, so that the peer is told.
     pub(super) fn note_omitted(&mut self, lines: i64) {
         if lines > 0 {
-            let told = self
-                .waiting
-                .front()
-                .is_some_and(|first| first.is_required());
+            let told = self.waiting.front().is_some_and(|first| first.is_required());
             let told = told.then(|| self.waiting.pop()).flatten();
             let more = told.map_or(0, |told| told.line_count());
-            self.waiting
-                .put_back(OutgoingRecord::omission_notice(lines + more));
+            self.waiting.put_back(OutgoingRecord::omission_notice(lines + more));
         }
     }
 
@@ -188,11 +174,7 @@ impl LineQueue {
     }
 
     /// Takes the next line, if it `may` be sent. `is_alone`: nothing else can be sent.
-    pub(super) fn take(
-        &mut self,
-        is_alone: bool,
-        may: impl Fn(&OutgoingRecord) -> bool,
-    ) -> Option<OutgoingRecord> {
+    pub(super) fn take(&mut self, is_alone: bool, may: impl Fn(&OutgoingRecord) -> bool) -> Option<OutgoingRecord> {
         let first = self.waiting.front().filter(|out| may(out))?;
         let length = first.len().min(MOST_CREDIT);
         if !is_alone && length > self.credit {
@@ -223,11 +205,7 @@ impl OutgoingRecord {
             ),
         };
         let json = serde_json::to_vec(&line).unwrap_or_default();
-        Self {
-            each: true,
-            born: lines,
-            ..Self::new(&Record::Control(json.into()), RecordLane::Lines)
-        }
+        Self { each: true, born: lines, ..Self::new(&Record::Control(json.into()), RecordLane::Lines) }
     }
 
     /// Returns the number of the node's lines that this record stands for.

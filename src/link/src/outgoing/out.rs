@@ -68,17 +68,7 @@ impl OutgoingRecord {
             Record::Data(data) => (Some(data.channel), data.born),
             _ => (None, 0),
         };
-        Self {
-            head,
-            payload,
-            born,
-            each: false,
-            lane,
-            order: 0,
-            channel,
-            plain: None,
-            closes: false,
-        }
+        Self { head, payload, born, each: false, lane, order: 0, channel, plain: None, closes: false }
     }
 
     /// Returns the length of the record in bytes.

@@ -79,11 +79,7 @@ impl RetransmitBuffer {
 
     /// Removes the next record kept for retransmission, among those acknowledged by this number.
     pub(super) fn pop_acknowledged(&mut self, number: u64) -> Option<OutgoingRecord> {
-        while self
-            .records
-            .front()
-            .is_some_and(|(kept, _)| *kept <= number)
-        {
+        while self.records.front().is_some_and(|(kept, _)| *kept <= number) {
             if let Some((_, SentRecord::Again(out))) = self.records.pop_front() {
                 self.update_counter(&out, |counter| counter - out.memory_size());
                 return Some(out);
@@ -96,21 +92,14 @@ impl RetransmitBuffer {
     /// message of its channel or was returned before.
     pub(super) fn take_unencoded(&mut self, channel: u32, born: i64) -> Option<OutgoingRecord> {
         let of_channel = |sent: &SentRecord| matches!(sent, SentRecord::Again(out) if out.channel == Some(channel));
-        let at = self
-            .records
-            .iter()
-            .rposition(|(_, sent)| of_channel(sent))?;
+        let at = self.records.iter().rposition(|(_, sent)| of_channel(sent))?;
         let (number, sent) = self.records.remove(at)?;
         let SentRecord::Again(mut out) = sent else {
             return None;
         };
         // Without the unencoded form the record is smaller and may be counted elsewhere.
         self.update_counter(&out, |counter| counter - out.memory_size());
-        let plain = if out.born == born {
-            out.plain.take()
-        } else {
-            None
-        };
+        let plain = if out.born == born { out.plain.take() } else { None };
         let mut again = out.clone();
         self.update_counter(&out, |counter| counter + out.memory_size());
         self.records.insert(at, (number, SentRecord::Again(out)));
@@ -168,10 +157,7 @@ impl Outgoing {
                 }
             }
         }
-        for InFlightRecord {
-            number, again, out, ..
-        } in std::mem::take(&mut self.sending)
-        {
+        for InFlightRecord { number, again, out, .. } in std::mem::take(&mut self.sending) {
             if number == 0 {
                 self.on_lost(out.channel);
             }
@@ -185,9 +171,7 @@ impl Outgoing {
                 }
                 SentRecord::Again(out) => match (out.lane, out.channel) {
                     (RecordLane::Lines, _) => self.lines.put_back(out),
-                    (RecordLane::Data, Some(channel)) => {
-                        topic_queue(&mut self.topics, channel).put_back(out)
-                    }
+                    (RecordLane::Data, Some(channel)) => topic_queue(&mut self.topics, channel).put_back(out),
                     _ => self.lanes.put_back(out),
                 },
                 SentRecord::Once(_) if number <= received || ahead.contains(&number) => {}

@@ -29,18 +29,11 @@ fn control(number: u8) -> Record {
 fn deliver(incoming: &mut Incoming, frame: Frame) -> Option<Record> {
     let record = match frame {
         Frame::Whole { number, record } => incoming.receive_whole(number, record),
-        Frame::Begin {
-            stream,
-            number,
-            total,
-            bytes,
-        } => incoming.receive_begin(stream, number, total, &bytes),
+        Frame::Begin { stream, number, total, bytes } => incoming.receive_begin(stream, number, total, &bytes),
         Frame::More { stream, bytes } => incoming.receive_more(stream, &bytes),
         other => panic!("{other:?}"),
     };
-    record
-        .unwrap()
-        .map(|record| Record::decode(record).unwrap())
+    record.unwrap().map(|record| Record::decode(record).unwrap())
 }
 
 fn born_time(record: Option<Record>) -> Option<i64> {
@@ -53,8 +46,7 @@ fn born_time(record: Option<Record>) -> Option<i64> {
 /// Returns the number of messages of a channel dropped for this cause.
 fn drop_count(out: &Outgoing, channel: u32, cause: Cause) -> u64 {
     let mut all = out.dropped.iter();
-    all.find_map(|(of, why, count)| (*of == channel && why == cause).then_some(count))
-        .unwrap_or(0)
+    all.find_map(|(of, why, count)| (*of == channel && why == cause).then_some(count)).unwrap_or(0)
 }
 
 #[test]
@@ -126,9 +118,7 @@ fn a_flood_of_small_ones_does_not_stop_a_big_one() {
         out.push(&data(2, n, 10), DeliveryMode::Newest);
     }
     let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).take(100).collect();
-    let pieces = frames
-        .iter()
-        .filter(|frame| matches!(frame, Frame::More { .. }));
+    let pieces = frames.iter().filter(|frame| matches!(frame, Frame::More { .. }));
     assert!(pieces.count() >= 4, "{frames:?}");
 }
 
@@ -143,14 +133,9 @@ fn newest_wins_among_big_ones_and_old_ones_are_not_sent() {
         out.push(&data(2, n * 50, 10), DeliveryMode::Newest);
     }
     let mut incoming = Incoming::default();
-    let mut came: Vec<i64> = std::iter::from_fn(|| out.next(250))
-        .filter_map(|frame| born_time(deliver(&mut incoming, frame)))
-        .collect();
-    assert_eq!(
-        drop_count(&out, 2, Cause::Stale),
-        3,
-        "those of 0, 50 and 100"
-    );
+    let mut came: Vec<i64> =
+        std::iter::from_fn(|| out.next(250)).filter_map(|frame| born_time(deliver(&mut incoming, frame))).collect();
+    assert_eq!(drop_count(&out, 2, Cause::Stale), 3, "those of 0, 50 and 100");
     came.sort_unstable();
     assert_eq!(came, [4, 150, 200]);
 }
@@ -268,18 +253,12 @@ fn the_newest_message_is_encoded() {
     assert_eq!(born_time(deliver(&mut incoming, next)), Some(9));
     assert_eq!(out.next(0), None);
     assert!(out.is_idle() && !out.is_empty());
-    out.encoding.finish(Some((
-        Bytes::from_static(b"frame"),
-        Duration::from_micros(7),
-    )));
+    out.encoding.finish(Some((Bytes::from_static(b"frame"), Duration::from_micros(7))));
     let frame = out.next(0).unwrap();
     let Some(Record::Data(sent)) = deliver(&mut incoming, frame) else {
         panic!("a message");
     };
-    assert_eq!(
-        (sent.born, sent.encoded, sent.serialise, &sent.message[..]),
-        (3, true, 7, &b"frame"[..])
-    );
+    assert_eq!((sent.born, sent.encoded, sent.serialise, &sent.message[..]), (3, true, 7, &b"frame"[..]));
     assert_eq!(out.next(0), None);
     assert_eq!(out.encoding.take().unwrap().1[0], 4, "the next in turn");
     out.encoding.finish(None);
@@ -287,11 +266,7 @@ fn the_newest_message_is_encoded() {
     while let Some(frame) = out.next(0) {
         whole = deliver(&mut incoming, frame).or(whole);
     }
-    assert_eq!(
-        born_time(whole),
-        Some(4),
-        "as it is, where it cannot be encoded"
-    );
+    assert_eq!(born_time(whole), Some(4), "as it is, where it cannot be encoded");
     assert!(out.is_empty());
 }
 
@@ -302,17 +277,14 @@ fn a_message_that_came_damaged_goes_once_more_and_leaves_nothing() {
     out.push(&data(1, 1, 2 * SMALL), DeliveryMode::Each);
     assert_eq!(out.next(0), None);
     out.encoding.take().unwrap();
-    out.encoding
-        .finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
+    out.encoding.finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
     assert!(out.next(0).is_some());
     assert!(out.resend_damaged(1, 1) && !out.resend_damaged(1, 1));
     out.encoding.set_enabled(false);
     let mut incoming = Incoming::default();
     incoming.reconnect(2);
     let frames: Vec<Frame> = std::iter::from_fn(|| out.next(0)).collect();
-    let mut came = frames
-        .into_iter()
-        .map(|frame| deliver(&mut incoming, frame));
+    let mut came = frames.into_iter().map(|frame| deliver(&mut incoming, frame));
     assert_eq!(came.find_map(born_time), Some(1));
     out.acknowledge(out.next_number() - 1);
     let kept = &out.retransmit;
@@ -324,24 +296,17 @@ fn a_message_that_was_being_encoded_when_the_connection_was_lost_is_not() {
     let (mut out, mut incoming) = (encoding_outgoing(), Incoming::default());
     out.push(&data(1, 1, 50_000), DeliveryMode::Each);
     assert_eq!(out.next(0), None);
-    assert!(
-        out.encoding.take().unwrap().2,
-        "it must be understood alone"
-    );
+    assert!(out.encoding.take().unwrap().2, "it must be understood alone");
     out.reconnect(0, &[]);
     assert_eq!(out.next(0), None);
     assert_eq!(out.encoding.take().unwrap().1[0], 1);
-    out.encoding
-        .finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
+    out.encoding.finish(Some((Bytes::from_static(b"frame"), Duration::ZERO)));
     let frame = out.next(0).unwrap();
     assert_eq!(born_time(deliver(&mut incoming, frame)), Some(1));
     // It was encoded once and is sent again in that form.
     out.reconnect(0, &[]);
     let frame = out.next(0).unwrap();
-    assert!(
-        matches!(frame, Frame::Whole { number: 1.., .. }),
-        "{frame:?}"
-    );
+    assert!(matches!(frame, Frame::Whole { number: 1.., .. }), "{frame:?}");
     assert_eq!(out.encoding.take(), None);
 }
 
@@ -355,13 +320,8 @@ fn small_messages_and_other_topics_are_not_encoded() {
 }
 
 fn latched_message(channel: u32, born: i64, size: usize) -> Record {
-    let Record::Data(data) = data(channel, born, size) else {
-        unreachable!("data is data")
-    };
-    Record::Data(Data {
-        latching: true,
-        ..data
-    })
+    let Record::Data(data) = data(channel, born, size) else { unreachable!("data is data") };
+    Record::Data(Data { latching: true, ..data })
 }
 
 /// Returns the number of bytes of queued messages.
@@ -379,11 +339,7 @@ fn latched_messages_for_a_dead_link_take_so_much_memory_and_no_more() {
     for number in 1..=100 {
         out.push(&latched_message(1, number, 3 * MB), DeliveryMode::Each);
         out.push(&latched_message(3, number, 100), DeliveryMode::Each);
-        assert!(
-            queued_bytes(&out) <= 68 * MB,
-            "{} MB",
-            queued_bytes(&out) / MB
-        );
+        assert!(queued_bytes(&out) <= 68 * MB, "{} MB", queued_bytes(&out) / MB);
     }
     assert_eq!(out.topics[&2].len(), 1, "nothing has taken its place");
     assert_eq!(out.topics[&3].len(), 100, "small ones cost nothing");
@@ -396,11 +352,7 @@ fn latched_messages_for_a_dead_link_take_so_much_memory_and_no_more() {
     // With many topics, one of them drops a message when their sum is too large.
     for channel in 10..40 {
         out.push(&latched_message(channel, 1, 8 * MB), DeliveryMode::Each);
-        assert!(
-            queued_bytes(&out) <= 73 * MB,
-            "{} MB",
-            queued_bytes(&out) / MB
-        );
+        assert!(queued_bytes(&out) <= 73 * MB, "{} MB", queued_bytes(&out) / MB);
     }
     assert_eq!(out.topics[&39].len(), 1);
     // The last message stays however big it is.
@@ -458,31 +410,17 @@ fn a_channel_is_closed_after_its_last_message_and_leaves_nothing() {
     while let Some(frame) = out.next(0) {
         came.extend(deliver(&mut incoming, frame));
     }
-    let messages: Vec<i64> = came
-        .iter()
-        .cloned()
-        .filter_map(|it| born_time(Some(it)))
-        .collect();
+    let messages: Vec<i64> = came.iter().cloned().filter_map(|it| born_time(Some(it))).collect();
     assert_eq!(messages, [1, 2, 3, 4]);
     assert_eq!(came.last(), Some(&close), "after all of them: {came:?}");
-    assert!(
-        out.closed.is_empty(),
-        "the peer has not said that it has it"
-    );
+    assert!(out.closed.is_empty(), "the peer has not said that it has it");
     out.acknowledge(incoming.received_numbers().0);
     assert_eq!(out.closed, [1]);
-    assert!(
-        out.topics.is_empty() && out.encoding.channels().is_empty() && out.retransmit.len() == 0
-    );
+    assert!(out.topics.is_empty() && out.encoding.channels().is_empty() && out.retransmit.len() == 0);
 }
 
 fn answer(size: usize) -> Record {
-    Record::Answer {
-        id: 1,
-        taken: 0,
-        given: 0,
-        response: Ok(Bytes::from(vec![0; size])),
-    }
+    Record::Answer { id: 1, taken: 0, given: 0, response: Ok(Bytes::from(vec![0; size])) }
 }
 
 #[test]
@@ -492,10 +430,7 @@ fn a_peer_that_acknowledges_nothing_ends_the_session_before_memory_does() {
         let mut pushed = 0;
         // The peer reads everything immediately.
         while out.overflow_reason().is_none() {
-            assert!(
-                pushed <= ANSWERS.messages,
-                "{pushed} answers of {size} bytes"
-            );
+            assert!(pushed <= ANSWERS.messages, "{pushed} answers of {size} bytes");
             out.push(&answer(size), DeliveryMode::Each);
             while out.next(0).is_some() {}
             pushed += 1;
@@ -531,9 +466,8 @@ fn goals_and_what_cancels_them_come_in_order_and_results_all() {
     let (mut out, mut incoming) = (Outgoing::new(None), Incoming::default());
     out.push(&data(1, 1, 10 * SMALL), DeliveryMode::InOrder);
     out.push(&data(2, 2, 10), DeliveryMode::InOrder);
-    let came: Vec<i64> = std::iter::from_fn(|| out.next(0))
-        .filter_map(|frame| born_time(deliver(&mut incoming, frame)))
-        .collect();
+    let came: Vec<i64> =
+        std::iter::from_fn(|| out.next(0)).filter_map(|frame| born_time(deliver(&mut incoming, frame))).collect();
     assert_eq!(came, [1, 2], "the goal, and then what cancels it");
 }
 
@@ -543,20 +477,14 @@ fn goals_beyond_the_limit_are_dropped_and_counted() {
     for number in 0..CALLS.messages as i64 + 3 {
         out.push(&data(1, number, 10), DeliveryMode::InOrder);
     }
-    assert_eq!(
-        (out.overflow_reason(), drop_count(&out, 1, Cause::Full)),
-        (None, 3)
-    );
+    assert_eq!((out.overflow_reason(), drop_count(&out, 1, Cause::Full)), (None, 3));
 }
 
 #[test]
 fn what_is_longer_than_the_peer_takes_is_left_out_and_counted() {
     let mut out = Outgoing::new(None);
     let record = 2 << 20;
-    out.set_limits(LinkLimits {
-        record,
-        ..LinkLimits::default()
-    });
+    out.set_limits(LinkLimits { record, ..LinkLimits::default() });
     out.push(&data(1, 1, record), DeliveryMode::Each);
     out.push(&data(1, 2, record - 100), DeliveryMode::Each);
     assert_eq!(drop_count(&out, 1, Cause::Full), 1);
@@ -566,12 +494,7 @@ fn what_is_longer_than_the_peer_takes_is_left_out_and_counted() {
 #[test]
 fn limits_without_which_nothing_could_be_sent_are_not_believed() {
     let mut out = Outgoing::new(None);
-    out.set_limits(LinkLimits {
-        record: 0,
-        under_way: 0,
-        under_way_bytes: 0,
-        ahead: 0,
-    });
+    out.set_limits(LinkLimits { record: 0, under_way: 0, under_way_bytes: 0, ahead: 0 });
     out.push(&control(1), DeliveryMode::Each);
     out.push(&data(1, 1, 100_000), DeliveryMode::Each);
     assert!(out.next(0).is_some() && out.next(0).is_some());
@@ -607,9 +530,8 @@ fn a_flood_of_calls_does_not_stop_messages() {
         out.push(&answer(10), DeliveryMode::Each);
     }
     out.push(&data(1, 7, 10), DeliveryMode::Newest);
-    let came: Vec<Option<i64>> = std::iter::from_fn(|| out.next(0))
-        .map(|frame| born_time(deliver(&mut incoming, frame)))
-        .collect();
+    let came: Vec<Option<i64>> =
+        std::iter::from_fn(|| out.next(0)).map(|frame| born_time(deliver(&mut incoming, frame))).collect();
     let at = came.iter().position(|born| *born == Some(7));
     assert!(at < Some(5), "{at:?}");
 }
@@ -624,18 +546,12 @@ fn what_waits_counts_and_beyond_the_budget_messages_go_before_answers_do() {
             out.push(&data(channel, born, 1 << 20), DeliveryMode::Each);
         }
     }
-    assert!(
-        (6 << 20..=8 << 20).contains(&budget.used_bytes()),
-        "{budget:?}"
-    );
+    assert!((6 << 20..=8 << 20).contains(&budget.used_bytes()), "{budget:?}");
     let lost: u64 = out.dropped.iter().map(|(.., count)| count).sum();
     assert!(lost >= 20 * 8 - 8, "{:?}", out.dropped);
     assert_eq!(out.overflow_reason(), None);
     out.push(&answer(3 << 20), DeliveryMode::Each);
-    let reason = out
-        .overflow_reason()
-        .expect("there is no room for it")
-        .to_owned();
+    let reason = out.overflow_reason().expect("there is no room for it").to_owned();
     assert!(reason.contains("the memory for servant x"), "{reason}");
 
     drop(out);

@@ -62,11 +62,7 @@ fn every_grid_is_understood_alone() {
 #[test]
 fn pictures_lose_detail_only_where_both_ends_say_so() {
     let names = |welcome: fn(Codec) -> bool| supported_codecs(welcome);
-    assert!(
-        names(|_| false)
-            .iter()
-            .all(|name| name != "jpeg" && name != "video")
-    );
+    assert!(names(|_| false).iter().all(|name| name != "jpeg" && name != "video"));
     assert!(names(|codec| codec == Codec::Jpeg).contains(&"jpeg".to_owned()));
     // Codecs that are not built in are not announced.
     let video = names(|codec| codec == Codec::Video).contains(&"video".to_owned());
@@ -80,9 +76,7 @@ fn pictures_lose_detail_only_where_both_ends_say_so() {
     // allows.
     let mut used = Vec::new();
     for number in 0..60 {
-        let job = robot
-            .encode_job(1, noisy(number), false, Some(60e3))
-            .unwrap();
+        let job = robot.encode_job(1, noisy(number), false, Some(60e3)).unwrap();
         let frame = robot.finish(job.run());
         used.push(codec::peek(&frame).unwrap().codec);
         let (message, _) = SessionCodecs::default().decode(1, &frame);
@@ -112,10 +106,7 @@ fn encoding_pays_where_the_link_is_slow_and_the_peer_decodes() {
     let (robot, cloud) = codec_pair();
     assert!(robot.is_worthwhile(Some(2.5e6)));
     assert!(!robot.is_worthwhile(Some(1e9)) && !robot.is_worthwhile(None));
-    assert!(
-        !cloud.is_worthwhile(Some(2.5e6)),
-        "it was not told what its peer decodes"
-    );
+    assert!(!cloud.is_worthwhile(Some(2.5e6)), "it was not told what its peer decodes");
     let mut old = SessionCodecs::default();
     old.set_peer_codecs(&["raw".to_owned(), "zstd".to_owned()]);
     assert!(!old.is_worthwhile(Some(2.5e6)));

@@ -55,9 +55,7 @@ impl<O: ControlMessage> Session<O> {
         let goodbye = match &lost {
             DisconnectReason::Ended => {
                 let ending = &self.state.lock().ending;
-                ending
-                    .as_ref()
-                    .map(|ending| (ending.code, ending.reason.clone()))
+                ending.as_ref().map(|ending| (ending.code, ending.reason.clone()))
             }
             DisconnectReason::Closed { code, .. } => Some((*code, String::new())),
             lost => lost.close_frame(),
@@ -218,12 +216,7 @@ impl<O: ControlMessage> Session<O> {
                 connection.unacknowledged += u32::from(number != 0);
                 self.state.lock().incoming.receive_whole(number, record)?
             }
-            Frame::Begin {
-                stream,
-                number,
-                total,
-                bytes,
-            } => {
+            Frame::Begin { stream, number, total, bytes } => {
                 connection.unacknowledged += u32::from(number != 0);
                 let incoming = &mut self.state.lock().incoming;
                 incoming.receive_begin(stream, number, total, &bytes)?
@@ -237,21 +230,11 @@ impl<O: ControlMessage> Session<O> {
             Frame::Ping { sent, received } => {
                 self.on_acknowledged(received);
                 let received = self.take_progress(connection);
-                let pong = Frame::Pong {
-                    sent,
-                    arrived,
-                    left: now(),
-                    received,
-                };
+                let pong = Frame::Pong { sent, arrived, left: now(), received };
                 socket.queue(opcode::BINARY, pong.encode());
                 None
             }
-            Frame::Pong {
-                sent,
-                arrived: there,
-                left,
-                received,
-            } => {
+            Frame::Pong { sent, arrived: there, left, received } => {
                 self.on_acknowledged(received);
                 let sample = ClockSample::new(sent, there, left, arrived);
                 let best = {
@@ -297,9 +280,7 @@ impl<O: ControlMessage> Session<O> {
                         }
                     }
                 }
-                Record::Call {
-                    id, ref request, ..
-                } => match self.called.take(CALL + request.len()) {
+                Record::Call { id, ref request, .. } => match self.called.take(CALL + request.len()) {
                     Ok(permit) => {
                         held = permit;
                         record.try_map_control(|_| Ok::<_, Error>(None))?
@@ -393,19 +374,14 @@ impl SessionConnection {
     ) {
         self.pinged = Instant::now();
         let received = session.take_progress(self);
-        let ping = Frame::Ping {
-            sent: now(),
-            received,
-        };
+        let ping = Frame::Ping { sent: now(), received };
         socket.queue(opcode::BINARY, ping.encode());
     }
 }
 
 pub(super) fn disconnect_reason(error: WsError) -> DisconnectReason {
     match error {
-        WsError::Refused { code, reason } => {
-            DisconnectReason::Protocol(Error::Refused { code, reason })
-        }
+        WsError::Refused { code, reason } => DisconnectReason::Protocol(Error::Refused { code, reason }),
         error => DisconnectReason::Socket(error.to_string()),
     }
 }

@@ -16,12 +16,7 @@ impl<O: ControlMessage> Session<O> {
     /// Starts encoding the next message on another thread.
     pub(super) fn start_encoding(&self) -> Option<JoinHandle<EncodedMessage>> {
         let mut state = self.state.lock();
-        let State {
-            out,
-            packing,
-            throughput,
-            ..
-        } = &mut *state;
+        let State { out, packing, throughput, .. } = &mut *state;
         let (channel, message, alone) = out.encoding.take()?;
         let Some(job) = packing.encode_job(channel, message, alone, throughput.estimate()) else {
             out.encoding.finish(None);
@@ -86,11 +81,7 @@ impl<O: ControlMessage> Session<O> {
 
     /// Parses a control record. Returns `None` for a message between the sessions, which is handled here. The record is
     /// charged to `held` before it is parsed.
-    pub(super) fn parse_control(
-        &self,
-        json: &[u8],
-        held: &mut Permit,
-    ) -> Result<Option<O::FromPeer>, Error> {
+    pub(super) fn parse_control(&self, json: &[u8], held: &mut Permit) -> Result<Option<O::FromPeer>, Error> {
         let limit = control::max_control_length(json);
         if json.len() > limit {
             return Err(limit_error("a control record", json.len(), limit));

@@ -21,9 +21,7 @@ where
 {
     let json = serde_json::to_vec(open).unwrap_or_default();
     socket.queue(opcode::BINARY, Frame::Open(json.into()).encode());
-    poll_fn(|cx| socket.poll_flush(cx))
-        .await
-        .map_err(|error| DisconnectReason::Socket(error.to_string()))
+    poll_fn(|cx| socket.poll_flush(cx)).await.map_err(|error| DisconnectReason::Socket(error.to_string()))
 }
 
 /// Receives the peer's opening frame; `what` names it in errors. It is charged to `held` before it is parsed.
@@ -37,10 +35,7 @@ where
     T: DeserializeOwned,
 {
     loop {
-        match poll_fn(|cx| socket.poll_next(cx))
-            .await
-            .map_err(disconnect_reason)?
-        {
+        match poll_fn(|cx| socket.poll_next(cx)).await.map_err(disconnect_reason)? {
             WsMessage::Binary(bytes) => {
                 let Frame::Open(json) = Frame::decode(bytes)? else {
                     return Err(Error::Protocol("no opening frame").into());

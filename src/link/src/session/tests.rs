@@ -32,15 +32,9 @@ fn session() -> Arc<Session> {
     }))
 }
 
-fn sockets() -> (
-    WebSocket<tokio::io::DuplexStream>,
-    WebSocket<tokio::io::DuplexStream>,
-) {
+fn sockets() -> (WebSocket<tokio::io::DuplexStream>, WebSocket<tokio::io::DuplexStream>) {
     let (robot, cloud) = duplex(1 << 16);
-    (
-        WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7),
-        WebSocket::new(cloud, b"", MAX_FRAME, MAX_RECORD),
-    )
+    (WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7), WebSocket::new(cloud, b"", MAX_FRAME, MAX_RECORD))
 }
 
 fn data(channel: u32, size: usize) -> Data {
@@ -111,16 +105,8 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
     while !collected.is_finished() {
         open(&robot, &cloud);
         let (mut at_robot, mut at_cloud) = sockets();
-        let (to_robot, to_cloud) = (
-            RecordSender(to_robot.clone()),
-            RecordSender(to_cloud.clone()),
-        );
-        let both = async {
-            tokio::join!(
-                robot.run(&mut at_robot, &to_robot),
-                cloud.run(&mut at_cloud, &to_cloud)
-            )
-        };
+        let (to_robot, to_cloud) = (RecordSender(to_robot.clone()), RecordSender(to_cloud.clone()));
+        let both = async { tokio::join!(robot.run(&mut at_robot, &to_robot), cloud.run(&mut at_cloud, &to_cloud)) };
         // Cut at an arbitrary point, later each time, because a busy machine may transfer almost nothing at first.
         round += 1;
         let later = Duration::from_micros(300 * (round % 40 + 1)) * (1 + round as u32 / 100);
@@ -137,10 +123,7 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
 async fn a_peer_gives_a_sign_when_it_is_asked_for_one() {
     let quiet = || {
         let seldom = SessionOptions::for_silence(Duration::from_secs(600), None);
-        Arc::new(Session::new(SessionOptions {
-            ping: Duration::from_secs(600),
-            ..seldom
-        }))
+        Arc::new(Session::new(SessionOptions { ping: Duration::from_secs(600), ..seldom }))
     };
     let (robot, cloud) = (quiet(), quiet());
     let nobody = RecordSender(mpsc::unbounded_channel().0);
@@ -191,10 +174,7 @@ async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
                 };
                 cloud.answer(asked, 0, Ok(Bytes::new()));
                 let answer = answers.recv().await;
-                assert!(
-                    matches!(answer, Some(Record::Answer { id: answered, .. }) if answered == id),
-                    "{answer:?}"
-                );
+                assert!(matches!(answer, Some(Record::Answer { id: answered, .. }) if answered == id), "{answer:?}");
             }
         };
         tokio::select! {
@@ -215,19 +195,12 @@ async fn answers_ahead(socket: &mut WebSocket<tokio::io::DuplexStream>, ahead: i
     let mut pongs = 0;
     while pongs < 3 {
         let message = poll_fn(|cx| socket.poll_next(cx)).await.unwrap();
-        let WsMessage::Binary(bytes) = message else {
-            panic!("{message:?}")
-        };
+        let WsMessage::Binary(bytes) = message else { panic!("{message:?}") };
         let arrived = now() + ahead;
         let Frame::Ping { sent, received } = Frame::decode(bytes).unwrap() else {
             continue;
         };
-        let pong = Frame::Pong {
-            sent,
-            arrived,
-            left: now() + ahead,
-            received,
-        };
+        let pong = Frame::Pong { sent, arrived, left: now() + ahead, received };
         socket.queue(ws::frame::BINARY, pong.encode());
         poll_fn(|cx| socket.poll_flush(cx)).await.unwrap();
         pongs += 1;
@@ -254,10 +227,7 @@ async fn a_clock_an_hour_ahead_is_measured_and_a_silent_peer_is_noticed() {
         } => {}
     }
     let sample = robot.clock().unwrap();
-    assert!(
-        (sample.offset - HOUR).abs() <= sample.delay / 2 + 1,
-        "{sample:?}"
-    );
+    assert!((sample.offset - HOUR).abs() <= sample.delay / 2 + 1, "{sample:?}");
 }
 
 /// Measures a link that silently carries nothing any more: the time until it is detected, and the time until the
@@ -296,10 +266,7 @@ async fn a_silent_link_is_noticed_within_t_max() {
         let (noticed, given_up) = measure_detection(options).await;
         assert!(noticed <= max, "{noticed:?} for {max:?}");
         // Silence is measured from the last message, which was at most a ping before the cut.
-        assert!(
-            given_up <= lost && given_up + ping >= lost,
-            "{given_up:?} for {max:?}: {ping:?}, {lost:?}"
-        );
+        assert!(given_up <= lost && given_up + ping >= lost, "{given_up:?} for {max:?}: {ping:?}, {lost:?}");
     }
 }
 
@@ -415,10 +382,7 @@ fn map() -> Bytes {
 }
 
 /// Counts undecodable messages and collects records.
-struct CountingHandler(
-    mpsc::UnboundedSender<Record<FromCloud>>,
-    std::sync::atomic::AtomicUsize,
-);
+struct CountingHandler(mpsc::UnboundedSender<Record<FromCloud>>, std::sync::atomic::AtomicUsize);
 
 impl SessionHandler<FromCloud> for CountingHandler {
     fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
@@ -461,10 +425,7 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
     });
     let (to_robot, _records) = mpsc::unbounded_channel();
     let (to_cloud, mut records) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (
-        RecordSender(to_robot),
-        CountingHandler(to_cloud, Default::default()),
-    );
+    let (to_robot, to_cloud) = (RecordSender(to_robot), CountingHandler(to_cloud, Default::default()));
     let mut latched = data(1, 0);
     latched.latching = true;
     latched.message = map();
@@ -495,16 +456,9 @@ impl SessionHandler<FromCloud> for SlowHandler {
 }
 
 /// Sends control records to an end with a budget of `limit` bytes, and returns how its link ends.
-async fn deliver_control(
-    limit: usize,
-    orders: impl IntoIterator<Item = Bytes>,
-) -> (DisconnectReason, usize, Budget) {
+async fn deliver_control(limit: usize, orders: impl IntoIterator<Item = Bytes>) -> (DisconnectReason, usize, Budget) {
     let budget = Budget::new("robot x", limit);
-    let told = Arc::new(
-        Arc::into_inner(session())
-            .expect("the only one")
-            .with_budget(&budget),
-    );
+    let told = Arc::new(Arc::into_inner(session()).expect("the only one").with_budget(&budget));
     let tells = session();
     open(&told, &tells);
     let (mut at_told, mut at_teller) = sockets();
@@ -512,14 +466,8 @@ async fn deliver_control(
         tells.push(&Record::Control(json), DeliveryMode::Each);
     }
     tells.close(1000, "all is told");
-    let (slow, nobody) = (
-        SlowHandler::default(),
-        RecordSender(mpsc::unbounded_channel().0),
-    );
-    let (lost, _) = tokio::join!(
-        told.run(&mut at_told, &slow),
-        tells.run(&mut at_teller, &nobody)
-    );
+    let (slow, nobody) = (SlowHandler::default(), RecordSender(mpsc::unbounded_channel().0));
+    let (lost, _) = tokio::join!(told.run(&mut at_told, &slow), tells.run(&mut at_teller, &nobody));
     let kept = slow.0.into_inner().len();
     (lost, kept, budget)
 }
@@ -528,10 +476,7 @@ async fn deliver_control(
 async fn orders_count_until_they_are_obeyed() {
     let line = Bytes::from_static(br#"{"line":{"error":false,"text":"a"}}"#);
     let (lost, kept, budget) = deliver_control(1 << 20, vec![line.clone(); 100]).await;
-    assert!(
-        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
-        "{lost}"
-    );
+    assert!(matches!(lost, DisconnectReason::Closed { code: 1000, .. }), "{lost}");
     assert_eq!((kept, budget.used_bytes()), (100, 0));
     let (lost, kept, _) = deliver_control(1 << 20, vec![line; 10_000]).await;
     let DisconnectReason::Protocol(Error::Exceeded(_)) = lost else {
@@ -547,28 +492,19 @@ async fn an_order_is_as_long_as_it_may_be() {
         Bytes::from(format!(r#"{{"line":{{"error":false,"text":"{text}"}}}}"#))
     };
     let (lost, kept, _) = deliver_control(64 << 20, [line(crate::MAX_CONTROL - 100)]).await;
-    assert!(
-        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
-        "{lost}"
-    );
+    assert!(matches!(lost, DisconnectReason::Closed { code: 1000, .. }), "{lost}");
     assert_eq!(kept, 1);
     let (lost, kept, _) = deliver_control(64 << 20, [line(crate::MAX_CONTROL)]).await;
     let DisconnectReason::Protocol(error @ Error::TooMuch { .. }) = lost else {
         panic!("it is too long: {lost}");
     };
-    assert!(
-        error.to_string().contains("a control record of 10486"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("a control record of 10486"), "{error}");
     assert_eq!(kept, 0);
     // Parameters may be long texts.
     let text = "x".repeat(4 << 20);
     let parameters = format!(r#"{{"parameters":[["/robot_description","{text}"]]}}"#);
     let (lost, kept, _) = deliver_control(64 << 20, [parameters.into()]).await;
-    assert!(
-        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
-        "{lost}"
-    );
+    assert!(matches!(lost, DisconnectReason::Closed { code: 1000, .. }), "{lost}");
     assert_eq!(kept, 1);
 }
 
@@ -610,11 +546,7 @@ async fn a_hello_is_read_if_what_it_becomes_has_room() {
 async fn calls_count_until_they_are_answered() {
     // Half of the budget is for calls, so that records in flight are not affected.
     let budget = Budget::new("robot x", 2 << 20);
-    let asked = Arc::new(
-        Arc::into_inner(session())
-            .expect("the only one")
-            .with_budget(&budget),
-    );
+    let asked = Arc::new(Arc::into_inner(session()).expect("the only one").with_budget(&budget));
     let asks = session();
     open(&asked, &asks);
     let (mut at_asked, mut at_asking) = sockets();

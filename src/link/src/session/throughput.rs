@@ -90,12 +90,7 @@ mod tests {
         let start = Instant::now();
         let mut counters = |seconds: u64, bytes: u64, sent: u64, idle: bool| {
             let at = start + Duration::from_secs(seconds);
-            throughput.update(Counters {
-                at,
-                bytes,
-                sent,
-                idle,
-            })
+            throughput.update(Counters { at, bytes, sent, idle })
         };
         // There was always more to send: 100 bytes per second, disturbed once.
         assert_eq!(counters(0, 0, 1000, false), None);
@@ -108,12 +103,7 @@ mod tests {
         // Another connection starts anew.
         throughput.reconnect();
         let at = start + Duration::from_secs(20);
-        let first = Counters {
-            at,
-            bytes: 5000,
-            sent: 5000,
-            idle: false,
-        };
+        let first = Counters { at, bytes: 5000, sent: 5000, idle: false };
         assert_eq!(throughput.update(first), None);
         assert_eq!(throughput.estimate(), Some(106.25));
     }

@@ -75,10 +75,7 @@ fn what_no_clock_shows_stays() {
     let skew = skew_ahead();
     for (seconds, nanoseconds) in [(0, 0), (5, 1_000_000_000), (60, 0), (0, 1)] {
         let message = stamped_message(seconds, nanoseconds);
-        assert_eq!(
-            skew.apply(Direction::In, &header(), message.clone()),
-            message
-        );
+        assert_eq!(skew.apply(Direction::In, &header(), message.clone()), message);
     }
     let last = stamped_message(u32::MAX, 999_999_999);
     assert_eq!(skew.apply(Direction::Out, &header(), last.clone()), last);

@@ -32,17 +32,8 @@ impl FitsFixture {
 }
 
 fn distributions() -> Vec<Distribution> {
-    let of = |(version, name): (RosVersion, &str)| Distribution {
-        version,
-        name: name.to_owned(),
-    };
-    [
-        (RosVersion::One, "noetic"),
-        (RosVersion::Two, "humble"),
-        (RosVersion::Two, "jazzy"),
-    ]
-    .map(of)
-    .into()
+    let of = |(version, name): (RosVersion, &str)| Distribution { version, name: name.to_owned() };
+    [(RosVersion::One, "noetic"), (RosVersion::Two, "humble"), (RosVersion::Two, "jazzy")].map(of).into()
 }
 
 fn build_type(name: &str) -> String {
@@ -68,38 +59,17 @@ fn the_build_type_tells_the_version() {
         (build_type("catkin"), 1, "has build type catkin"),
         // The default is catkin.
         (String::new(), 1, "has build type catkin"),
-        (
-            "<buildtool_depend>catkin</buildtool_depend>".to_owned(),
-            1,
-            "has build type catkin",
-        ),
+        ("<buildtool_depend>catkin</buildtool_depend>".to_owned(), 1, "has build type catkin"),
         (build_type("ament_cmake"), 2, "has build type ament_cmake"),
         (build_type("ament_python"), 2, "has build type ament_python"),
         (build_type("cmake"), 0, ""),
+        (format!("<buildtool_depend>catkin</buildtool_depend>{}", build_type("cmake")), 1, "is built with catkin"),
         (
-            format!(
-                "<buildtool_depend>catkin</buildtool_depend>{}",
-                build_type("cmake")
-            ),
-            1,
-            "is built with catkin",
-        ),
-        (
-            format!(
-                "<buildtool_depend>ament_cmake</buildtool_depend>{}",
-                build_type("cmake")
-            ),
+            format!("<buildtool_depend>ament_cmake</buildtool_depend>{}", build_type("cmake")),
             2,
             "is built with ament_cmake",
         ),
-        (
-            format!(
-                "<member_of_group>{INTERFACES}</member_of_group>{}",
-                build_type("cmake")
-            ),
-            2,
-            "is built with rosidl",
-        ),
+        (format!("<member_of_group>{INTERFACES}</member_of_group>{}", build_type("cmake")), 2, "is built with rosidl"),
         (BOTH.to_owned(), 0, ""),
         // With one distribution of a version only.
         (
@@ -112,12 +82,7 @@ fn the_build_type_tells_the_version() {
     ] {
         let fits = FitsFixture::new(&[("p", &rest)]).fits().expect("it fits");
         assert_eq!(number(&fits), expected, "{rest}");
-        if let RosSupport::Only {
-            package,
-            because: why,
-            ..
-        } = fits
-        {
+        if let RosSupport::Only { package, because: why, .. } = fits {
             assert_eq!((&*package, &*why), ("p", because), "{rest}");
         }
     }
@@ -131,11 +96,9 @@ fn two_flavours_name_both_packages() {
         ("c_listener", &build_type("ament_python")),
     ]);
     let text = place.refusal();
-    for words in [
-        "b_talker has build type catkin (ROS 1)",
-        "c_listener has build type ament_python (ROS 2)",
-        "COLCON_IGNORE",
-    ] {
+    for words in
+        ["b_talker has build type catkin (ROS 1)", "c_listener has build type ament_python (ROS 2)", "COLCON_IGNORE"]
+    {
         assert!(text.contains(words), "{text}");
     }
     place.write("src/c_listener/COLCON_IGNORE", "");
@@ -145,10 +108,7 @@ fn two_flavours_name_both_packages() {
 #[test]
 fn what_nothing_builds_is_told_with_its_file() {
     let text = FitsFixture::new(&[("p", &build_type("bazel"))]).refusal();
-    assert!(
-        text.contains("src/p/package.xml: no base supports build type bazel"),
-        "{text}"
-    );
+    assert!(text.contains("src/p/package.xml: no base supports build type bazel"), "{text}");
     for (tool, add) in [
         ("ament_cmake", "<build_type>ament_cmake</build_type>"),
         ("ament_cmake_auto", "<build_type>ament_cmake</build_type>"),
@@ -167,24 +127,13 @@ fn what_nothing_builds_is_told_with_its_file() {
 fn install_spaces_are_of_the_tools_that_made_them() {
     let manifest = "<package><name>p</name></package>";
     let place = FitsFixture(tempfile::tempdir().expect("a directory"));
-    place
-        .write(".catkin", "")
-        .write("setup.sh", "")
-        .write("share/p/package.xml", manifest);
+    place.write(".catkin", "").write("setup.sh", "").write("share/p/package.xml", manifest);
     let fits = place.fits().expect("a space");
-    assert!(
-        fits.supports(RosVersion::One) && !fits.supports(RosVersion::Two),
-        "{fits:?}"
-    );
+    assert!(fits.supports(RosVersion::One) && !fits.supports(RosVersion::Two), "{fits:?}");
     let place = FitsFixture(tempfile::tempdir().expect("a directory"));
-    place
-        .write("share/ament_index/resource_index/packages/p", "")
-        .write("share/p/package.xml", manifest);
+    place.write("share/ament_index/resource_index/packages/p", "").write("share/p/package.xml", manifest);
     let fits = place.fits().expect("a space");
-    assert!(
-        fits.supports(RosVersion::Two) && !fits.supports(RosVersion::One),
-        "{fits:?}"
-    );
+    assert!(fits.supports(RosVersion::Two) && !fits.supports(RosVersion::One), "{fits:?}");
 }
 
 /// Returns the package.xml of a package that supports both versions (0), or one of them (1, 2).

@@ -17,11 +17,7 @@ const MAX_DEPTH: usize = 8;
 const MAX_FILES: usize = 200;
 
 /// Words in a build file that change where executables are installed, or whether they are built.
-const UNCLEAR: [&str; 3] = [
-    "RUNTIME_OUTPUT_DIRECTORY",
-    "OUTPUT_NAME",
-    "EXCLUDE_FROM_ALL",
-];
+const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
 
 /// Commands that begin a block whose content is conditional.
 const BLOCKS: [&str; 6] = ["if", "foreach", "while", "function", "macro", "block"];
@@ -102,9 +98,7 @@ impl BuildFileReader<'_> {
                 && BLOCKS.contains(&block)
             {
                 open = open.saturating_sub(1);
-            } else if command.name == "return"
-                || command.name == "include" && includes_own_file(&command)
-            {
+            } else if command.name == "return" || command.name == "include" && includes_own_file(&command) {
                 // The following statements may not be reached, or may be affected by other files.
                 return false;
             } else if open == 0 && !self.apply_command(&command, directory, depth) {
@@ -119,9 +113,7 @@ impl BuildFileReader<'_> {
         match (command.name.as_str(), arguments) {
             ("catkin_package", _) => self.has_place = true,
             ("add_executable", [target, ..]) => {
-                let is_made = !arguments
-                    .iter()
-                    .any(|word| word == "IMPORTED" || word == "ALIAS");
+                let is_made = !arguments.iter().any(|word| word == "IMPORTED" || word == "ALIAS");
                 if is_made && self.has_place {
                     let target = self.expand_project_name(target);
                     if self.version == RosVersion::One {
@@ -149,10 +141,7 @@ impl BuildFileReader<'_> {
             return;
         };
         let destination = self.expand_project_name(destination.trim_end_matches('/'));
-        let of_programs = [
-            "${CATKIN_PACKAGE_BIN_DESTINATION}".to_owned(),
-            format!("lib/{}", self.name),
-        ];
+        let of_programs = ["${CATKIN_PACKAGE_BIN_DESTINATION}".to_owned(), format!("lib/{}", self.name)];
         let is_plain = |word: &&String| !word.contains('$');
         let listed = &arguments[..at];
         match kind {
@@ -168,8 +157,7 @@ impl BuildFileReader<'_> {
                 let is_for_others = |word: &String| word == "ARCHIVE" || word == "LIBRARY";
                 if !listed.iter().any(is_for_others) {
                     let names = listed.iter().map(|target| self.expand_project_name(target));
-                    let names: Vec<String> =
-                        names.filter(|name| self.targets.contains(name)).collect();
+                    let names: Vec<String> = names.filter(|name| self.targets.contains(name)).collect();
                     self.shown.programs.extend(names);
                 }
             }
@@ -192,8 +180,7 @@ impl BuildFileReader<'_> {
     }
 
     fn has_file(&self, path: &Path) -> bool {
-        let found =
-            Tree::open(self.root).and_then(|tree| tree.read_file_following(path, MAX_BYTES));
+        let found = Tree::open(self.root).and_then(|tree| tree.read_file_following(path, MAX_BYTES));
         found.is_ok_and(|file| file.is_some())
     }
 
@@ -213,10 +200,7 @@ impl BuildFileReader<'_> {
 
 /// Returns whether the command includes a file of the package itself rather than a CMake module.
 fn includes_own_file(command: &Command) -> bool {
-    command
-        .arguments
-        .first()
-        .is_some_and(|file| file.contains(['/', '.', '$']))
+    command.arguments.first().is_some_and(|file| file.contains(['/', '.', '$']))
 }
 
 /// Returns the names before `=` in the list of `console_scripts`; empty unless it consists of string literals only.
@@ -231,14 +215,9 @@ fn console_scripts(setup: &str) -> Vec<String> {
     let Some((list, _)) = list else {
         return Vec::new();
     };
-    let entries = list
-        .lines()
-        .map(|line| line.split('#').next().unwrap_or_default());
+    let entries = list.lines().map(|line| line.split('#').next().unwrap_or_default());
     let entries: String = entries.collect();
-    let names = entries
-        .split(',')
-        .map(str::trim)
-        .filter(|entry| !entry.is_empty());
+    let names = entries.split(',').map(str::trim).filter(|entry| !entry.is_empty());
     let names = names.map(|entry| {
         let inside = entry.strip_prefix(['\'', '"'])?.strip_suffix(['\'', '"'])?;
         Some(inside.split_once('=')?.0.trim().to_owned())

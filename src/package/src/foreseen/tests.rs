@@ -26,9 +26,7 @@ impl SourceFixture {
 
     fn scan(&self, version: RosVersion) -> SourceScan {
         let variables = Variables::for_distribution(version.number(), "any");
-        let PushedDirectory::Source(workspace) =
-            inspect(self.0.path(), &variables).expect("a workspace")
-        else {
+        let PushedDirectory::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace") else {
             panic!("sources")
         };
         scan_sources(&workspace, version)
@@ -51,8 +49,7 @@ fn ros1_package(rest: &str) -> SourceFixture {
     place
 }
 
-const WTF: &str =
-    "catkin_install_python(PROGRAMS scripts/wtf.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})";
+const WTF: &str = "catkin_install_python(PROGRAMS scripts/wtf.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})";
 
 #[test]
 fn several_programs_and_launch_files_must_be_chosen_from() {
@@ -67,15 +64,8 @@ fn several_programs_and_launch_files_must_be_chosen_from() {
     assert!(foreseen.must_be_chosen());
     // Executables of several packages count together.
     let place = ros1_package("add_executable(${NODE}_b b.cpp)");
-    place.package(
-        "other",
-        "catkin",
-        "catkin_package()\nadd_subdirectory(src/driver)",
-    );
-    place.write(
-        "src/other/src/driver/CMakeLists.txt",
-        "add_executable(driver driver.cpp)",
-    );
+    place.package("other", "catkin", "catkin_package()\nadd_subdirectory(src/driver)");
+    place.write("src/other/src/driver/CMakeLists.txt", "add_executable(driver driver.cpp)");
     let foreseen = place.scan(RosVersion::One);
     assert_eq!(foreseen.executables, ["ekf", "driver"]);
     assert!(foreseen.must_be_chosen(), "{foreseen:?}");
@@ -100,10 +90,7 @@ fn where_a_push_may_work_nothing_is_asked() {
         "install(PROGRAMS ${SCRIPTS} DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})",
         "add_subdirectory(gone)",
     ] {
-        assert!(
-            !ros1_package(rest).must_be_chosen(RosVersion::One),
-            "{rest}"
-        );
+        assert!(!ros1_package(rest).must_be_chosen(RosVersion::One), "{rest}");
     }
     // A single launch file is used, and others may be generated.
     let launch = ros1_package(WTF);
@@ -117,8 +104,7 @@ fn where_a_push_may_work_nothing_is_asked() {
     // Without `catkin_package` executables may be installed anywhere; unreadable files are ignored.
     for build in ["project(p)", "\u{0}((", ""] {
         let place = SourceFixture::new();
-        let build =
-            format!("{build}\nadd_executable(a a.cpp)\nadd_executable(b b.cpp)\ncatkin_package()");
+        let build = format!("{build}\nadd_executable(a a.cpp)\nadd_executable(b b.cpp)\ncatkin_package()");
         place.package("p", "catkin", &build);
         assert!(!place.must_be_chosen(RosVersion::One), "{build:?}");
     }
@@ -139,22 +125,10 @@ fn of_ros_2_what_is_installed_counts() {
         (format!("{both}{apart}"), &[], false),
         (both.to_owned(), &[], false),
         (format!("{both}{installed}"), &["launch/x.launch.py"], false),
-        (
-            format!("{both}{installed}{launch}"),
-            &["launch/x.launch.py"],
-            false,
-        ),
-        (
-            format!("{both}{installed}{launch}"),
-            &["launch/x.launch.py", "launch/deep/y.launch.xml"],
-            true,
-        ),
+        (format!("{both}{installed}{launch}"), &["launch/x.launch.py"], false),
+        (format!("{both}{installed}{launch}"), &["launch/x.launch.py", "launch/deep/y.launch.xml"], true),
         // Other files of a launch directory may be launch files.
-        (
-            format!("{both}{installed}{launch}"),
-            &["launch/x.py"],
-            false,
-        ),
+        (format!("{both}{installed}{launch}"), &["launch/x.py"], false),
     ] {
         let place = SourceFixture::new();
         place.package("p", "ament_cmake", &build);
@@ -171,11 +145,7 @@ fn scripts_of_python_are_those_that_are_listed_as_texts() {
     let setup = |list: &str| format!("setup(entry_points={{\n'console_scripts': {list},\n}})");
     let places = "[install]\ninstall_scripts=$base/lib/p\n";
     for (list, places, expected) in [
-        (
-            "[\n'talk = p.talk:main',  # first, of two\n\"hear=p.hear:main\",\n]",
-            places,
-            &["hear", "talk"][..],
-        ),
+        ("[\n'talk = p.talk:main',  # first, of two\n\"hear=p.hear:main\",\n]", places, &["hear", "talk"][..]),
         ("['talk = p.talk:main', 'hear = p.hear:main']", "", &[]),
         ("[name + ' = p:main' for name in names]", places, &[]),
         ("['a = p:main'] + more", places, &["a"]),
@@ -183,10 +153,7 @@ fn scripts_of_python_are_those_that_are_listed_as_texts() {
         ("[]", places, &[]),
     ] {
         let place = SourceFixture::new();
-        place
-            .package("p", "ament_python", "")
-            .write("src/p/setup.py", &setup(list))
-            .write("src/p/setup.cfg", places);
+        place.package("p", "ament_python", "").write("src/p/setup.py", &setup(list)).write("src/p/setup.cfg", places);
         let foreseen = place.scan(RosVersion::Two);
         assert_eq!(foreseen.executables, expected, "{list}");
         assert_eq!(foreseen.must_be_chosen(), expected.len() > 1, "{list}");

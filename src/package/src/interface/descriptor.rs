@@ -57,10 +57,7 @@ impl From<ParameterDescription> for Descriptor {
             from: Some(range.from.into()),
             to: Some(range.to.into()),
             // TOML integers are signed.
-            step: i64::try_from(range.step)
-                .ok()
-                .filter(|step| *step != 0)
-                .map(Number::from),
+            step: i64::try_from(range.step).ok().filter(|step| *step != 0).map(Number::from),
         });
         Self {
             kind: kind_name(said.kind).to_owned(),
@@ -110,11 +107,7 @@ mod tests {
         let open = Descriptor::from(ParameterDescription {
             kind: ParameterKind::Double,
             description: "m/s".to_owned(),
-            double_range: Some(DoubleRange {
-                from: 0.0,
-                to: f64::INFINITY,
-                step: 0.0,
-            }),
+            double_range: Some(DoubleRange { from: 0.0, to: f64::INFINITY, step: 0.0 }),
             ..ParameterDescription::default()
         });
         assert_eq!(
@@ -124,11 +117,7 @@ mod tests {
         let whole = Descriptor::from(ParameterDescription {
             kind: ParameterKind::Integer,
             read_only: true,
-            integer_range: Some(IntegerRange {
-                from: -1,
-                to: 9,
-                step: u64::MAX,
-            }),
+            integer_range: Some(IntegerRange { from: -1, to: 9, step: u64::MAX }),
             ..ParameterDescription::default()
         });
         let written = toml::to_string(&whole).expect("TOML");

@@ -65,10 +65,7 @@ mod tests {
             ..Qos::default()
         };
         assert_eq!(from_bus(&to_bus(&qos, 7)), qos);
-        let impossible = Qos {
-            deadline: Some(f64::INFINITY),
-            ..qos
-        };
+        let impossible = Qos { deadline: Some(f64::INFINITY), ..qos };
         assert_eq!(to_bus(&impossible, 7).deadline, None);
     }
 }

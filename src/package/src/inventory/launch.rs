@@ -11,13 +11,7 @@ const MAX_DEPTH: usize = 4;
 const MAX_FILES: usize = 1000;
 
 /// File name suffixes of launch files in any directory: of ROS 1, and of ROS 2's parsers.
-const ENDS: [&str; 5] = [
-    ".launch",
-    "launch.py",
-    "launch.xml",
-    "launch.yaml",
-    "launch.yml",
-];
+const ENDS: [&str; 5] = [".launch", "launch.py", "launch.xml", "launch.yaml", "launch.yml"];
 /// Further suffixes of launch files in a directory `launch`.
 const EXTENSIONS: [&str; 4] = [".py", ".xml", ".yaml", ".yml"];
 

@@ -29,11 +29,7 @@ impl Layers {
         let words = |command: &&[&str]| command.iter().map(|word| (*word).to_owned()).collect();
         let commands: Vec<Vec<String>> = commands.iter().map(words).collect();
         let commands: Vec<&[String]> = commands.iter().map(Vec::as_slice).collect();
-        let of = SearchHints {
-            package: "p",
-            environment: &environment,
-            commands: &commands,
-        };
+        let of = SearchHints { package: "p", environment: &environment, commands: &commands };
         Inventory::scan(&self.paths(), of).expect("taken")
     }
 }
@@ -54,34 +50,19 @@ fn layers() -> Layers {
 #[test]
 fn install_spaces_are_in_the_order_in_which_nodes_search_them() {
     let layers = layers();
-    for path in [
-        "high/opt/mine/share/x",
-        "high/opt/other/share/x",
-        "low/opt/ros/noetic/share/x",
-        "low/opt/alone/lib/p/run",
-    ] {
+    for path in
+        ["high/opt/mine/share/x", "high/opt/other/share/x", "low/opt/ros/noetic/share/x", "low/opt/alone/lib/p/run"]
+    {
         layers.file(path, 0o644);
     }
     // An absolute link in a layer points into the host.
     symlink("/usr", layers.place("high/opt/linked")).expect("linked");
     let environment = [
-        (
-            "CMAKE_PREFIX_PATH",
-            "/opt/mine:/usr/:/opt/../usr:relative:/gone",
-        ),
+        ("CMAKE_PREFIX_PATH", "/opt/mine:/usr/:/opt/../usr:relative:/gone"),
         ("ROS_PACKAGE_PATH", "/opt/mine/share:/opt/other/share"),
     ];
     let taken = layers.collect_inventory(&environment, &[&["/opt/alone/lib/p/run"]]);
-    assert_eq!(
-        taken.prefixes,
-        [
-            "/opt/mine",
-            "/usr",
-            "/opt/other",
-            "/opt/alone",
-            "/opt/ros/noetic"
-        ]
-    );
+    assert_eq!(taken.prefixes, ["/opt/mine", "/usr", "/opt/other", "/opt/alone", "/opt/ros/noetic"]);
 }
 
 #[test]
@@ -101,10 +82,7 @@ fn packages_have_directories_and_programs() {
         ..InstalledPackage::default()
     };
     let expected = [
-        (
-            "p",
-            installed("/usr/share/p", "/usr/lib/p", &["alias", "node"]),
-        ),
+        ("p", installed("/usr/share/p", "/usr/lib/p", &["alias", "node"])),
         ("q", installed("/opt/mine/share/q", "/usr/lib/q", &["old"])),
     ];
     let expected = expected.map(|(name, installed)| (name.to_owned(), installed));
@@ -123,18 +101,12 @@ fn what_nodes_run_of_the_package_can_be_started_by_a_stub() {
             &["/usr/share/p/scripts/tool.py", "x:=/lib/p/y"],
             &["/usr/lib/q/other"],
             // A data file among the arguments of a node is not an executable.
-            &[
-                "/usr/lib/map_server/map_server",
-                "/usr/share/p/maps/map.yaml",
-            ],
+            &["/usr/lib/map_server/map_server", "/usr/share/p/maps/map.yaml"],
             &["/usr/bin/nice", "/usr/lib/p/model", "/opt/gone/lib/p/lost"],
         ],
     );
-    let programs = [
-        ("lost", "/opt/gone/lib/p/lost"),
-        ("node", "/usr/lib/p/node"),
-        ("tool.py", "/usr/share/p/scripts/tool.py"),
-    ];
+    let programs =
+        [("lost", "/opt/gone/lib/p/lost"), ("node", "/usr/lib/p/node"), ("tool.py", "/usr/share/p/scripts/tool.py")];
     let programs = programs.map(|(name, path)| (name.to_owned(), path.to_owned()));
     assert_eq!(taken.programs, programs.into());
 }
@@ -142,9 +114,7 @@ fn what_nodes_run_of_the_package_can_be_started_by_a_stub() {
 #[test]
 fn programs_are_told_from_data() {
     let layers = layers();
-    layers
-        .file("high/usr/lib/p/hidden", 0o644)
-        .file("low/usr/lib/p/hidden", 0o755);
+    layers.file("high/usr/lib/p/hidden", 0o644).file("low/usr/lib/p/hidden", 0o755);
     for (name, target) in [
         ("high/usr/lib/p/alias", "../../share/p/scripts/tool.py"),
         ("high/usr/lib/p/data", "/usr/share/p/maps/map.yaml"),
@@ -175,9 +145,7 @@ fn programs_are_told_from_data() {
 #[test]
 fn a_prefix_cannot_lead_out_of_the_layers() {
     let layers = layers();
-    layers
-        .file("secret/share/p/package.xml", 0o600)
-        .file("secret/lib/p/tool", 0o755);
+    layers.file("secret/share/p/package.xml", 0o600).file("secret/lib/p/tool", 0o755);
     let paths = "/../secret:../secret:/usr/../../secret:/..";
     let taken = layers.collect_inventory(&[("CMAKE_PREFIX_PATH", paths)], &[]);
     assert_eq!(taken.prefixes, ["/usr"]);
@@ -212,10 +180,7 @@ fn layers_of_two() -> Layers {
         .file("high/opt/mine/share/p/params.yaml", 0o644)
         // The form of console_scripts of a setup.py once installed.
         .file("high/opt/mine/lib/p/talker", 0o755)
-        .file(
-            "high/opt/mine/lib/python3.11/site-packages/p/talker.py",
-            0o644,
-        )
+        .file("high/opt/mine/lib/python3.11/site-packages/p/talker.py", 0o644)
         .file("high/opt/apart/q/share/q/package.xml", 0o644)
         .file("high/opt/apart/q/lib/q/run", 0o755);
     layers
@@ -225,29 +190,15 @@ const OF_TWO: (&str, &str) = ("AMENT_PREFIX_PATH", "/opt/mine:/opt/apart/q:/opt/
 
 #[test]
 fn packages_of_ros_2_are_those_of_aments_index() {
-    let taken =
-        layers_of_two().collect_inventory(&[OF_TWO, ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy")], &[]);
-    assert_eq!(
-        taken.prefixes[..3],
-        ["/opt/mine", "/opt/apart/q", "/opt/ros/jazzy"]
-    );
+    let taken = layers_of_two().collect_inventory(&[OF_TWO, ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy")], &[]);
+    assert_eq!(taken.prefixes[..3], ["/opt/mine", "/opt/apart/q", "/opt/ros/jazzy"]);
     let names: Vec<&str> = taken.packages.keys().map(String::as_str).collect();
     assert_eq!(names, ["p", "q", "std_msgs", "unshared"]);
     let own = &taken.packages["p"];
-    assert_eq!(
-        (&*own.share, &*own.lib),
-        ("/opt/mine/share/p", "/opt/mine/lib/p")
-    );
+    assert_eq!((&*own.share, &*own.lib), ("/opt/mine/share/p", "/opt/mine/lib/p"));
     assert_eq!(own.executables, ["talker".to_owned()].into());
     let launch: Vec<&str> = own.launch_files.iter().map(String::as_str).collect();
-    assert_eq!(
-        launch,
-        [
-            "launch/deep/all.yaml",
-            "launch/up.launch.py",
-            "top_launch.xml"
-        ]
-    );
+    assert_eq!(launch, ["launch/deep/all.yaml", "launch/up.launch.py", "top_launch.xml"]);
     assert_eq!(taken.packages["q"].lib, "/opt/apart/q/lib/q");
     let keys: Vec<&String> = taken.definitions.keys().collect();
     assert_eq!(keys, ["p/msg/Said", "std_msgs/msg/String"]);
@@ -261,10 +212,7 @@ fn component_libraries_are_told() {
                 p::ns::Other;lib/libtalker.so\n";
     std::fs::write(layers.place(path), text).expect("written");
     let taken = layers.collect_inventory(&[OF_TWO], &[]);
-    let expected = [
-        ("p::Talker", "/opt/mine/lib/libtalker.so"),
-        ("p::ns::Other", "/opt/mine/lib/libtalker.so"),
-    ];
+    let expected = [("p::Talker", "/opt/mine/lib/libtalker.so"), ("p::ns::Other", "/opt/mine/lib/libtalker.so")];
     let expected = expected.map(|(class, library)| (class.to_owned(), library.to_owned()));
     assert_eq!(taken.packages["p"].components, expected.into());
     assert!(taken.packages["q"].components.is_empty());
@@ -283,10 +231,6 @@ fn configurations_of_parameters_are_no_executables() {
     let layers = layers();
     layers.file("low/usr/lib/p/DWAPlanner.cfg", 0o755);
     let taken = layers.collect_inventory(&[], &[]);
-    let executables: Vec<&str> = taken.packages["p"]
-        .executables
-        .iter()
-        .map(String::as_str)
-        .collect();
+    let executables: Vec<&str> = taken.packages["p"].executables.iter().map(String::as_str).collect();
     assert_eq!(executables, ["node"]);
 }

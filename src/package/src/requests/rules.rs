@@ -89,10 +89,7 @@ pub(super) fn pair_topics(
     let mut unanswered = Vec::new();
     for trigger in triggers {
         let carried = |output: &&TopicEnd| {
-            let answer = ObservedAnswer {
-                input: trigger.name.clone(),
-                output: output.name.clone(),
-            };
+            let answer = ObservedAnswer { input: trigger.name.clone(), output: output.name.clone() };
             trigger.is_stamped && output.is_stamped && watched.contains(&answer)
         };
         let (seen, rest) = answers.into_iter().partition(carried);
@@ -106,9 +103,7 @@ pub(super) fn pair_topics(
         }
     }
     // The trigger is likelier than the inputs with observed answers, or nothing was observed.
-    let likelier = unanswered
-        .first()
-        .filter(|trigger| trigger_rank(trigger) < best_watched);
+    let likelier = unanswered.first().filter(|trigger| trigger_rank(trigger) < best_watched);
     match likelier {
         Some(trigger) => pairs.extend(guess(trigger, inputs, answers)),
         None => {
@@ -123,42 +118,22 @@ pub(super) fn pair_topics(
 }
 
 /// Guesses the answers to the most likely of `inputs` inputs.
-fn guess(
-    trigger: &TopicEnd,
-    inputs: usize,
-    answers: Vec<&TopicEnd>,
-) -> Option<(TopicPair, Reason)> {
-    let stamped: Vec<&TopicEnd> = answers
-        .iter()
-        .copied()
-        .filter(|end| end.is_stamped)
-        .collect();
+fn guess(trigger: &TopicEnd, inputs: usize, answers: Vec<&TopicEnd>) -> Option<(TopicPair, Reason)> {
+    let stamped: Vec<&TopicEnd> = answers.iter().copied().filter(|end| end.is_stamped).collect();
     let (answers, by) = if trigger.is_stamped && !stamped.is_empty() {
         (stamped, Correlation::Stamp)
     } else {
         // A latched output represents a state; it is the answer only if there is no other.
-        let passing: Vec<&TopicEnd> = answers
-            .iter()
-            .copied()
-            .filter(|end| !end.is_latched)
-            .collect();
+        let passing: Vec<&TopicEnd> = answers.iter().copied().filter(|end| !end.is_latched).collect();
         let all = if passing.is_empty() { answers } else { passing };
         (all, Correlation::Arrival)
     };
-    let reason = if inputs == 1 && answers.len() == 1 {
-        Reason::Alone
-    } else {
-        Reason::Guessed
-    };
+    let reason = if inputs == 1 && answers.len() == 1 { Reason::Alone } else { Reason::Guessed };
     Some((make_pair(trigger, answers, by)?, reason))
 }
 
 /// Creates the pair of these topics; `None` without an output.
-fn make_pair(
-    trigger: &TopicEnd,
-    mut answers: Vec<&TopicEnd>,
-    by: Correlation,
-) -> Option<TopicPair> {
+fn make_pair(trigger: &TopicEnd, mut answers: Vec<&TopicEnd>, by: Correlation) -> Option<TopicPair> {
     answers.sort_by_key(|end| (view_rank(end, trigger), end.is_latched, end.name.as_str()));
     if by == Correlation::Arrival {
         // Any output would be an answer, so a single one must be chosen.
@@ -179,9 +154,7 @@ fn make_pair(
 fn is_housekeeping(end: &TopicEnd) -> bool {
     !TopicPair::is_valid_topic(&end.name)
         || HOUSEKEEPING.contains(&end.name.as_str())
-        || HOUSEKEEPING_ENDINGS
-            .iter()
-            .any(|ending| end.name.ends_with(ending))
+        || HOUSEKEEPING_ENDINGS.iter().any(|ending| end.name.ends_with(ending))
         || COMPANIONS.contains(&end.type_name.as_str())
 }
 
@@ -203,8 +176,7 @@ fn is_accompanying(end: &TopicEnd) -> bool {
 }
 
 fn view_rank(output: &TopicEnd, input: &TopicEnd) -> u8 {
-    let is_picture =
-        output.type_name.ends_with("/Image") || output.type_name.ends_with("/CompressedImage");
+    let is_picture = output.type_name.ends_with("/Image") || output.type_name.ends_with("/CompressedImage");
     // An image for an image may be the result (a rectified one, for example), but not if there is another result.
     u8::from(output.type_name == input.type_name) + u8::from(is_picture)
 }

@@ -17,12 +17,7 @@ const STAMPED: [&str; 9] = [
 /// Creates an interface of topics with their types: `<` is an input, `>` an output, and `!` after the name means
 /// latched.
 fn interface(topics: &[&str]) -> Interface {
-    interface_of_nodes(
-        &topics
-            .iter()
-            .map(|topic| (*topic, "/node"))
-            .collect::<Vec<_>>(),
-    )
+    interface_of_nodes(&topics.iter().map(|topic| (*topic, "/node")).collect::<Vec<_>>())
 }
 
 fn interface_of_nodes(topics: &[(&str, &str)]) -> Interface {
@@ -38,11 +33,7 @@ fn interface_of_nodes(topics: &[(&str, &str)]) -> Interface {
     define("std_msgs/Header", header);
     for (topic, _) in topics {
         let (_, type_name) = topic.split_once(' ').expect("a type");
-        let text = if STAMPED.contains(&type_name) {
-            "std_msgs/Header header\n"
-        } else {
-            "int32 x\n"
-        };
+        let text = if STAMPED.contains(&type_name) { "std_msgs/Header header\n" } else { "int32 x\n" };
         define(type_name, text);
     }
     for (topic, node) in topics {
@@ -66,10 +57,8 @@ fn interface_of_nodes(topics: &[(&str, &str)]) -> Interface {
 }
 
 fn observed_answers(answers: &[(&str, &str)]) -> BTreeSet<ObservedAnswer> {
-    let watched = |(input, output): &(&str, &str)| ObservedAnswer {
-        input: (*input).to_owned(),
-        output: (*output).to_owned(),
-    };
+    let watched =
+        |(input, output): &(&str, &str)| ObservedAnswer { input: (*input).to_owned(), output: (*output).to_owned() };
     answers.iter().map(watched).collect()
 }
 
@@ -79,11 +68,7 @@ fn display_requests(requests: &[Request]) -> Vec<String> {
 }
 
 fn decide_and_display(topics: &[&str], answers: &[(&str, &str)]) -> Vec<String> {
-    display_requests(&decide_requests(
-        RosVersion::One,
-        &interface(topics),
-        &observed_answers(answers),
-    ))
+    display_requests(&decide_requests(RosVersion::One, &interface(topics), &observed_answers(answers)))
 }
 
 #[test]
@@ -118,42 +103,23 @@ fn by_rule_data_answers_before_switches_and_results_before_views() {
             &["/scan -> /map by stamp Alone"],
         ),
         (
-            &[
-                "</depth_enable std_msgs/Bool",
-                "</image sensor_msgs/Image",
-                ">/boxes p/Stamped",
-            ],
+            &["</depth_enable std_msgs/Bool", "</image sensor_msgs/Image", ">/boxes p/Stamped"],
             &["/image -> /boxes by stamp Guessed"],
         ),
         (
-            &[
-                "</a_switch std_msgs/Bool",
-                "</word std_msgs/String",
-                ">/out std_msgs/String",
-            ],
+            &["</a_switch std_msgs/Bool", "</word std_msgs/String", ">/out std_msgs/String"],
             &["/word -> /out by arrival Guessed"],
         ),
         (
-            &[
-                "</camera/depth/image sensor_msgs/Image",
-                "</camera/rgb/image sensor_msgs/Image",
-                ">/boxes p/Stamped",
-            ],
+            &["</camera/depth/image sensor_msgs/Image", "</camera/rgb/image sensor_msgs/Image", ">/boxes p/Stamped"],
             &["/camera/rgb/image -> /boxes by stamp Guessed"],
         ),
         (
-            &[
-                "</in std_msgs/String",
-                ">/a_state! std_msgs/String",
-                ">/out std_msgs/String",
-            ],
+            &["</in std_msgs/String", ">/a_state! std_msgs/String", ">/out std_msgs/String"],
             &["/in -> /out by arrival Alone"],
         ),
         (&["</in *", ">/out *"], &["/in -> /out Alone"]),
-        (
-            &["</in std_msgs/String", ">/out std_msgs/String"],
-            &["/in -> /out by arrival Alone"],
-        ),
+        (&["</in std_msgs/String", ">/out std_msgs/String"], &["/in -> /out by arrival Alone"]),
         (&[">/out std_msgs/String"], &[]),
         (&["</in std_msgs/String"], &[]),
         (&["</tf tf2_msgs/TFMessage", ">/out std_msgs/String"], &[]),
@@ -173,10 +139,7 @@ fn topics_of_ros_2_that_every_node_has_answer_nothing() {
         ">/parameter_events rcl_interfaces/ParameterEvent",
         ">/rosout rosgraph_msgs/Log",
     ];
-    assert_eq!(
-        decide_and_display(&topics, &[]),
-        ["/in -> /out by arrival Alone"]
-    );
+    assert_eq!(decide_and_display(&topics, &[]), ["/in -> /out by arrival Alone"]);
     let two = Interface {
         topics: vec![Topic {
             type_name: "sensor_msgs/msg/Image".to_owned(),
@@ -204,25 +167,13 @@ fn what_was_seen_counts_before_rules() {
         ),
         // Two pipelines in one node.
         (
-            &[
-                "</left sensor_msgs/Image",
-                "</right sensor_msgs/Image",
-                ">/l p/Stamped",
-                ">/r p/Stamped",
-            ],
+            &["</left sensor_msgs/Image", "</right sensor_msgs/Image", ">/l p/Stamped", ">/r p/Stamped"],
             &[("/left", "/l"), ("/right", "/r")],
-            &[
-                "/left -> /l by stamp Watched",
-                "/right -> /r by stamp Watched",
-            ],
+            &["/left -> /l by stamp Watched", "/right -> /r by stamp Watched"],
         ),
         // A node that forwards everything: an output answers a single input.
         (
-            &[
-                "</left sensor_msgs/Image",
-                "</right sensor_msgs/Image",
-                ">/out sensor_msgs/Image",
-            ],
+            &["</left sensor_msgs/Image", "</right sensor_msgs/Image", ">/out sensor_msgs/Image"],
             &[("/left", "/out"), ("/right", "/out")],
             &["/left -> /out by stamp Watched"],
         ),
@@ -235,19 +186,11 @@ fn what_was_seen_counts_before_rules() {
                 ">/echo geometry_msgs/PoseStamped",
             ],
             &[("/pose", "/echo")],
-            &[
-                "/pose -> /echo by stamp Watched",
-                "/image -> /boxes by stamp Guessed",
-            ],
+            &["/pose -> /echo by stamp Watched", "/image -> /boxes by stamp Guessed"],
         ),
         // The depth image is processed together with the image and has no answer of its own.
         (
-            &[
-                "</depth sensor_msgs/Image",
-                "</rgb sensor_msgs/Image",
-                ">/boxes p/Stamped",
-                ">/debug p/Stamped",
-            ],
+            &["</depth sensor_msgs/Image", "</rgb sensor_msgs/Image", ">/boxes p/Stamped", ">/debug p/Stamped"],
             &[("/rgb", "/boxes")],
             &["/rgb -> /boxes, /debug by stamp Watched"],
         ),
@@ -281,13 +224,7 @@ fn each_node_has_its_own_requests() {
         (">/tracks p/Stamped", "/tracker"),
     ]);
     let found = decide_requests(RosVersion::One, &interface, &BTreeSet::new());
-    assert_eq!(
-        display_requests(&found),
-        [
-            "/image -> /boxes by stamp Alone",
-            "/boxes -> /tracks by stamp Alone"
-        ]
-    );
+    assert_eq!(display_requests(&found), ["/image -> /boxes by stamp Alone", "/boxes -> /tracks by stamp Alone"]);
     assert_eq!((&*found[0].node, &*found[1].node), ("/finder", "/tracker"));
     // Topics of a supplement may belong to any node.
     let mut stated = interface;
@@ -310,70 +247,32 @@ fn the_deployer_says_otherwise_or_is_told_what_there_is() {
     ]);
     let decided = decide_requests(RosVersion::One, &interface, &BTreeSet::new());
     let says = |stated: &[&str]| {
-        let stated: Vec<TopicPair> = stated
-            .iter()
-            .map(|text| text.parse().expect("a pair"))
-            .collect();
+        let stated: Vec<TopicPair> = stated.iter().map(|text| text.parse().expect("a pair")).collect();
         apply_stated(RosVersion::One, &interface, &stated, decided.clone())
     };
     assert_eq!(
         display_requests(&says(&["/switch -> /words"]).expect("fine")),
-        [
-            "/switch -> /words by arrival Stated",
-            "/in -> /out by arrival Alone"
-        ]
+        ["/switch -> /words by arrival Stated", "/in -> /out by arrival Alone"]
     );
+    assert_eq!(display_requests(&says(&["/image -> /boxes"]).expect("fine"))[0], "/image -> /boxes by stamp Stated");
     assert_eq!(
-        display_requests(&says(&["/image -> /boxes"]).expect("fine"))[0],
-        "/image -> /boxes by stamp Stated"
-    );
-    assert_eq!(
-        display_requests(
-            &says(&["/image -> /boxes by arrival", "/switch -> /words"]).expect("fine")
-        )[..2],
-        [
-            "/image -> /boxes by arrival Stated",
-            "/switch -> /words by arrival Stated"
-        ]
+        display_requests(&says(&["/image -> /boxes by arrival", "/switch -> /words"]).expect("fine"))[..2],
+        ["/image -> /boxes by arrival Stated", "/switch -> /words by arrival Stated"]
     );
     assert_eq!(says(&[]).expect("fine"), decided);
     for (stated, words) in [
-        (
-            &["/imge -> /boxes"][..],
-            "/imge is not an input of this service; its inputs are /switch, /image, /in",
-        ),
-        (
-            &["/image -> /image"],
-            "/image is not an output of this service; its outputs are /boxes, /words, /out",
-        ),
-        (
-            &["/switch -> /boxes by stamp"],
-            "/switch is a std_msgs/Bool, which has no header.stamp",
-        ),
+        (&["/imge -> /boxes"][..], "/imge is not an input of this service; its inputs are /switch, /image, /in"),
+        (&["/image -> /image"], "/image is not an output of this service; its outputs are /boxes, /words, /out"),
+        (&["/switch -> /boxes by stamp"], "/switch is a std_msgs/Bool, which has no header.stamp"),
         (&["/image -> /boxes by goal"], "remove it"),
-        (
-            &["/image -> /boxes", "/switch -> /boxes"],
-            "/boxes is named twice",
-        ),
-        (
-            &["/image -> /boxes", "/image -> /words"],
-            "/image is named twice",
-        ),
+        (&["/image -> /boxes", "/switch -> /boxes"], "/boxes is named twice"),
+        (&["/image -> /boxes", "/image -> /words"], "/image is named twice"),
     ] {
         let error = says(stated).expect_err("refused").to_string();
         assert!(error.contains(words), "{error}");
     }
-    let none = apply_stated(
-        RosVersion::One,
-        &Interface::default(),
-        &["/a -> /b".parse().expect("a pair")],
-        Vec::new(),
-    );
-    assert!(
-        none.expect_err("refused")
-            .to_string()
-            .ends_with("it has no inputs")
-    );
+    let none = apply_stated(RosVersion::One, &Interface::default(), &["/a -> /b".parse().expect("a pair")], Vec::new());
+    assert!(none.expect_err("refused").to_string().ends_with("it has no inputs"));
 }
 
 #[test]
@@ -383,21 +282,11 @@ fn what_was_recorded_before_has_its_requests_decided_now() {
     let text = serde_json::to_string(&old).expect("plain data");
     assert!(!text.contains("requests"), "as before");
     let found = old.decided_requests(RosVersion::One);
-    assert_eq!(
-        display_requests(&found),
-        ["/image -> /boxes by stamp Alone"]
-    );
-    let new = Interface {
-        requests: Some(Vec::new()),
-        ..old
-    };
+    assert_eq!(display_requests(&found), ["/image -> /boxes by stamp Alone"]);
+    let new = Interface { requests: Some(Vec::new()), ..old };
     assert_eq!(new.decided_requests(RosVersion::One), []);
     let again: Interface = serde_json::from_str(
-        &serde_json::to_string(&Interface {
-            requests: Some(found.clone()),
-            ..new.clone()
-        })
-        .expect("plain data"),
+        &serde_json::to_string(&Interface { requests: Some(found.clone()), ..new.clone() }).expect("plain data"),
     )
     .expect("its own form");
     assert_eq!(again.requests, Some(found));
@@ -406,15 +295,10 @@ fn what_was_recorded_before_has_its_requests_decided_now() {
 
 #[test]
 fn what_could_not_be_read_again_is_not_decided() {
-    let odd = [
-        "</camera-1/image sensor_msgs/Image",
-        ">/out std_msgs/String",
-        ">/o,ut std_msgs/String",
-    ];
+    let odd = ["</camera-1/image sensor_msgs/Image", ">/out std_msgs/String", ">/o,ut std_msgs/String"];
     assert_eq!(decide_and_display(&odd, &[]), [""; 0]);
     // Other fields of a record are still read.
-    let unreadable =
-        r#"{"requests": [{"pair": "/camera-1/image -> /out", "reason": "alone"}], "topics": []}"#;
+    let unreadable = r#"{"requests": [{"pair": "/camera-1/image -> /out", "reason": "alone"}], "topics": []}"#;
     let read: Interface = serde_json::from_str(unreadable).unwrap();
     assert_eq!(read.requests, None);
 }

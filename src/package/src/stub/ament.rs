@@ -43,10 +43,7 @@ pub(super) fn index_files(about: &StubInfo<'_>, contents: &Contents) -> Files {
         register("rosidl_interfaces", &interfaces);
     }
     if !contents.components.is_empty() {
-        register(
-            "rclcpp_components",
-            &unloadable_components(about, &contents.components),
-        );
+        register("rclcpp_components", &unloadable_components(about, &contents.components));
     }
     files
 }
@@ -55,8 +52,7 @@ pub(super) fn index_files(about: &StubInfo<'_>, contents: &Contents) -> Files {
 fn interface_list(about: &StubInfo<'_>, contents: &Contents) -> String {
     let shared = contents.share.keys().filter(|path| {
         let kinds = ["msg", "srv", "action"];
-        let (Some((kind, name)), Some((_, ending))) = (path.split_once('/'), path.rsplit_once('.'))
-        else {
+        let (Some((kind, name)), Some((_, ending))) = (path.split_once('/'), path.rsplit_once('.')) else {
             return false;
         };
         kinds.contains(&kind) && !name.contains('/') && (ending == kind || ending == "idl")
@@ -86,11 +82,7 @@ fn unloadable_components(about: &StubInfo<'_>, classes: &BTreeSet<String>) -> St
 
 /// Returns the names of all launchers in `lib/PACKAGE`, the only directory in which ROS 2 looks for executables.
 pub(super) fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String> {
-    contents
-        .executables
-        .union(about.outsourced)
-        .cloned()
-        .collect()
+    contents.executables.union(about.outsourced).cloned().collect()
 }
 
 /// Returns whether a shared file belongs to the image's install space rather than to the package.
@@ -99,9 +91,7 @@ pub(super) fn belongs_to_install_space(path: &str, content: &Content) -> bool {
         return false;
     }
     let (top, name) = path.split_once('/').unwrap_or(("", path));
-    let ending = ENVIRONMENT
-        .iter()
-        .find_map(|ending| name.strip_suffix(ending));
+    let ending = ENVIRONMENT.iter().find_map(|ending| name.strip_suffix(ending));
     match top {
         "" => matches!(ending, Some("local_setup" | "package")),
         // Directories of the hooks of ament and colcon.

@@ -18,44 +18,26 @@ pub(super) const WORDS: RosTerms = RosTerms {
 
 /// Returns the files in addition to those of the package.
 pub(super) fn setup_files() -> Files {
-    [
-        (".catkin", ""),
-        ("setup.sh", SETUP_SH),
-        ("setup.bash", SETUP_BASH),
-        ("setup.zsh", SETUP_ZSH),
-    ]
-    .map(|(name, text)| (name.to_owned(), text_file(text)))
-    .into()
+    [(".catkin", ""), ("setup.sh", SETUP_SH), ("setup.bash", SETUP_BASH), ("setup.zsh", SETUP_ZSH)]
+        .map(|(name, text)| (name.to_owned(), text_file(text)))
+        .into()
 }
 
 /// Replaces shared files that must differ in the stub.
 pub(super) fn replace_plugin_lists(about: &StubInfo<'_>, contents: &mut Contents) {
     for path in nodelets::plugin_lists(&contents.share) {
         if let Some(content) = contents.share.remove(&path) {
-            contents
-                .share
-                .insert(path, nodelets::unloadable_plugin_list(about, content));
+            contents.share.insert(path, nodelets::unloadable_plugin_list(about, content));
         }
     }
 }
 
 /// Returns the names of all launchers in `lib/PACKAGE`: executables of the image, and outsourced ones.
 pub(super) fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String> {
-    let in_share = |name: &String| {
-        contents
-            .share
-            .keys()
-            .any(|path| path.rsplit('/').next() == Some(name.as_str()))
-    };
+    let in_share = |name: &String| contents.share.keys().any(|path| path.rsplit('/').next() == Some(name.as_str()));
     let mut names = contents.executables.clone();
     // The launcher of a shared script is in place of the script: roslaunch accepts neither of two executables with the
     // same name.
-    names.extend(
-        about
-            .outsourced
-            .iter()
-            .filter(|name| !in_share(name))
-            .cloned(),
-    );
+    names.extend(about.outsourced.iter().filter(|name| !in_share(name)).cloned());
     names
 }

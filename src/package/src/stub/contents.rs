@@ -47,10 +47,7 @@ impl Contents {
     pub fn read<L: AsRef<Path>>(layers: &[L], package: &InstalledPackage) -> Result<Self, Error> {
         let mut share = BTreeMap::new();
         let directory = MergedDirectory::open_path(&merged::open_layers(layers)?, &package.share)?;
-        let mut reader = ShareReader {
-            share: &mut share,
-            total: 0,
-        };
+        let mut reader = ShareReader { share: &mut share, total: 0 };
         reader.directory(&directory, "", 0)?;
         Ok(Self {
             executables: package.executables.clone(),
@@ -66,12 +63,7 @@ struct ShareReader<'a> {
 }
 
 impl ShareReader<'_> {
-    fn directory(
-        &mut self,
-        directory: &MergedDirectory,
-        path: &str,
-        depth: usize,
-    ) -> Result<(), Error> {
+    fn directory(&mut self, directory: &MergedDirectory, path: &str, depth: usize) -> Result<(), Error> {
         for (name, level) in directory.names()? {
             let Ok(text) = std::str::from_utf8(&name) else {
                 continue;
@@ -79,11 +71,7 @@ impl ShareReader<'_> {
             if text == "." || text == ".." || text == "__pycache__" {
                 continue;
             }
-            let at = if path.is_empty() {
-                text.to_owned()
-            } else {
-                format!("{path}/{text}")
-            };
+            let at = if path.is_empty() { text.to_owned() } else { format!("{path}/{text}") };
             if let Some(content) = read_content(level, &name, path)? {
                 self.add(level, at, content)?;
             } else if depth < MAX_DEPTH {
@@ -109,20 +97,11 @@ impl ShareReader<'_> {
     }
 }
 
-fn read_content(
-    level: &LayerDirectory,
-    name: &[u8],
-    directory: &str,
-) -> Result<Option<Content>, Error> {
+fn read_content(level: &LayerDirectory, name: &[u8], directory: &str) -> Result<Option<Content>, Error> {
     if let Some(file) = level.file(name, MAX_BYTES)? {
-        return Ok(Some(Content::File {
-            bytes: file.bytes,
-            executable: file.executable,
-        }));
+        return Ok(Some(Content::File { bytes: file.bytes, executable: file.executable }));
     }
-    let target = level
-        .link(name)
-        .filter(|target| stays_inside(target, directory));
+    let target = level.link(name).filter(|target| stays_inside(target, directory));
     Ok(target.and_then(|target| Some(Content::Link(target.to_str()?.to_owned()))))
 }
 
@@ -191,9 +170,7 @@ mod tests {
         assert_eq!(contents.executables, ["node".to_owned()].into());
         let names: Vec<&str> = contents.share.keys().map(String::as_str).collect();
         assert_eq!(names, ["launch/a.launch", "package.xml", "scripts/tool.py"]);
-        let Content::File { bytes, executable } = &contents.share["package.xml"] else {
-            panic!("a file")
-        };
+        let Content::File { bytes, executable } = &contents.share["package.xml"] else { panic!("a file") };
         assert_eq!((&bytes[..], *executable), (&b"high"[..], false));
     }
 
@@ -209,10 +186,7 @@ mod tests {
             symlink(target, layers.place(name)).expect("linked");
         }
         let contents = layers.read();
-        assert_eq!(
-            contents.share["launch/b.launch"],
-            Content::Link("a.launch".into())
-        );
+        assert_eq!(contents.share["launch/b.launch"], Content::Link("a.launch".into()));
         assert!(contents.share.contains_key("launch/up"));
         assert!(!contents.share.contains_key("launch/out"));
         assert!(!contents.share.contains_key("launch/host"));

@@ -6,15 +6,12 @@ const DIRECTORIES: [&str; 5] = ["include", "cmake", "build", "devel", "debian"];
 /// Directories in which launch files may find what they read besides sources and test data.
 const MIXED: [&str; 3] = ["src", "test", "tests"];
 /// Suffixes of files that are read by launch files.
-const READ: [&str; 11] = [
-    ".launch", ".xml", ".yaml", ".yml", ".json", ".urdf", ".xacro", ".srdf", ".sdf", ".rviz",
-    ".test",
-];
+const READ: [&str; 11] =
+    [".launch", ".xml", ".yaml", ".yml", ".json", ".urdf", ".xacro", ".srdf", ".sdf", ".rviz", ".test"];
 const NAMES: [&str; 4] = ["CMakeLists.txt", "Makefile", "setup.py", "Dockerfile"];
 /// Suffixes of sources, and of files left behind by compilers and editors.
 const ENDINGS: [&str; 16] = [
-    ".c", ".cc", ".cpp", ".cxx", ".h", ".hh", ".hpp", ".hxx", ".o", ".a", ".pyc", ".pyo", ".bak",
-    ".orig", ".swp", "~",
+    ".c", ".cc", ".cpp", ".cxx", ".h", ".hh", ".hpp", ".hxx", ".o", ".a", ".pyc", ".pyo", ".bak", ".orig", ".swp", "~",
 ];
 
 /// Returns whether a robot gets a file below `share/PACKAGE`. Executables are kept, since rosrun finds them there.

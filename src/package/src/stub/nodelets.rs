@@ -42,10 +42,7 @@ pub(super) fn unloadable_plugin_list(about: &StubInfo<'_>, content: Content) -> 
          start its executables or launch files instead\">\n",
         about.package
     );
-    for class in document
-        .descendants()
-        .filter(|node| node.has_tag_name("class"))
-    {
+    for class in document.descendants().filter(|node| node.has_tag_name("class")) {
         list.push_str("  <class");
         for name in ["name", "type", "base_class_type"] {
             if let Some(value) = class.attribute(name) {
@@ -55,14 +52,9 @@ pub(super) fn unloadable_plugin_list(about: &StubInfo<'_>, content: Content) -> 
         list.push_str("/>\n");
     }
     list.push_str("</library>\n");
-    Content::File {
-        bytes: list.into_bytes(),
-        executable: false,
-    }
+    Content::File { bytes: list.into_bytes(), executable: false }
 }
 
 fn escape_xml(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('"', "&quot;")
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
 }

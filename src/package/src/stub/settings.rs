@@ -73,7 +73,5 @@ pub(super) fn revision_toml(about: &StubInfo<'_>, executables: &BTreeSet<String>
         requests: about.requests,
     };
     let text = toml::to_string(&revision).expect("texts and a number are TOML");
-    format!(
-        "# What this stub was made from. Written by the server; changes have no effect.\n{text}"
-    )
+    format!("# What this stub was made from. Written by the server; changes have no effect.\n{text}")
 }

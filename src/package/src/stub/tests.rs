@@ -7,10 +7,7 @@ const PACKAGE_XML: &str = r#"<package format="2"><name>p</name>
 <export><nodelet plugin="${prefix}/nodelets.xml"/><rviz plugin="${prefix}/rviz.xml"/></export></package>"#;
 
 fn file(text: &str, executable: bool) -> Content {
-    Content::File {
-        bytes: text.into(),
-        executable,
-    }
+    Content::File { bytes: text.into(), executable }
 }
 
 fn text(content: &Content) -> &str {
@@ -39,9 +36,7 @@ fn contents() -> Contents {
     ];
     Contents {
         executables: ["node", "helper_node"].map(str::to_owned).into(),
-        share: share
-            .map(|(path, content)| (path.to_owned(), content))
-            .into(),
+        share: share.map(|(path, content)| (path.to_owned(), content)).into(),
         components: BTreeSet::new(),
     }
 }
@@ -78,10 +73,7 @@ fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) ->
         package: "p",
         revision: 3,
         image: "sha256:0",
-        portal: &Portal {
-            address: "wss://here:9090".into(),
-            fingerprint: Some("SHA256:00".into()),
-        },
+        portal: &Portal { address: "wss://here:9090".into(), fingerprint: Some("SHA256:00".into()) },
         architecture: "x86_64",
         outsourced: &outsourced,
         names: &[("node".to_owned(), "names_itself".to_owned())].into(),
@@ -101,22 +93,13 @@ fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) ->
 fn every_executable_has_a_launcher_and_only_outsourced_ones_run_in_the_cloud() {
     let files = compose_stub(&["node", "tool.py"]);
     let node = text(&files["lib/p/node"]);
-    assert!(
-        node.contains("cloudroid-stub run --package 'p' --node 'node' --share"),
-        "{node}"
-    );
+    assert!(node.contains("cloudroid-stub run --package 'p' --node 'node' --share"), "{node}");
     assert!(node.contains("prefix=$here/../..\n"), "{node}");
     assert!(text(&files["lib/p/helper_node"]).contains("exec-original"));
     // An outsourced shared script is replaced in place; others are left unchanged.
     let tool = text(&files["share/p/scripts/tool.py"]);
-    assert!(
-        tool.contains(" run ") && tool.contains("prefix=$here/../../..\n"),
-        "{tool}"
-    );
-    assert_eq!(
-        text(&files["share/p/scripts/other.py"]),
-        "#!/usr/bin/python3"
-    );
+    assert!(tool.contains(" run ") && tool.contains("prefix=$here/../../..\n"), "{tool}");
+    assert_eq!(text(&files["share/p/scripts/other.py"]), "#!/usr/bin/python3");
     assert!(!files.contains_key("lib/p/tool.py"), "two would be found");
     // Machine code is for the server's architecture.
     assert!(text(&files["share/p/bin/helper"]).contains("exec-original"));
@@ -133,30 +116,14 @@ fn all_that_is_shared_is_there() {
     let files = compose_stub(&["node"]);
     assert_eq!(text(&files["share/p/package.xml"]), PACKAGE_XML);
     assert_eq!(text(&files["share/p/launch/a.launch"]), "<launch/>");
-    assert_eq!(
-        files["share/p/launch/same"],
-        Content::Link("a.launch".into())
-    );
+    assert_eq!(files["share/p/launch/same"], Content::Link("a.launch".into()));
     assert_eq!(text(&files["share/p/msg/T.msg"]), "int32 x\n");
-    assert!(
-        !files
-            .keys()
-            .any(|path| path.contains("Header") || path.contains(".."))
-    );
-    let interface = Interface::from_toml(
-        text(&files["share/p/interface.toml"]),
-        std::path::Path::new("interface.toml"),
-    )
-    .expect("its own form");
+    assert!(!files.keys().any(|path| path.contains("Header") || path.contains("..")));
+    let interface =
+        Interface::from_toml(text(&files["share/p/interface.toml"]), std::path::Path::new("interface.toml"))
+            .expect("its own form");
     assert_eq!(interface.topics[0].name, "/in");
-    for name in [
-        ".catkin",
-        "setup.sh",
-        "setup.bash",
-        "setup.zsh",
-        "install.sh",
-        "README.md",
-    ] {
+    for name in [".catkin", "setup.sh", "setup.bash", "setup.zsh", "install.sh", "README.md"] {
         assert!(files.contains_key(name), "{name}");
     }
 }
@@ -175,10 +142,7 @@ fn settings_and_origin_are_told_in_toml() {
     assert_eq!(revision["original"][0].as_str(), Some("helper_node"));
     assert_eq!(revision["names"]["node"].as_str(), Some("names_itself"));
     let defaults = &revision["defaults"];
-    assert_eq!(
-        (defaults["desire"].as_float(), defaults["max"].as_float()),
-        (Some(0.1), Some(0.3))
-    );
+    assert_eq!((defaults["desire"].as_float(), defaults["max"].as_float()), (Some(0.1), Some(0.3)));
     assert!(stub.get("desire").is_none(), "that is the robot's own");
     let request = &revision["requests"][0];
     let said = ["node", "program", "request"].map(|key| request[key].as_str().expect("a text"));
@@ -190,8 +154,7 @@ fn no_placeholder_is_left_and_the_same_input_gives_the_same_files() {
     let files = compose_stub(&["node"]);
     for (path, content) in &files {
         for word in text(content).split(|c: char| !(c.is_ascii_uppercase() || c == '@')) {
-            let left =
-                word.len() > 2 && word.starts_with('@') && word.ends_with('@') && word != "@@";
+            let left = word.len() > 2 && word.starts_with('@') && word.ends_with('@') && word != "@@";
             assert!(!left, "{path}: {word}");
         }
     }
@@ -204,21 +167,11 @@ fn nodelets_name_a_library_that_says_why() {
     let list = text(&files["share/p/nodelets.xml"]);
     let document = roxmltree::Document::parse(list).expect("XML");
     let library = document.root_element();
-    assert!(
-        library
-            .attribute("path")
-            .is_some_and(|path| path.starts_with("p runs in the cloud"))
-    );
-    let class = library
-        .children()
-        .find(|node| node.is_element())
-        .expect("a class");
+    assert!(library.attribute("path").is_some_and(|path| path.starts_with("p runs in the cloud")));
+    let class = library.children().find(|node| node.is_element()).expect("a class");
     assert_eq!(class.attribute("name"), Some("p/a"));
     assert_eq!(class.attribute("base_class_type"), Some("nodelet::Nodelet"));
-    assert!(
-        text(&files["share/p/rviz.xml"]).contains("lib/librv"),
-        "others stay"
-    );
+    assert!(text(&files["share/p/rviz.xml"]).contains("lib/librv"), "others stay");
 }
 
 #[test]
@@ -294,11 +247,7 @@ fn run(script: &std::path::Path, arguments: &[&str]) -> std::process::Output {
 fn run_with_path(script: &std::path::Path, arguments: &[&str], path: &str) -> std::process::Output {
     let mut shell = std::process::Command::new("sh");
     let directory = script.parent().expect("in a directory");
-    shell
-        .arg(script)
-        .args(arguments)
-        .current_dir(directory)
-        .env("PATH", path);
+    shell.arg(script).args(arguments).current_dir(directory).env("PATH", path);
     shell.output().expect("a shell")
 }
 
@@ -359,20 +308,11 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
     }
     let table: [(Meddling, &str); 11] = [
         (
-            |at| {
-                std::fs::write(at.join(format!("lib/p/{PROGRAM}")), run_and_read(at))
-                    .expect("written")
-            },
+            |at| std::fs::write(at.join(format!("lib/p/{PROGRAM}")), run_and_read(at)).expect("written"),
             "./lib/p/cloudroid-stub",
         ),
-        (
-            |at| std::fs::write(at.join("share/p/launch/b.launch"), "").expect("written"),
-            "./share/p/launch/b.launch",
-        ),
-        (
-            |at| std::fs::remove_file(at.join("share/p/launch/a.launch")).expect("removed"),
-            "./share/p/launch/a.launch",
-        ),
+        (|at| std::fs::write(at.join("share/p/launch/b.launch"), "").expect("written"), "./share/p/launch/b.launch"),
+        (|at| std::fs::remove_file(at.join("share/p/launch/a.launch")).expect("removed"), "./share/p/launch/a.launch"),
         (
             |at| {
                 let path = at.join("share/p/launch/a.launch");
@@ -390,9 +330,7 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
         ),
         (
             |at| {
-                let status = std::process::Command::new("mkfifo")
-                    .arg(at.join("share/p/pipe"))
-                    .status();
+                let status = std::process::Command::new("mkfifo").arg(at.join("share/p/pipe")).status();
                 assert!(status.expect("mkfifo").success());
             },
             "./share/p/pipe",
@@ -405,10 +343,7 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
             |at| std::fs::remove_file(at.join(MANIFEST)).expect("removed"),
             "this archive is not signed: it has no MANIFEST",
         ),
-        (
-            |at| std::fs::write(at.join(SIGNATURE), "").expect("written"),
-            "the signature is not the server's",
-        ),
+        (|at| std::fs::write(at.join(SIGNATURE), "").expect("written"), "the signature is not the server's"),
         (
             |at| {
                 let path = at.join(SIGNATURE);
@@ -437,10 +372,7 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
             let arguments = ["--prefix", target.to_str().expect("text")];
             let output = run_with_path(&stub.path().join("install.sh"), &arguments, path);
             let told = String::from_utf8_lossy(&output.stderr).into_owned();
-            assert!(
-                !output.status.success() && told.contains(words),
-                "{words}: {told}"
-            );
+            assert!(!output.status.success() && told.contains(words), "{words}: {told}");
             assert!(!stub.path().join("ran").exists(), "{words}: it ran");
             assert!(!target.exists(), "{words}: it was installed");
         }
@@ -452,10 +384,7 @@ fn the_key_that_is_known_is_the_one_that_counts() {
     let key = || sign::SigningKey::generate().expect("made").0;
     let (server, other) = (key(), key());
     let files = compose_stub(&["node"]);
-    let (stub, strangers) = (
-        unpack_signed_by(&files, &server),
-        unpack_signed_by(&files, &other),
-    );
+    let (stub, strangers) = (unpack_signed_by(&files, &server), unpack_signed_by(&files, &other));
     let old = old_openssh();
     let old = format!("{}:/usr/bin:/bin", old.path().display());
     for path in ["/usr/bin:/bin", &old] {
@@ -469,48 +398,27 @@ fn the_key_that_is_known_is_the_one_that_counts() {
             (output.status.success(), told)
         };
         let refused = install(&strangers, &["--key", &server.public_key().to_string()]);
-        assert!(
-            !refused.0 && refused.1.contains("signed by another key"),
-            "{refused:?}"
-        );
+        assert!(!refused.0 && refused.1.contains("signed by another key"), "{refused:?}");
         let refused = install(&stub, &["--key", "/nowhere"]);
-        assert!(
-            !refused.0 && refused.1.contains("neither a key"),
-            "{refused:?}"
-        );
+        assert!(!refused.0 && refused.1.contains("neither a key"), "{refused:?}");
         // Trusted on first use, with a message; from then on the same key is required.
         let first = install(&stub, &[]);
-        assert!(
-            first.0 && first.1.contains(&server.public_key().to_string()),
-            "{first:?}"
-        );
+        assert!(first.0 && first.1.contains(&server.public_key().to_string()), "{first:?}");
         assert_eq!(install(&stub, &[]), (true, String::new()));
         let refused = install(&strangers, &[]);
-        assert!(
-            !refused.0 && refused.1.contains("if the server was reinstalled"),
-            "{refused:?}"
-        );
-        assert!(
-            refused.1.contains(&other.public_key().to_string()),
-            "{refused:?}"
-        );
+        assert!(!refused.0 && refused.1.contains("if the server was reinstalled"), "{refused:?}");
+        assert!(refused.1.contains(&other.public_key().to_string()), "{refused:?}");
         // The user has asked the operator of the other server.
         assert!(install(&strangers, &["--key", &other.public_key().to_string()]).0);
         assert!(install(&strangers, &[]).0, "it is that server's by now");
         // The overlay still contains the first server's key, which does not verify the other server's files.
         let refused = install(&stub, &[]);
-        assert!(
-            !refused.0 && refused.1.contains("signed by another key"),
-            "{refused:?}"
-        );
+        assert!(!refused.0 && refused.1.contains("signed by another key"), "{refused:?}");
         let installed = std::path::Path::new(target).join("share/p");
         std::fs::remove_dir_all(installed).expect("removed");
         assert!(install(&stub, &[]).0, "what is nobody's yet");
         let setup = std::fs::read_to_string(format!("{target}/setup.sh")).expect("there");
-        assert!(
-            setup.contains(&format!("_cloudroid_installed='{target}'")),
-            "{setup}"
-        );
+        assert!(setup.contains(&format!("_cloudroid_installed='{target}'")), "{setup}");
     }
 }
 
@@ -519,22 +427,13 @@ fn what_is_installed_has_the_modes_that_it_must_have() {
     use std::os::unix::fs::PermissionsExt;
     let stub = unpack_stub(&compose_stub(&["node"]));
     // Unpacked with a restrictive umask, and by a tool that makes everything accessible.
-    for (path, mode) in [
-        ("lib/p/node", 0o700),
-        ("share/p/package.xml", 0o666),
-        ("share/p", 0o777),
-    ] {
+    for (path, mode) in [("lib/p/node", 0o700), ("share/p/package.xml", 0o666), ("share/p", 0o777)] {
         let path = stub.path().join(path);
         std::fs::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
     }
     let prefix = tempfile::tempdir().expect("a directory");
     let target = prefix.path().join("overlay");
-    let arguments = [
-        "--prefix",
-        target.to_str().expect("text"),
-        "--token",
-        "secret",
-    ];
+    let arguments = ["--prefix", target.to_str().expect("text"), "--token", "secret"];
     let output = run(&stub.path().join("install.sh"), &arguments);
     assert!(output.status.success(), "{output:?}");
     let mut left = vec![target.clone()];
@@ -543,11 +442,7 @@ fn what_is_installed_has_the_modes_that_it_must_have() {
         if about.is_symlink() {
             continue;
         }
-        let name = path
-            .strip_prefix(&target)
-            .expect("below")
-            .display()
-            .to_string();
+        let name = path.strip_prefix(&target).expect("below").display().to_string();
         let mode = match &*name {
             "share/p/token" => 0o600,
             _ if about.is_dir() || name.starts_with("lib/p/") => 0o755,
@@ -556,11 +451,7 @@ fn what_is_installed_has_the_modes_that_it_must_have() {
         };
         assert_eq!(about.permissions().mode() & 0o7777, mode, "{name}");
         if about.is_dir() {
-            left.extend(
-                std::fs::read_dir(&path)
-                    .expect("there")
-                    .map(|entry| entry.expect("one").path()),
-            );
+            left.extend(std::fs::read_dir(&path).expect("there").map(|entry| entry.expect("one").path()));
         }
     }
 }
@@ -574,17 +465,11 @@ fn a_robots_token_is_its_own_whatever_the_package_brings() {
     let prefix = tempfile::tempdir().expect("a directory");
     let target = prefix.path().join("overlay");
     let target = target.to_str().expect("text");
-    let output = run(
-        &stub.path().join("install.sh"),
-        &["--prefix", target, "--token", "secret"],
-    );
+    let output = run(&stub.path().join("install.sh"), &["--prefix", target, "--token", "secret"]);
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{told}");
     let installed = prefix.path().join("overlay/share/p/token");
-    assert_eq!(
-        std::fs::read_to_string(&installed).expect("there"),
-        "secret\n"
-    );
+    assert_eq!(std::fs::read_to_string(&installed).expect("there"), "secret\n");
     let mode = installed.metadata().expect("there").permissions().mode() & 0o777;
     assert_eq!(mode, 0o600);
 }
@@ -593,36 +478,23 @@ fn a_robots_token_is_its_own_whatever_the_package_brings() {
 fn a_package_brings_no_settings_and_no_token() {
     let mut contents = contents();
     for name in ["token", "ca.pem", "token/below", "launch/token"] {
-        contents
-            .share
-            .insert(name.into(), file("the package's", false));
+        contents.share.insert(name.into(), file("the package's", false));
     }
     let files = compose_stub_from(&["node"], contents);
-    let brought: Vec<&String> = files
-        .keys()
-        .filter(|path| path.contains("token") || path.contains("ca.pem"))
-        .collect();
+    let brought: Vec<&String> = files.keys().filter(|path| path.contains("token") || path.contains("ca.pem")).collect();
     assert_eq!(brought, ["share/p/launch/token"]);
 }
 
 #[test]
 fn a_robot_gets_no_sources_and_nothing_hidden() {
     let mut contents = contents();
-    for name in [
-        "src/a.cpp",
-        ".git/config",
-        "launch/.env",
-        "launch/a\nb",
-        "back\\slash",
-    ] {
+    for name in ["src/a.cpp", ".git/config", "launch/.env", "launch/a\nb", "back\\slash"] {
         contents.share.insert(name.into(), file("", false));
     }
     contents.executables.insert("a\nb".into());
     let files = compose_stub_from(&["node"], contents);
     let brought = ["src/", ".git", ".env", "\n"];
-    let found = files
-        .keys()
-        .find(|path| brought.iter().any(|part| path.contains(part)));
+    let found = files.keys().find(|path| brought.iter().any(|part| path.contains(part)));
     assert_eq!(found, None);
     // Names that sha256sum escapes are listed with the same escaping.
     let stub = unpack_stub(&files);

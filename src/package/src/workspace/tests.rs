@@ -16,13 +16,8 @@ impl WorkspaceFixture {
 
     /// Creates a package of format 2 in `directory` that depends on `needs`.
     fn package(&self, directory: &str, name: &str, needs: &[&str]) -> &Self {
-        let needs: String = needs
-            .iter()
-            .map(|need| format!("<depend>{need}</depend>"))
-            .collect();
-        let text = format!(
-            "<package format='2'><name>{name}</name>{needs}<exec_depend>rospy</exec_depend></package>"
-        );
+        let needs: String = needs.iter().map(|need| format!("<depend>{need}</depend>")).collect();
+        let text = format!("<package format='2'><name>{name}</name>{needs}<exec_depend>rospy</exec_depend></package>");
         self.write(&format!("{directory}/package.xml"), &text)
     }
 
@@ -44,36 +39,23 @@ impl WorkspaceFixture {
     fn found_packages(&self) -> Vec<(String, String)> {
         let pushed = self.inspect().unwrap();
         let packages = pushed.packages().iter();
-        packages
-            .map(|p| (p.manifest.name.clone(), p.path.display().to_string()))
-            .collect()
+        packages.map(|p| (p.manifest.name.clone(), p.path.display().to_string())).collect()
     }
 }
 
 fn pairs(expected: &[(&str, &str)]) -> Vec<(String, String)> {
-    expected
-        .iter()
-        .map(|(name, path)| ((*name).to_owned(), (*path).to_owned()))
-        .collect()
+    expected.iter().map(|(name, path)| ((*name).to_owned(), (*path).to_owned())).collect()
 }
 
 #[test]
 fn one_package() {
     let place = WorkspaceFixture::new();
-    place
-        .package(".", "single", &["roscpp"])
-        .package("nested", "not_looked_at", &[]);
+    place.package(".", "single", &["roscpp"]).package("nested", "not_looked_at", &[]);
     assert_eq!(place.found_packages(), pairs(&[("single", "")]));
     let external = place.inspect().unwrap().external_dependencies();
-    let names: Vec<_> = external
-        .iter()
-        .map(|external| external.name.as_str())
-        .collect();
+    let names: Vec<_> = external.iter().map(|external| external.name.as_str()).collect();
     assert_eq!(names, ["roscpp", "rospy"]);
-    assert_eq!(
-        external[0].kinds,
-        BTreeSet::from([Kind::Build, Kind::BuildExport, Kind::Exec])
-    );
+    assert_eq!(external[0].kinds, BTreeSet::from([Kind::Build, Kind::BuildExport, Kind::Exec]));
     assert_eq!(external[1].kinds, BTreeSet::from([Kind::Exec]));
     assert_eq!(external[0].needed_by, BTreeSet::from(["single".to_owned()]));
 }
@@ -87,34 +69,16 @@ fn a_workspace_in_build_order() {
         .package("src/stack/z", "z_msgs", &["std_msgs"])
         .package("src/stack/z/test/inner", "inner", &[])
         .package("elsewhere/c", "c", &[]);
-    assert_eq!(
-        place.found_packages(),
-        pairs(&[
-            ("z_msgs", "src/stack/z"),
-            ("a", "src/a"),
-            ("b", "src/stack/b")
-        ])
-    );
+    assert_eq!(place.found_packages(), pairs(&[("z_msgs", "src/stack/z"), ("a", "src/a"), ("b", "src/stack/b")]));
     let external = place.inspect().unwrap().external_dependencies();
     assert!(external.iter().all(|external| external.name != "z_msgs"));
-    assert_eq!(
-        external
-            .iter()
-            .find(|e| e.name == "rospy")
-            .unwrap()
-            .needed_by
-            .len(),
-        3
-    );
+    assert_eq!(external.iter().find(|e| e.name == "rospy").unwrap().needed_by.len(), 3);
 }
 
 #[test]
 fn packages_side_by_side_without_src() {
     let place = WorkspaceFixture::new();
-    place
-        .package("a", "a", &[])
-        .package("b", "b", &[])
-        .package(".hidden/c", "c", &[]);
+    place.package("a", "a", &[]).package("b", "b", &[]).package(".hidden/c", "c", &[]);
     assert_eq!(place.found_packages(), pairs(&[("a", "a"), ("b", "b")]));
 }
 
@@ -122,15 +86,10 @@ fn packages_side_by_side_without_src() {
 fn ignored_and_built_directories_are_left_out() {
     let place = WorkspaceFixture::new();
     place.package("src/a", "a", &[]);
-    for (directory, mark) in [
-        ("x", "CATKIN_IGNORE"),
-        ("y", "COLCON_IGNORE"),
-        ("z", "AMENT_IGNORE"),
-        ("devel", ".catkin"),
-    ] {
-        place
-            .package(&format!("src/{directory}/a"), "a", &[])
-            .write(&format!("src/{directory}/{mark}"), "");
+    for (directory, mark) in
+        [("x", "CATKIN_IGNORE"), ("y", "COLCON_IGNORE"), ("z", "AMENT_IGNORE"), ("devel", ".catkin")]
+    {
+        place.package(&format!("src/{directory}/a"), "a", &[]).write(&format!("src/{directory}/{mark}"), "");
     }
     assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
 }
@@ -141,26 +100,17 @@ fn links_are_followed_inside_only() {
     outside.package("o", "o", &[]);
     let place = WorkspaceFixture::new();
     place.package("repos/a", "a", &[]);
-    place
-        .link("../repos/a", "src/a")
-        .link("..", "src/circle")
-        .link(outside.0.path().join("o"), "src/o");
+    place.link("../repos/a", "src/a").link("..", "src/circle").link(outside.0.path().join("o"), "src/o");
     assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
     let place = WorkspaceFixture::new();
     place.link(outside.0.path().join("o/package.xml"), "src/o/package.xml");
-    assert!(
-        place.refusal().contains("leads out of"),
-        "{}",
-        place.refusal()
-    );
+    assert!(place.refusal().contains("leads out of"), "{}", place.refusal());
 }
 
 #[test]
 fn two_packages_of_one_name_are_refused() {
     let place = WorkspaceFixture::new();
-    place
-        .package("src/a", "same", &[])
-        .package("src/b", "same", &[]);
+    place.package("src/a", "same", &[]).package("src/b", "same", &[]);
     let text = place.refusal();
     assert!(text.contains("\"same\": src/a and src/b"), "{text}");
 }
@@ -168,27 +118,18 @@ fn two_packages_of_one_name_are_refused() {
 #[test]
 fn packages_that_need_each_other_are_refused() {
     let place = WorkspaceFixture::new();
-    place
-        .package("src/a", "a", &["b"])
-        .package("src/b", "b", &["c"])
-        .package("src/c", "c", &["b"]);
+    place.package("src/a", "a", &["b"]).package("src/b", "b", &["c"]).package("src/c", "c", &["b"]);
     let text = place.refusal();
     assert!(text.contains("b needs c needs b"), "{text}");
     // Mutual exec dependencies are allowed, and so is a dependency on itself.
     let place = WorkspaceFixture::new();
     place.package("src/a", "a", &["a"]);
-    place.write(
-        "src/b/package.xml",
-        "<package format='2'><name>b</name><depend>a</depend></package>",
-    );
+    place.write("src/b/package.xml", "<package format='2'><name>b</name><depend>a</depend></package>");
     place.write(
         "src/a/package.xml",
         "<package format='2'><name>a</name><build_depend>a</build_depend><exec_depend>b</exec_depend></package>",
     );
-    assert_eq!(
-        place.found_packages(),
-        pairs(&[("a", "src/a"), ("b", "src/b")])
-    );
+    assert_eq!(place.found_packages(), pairs(&[("a", "src/a"), ("b", "src/b")]));
 }
 
 #[test]
@@ -196,31 +137,15 @@ fn a_directory_without_packages_is_told_what_was_looked_for() {
     let place = WorkspaceFixture::new();
     place.write("README", "x");
     let text = place.refusal();
-    assert!(
-        text.contains("is not a ROS package: no package.xml in it or anywhere below it"),
-        "{text}"
-    );
+    assert!(text.contains("is not a ROS package: no package.xml in it or anywhere below it"), "{text}");
     assert!(text.contains("give the directory of a package"), "{text}");
     place.write("src/CATKIN_IGNORE", "");
     let text = place.refusal();
-    assert!(
-        text.contains("below its src") && text.contains("1 directories were skipped"),
-        "{text}"
-    );
-    let missing = inspect(&place.0.path().join("missing"), &Variables::default())
-        .unwrap_err()
-        .to_string();
-    assert!(
-        missing.starts_with("cannot open ") && missing.contains("missing"),
-        "{missing}"
-    );
-    let file = inspect(&place.0.path().join("README"), &Variables::default())
-        .unwrap_err()
-        .to_string();
-    assert!(
-        file.contains("README") && file.contains("not a directory"),
-        "{file}"
-    );
+    assert!(text.contains("below its src") && text.contains("1 directories were skipped"), "{text}");
+    let missing = inspect(&place.0.path().join("missing"), &Variables::default()).unwrap_err().to_string();
+    assert!(missing.starts_with("cannot open ") && missing.contains("missing"), "{missing}");
+    let file = inspect(&place.0.path().join("README"), &Variables::default()).unwrap_err().to_string();
+    assert!(file.contains("README") && file.contains("not a directory"), "{file}");
 }
 
 #[test]
@@ -238,29 +163,14 @@ const SETUP: &str = "#!/usr/bin/env sh\n# since this file is sourced ...\n\
 fn an_install_space_and_where_it_was_built_for() {
     for below in ["", "install/"] {
         let place = WorkspaceFixture::new();
-        place
-            .write(&format!("{below}.catkin"), "")
-            .write(&format!("{below}setup.sh"), SETUP);
-        place
-            .package(&format!("{below}share/b"), "b", &["a"])
-            .package(&format!("{below}share/a"), "a", &[]);
+        place.write(&format!("{below}.catkin"), "").write(&format!("{below}setup.sh"), SETUP);
+        place.package(&format!("{below}share/b"), "b", &["a"]).package(&format!("{below}share/a"), "a", &[]);
         place.write(&format!("{below}share/doc/readme"), "");
-        let PushedDirectory::Installed(space) = place.inspect().unwrap() else {
-            panic!("not an install space")
-        };
-        assert_eq!(
-            space.prefix.as_deref(),
-            Some(Path::new("/home/me/ws/install"))
-        );
-        assert_eq!(
-            space.root,
-            place.0.path().canonicalize().unwrap().join(below)
-        );
-        let names: Vec<_> = space
-            .packages
-            .iter()
-            .map(|p| (p.manifest.name.as_str(), p.path.to_str().unwrap()))
-            .collect();
+        let PushedDirectory::Installed(space) = place.inspect().unwrap() else { panic!("not an install space") };
+        assert_eq!(space.prefix.as_deref(), Some(Path::new("/home/me/ws/install")));
+        assert_eq!(space.root, place.0.path().canonicalize().unwrap().join(below));
+        let names: Vec<_> =
+            space.packages.iter().map(|p| (p.manifest.name.as_str(), p.path.to_str().unwrap())).collect();
         assert_eq!(names, [("a", "share/a"), ("b", "share/b")]);
     }
 }
@@ -274,13 +184,8 @@ fn an_install_space_that_names_no_usable_place() {
         ": ${_CATKIN_SETUP_DIR:=/a;rm}",
     ] {
         let place = WorkspaceFixture::new();
-        place
-            .write(".catkin", "")
-            .write("setup.sh", script)
-            .package("share/a", "a", &[]);
-        let PushedDirectory::Installed(space) = place.inspect().unwrap() else {
-            panic!("not an install space")
-        };
+        place.write(".catkin", "").write("setup.sh", script).package("share/a", "a", &[]);
+        let PushedDirectory::Installed(space) = place.inspect().unwrap() else { panic!("not an install space") };
         assert_eq!(space.prefix, None, "{script}");
     }
 }
@@ -288,10 +193,7 @@ fn an_install_space_that_names_no_usable_place() {
 #[test]
 fn sources_win_over_their_own_install_space() {
     let place = WorkspaceFixture::new();
-    place
-        .package("src/a", "a", &[])
-        .write("install/.catkin", "")
-        .write("install/setup.sh", SETUP);
+    place.package("src/a", "a", &[]).write("install/.catkin", "").write("install/setup.sh", SETUP);
     place.package("install/share/a", "a", &[]);
     assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
 }
@@ -299,20 +201,10 @@ fn sources_win_over_their_own_install_space() {
 #[test]
 fn a_devel_space_and_an_empty_install_space_are_refused() {
     let place = WorkspaceFixture::new();
-    place
-        .write(".catkin", "/home/me/ws/src")
-        .write("setup.sh", SETUP);
-    assert!(
-        place.refusal().contains("is a devel space"),
-        "{}",
-        place.refusal()
-    );
+    place.write(".catkin", "/home/me/ws/src").write("setup.sh", SETUP);
+    assert!(place.refusal().contains("is a devel space"), "{}", place.refusal());
     place.write(".catkin", "");
-    assert!(
-        place.refusal().contains("has no share/*/package.xml"),
-        "{}",
-        place.refusal()
-    );
+    assert!(place.refusal().contains("has no share/*/package.xml"), "{}", place.refusal());
 }
 
 /// Prefix statement in colcon's `local_setup.sh`.
@@ -326,11 +218,11 @@ const AMENT: &str = ": ${AMENT_CURRENT_PREFIX:=\"/opt/mine\"}\n";
 impl WorkspaceFixture {
     /// Creates a ROS 2 package in a prefix.
     fn write_indexed_package(&self, prefix: &str, name: &str) -> &Self {
-        self.write(
-            &format!("{prefix}share/ament_index/resource_index/packages/{name}"),
-            "",
+        self.write(&format!("{prefix}share/ament_index/resource_index/packages/{name}"), "").package(
+            &format!("{prefix}share/{name}"),
+            name,
+            &[],
         )
-        .package(&format!("{prefix}share/{name}"), name, &[])
     }
 
     fn space(&self) -> InstallSpace {
@@ -345,26 +237,11 @@ impl WorkspaceFixture {
 fn install_spaces_of_ros_2_in_either_layout() {
     for below in ["", "install/"] {
         for (layout, script, text, prefix) in [
-            (
-                Layout::Merged,
-                "local_setup.sh",
-                COLCON,
-                Some("/home/me/ws/install"),
-            ),
-            (
-                Layout::Merged,
-                "setup.sh",
-                COLCON_CHAIN,
-                Some("/home/me/ws/install"),
-            ),
+            (Layout::Merged, "local_setup.sh", COLCON, Some("/home/me/ws/install")),
+            (Layout::Merged, "setup.sh", COLCON_CHAIN, Some("/home/me/ws/install")),
             (Layout::Merged, "local_setup.sh", AMENT, Some("/opt/mine")),
             (Layout::Merged, "README", "no script at all", None),
-            (
-                Layout::Isolated,
-                "local_setup.sh",
-                COLCON,
-                Some("/home/me/ws/install"),
-            ),
+            (Layout::Isolated, "local_setup.sh", COLCON, Some("/home/me/ws/install")),
         ] {
             let place = WorkspaceFixture::new();
             place.write(&format!("{below}{script}"), text);
@@ -379,10 +256,7 @@ fn install_spaces_of_ros_2_in_either_layout() {
             assert_eq!(space.layout, layout, "{below}{script}");
             assert_eq!(space.layout.version(), ros::bus::RosVersion::Two);
             assert_eq!(space.prefix.as_deref(), prefix.map(Path::new), "{text}");
-            assert_eq!(
-                space.root,
-                place.0.path().canonicalize().unwrap().join(below)
-            );
+            assert_eq!(space.root, place.0.path().canonicalize().unwrap().join(below));
             let paths: Vec<_> = space.packages.iter().map(|p| p.path.clone()).collect();
             let expected = match layout {
                 Layout::Isolated => ["a/share/a", "b/share/b"],
@@ -397,10 +271,7 @@ fn install_spaces_of_ros_2_in_either_layout() {
 fn sources_side_by_side_are_no_isolated_space() {
     let place = WorkspaceFixture::new();
     // A repository may contain an index among its tests.
-    place
-        .package("a", "a", &[])
-        .write("b/share/ament_index/resource_index/packages/x", "")
-        .package("b", "b", &[]);
+    place.package("a", "a", &[]).write("b/share/ament_index/resource_index/packages/x", "").package("b", "b", &[]);
     assert_eq!(place.found_packages(), pairs(&[("a", "a"), ("b", "b")]));
 }
 
@@ -412,21 +283,14 @@ fn a_space_that_leads_back_to_its_sources_is_refused() {
         .write("local_setup.sh", COLCON)
         .write("share/talker/hook/pythonpath_develop.sh", "");
     let text = place.refusal();
-    assert!(
-        text.contains("--symlink-install") && text.contains("push the workspace"),
-        "{text}"
-    );
+    assert!(text.contains("--symlink-install") && text.contains("push the workspace"), "{text}");
 }
 
 #[test]
 fn an_index_without_package_xml_is_no_package() {
     let place = WorkspaceFixture::new();
     place.write("share/ament_index/resource_index/packages/x", "");
-    assert!(
-        place.refusal().contains("has no share/*/package.xml"),
-        "{}",
-        place.refusal()
-    );
+    assert!(place.refusal().contains("has no share/*/package.xml"), "{}", place.refusal());
 }
 
 #[test]
@@ -436,23 +300,10 @@ fn members_of_a_group_come_before_those_that_need_it() {
         let text = format!("<package format='3'><name>{name}</name>{rest}</package>");
         place.write(&format!("src/{name}/package.xml"), &text);
     };
-    write(
-        "a_bridge",
-        "<group_depend>rosidl_interface_packages</group_depend>",
-    );
-    write(
-        "z_msgs",
-        "<member_of_group>rosidl_interface_packages</member_of_group>",
-    );
-    write(
-        "m_msgs",
-        "<member_of_group>rosidl_interface_packages</member_of_group>",
-    );
-    let expected = [
-        ("m_msgs", "src/m_msgs"),
-        ("z_msgs", "src/z_msgs"),
-        ("a_bridge", "src/a_bridge"),
-    ];
+    write("a_bridge", "<group_depend>rosidl_interface_packages</group_depend>");
+    write("z_msgs", "<member_of_group>rosidl_interface_packages</member_of_group>");
+    write("m_msgs", "<member_of_group>rosidl_interface_packages</member_of_group>");
+    let expected = [("m_msgs", "src/m_msgs"), ("z_msgs", "src/z_msgs"), ("a_bridge", "src/a_bridge")];
     assert_eq!(place.found_packages(), pairs(&expected));
     // A member that needs the group needs the other members, not itself.
     write(
@@ -460,10 +311,6 @@ fn members_of_a_group_come_before_those_that_need_it() {
         "<member_of_group>rosidl_interface_packages</member_of_group>\
          <group_depend>rosidl_interface_packages</group_depend>",
     );
-    let expected = [
-        ("z_msgs", "src/z_msgs"),
-        ("m_msgs", "src/m_msgs"),
-        ("a_bridge", "src/a_bridge"),
-    ];
+    let expected = [("z_msgs", "src/z_msgs"), ("m_msgs", "src/m_msgs"), ("a_bridge", "src/a_bridge")];
     assert_eq!(place.found_packages(), pairs(&expected));
 }

@@ -40,9 +40,7 @@ pub async fn audit(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let told = app.audit.last.subscribe();
-    let past = app
-        .state
-        .audit_records(which.since, which.limit.unwrap_or(RECORDS))?;
+    let past = app.state.audit_records(which.since, which.limit.unwrap_or(RECORDS))?;
     if !which.follow {
         return Ok(json_lines(futures_util::stream::iter(past)));
     }
@@ -70,9 +68,5 @@ pub async fn audit(
         .take_while(|new| std::future::ready(new.is_ok()))
         .flat_map(|new| futures_util::stream::iter(new.unwrap_or_default()));
     let ending = caller.wait_for_end(&app, "");
-    Ok(json_lines(
-        futures_util::stream::iter(past)
-            .chain(coming)
-            .take_until(ending),
-    ))
+    Ok(json_lines(futures_util::stream::iter(past).chain(coming).take_until(ending)))
 }

@@ -7,8 +7,7 @@ use super::Error;
 use crate::principals::refusals::AuthenticationError;
 
 const NEXT_OF_ENDING: &str = "try again when the daemon has restarted";
-const NEXT_OF_INTERNAL: &str =
-    "try again; if it fails again, see the daemon's log: journalctl -u cloudroid";
+const NEXT_OF_INTERNAL: &str = "try again; if it fails again, see the daemon's log: journalctl -u cloudroid";
 
 impl Error {
     /// Returns what the client should do now.
@@ -16,7 +15,8 @@ impl Error {
         match self {
             Error::UnknownRobot { .. } => {
                 "list robots with servants by: cloudroidctl servants; on the robot: rosrun PACKAGE cloudroid-stub \
-                    doctor".into()
+                    doctor"
+                    .into()
             }
             Error::Unstatable(_) => "see docs/robots.md for what a robot can ask for".into(),
             Error::UnknownPath { .. } => {
@@ -25,14 +25,16 @@ impl Error {
             Error::OtherMethod { .. } => "use one of the methods in the header Allow".into(),
             Error::BadRequest(_) => {
                 "correct the request and try again; the API is described at /api/v1/openapi.json, for robots in \
-                    docs/robots.md".into()
+                    docs/robots.md"
+                    .into()
             }
             Error::UnknownRow { service, .. } => {
                 format!("list them with: cloudroidctl sla list {service}")
             }
             Error::Forbidden { .. } => {
                 "use a token that may do this (an admin creates one with: cloudroidctl token create), or run the \
-                    command on the server as root".into()
+                    command on the server as root"
+                    .into()
             }
             Error::UnknownToken { .. } => "list them with: cloudroidctl token list".into(),
             Error::TokenExists(name) => format!(
@@ -40,35 +42,38 @@ impl Error {
                     cloudroidctl token revoke {name}"
             ),
             Error::UnknownAccount { .. } => "list them with: cloudroidctl account list".into(),
-            Error::AccountExists(name) => format!(
-                "choose another name, or remove it with: cloudroidctl account remove {name}"
-            ),
-            Error::PairingExists(name) => format!(
-                "choose another name, or end the pairing with: cloudroidctl unpair {name}"
-            ),
+            Error::AccountExists(name) => {
+                format!("choose another name, or remove it with: cloudroidctl account remove {name}")
+            }
+            Error::PairingExists(name) => {
+                format!("choose another name, or end the pairing with: cloudroidctl unpair {name}")
+            }
             Error::WrongPassword => {
                 "try again, or have an admin set another password with: cloudroidctl account passwd NAME".into()
             }
             Error::SignInBusy => "try again later".into(),
             Error::TooManyStreams { .. } => {
                 "close other open pages of the portal, or stop commands that follow (cloudroidctl logs --follow), then \
-                    try again".into()
+                    try again"
+                    .into()
             }
-            Error::TooManyLook { .. } => {
-                "close other pages that look into it, then try again".into()
-            }
+            Error::TooManyLook { .. } => "close other pages that look into it, then try again".into(),
             Error::NotThereYet(id) => {
-                format!("see its state with: cloudroidctl servants, or GET /api/v1/servants/{id}; try again when it \
-                         is ready")
+                format!(
+                    "see its state with: cloudroidctl servants, or GET /api/v1/servants/{id}; try again when it \
+                         is ready"
+                )
             }
             Error::NoBlackBox(_) => {
                 "have an operator set seconds in [black_box] of the configuration (docs/viewers.md); if it is set, \
-                    recording begins a second after the servant is ready".into()
+                    recording begins a second after the servant is ready"
+                    .into()
             }
             Error::UnknownRecording(_) => "list them with: cloudroidctl recordings list".into(),
             Error::NotRecorded { .. } => {
                 "free some space on the disk of the state directory, or set another disk in [black_box] of the \
-                    configuration; then: cloudroidctl recordings take SERVANT".into()
+                    configuration; then: cloudroidctl recordings take SERVANT"
+                    .into()
             }
             Error::RecordedLately { .. } => {
                 "use that one (cloudroidctl recordings list), or try again in a few seconds".into()
@@ -77,7 +82,8 @@ impl Error {
             Error::Provider(error) => error.next_step().into(),
             Error::NoRole { .. } => {
                 "ask an operator to add one of them to roles in [oidc] of the configuration (docs/access.md), or ask \
-                    the provider to put you into a group that is listed there; then sign in again".into()
+                    the provider to put you into a group that is listed there; then sign in again"
+                    .into()
             }
             Error::UnknownRule { .. } => "list them with: cloudroidctl policy list".into(),
             Error::WebSocketVersion => "use a client that speaks RFC 6455".into(),
@@ -86,33 +92,34 @@ impl Error {
             }
             Error::Unrecognised(AuthenticationError::SlowedSignIn(_)) => {
                 "try again then; open sessions are not affected, and root and the group cloudroid need no password at \
-                    the daemon's sockets".into()
+                    the daemon's sockets"
+                    .into()
             }
             Error::Unrecognised(AuthenticationError::SessionOver) => "sign in again".into(),
             Error::Unauthorised(_)
             | Error::Unrecognised(
                 AuthenticationError::Revoked | AuthenticationError::Expired | AuthenticationError::Unknown,
-            ) => {
-                "send a token from the operator: Authorization: Bearer TOKEN, or ?token=TOKEN".into()
-            }
+            ) => "send a token from the operator: Authorization: Bearer TOKEN, or ?token=TOKEN".into(),
             Error::Uncertified(_) | Error::Uncoded(_) => {
                 "pair it: on the server cloudroidctl pair ROBOT, on the robot cloudroid-stub pair 'LINE'".into()
             }
             Error::UnknownPairing { .. } => "list them with: cloudroidctl pair --list".into(),
-            Error::PlainText { instead } => format!(
-                "use {instead}; anything sent in plain text, such as a token, can be read on the way"
-            ),
+            Error::PlainText { instead } => {
+                format!("use {instead}; anything sent in plain text, such as a token, can be read on the way")
+            }
             Error::Foreign { next, .. } => next.clone(),
             Error::RobotTaken(_) => "connect with that token, or under another name".into(),
             Error::Memory(_) => "send less at a time, or raise client and daemon in [memory] of the \
-                                 configuration".into(),
+                                 configuration"
+                .into(),
             Error::BodyTooLarge { .. } => "send less in one request".into(),
             Error::Unfinished { .. } => {
                 "send it over a faster connection, or raise unfinished in [memory] of the configuration".into()
             }
             Error::TrialTooLarge { .. } => {
                 "send a shorter one, or raise client and daemon in [memory] of the configuration; 512M is the \
-                 most".into()
+                 most"
+                    .into()
             }
             Error::Uncertifiable(error) => authority_next_step(error).into(),
             Error::Push(error) => push_next_step(error),
@@ -132,9 +139,7 @@ fn authority_next_step(error: &authority::Error) -> &'static str {
         A::NoRequest(_) | A::TooLong(_) | A::OtherName { .. } | A::Kind => {
             "have the robot make its request itself: cloudroid-stub pair 'LINE'"
         }
-        A::Nameless(_) => {
-            "use a certificate that names a robot, or pair the robot again: cloudroidctl pair ROBOT"
-        }
+        A::Nameless(_) => "use a certificate that names a robot, or pair the robot again: cloudroidctl pair ROBOT",
     }
 }
 
@@ -156,11 +161,9 @@ fn image_next_step(error: &image::Error) -> &'static str {
         I::Json { .. } | I::UnknownLayer { .. } | I::UnknownImage { .. } | I::Damaged { .. } => {
             "push the package again"
         }
-        I::BadDigest { .. }
-        | I::BadTag { .. }
-        | I::Unreceivable { .. }
-        | I::Tree { .. }
-        | I::Archive { .. } => "correct the content and send it again",
+        I::BadDigest { .. } | I::BadTag { .. } | I::Unreceivable { .. } | I::Tree { .. } | I::Archive { .. } => {
+            "correct the content and send it again"
+        }
         I::File { .. } | I::NotALayout { .. } => NEXT_OF_INTERNAL,
     }
 }
@@ -170,17 +173,14 @@ fn push_next_step(error: &push::Error) -> String {
     match error {
         P::NotAllowed(_) => "choose another name with --name, or ask its owner".into(),
         P::NameTaken { name, .. } => {
-            format!(
-                "choose another name with --name, or remove the service with: cloudroidctl rm {name}"
-            )
+            format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
         }
         P::Options(_) => "correct the options and push again; see cloudroidctl push --help".into(),
-        P::Failed { next, .. } => next
-            .clone()
-            .unwrap_or_else(|| "correct the problem named above and push again".into()),
+        P::Failed { next, .. } => {
+            next.clone().unwrap_or_else(|| "correct the problem named above and push again".into())
+        }
         P::TooLarge { .. } => {
-            "remove files that are not needed, or raise archive in [push] of the configuration"
-                .into()
+            "remove files that are not needed, or raise archive in [push] of the configuration".into()
         }
         P::Choreographer(error) => choreographer_next_step(error),
         P::Catalogue(error) => catalogue_next_step(error),
@@ -215,9 +215,7 @@ fn choreographer_next_step(error: &choreographer::Error) -> String {
             ResizeError::Used { used, .. } => {
                 format!("request memory={used} or more, or stop it with: cloudroidctl stop")
             }
-            ResizeError::Many => {
-                "remove the terms of these stubs, or stop the servant with: cloudroidctl stop".into()
-            }
+            ResizeError::Many => "remove the terms of these stubs, or stop the servant with: cloudroidctl stop".into(),
         },
         C::Full(
             AdmissionError::NoMore { .. }
@@ -242,16 +240,20 @@ fn choreographer_next_step(error: &choreographer::Error) -> String {
                 REVISION --canary 10%"
         ),
         C::BackOff { service, .. } => {
-            format!("see why with: cloudroidctl events; push {service} again when its package is fixed: a new revision \
-                starts at once")
+            format!(
+                "see why with: cloudroidctl events; push {service} again when its package is fixed: a new revision \
+                starts at once"
+            )
         }
         C::Rollout(_) => {
             "see the service's revisions with: cloudroidctl services NAME, and its rollout with: cloudroidctl rollout \
-                NAME".into()
+                NAME"
+                .into()
         }
         C::OutOfMemory { .. } => {
             "give it more memory: with --robot-memory if it stands for a robot, otherwise push it with a larger \
-                --memory".into()
+                --memory"
+                .into()
         }
         C::Calibration(_) | C::Shadow(_) => "correct the problem named above and start again".into(),
         C::Catalogue(error) => catalogue_next_step(error),
@@ -266,9 +268,7 @@ fn choreographer_next_step(error: &choreographer::Error) -> String {
 fn reach_next_step(error: &reach::Error) -> &'static str {
     use reach::Error as R;
     match error {
-        R::Bus(_) | R::Elsewhere(_) => {
-            "see what happened to the servant with: cloudroidctl events, then try again"
-        }
+        R::Bus(_) | R::Elsewhere(_) => "see what happened to the servant with: cloudroidctl events, then try again",
         R::Linked(_) => "try the service with a robot that has its stub",
         R::Trial(_) => {
             "give a recording (rosbag 2.0) of the topics that the service subscribes to; try and calibrate also take \
@@ -280,29 +280,18 @@ fn reach_next_step(error: &reach::Error) -> &'static str {
 fn engine_next_step(error: &servant::Error) -> &'static str {
     use servant::Error as E;
     match error {
-        E::Grant(_) => {
-            "push again without it, or ask the operator to allow it in [allow] of the configuration"
-        }
-        E::Refused { .. }
-        | E::Ended { .. }
-        | E::Start { .. }
-        | E::Exists { .. }
-        | E::NoNode { .. } => {
+        E::Grant(_) => "push again without it, or ask the operator to allow it in [allow] of the configuration",
+        E::Refused { .. } | E::Ended { .. } | E::Start { .. } | E::Exists { .. } | E::NoNode { .. } => {
             "see what happened to the servant with: cloudroidctl events, then try again"
         }
-        E::Unanswered { .. } => {
-            "check with cloudroidctl doctor whether its shim runs, or stop the servant"
+        E::Unanswered { .. } => "check with cloudroidctl doctor whether its shim runs, or stop the servant",
+        E::Isolation { .. } | E::IdmapUnsupported { .. } | E::NoUidRange { .. } | E::Stray { .. } => {
+            "do this on the server, then check it with: cloudroidctl doctor"
         }
-        E::Isolation { .. }
-        | E::IdmapUnsupported { .. }
-        | E::NoUidRange { .. }
-        | E::Stray { .. } => "do this on the server, then check it with: cloudroidctl doctor",
         E::Image { .. } => "push the package again",
-        E::File { .. }
-        | E::Call { .. }
-        | E::InvalidSpec { .. }
-        | E::LeftOver { .. }
-        | E::Malformed { .. } => NEXT_OF_INTERNAL,
+        E::File { .. } | E::Call { .. } | E::InvalidSpec { .. } | E::LeftOver { .. } | E::Malformed { .. } => {
+            NEXT_OF_INTERNAL
+        }
     }
 }
 
@@ -312,8 +301,7 @@ fn terms_next_step(untenable: &TermsError) -> String {
             "request no class, or ask the operator to add it: [class.NAME] of the configuration".into()
         }
         TermsError::UnknownClass { .. } => {
-            "request an existing class, or ask the operator to add it: [class.NAME] of the configuration"
-                .into()
+            "request an existing class, or ask the operator to add it: [class.NAME] of the configuration".into()
         }
         TermsError::Capped { cap, .. } => {
             format!("request {}={} or less", cap.resource, cap.most)
@@ -324,12 +312,9 @@ fn terms_next_step(untenable: &TermsError) -> String {
             let keys = keys.join(" and ");
             format!("give {keys}{}", fits.unwrap_or_default())
         }
-        TermsError::Beyond {
-            fits: Some(fits), ..
+        TermsError::Beyond { fits: Some(fits), .. } | TermsError::Unmet { fits: Some(fits), .. } => {
+            format!("request what fits: {fits}")
         }
-        | TermsError::Unmet {
-            fits: Some(fits), ..
-        } => format!("request what fits: {fits}"),
         TermsError::Beyond { .. } => "request less, or ask the operator to raise the cap".into(),
         TermsError::Unmet { service, .. } => format!(
             "request cpus and memory directly, or ask the deployer to add a row: cloudroidctl sla set {service}"
@@ -340,12 +325,8 @@ fn terms_next_step(untenable: &TermsError) -> String {
 fn catalogue_next_step(error: &catalogue::Error) -> String {
     use catalogue::Error as C;
     match error {
-        C::UnknownService { exists, .. } if exists.is_empty() => {
-            "publish one with: cloudroidctl push".to_owned()
-        }
-        C::UnknownService { .. } => {
-            "use an existing service, or publish this one with: cloudroidctl push".to_owned()
-        }
+        C::UnknownService { exists, .. } if exists.is_empty() => "publish one with: cloudroidctl push".to_owned(),
+        C::UnknownService { .. } => "use an existing service, or publish this one with: cloudroidctl push".to_owned(),
         C::UnknownRevision { service, .. } => {
             format!("list them with: cloudroidctl services {service}")
         }
@@ -353,12 +334,8 @@ fn catalogue_next_step(error: &catalogue::Error) -> String {
         C::UnknownArchitecture { .. } => {
             "request an available one with ?arch=, or ask the operator to add others: make stub-cross".to_owned()
         }
-        C::UnknownImage { .. } => {
-            "list them with: cloudroidctl services NAME".to_owned()
-        }
-        C::Name(NameError::Service(_) | NameError::Reserved(_)) => {
-            "choose another name with --name".to_owned()
-        }
+        C::UnknownImage { .. } => "list them with: cloudroidctl services NAME".to_owned(),
+        C::Name(NameError::Service(_) | NameError::Reserved(_)) => "choose another name with --name".to_owned(),
         C::Name(NameError::Robot(_)) => "rename the robot accordingly".to_owned(),
         C::Inventory(_) => "correct the package and push it again".to_owned(),
         C::State(error) => state_next_step(error).to_owned(),

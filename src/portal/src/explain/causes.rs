@@ -31,10 +31,7 @@ pub(super) fn find_causes(
                 earliest",
             one.service, one.failures, one.reason
         );
-        let next = format!(
-            "cloudroidctl events; push {} again when it is fixed",
-            one.service
-        );
+        let next = format!("cloudroidctl events; push {} again when it is fixed", one.service);
         say(Weight::Blocks, what, next);
     }
     if servants.is_empty() {
@@ -69,8 +66,7 @@ pub(super) fn find_causes(
         say(
             Weight::Hint,
             lost.message.clone(),
-            "if that matters, restart its nodes, or set local = \"none\" so that only the cloud answers"
-                .to_owned(),
+            "if that matters, restart its nodes, or set local = \"none\" so that only the cloud answers".to_owned(),
         );
     }
     causes.sort_by_key(|cause| cause.weight);
@@ -96,10 +92,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         let left = down.again.saturating_sub(store::now()).div_ceil(1000);
         say(
             Weight::Blocks,
-            format!(
-                "{} of {id} failed {} times in a row and restarts in {left} s",
-                down.node, down.failures
-            ),
+            format!("{} of {id} failed {} times in a row and restarts in {left} s", down.node, down.failures),
             format!("cloudroidctl logs {id}"),
         );
     }
@@ -107,9 +100,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         say(
             Weight::Blocks,
             format!("{id} hangs: {hangs}"),
-            format!(
-                "cloudroidctl logs {id}; to restart such nodes automatically: hung = \"restart\" in [servant]"
-            ),
+            format!("cloudroidctl logs {id}; to restart such nodes automatically: hung = \"restart\" in [servant]"),
         );
     }
     if servant.connections == 0 {
@@ -120,28 +111,17 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         );
     }
     if served.throttled > THROTTLED {
-        let cpus = servant
-            .enforced
-            .and_then(|limits| limits.cpus)
-            .or(servant.limits.cpus);
+        let cpus = servant.enforced.and_then(|limits| limits.cpus).or(servant.limits.cpus);
         let limit = cpus.map_or_else(String::new, |cpus| format!(" of {cpus}"));
         say(
             Weight::Slows,
-            format!(
-                "{id} is throttled by its CPU limit{limit} for {:.0} % of the time",
-                served.throttled * 100.0
-            ),
+            format!("{id} is throttled by its CPU limit{limit} for {:.0} % of the time", served.throttled * 100.0),
             format!("give {} more cores: push it with --cpus N", servant.service),
         );
     }
     let pressure = servant.usage.and_then(|usage| usage.pressure);
-    let waits = pressure.map(|pressure| {
-        [
-            ("a core", pressure.cpu),
-            ("memory", pressure.memory),
-            ("a disk", pressure.io),
-        ]
-    });
+    let waits =
+        pressure.map(|pressure| [("a core", pressure.cpu), ("memory", pressure.memory), ("a disk", pressure.io)]);
     for (what, share) in waits.into_iter().flatten() {
         // Throttling by the servant's own limit also counts as waiting for a core.
         let by_itself = what == "a core" && served.throttled > THROTTLED;
@@ -158,19 +138,13 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         say(
             Weight::Slows,
             format!("{killed} processes of {id} were killed because they ran out of memory"),
-            format!(
-                "give {} more memory: push it with --memory SIZE",
-                servant.service
-            ),
+            format!("give {} more memory: push it with --memory SIZE", servant.service),
         );
     }
     if servant.dropped > 0 {
         say(
             Weight::Hint,
-            format!(
-                "{} messages of {id} were dropped because a subscriber was slow",
-                servant.dropped
-            ),
+            format!("{} messages of {id} were dropped because a subscriber was slow", servant.dropped),
             "lower the rate of the subscribed topics, or compress them".to_owned(),
         );
     }
@@ -213,27 +187,21 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
         say(
             Weight::Hint,
             format!("{node} looked for the service {service}, which no node serves"),
-            format!(
-                "start a node that serves it on the robot, or remap it: {service}:=/THE/SERVICE"
-            ),
+            format!("start a node that serves it on the robot, or remap it: {service}:=/THE/SERVICE"),
         );
     }
     for refused in &link.refused {
         say(
             Weight::Hint,
             refused.clone(),
-            "let the subscriber request no more than the publisher offers (ros2 topic info -v shows both)"
-                .to_owned(),
+            "let the subscriber request no more than the publisher offers (ros2 topic info -v shows both)".to_owned(),
         );
     }
     if let Some(clock) = link.clock.filter(|clock| clock.abs() > CLOCK_APART) {
         let side = if clock > 0.0 { "ahead of" } else { "behind" };
         say(
             Weight::Hint,
-            format!(
-                "the robot's clock is {:.0} ms {side} the server's",
-                clock.abs()
-            ),
+            format!("the robot's clock is {:.0} ms {side} the server's", clock.abs()),
             "sudo apt install chrony, on both sides".to_owned(),
         );
     }
@@ -242,8 +210,7 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
         say(
             Weight::Hint,
             drop.clone(),
-            "send less (a lower rate, codec = \"jpeg\"), or give the topic's subscriber a longer queue"
-                .to_owned(),
+            "send less (a lower rate, codec = \"jpeg\"), or give the topic's subscriber a longer queue".to_owned(),
         );
     }
     if link.requests == 0 {
@@ -251,34 +218,21 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
     }
     let late = link.late as f64 / link.requests as f64;
     if late > LATE {
-        let max = link
-            .max
-            .map_or_else(String::new, |max| format!(" ({max:.0} ms)"));
+        let max = link.max.map_or_else(String::new, |max| format!(" ({max:.0} ms)"));
         let (part, next) = blame(served, link);
         say(
             Weight::Slows,
-            format!(
-                "{} of the last {} requests of {node} exceeded T_max{max}{part}",
-                link.late, link.requests
-            ),
+            format!("{} of the last {} requests of {node} exceeded T_max{max}{part}", link.late, link.requests),
             next,
         );
     }
     if link.local > 0 {
-        let q = link
-            .satisfaction
-            .map_or_else(String::new, |q| format!(", Q is {q:.1}"));
+        let q = link.satisfaction.map_or_else(String::new, |q| format!(", Q is {q:.1}"));
         say(
             Weight::Hint,
-            format!(
-                "the local original answered {} of the last {} requests of {node}{q}",
-                link.local, link.requests
-            ),
+            format!("the local original answered {} of the last {} requests of {node}{q}", link.local, link.requests),
             match link.fallback_after {
-                Some(_) => {
-                    "it takes over while the link is down, and stops automatically when it is back"
-                        .to_owned()
-                }
+                Some(_) => "it takes over while the link is down, and stops automatically when it is back".to_owned(),
                 None => "it stops automatically when the cloud meets T_max again".to_owned(),
             },
         );
@@ -289,10 +243,7 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
 fn add_queue_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
     let node = &link.node;
     let next = || {
-        format!(
-            "lower the rate of its inputs, or give it more cores: cloudroidctl set {} --cpus N",
-            served.servant.id
-        )
+        format!("lower the rate of its inputs, or give it more cores: cloudroidctl set {} --cpus N", served.servant.id)
     };
     let median = |name: &str| link.part(name).map_or(0.0, |part| part.p50);
     let (queue, compute, total) = (median("queue"), median("compute"), median("total"));
@@ -338,10 +289,7 @@ fn blame(served: &Served, link: &Link) -> (String, String) {
             "see the robot's log and the other causes listed here".to_owned(),
         );
     };
-    let text = format!(
-        "; most of the time is spent in {} ({:.0} ms)",
-        part.name, part.p50
-    );
+    let text = format!("; most of the time is spent in {} ({:.0} ms)", part.name, part.p50);
     let next = match part.name.as_str() {
         "up" | "down" => "check the robot's network; codec = \"jpeg\" in stub.toml makes \
             pictures smaller"
@@ -349,10 +297,9 @@ fn blame(served: &Served, link: &Link) -> (String, String) {
         "queue" => "requests arrive faster than they are answered: lower their rate, or give more \
                     cores with --cpus"
             .to_owned(),
-        "compute" => format!(
-            "the node itself is slow: push {} with more --cpus, or raise T_max",
-            served.servant.service
-        ),
+        "compute" => {
+            format!("the node itself is slow: push {} with more --cpus, or raise T_max", served.servant.service)
+        }
         _ => "the robot itself is busy: run top there".to_owned(),
     };
     (text, next)

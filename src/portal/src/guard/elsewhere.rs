@@ -15,11 +15,8 @@ pub fn check_host(headers: &HeaderMap) -> Result<(), Error> {
         return Ok(());
     }
     Err(Error::Foreign {
-        what: format!(
-            "the request is addressed to {host:?}, but this portal serves only this machine"
-        ),
-        next: "use 127.0.0.1 or localhost, or configure tokens, as a proxy in front of it needs"
-            .to_owned(),
+        what: format!("the request is addressed to {host:?}, but this portal serves only this machine"),
+        next: "use 127.0.0.1 or localhost, or configure tokens, as a proxy in front of it needs".to_owned(),
     })
 }
 
@@ -28,14 +25,10 @@ pub fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<(), Error
     let Some(origin) = header_text(headers, header::ORIGIN) else {
         return Ok(());
     };
-    let of_this_machine = origin.split_once("://").is_some_and(|(scheme, host)| {
-        scheme.starts_with("http") && is_loopback_host(without_port(host))
-    });
-    if of_this_machine
-        || allowed
-            .iter()
-            .any(|allowed| allowed.trim_end_matches('/') == origin)
-    {
+    let of_this_machine = origin
+        .split_once("://")
+        .is_some_and(|(scheme, host)| scheme.starts_with("http") && is_loopback_host(without_port(host)));
+    if of_this_machine || allowed.iter().any(|allowed| allowed.trim_end_matches('/') == origin) {
         return Ok(());
     }
     Err(Error::Foreign {
@@ -57,8 +50,7 @@ pub fn check_not_embedded(headers: &HeaderMap) -> Result<(), Error> {
     if elsewhere && !follows && !headers.contains_key(header::ORIGIN) {
         Err(Error::Foreign {
             what: "a page of another site may not embed this portal's answers".to_owned(),
-            next: "open the address itself, or ask with a token (Authorization: Bearer TOKEN)"
-                .to_owned(),
+            next: "open the address itself, or ask with a token (Authorization: Bearer TOKEN)".to_owned(),
         })
     } else {
         Ok(())
@@ -66,14 +58,8 @@ pub fn check_not_embedded(headers: &HeaderMap) -> Result<(), Error> {
 }
 
 /// Headers added by proxies.
-const FORWARDED: [&str; 6] = [
-    "forwarded",
-    "via",
-    "x-forwarded-for",
-    "x-forwarded-host",
-    "x-forwarded-proto",
-    "x-real-ip",
-];
+const FORWARDED: [&str; 6] =
+    ["forwarded", "via", "x-forwarded-for", "x-forwarded-host", "x-forwarded-proto", "x-real-ip"];
 
 /// Refuses requests with a proxy's headers: their clients are on other machines, whatever `Host` says.
 pub fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
@@ -84,27 +70,19 @@ pub fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
                 "a proxy passes this request on (its header {name} says so), but this portal has no tokens to identify \
                     the caller"
             ),
-            next: "configure tokens, and send one: Authorization: Bearer TOKEN, or ?token=TOKEN"
-                .to_owned(),
+            next: "configure tokens, and send one: Authorization: Bearer TOKEN, or ?token=TOKEN".to_owned(),
         }),
     }
 }
 
 fn without_port(host: &str) -> &str {
     match host.rsplit_once(':') {
-        Some((name, port))
-            if port.bytes().all(|byte| byte.is_ascii_digit()) && !name.ends_with(':') =>
-        {
-            name
-        }
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) && !name.ends_with(':') => name,
         _ => host,
     }
 }
 
 fn is_loopback_host(host: &str) -> bool {
     let bare = host.trim_start_matches('[').trim_end_matches(']');
-    host.eq_ignore_ascii_case("localhost")
-        || bare
-            .parse::<IpAddr>()
-            .is_ok_and(|address| address.is_loopback())
+    host.eq_ignore_ascii_case("localhost") || bare.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
 }

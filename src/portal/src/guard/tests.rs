@@ -11,18 +11,13 @@ struct TestRequest<'a> {
 }
 
 fn request<'a>(rules: &AdmissionRules<'a>) -> TestRequest<'a> {
-    TestRequest {
-        rules: AdmissionRules { ..*rules },
-        method: Method::GET,
-        headers: HeaderMap::new(),
-    }
-    .with_header("host", "127.0.0.1:9090")
+    TestRequest { rules: AdmissionRules { ..*rules }, method: Method::GET, headers: HeaderMap::new() }
+        .with_header("host", "127.0.0.1:9090")
 }
 
 impl TestRequest<'_> {
     fn with_header(mut self, name: &'static str, value: &str) -> Self {
-        self.headers
-            .insert(name, value.parse().expect("a header value"));
+        self.headers.insert(name, value.parse().expect("a header value"));
         self
     }
 
@@ -39,8 +34,7 @@ impl TestRequest<'_> {
         let peer = ConnectionPeer::Tcp("127.0.0.1:5000".parse().expect("an address"));
         let uri = uri.parse().expect("a URI");
         let connection = PortalConnection::without_tls(peer);
-        self.rules
-            .admit(&connection, &self.method, &uri, &self.headers)
+        self.rules.admit(&connection, &self.method, &uri, &self.headers)
     }
 }
 
@@ -62,27 +56,12 @@ fn on_loopback_nobody_needs_a_token() {
         },
         origins: &[],
     };
-    assert!(
-        request(&rules)
-            .admit_or_status("/api/v1/services")
-            .expect("let through")
-            .is_known()
-    );
+    assert!(request(&rules).admit_or_status("/api/v1/services").expect("let through").is_known());
     for host in ["localhost", "localhost:9090", "[::1]:9090", "127.0.0.1"] {
-        request(&rules)
-            .with_header("host", host)
-            .admit_or_status("/")
-            .expect(host);
+        request(&rules).with_header("host", host).admit_or_status("/").expect(host);
     }
-    for origin in [
-        "http://localhost:8080",
-        "http://127.0.0.1:9090",
-        "https://[::1]:1",
-    ] {
-        request(&rules)
-            .with_header("origin", origin)
-            .admit_or_status("/")
-            .expect(origin);
+    for origin in ["http://localhost:8080", "http://127.0.0.1:9090", "https://[::1]:1"] {
+        request(&rules).with_header("origin", origin).admit_or_status("/").expect(origin);
     }
 }
 
@@ -102,29 +81,14 @@ fn pages_from_elsewhere_cannot_use_a_portal_on_loopback() {
         origins: &origins,
     };
     assert_eq!(
-        request(&rules)
-            .with_header("host", "evil.example:9090")
-            .admit_or_status("/opencv_apps"),
+        request(&rules).with_header("host", "evil.example:9090").admit_or_status("/opencv_apps"),
         Err(403),
         "DNS rebinding"
     );
-    for origin in [
-        "https://evil.example",
-        "null",
-        "http://localhost.evil.example",
-    ] {
-        assert_eq!(
-            request(&rules)
-                .with_header("origin", origin)
-                .admit_or_status("/opencv_apps"),
-            Err(403),
-            "{origin}"
-        );
+    for origin in ["https://evil.example", "null", "http://localhost.evil.example"] {
+        assert_eq!(request(&rules).with_header("origin", origin).admit_or_status("/opencv_apps"), Err(403), "{origin}");
     }
-    request(&rules)
-        .with_header("origin", "https://tool.example")
-        .admit_or_status("/opencv_apps")
-        .expect("configured");
+    request(&rules).with_header("origin", "https://tool.example").admit_or_status("/opencv_apps").expect("configured");
 }
 
 #[test]
@@ -143,9 +107,7 @@ fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
     };
     let loads = |site: &str, mode: &str, dest: &str| {
         let ask = request(&rules).with_header("sec-fetch-site", site);
-        let ask = ask
-            .with_header("sec-fetch-mode", mode)
-            .with_header("sec-fetch-dest", dest);
+        let ask = ask.with_header("sec-fetch-mode", mode).with_header("sec-fetch-dest", dest);
         ask.admit_or_status("/api/v1/services").map(|_| ())
     };
     for (site, mode, dest) in [
@@ -168,11 +130,9 @@ fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
         assert_eq!(loads(site, mode, dest), Ok(()), "{site} {mode} {dest}");
     }
     // The origin decides whether a page of this machine may use the portal.
-    let page = request(&rules)
-        .with_header("sec-fetch-site", "same-site")
-        .with_header("origin", "http://localhost:8080");
-    page.admit_or_status("/opencv_apps")
-        .expect("a page of this machine");
+    let page =
+        request(&rules).with_header("sec-fetch-site", "same-site").with_header("origin", "http://localhost:8080");
+    page.admit_or_status("/opencv_apps").expect("a page of this machine");
 }
 
 #[test]
@@ -189,21 +149,12 @@ fn an_origin_that_a_sandboxed_page_has_is_named_with_what_to_write() {
         },
         origins: &[],
     };
-    let refused = request(&closed)
-        .with_header("origin", "null")
-        .admit("/opencv_apps")
-        .expect_err("nobody's page");
+    let refused = request(&closed).with_header("origin", "null").admit("/opencv_apps").expect_err("nobody's page");
     let next = refused.problem().next.unwrap_or_default();
     assert!(next.contains(r#"origins = ["null"]"#), "{next}");
     let origins = ["null".to_owned()];
-    let opened = AdmissionRules {
-        origins: &origins,
-        ..closed
-    };
-    request(&opened)
-        .with_header("origin", "null")
-        .admit_or_status("/opencv_apps")
-        .expect("configured");
+    let opened = AdmissionRules { origins: &origins, ..closed };
+    request(&opened).with_header("origin", "null").admit_or_status("/opencv_apps").expect("configured");
 }
 
 #[test]
@@ -227,14 +178,8 @@ fn what_a_proxy_passes_on_needs_tokens() {
         ("via", "1.1 proxy"),
     ] {
         // Its client may send any Host.
-        let refused = request(&rules)
-            .with_header("host", "localhost")
-            .with_header(name, value);
-        assert_eq!(
-            refused.admit_or_status("/api/v1/services"),
-            Err(403),
-            "{name}"
-        );
+        let refused = request(&rules).with_header("host", "localhost").with_header(name, value);
+        assert_eq!(refused.admit_or_status("/api/v1/services"), Err(403), "{name}");
     }
     rules.known.tokens = &some;
     request(&rules)
@@ -257,9 +202,7 @@ fn without_configured_tokens_any_token_owns_robots_names() {
         },
         origins: &[],
     };
-    let caller = request(&open)
-        .admit_or_status("/x?robot=r&token=mine")
-        .expect("let through");
+    let caller = request(&open).admit_or_status("/x?robot=r&token=mine").expect("let through");
     assert_eq!(caller.who.token, Some(tokens::hash("mine")));
 }
 
@@ -279,26 +222,15 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
             origins: &[],
         };
         let far = || request(&rules).with_header("host", "localhost");
-        for path in [
-            "/api/v1/services",
-            "/metrics",
-            "/opencv_apps",
-            "/stubs",
-            "/v2/",
-        ] {
+        for path in ["/api/v1/services", "/metrics", "/opencv_apps", "/stubs", "/v2/"] {
             assert_eq!(far().admit_or_status(path), Err(401), "{path}");
         }
         assert_eq!(far().admit_or_status("/x?token=wrong"), Err(401));
         let bearer = |word: &str| far().with_header("authorization", &format!("Bearer {word}"));
-        assert_eq!(
-            bearer("wrong").admit_or_status("/api/v1/services"),
-            Err(401)
-        );
+        assert_eq!(bearer("wrong").admit_or_status("/api/v1/services"), Err(401));
         for known in [
             bearer("open sesame").admit_or_status("/api/v1/services"),
-            far()
-                .with_header("origin", "https://far.example")
-                .admit_or_status("/api/v1/services?token=open+sesame"),
+            far().with_header("origin", "https://far.example").admit_or_status("/api/v1/services?token=open+sesame"),
             far()
                 .with_header("sec-websocket-protocol", "rosbridge, bearer.open sesame")
                 .admit_or_status("/opencv_apps?token=wrong"),
@@ -335,24 +267,14 @@ fn at_the_registry_a_token_is_the_password_of_any_name() {
             assert_eq!(known.who.token, Some(tokens::hash("open sesame")));
         }
     }
-    for wrong in [
-        "open sesame:",
-        "x:open",
-        "open sesame",
-        "x:open sesame ",
-        "\u{ff}",
-    ] {
+    for wrong in ["open sesame:", "x:open", "open sesame", "x:open sesame ", "\u{ff}"] {
         assert_eq!(basic(wrong).admit_or_status("/v2/"), Err(401), "{wrong}");
     }
     let unreadable = request(&rules).with_header("authorization", "Basic *");
     assert_eq!(unreadable.admit_or_status("/v2/"), Err(401));
     // Browsers keep a password and resend it by themselves: elsewhere it is ignored.
     for path in ["/api/v1/services", "/metrics", "/v2x", "/v1/v2/"] {
-        assert_eq!(
-            basic("x:open sesame").admit_or_status(path),
-            Err(401),
-            "{path}"
-        );
+        assert_eq!(basic("x:open sesame").admit_or_status(path), Err(401), "{path}");
     }
 }
 
@@ -370,52 +292,28 @@ fn without_a_token_only_the_page_health_and_handshakes_are_open() {
         },
         origins: &[],
     };
-    let handshake = |method: Method| {
-        request(&rules)
-            .with_method(method)
-            .with_header("upgrade", "WebSocket")
-    };
+    let handshake = |method: Method| request(&rules).with_method(method).with_header("upgrade", "WebSocket");
     for path in ["/", "/healthz", "/assets/portal.js"] {
         let caller = request(&rules).admit_or_status(path).expect(path);
         assert!(!caller.is_known(), "{path}");
-        request(&rules)
-            .with_method(Method::HEAD)
-            .admit_or_status(path)
-            .expect(path);
-        assert_eq!(
-            request(&rules)
-                .with_method(Method::POST)
-                .admit_or_status(path),
-            Err(401),
-            "{path}"
-        );
+        request(&rules).with_method(Method::HEAD).admit_or_status(path).expect(path);
+        assert_eq!(request(&rules).with_method(Method::POST).admit_or_status(path), Err(401), "{path}");
     }
     // The sender of a pairing code is unauthenticated until the code is checked.
-    let caller = request(&rules)
-        .with_method(Method::POST)
-        .admit_or_status("/api/v1/pair");
+    let caller = request(&rules).with_method(Method::POST).admit_or_status("/api/v1/pair");
     assert!(!caller.expect("may show a code").is_known());
     for method in [Method::GET, Method::HEAD, Method::PUT, Method::DELETE] {
-        let refused = request(&rules)
-            .with_method(method.clone())
-            .admit_or_status("/api/v1/pair");
+        let refused = request(&rules).with_method(method.clone()).admit_or_status("/api/v1/pair");
         assert_eq!(refused, Err(401), "{method}");
     }
+    assert_eq!(handshake(Method::POST).admit_or_status("/api/v1/pair"), Err(401));
     assert_eq!(
-        handshake(Method::POST).admit_or_status("/api/v1/pair"),
-        Err(401)
-    );
-    assert_eq!(
-        request(&rules)
-            .with_method(Method::POST)
-            .admit_or_status("/api/v1/renew"),
+        request(&rules).with_method(Method::POST).admit_or_status("/api/v1/renew"),
         Err(401),
         "needs its certificate"
     );
     for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
-        let caller = handshake(Method::GET)
-            .admit_or_status(path)
-            .expect("may send auth");
+        let caller = handshake(Method::GET).admit_or_status(path).expect("may send auth");
         assert!(!caller.is_known(), "{path}");
         for method in [Method::HEAD, Method::POST, Method::DELETE, Method::PATCH] {
             let refused = handshake(method.clone()).admit_or_status(path);
@@ -439,31 +337,18 @@ fn without_a_token_only_the_page_health_and_handshakes_are_open() {
         "/opencv_apps//",
         "/%61pi",
     ] {
-        assert_eq!(
-            handshake(Method::GET).admit_or_status(path),
-            Err(401),
-            "{path}"
-        );
+        assert_eq!(handshake(Method::GET).admit_or_status(path), Err(401), "{path}");
     }
 }
 
 #[test]
 fn only_root_and_members_use_the_socket() {
-    for (uid, is_member, admitted) in [
-        (0, false, true),
-        (1, false, false),
-        (1, true, true),
-        (privilege::DEFAULT_USER, false, false),
-    ] {
+    for (uid, is_member, admitted) in
+        [(0, false, true), (1, false, false), (1, true, true), (privilege::DEFAULT_USER, false, false)]
+    {
         let user = User { uid, is_member };
-        match admit_user(
-            &PortalConnection::without_tls(ConnectionPeer::Unix(user)),
-            user,
-        ) {
-            Ok(caller) => assert!(
-                admitted && caller.who.principal.has_role(access::Role::Admin),
-                "{uid}"
-            ),
+        match admit_user(&PortalConnection::without_tls(ConnectionPeer::Unix(user)), user) {
+            Ok(caller) => assert!(admitted && caller.who.principal.has_role(access::Role::Admin), "{uid}"),
             Err(error) => assert!(!admitted && error.problem().status == 403, "{uid}: {error}"),
         }
     }

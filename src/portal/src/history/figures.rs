@@ -17,9 +17,8 @@ pub enum Aggregation {
 use Aggregation::{Last, Least, Mean, Most, Sum};
 
 /// Aggregations of a servant's figures, in the order of recording. Append only.
-pub const SERVANT: [Aggregation; 15] = [
-    Mean, Most, Mean, Most, Mean, Most, Last, Last, Least, Sum, Mean, Mean, Mean, Mean, Mean,
-];
+pub const SERVANT: [Aggregation; 15] =
+    [Mean, Most, Mean, Most, Mean, Most, Last, Last, Least, Sum, Mean, Mean, Mean, Mean, Mean];
 /// Like [`SERVANT`], for the machine.
 pub const MACHINE: [Aggregation; 8] = [Mean, Most, Mean, Most, Mean, Mean, Mean, Most];
 
@@ -35,8 +34,7 @@ pub fn servant_sample(served: &Served, dropped: Option<u64>) -> Vec<f32> {
     let one = &served.servant;
     let used = one.usage.as_ref();
     let measured = |value: f64| to_figure(used.map(|_| value));
-    let least =
-        |all: &mut dyn Iterator<Item = Option<f64>>| to_figure(all.flatten().reduce(f64::min));
+    let least = |all: &mut dyn Iterator<Item = Option<f64>>| to_figure(all.flatten().reduce(f64::min));
     let stated = || one.terms.iter().flat_map(|terms| terms.stated.values());
     let millis = |span: Option<api::Span>| span.map(|span| span.as_seconds() * 1e3);
     let links = &served.links;
@@ -45,8 +43,7 @@ pub fn servant_sample(served: &Served, dropped: Option<u64>) -> Vec<f32> {
         .filter_map(|link| Some((link, link.part("total")?.p50)))
         .max_by(|(_, one), (_, other)| one.total_cmp(other))
         .map(|(link, _)| link);
-    let phase =
-        |name| to_figure(slowest.and_then(|link: &explain::Link| Some(link.part(name)?.p50)));
+    let phase = |name| to_figure(slowest.and_then(|link: &explain::Link| Some(link.part(name)?.p50)));
     vec![
         measured(served.cores),
         measured(served.cores),
@@ -54,18 +51,8 @@ pub fn servant_sample(served: &Served, dropped: Option<u64>) -> Vec<f32> {
         to_figure(used.map(|used| used.memory as f64)),
         to_figure(one.response.map(|response| response.p50_ms)),
         to_figure(one.response.map(|response| response.p95_ms)),
-        least(
-            &mut links
-                .iter()
-                .map(|link| link.desire)
-                .chain(stated().map(|stated| millis(stated.sla.rrt))),
-        ),
-        least(
-            &mut links
-                .iter()
-                .map(|link| link.max)
-                .chain(stated().map(|stated| millis(stated.sla.max_rrt))),
-        ),
+        least(&mut links.iter().map(|link| link.desire).chain(stated().map(|stated| millis(stated.sla.rrt)))),
+        least(&mut links.iter().map(|link| link.max).chain(stated().map(|stated| millis(stated.sla.max_rrt)))),
         least(&mut links.iter().map(|link| link.satisfaction)),
         to_figure(dropped.map(|dropped| dropped as f64)),
         phase("serialise"),
@@ -142,9 +129,7 @@ fn times(samples: &Samples) -> Vec<Millis> {
 }
 
 fn list(samples: &Samples, index: usize) -> Vec<Option<f64>> {
-    let of = samples
-        .iter()
-        .map(|(_, figures)| round_figure(figures.get(index)));
+    let of = samples.iter().map(|(_, figures)| round_figure(figures.get(index)));
     of.collect()
 }
 
@@ -212,10 +197,7 @@ mod tests {
             desire: Some(total * 10.0),
             max: Some(total * 20.0),
             satisfaction: Some(2.0),
-            phases: phases
-                .iter()
-                .filter_map(|name| explain::Part::from_samples(name, vec![total]))
-                .collect(),
+            phases: phases.iter().filter_map(|name| explain::Part::from_samples(name, vec![total])).collect(),
             ..explain::Link::default()
         };
         one.links = vec![link(3.0), link(7.0)];
@@ -233,19 +215,10 @@ mod tests {
 
     #[test]
     fn figures_are_told_with_four_digits() {
-        for (value, as_told) in [
-            (1234567.0, 1235000.0),
-            (0.123456, 0.1235),
-            (-2.0, -2.0),
-            (0.0, 0.0),
-        ] {
+        for (value, as_told) in [(1234567.0, 1235000.0), (0.123456, 0.1235), (-2.0, -2.0), (0.0, 0.0)] {
             assert_eq!(round_figure(Some(&value)), Some(as_told));
         }
         assert_eq!(round_figure(Some(&NONE)), None);
-        assert_eq!(
-            round_figure(None),
-            None,
-            "recorded before there was such a figure"
-        );
+        assert_eq!(round_figure(None), None, "recorded before there was such a figure");
     }
 }

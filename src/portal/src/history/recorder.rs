@@ -74,40 +74,24 @@ impl Recorder {
         servants.truncate(SERVANTS);
         let mut sampled = vec![(
             THE_MACHINE.to_owned(),
-            SeriesOwner {
-                service: String::new(),
-                robot: String::new(),
-                began: app.started,
-            },
+            SeriesOwner { service: String::new(), robot: String::new(), began: app.started },
             figures::machine_sample(&machine),
         )];
         let earlier = std::mem::take(&mut self.dropped);
         for served in servants {
             let before = earlier.get(&served.servant.id);
             let now = served.servant.dropped;
-            let figures =
-                figures::servant_sample(&served, before.map(|before| now.saturating_sub(*before)));
+            let figures = figures::servant_sample(&served, before.map(|before| now.saturating_sub(*before)));
             let one = served.servant;
             self.dropped.insert(one.id.clone(), now);
-            let of = SeriesOwner {
-                service: one.service,
-                robot: one.robot,
-                began: one.created,
-            };
+            let of = SeriesOwner { service: one.service, robot: one.robot, began: one.created };
             sampled.push((one.id, of, figures));
         }
-        let new: Vec<_> = sampled
-            .iter()
-            .map(|(id, of, figures)| new_sample(id, of, figures))
-            .collect();
+        let new: Vec<_> = sampled.iter().map(|(id, of, figures)| new_sample(id, of, figures)).collect();
         app.state.add_samples(FINE.seconds, time, &new)?;
         self.finish_minute(app, time)?;
         for (id, of, figures) in sampled {
-            let (_, gathered) = self
-                .minute
-                .gathered
-                .entry(id)
-                .or_insert_with(|| (of, SampleAccumulator::default()));
+            let (_, gathered) = self.minute.gathered.entry(id).or_insert_with(|| (of, SampleAccumulator::default()));
             gathered.add(figures);
         }
         Ok(())
@@ -119,24 +103,10 @@ impl Recorder {
         if number == self.minute.number {
             return Ok(());
         }
-        let over = std::mem::replace(
-            &mut self.minute,
-            Minute {
-                number,
-                ..Minute::default()
-            },
-        );
+        let over = std::mem::replace(&mut self.minute, Minute { number, ..Minute::default() });
         let one = |(id, (of, gathered)): (&String, &(SeriesOwner, SampleAccumulator))| {
-            let rules = if id == THE_MACHINE {
-                &MACHINE[..]
-            } else {
-                &SERVANT
-            };
-            (
-                id.clone(),
-                gathered.aggregate(rules),
-                (of.service.clone(), of.robot.clone(), of.began),
-            )
+            let rules = if id == THE_MACHINE { &MACHINE[..] } else { &SERVANT };
+            (id.clone(), gathered.aggregate(rules), (of.service.clone(), of.robot.clone(), of.began))
         };
         let figures: Vec<_> = over.gathered.iter().map(one).collect();
         let samples: Vec<_> = figures
@@ -157,11 +127,5 @@ impl Recorder {
 }
 
 fn new_sample<'a>(id: &'a str, of: &'a SeriesOwner, figures: &'a [f32]) -> NewSample<'a> {
-    NewSample {
-        servant: id,
-        service: &of.service,
-        robot: &of.robot,
-        began: of.began,
-        figures,
-    }
+    NewSample { servant: id, service: &of.service, robot: &of.robot, began: of.began, figures }
 }

@@ -33,18 +33,10 @@ impl InsideConnections {
         let there = all.entry(servant.to_owned()).or_default();
         let own = there.iter().filter(|other| *other == who).count();
         if there.len() >= MOST || own >= MOST_EACH {
-            return Err(Error::TooManyLook {
-                servant: servant.to_owned(),
-                most: MOST,
-                each: MOST_EACH,
-            });
+            return Err(Error::TooManyLook { servant: servant.to_owned(), most: MOST, each: MOST_EACH });
         }
         there.push(who.to_owned());
-        Ok(InsideSlot {
-            all: Arc::clone(&self.all),
-            servant: servant.to_owned(),
-            who: who.to_owned(),
-        })
+        Ok(InsideSlot { all: Arc::clone(&self.all), servant: servant.to_owned(), who: who.to_owned() })
     }
 }
 
@@ -79,15 +71,12 @@ mod tests {
     #[test]
     fn a_servant_is_looked_into_by_so_many_and_nobody_keeps_the_others_out() {
         let lookers = InsideConnections::default();
-        let mut eves: Vec<_> = (0..MOST_EACH)
-            .map(|_| lookers.acquire("s1", "eve").expect("room"))
-            .collect();
+        let mut eves: Vec<_> = (0..MOST_EACH).map(|_| lookers.acquire("s1", "eve").expect("room")).collect();
         let refused = lookers.acquire("s1", "eve").expect_err("hers are taken");
         assert!(matches!(refused, Error::TooManyLook { .. }), "{refused}");
         let elsewhere = lookers.acquire("s2", "eve").expect("another servant");
-        let others: Vec<_> = (0..MOST - MOST_EACH)
-            .map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room"))
-            .collect();
+        let others: Vec<_> =
+            (0..MOST - MOST_EACH).map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room")).collect();
         lookers.acquire("s1", "late").expect_err("all are taken");
         eves.pop();
         let late = lookers.acquire("s1", "late").expect("room again");

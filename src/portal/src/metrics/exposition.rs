@@ -24,9 +24,7 @@ pub fn accepts_open_metrics(headers: &HeaderMap) -> bool {
 pub fn to_open_metrics(prometheus: &str) -> String {
     let mut out = String::with_capacity(prometheus.len());
     for line in prometheus.lines() {
-        let about = line
-            .strip_prefix("# HELP ")
-            .or_else(|| line.strip_prefix("# TYPE "));
+        let about = line.strip_prefix("# HELP ").or_else(|| line.strip_prefix("# TYPE "));
         let named = about.and_then(|about| about.split_once(' '));
         match named.and_then(|(name, rest)| Some((name.strip_suffix("_total")?, rest))) {
             Some((name, rest)) => {
@@ -45,12 +43,7 @@ pub fn to_open_metrics(prometheus: &str) -> String {
 }
 
 /// Writes a gauge.
-pub fn write_gauge(
-    out: &mut String,
-    name: &str,
-    help: &str,
-    rows: impl IntoIterator<Item = (String, f64)>,
-) {
+pub fn write_gauge(out: &mut String, name: &str, help: &str, rows: impl IntoIterator<Item = (String, f64)>) {
     write_family(out, name, "gauge", help, rows);
 }
 
@@ -65,27 +58,15 @@ pub fn write_family(
     // Writing to a String cannot fail.
     let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} {kind}");
     for (labels, value) in rows {
-        let braces = if labels.is_empty() {
-            String::new()
-        } else {
-            format!("{{{labels}}}")
-        };
+        let braces = if labels.is_empty() { String::new() } else { format!("{{{labels}}}") };
         let _ = writeln!(out, "{name}{braces} {value}");
     }
 }
 
 /// Formats labels as they appear between braces.
 pub fn format_labels(pairs: &[(&str, &str)]) -> String {
-    let escape = |text: &str| {
-        text.replace('\\', "\\\\")
-            .replace('"', "\\\"")
-            .replace('\n', "\\n")
-    };
-    pairs
-        .iter()
-        .map(|(name, value)| format!("{name}=\"{}\"", escape(value)))
-        .collect::<Vec<_>>()
-        .join(",")
+    let escape = |text: &str| text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n");
+    pairs.iter().map(|(name, value)| format!("{name}=\"{}\"", escape(value))).collect::<Vec<_>>().join(",")
 }
 
 #[cfg(test)]
@@ -95,31 +76,14 @@ mod tests {
     #[test]
     fn figures_come_out_as_prometheus_reads_them() {
         let mut out = String::new();
-        write_gauge(
-            &mut out,
-            "a",
-            "Help.",
-            [
-                (String::new(), 1.0),
-                (format_labels(&[("x", "q\"\\")]), 0.5),
-            ],
-        );
-        assert_eq!(
-            out,
-            "# HELP a Help.\n# TYPE a gauge\na 1\na{x=\"q\\\"\\\\\"} 0.5\n"
-        );
+        write_gauge(&mut out, "a", "Help.", [(String::new(), 1.0), (format_labels(&[("x", "q\"\\")]), 0.5)]);
+        assert_eq!(out, "# HELP a Help.\n# TYPE a gauge\na 1\na{x=\"q\\\"\\\\\"} 0.5\n");
     }
 
     #[test]
     fn open_metrics_names_counters_without_their_ending_and_says_where_it_ends() {
         let mut out = String::new();
-        write_family(
-            &mut out,
-            "a_total",
-            "counter",
-            "A total.",
-            [(String::new(), 1.0)],
-        );
+        write_family(&mut out, "a_total", "counter", "A total.", [(String::new(), 1.0)]);
         write_gauge(&mut out, "b", "Not a_total.", [(String::new(), 2.0)]);
         assert_eq!(
             to_open_metrics(&out),
@@ -135,10 +99,7 @@ mod tests {
             (Some("*/*"), false),
             (Some("text/plain; version=0.0.4"), false),
             (Some("application/openmetrics-text"), true),
-            (
-                Some("application/openmetrics-text;version=1.0.0;q=0.5,text/plain;q=0.1"),
-                true,
-            ),
+            (Some("application/openmetrics-text;version=1.0.0;q=0.5,text/plain;q=0.1"), true),
             (Some("application/openmetrics-textual"), false),
         ] {
             let mut headers = HeaderMap::new();

@@ -34,12 +34,10 @@ pub struct BlackBoxOptions {
 
 impl BlackBoxOptions {
     pub(super) fn matches_topic(&self, topic: &str) -> bool {
-        self.topics
-            .iter()
-            .any(|pattern| match pattern.strip_suffix('*') {
-                Some(begins) => topic.starts_with(begins),
-                None => topic == pattern,
-            })
+        self.topics.iter().any(|pattern| match pattern.strip_suffix('*') {
+            Some(begins) => topic.starts_with(begins),
+            None => topic == pattern,
+        })
     }
 }
 
@@ -84,10 +82,7 @@ impl Observers {
             return Err(Error::NoBlackBox(servant.to_owned()));
         };
         match remaining(observed.taken, TAKEN) {
-            Some(left) => Err(Error::RecordedLately {
-                servant: servant.to_owned(),
-                again: left.as_secs() + 1,
-            }),
+            Some(left) => Err(Error::RecordedLately { servant: servant.to_owned(), again: left.as_secs() + 1 }),
             None => {
                 observed.taken = Some(Instant::now());
                 Ok(())
@@ -99,11 +94,8 @@ impl Observers {
     pub(super) fn is_due(&self, handle: &Handle) -> bool {
         // Without a black box there is nothing to write.
         let is_heard = self.black_box(&handle.id).is_some();
-        let whose = if handle.robot.starts_with('~') {
-            format!("service {}", handle.service())
-        } else {
-            handle.id.clone()
-        };
+        let whose =
+            if handle.robot.starts_with('~') { format!("service {}", handle.service()) } else { handle.id.clone() };
         is_heard && claim_interval(&mut self.written.lock(), whose)
     }
 }

@@ -24,9 +24,7 @@ fn references(value: &Value, found: &mut Vec<String>) {
                 }
             }
         }
-        Value::Array(elements) => elements
-            .iter()
-            .for_each(|element| references(element, found)),
+        Value::Array(elements) => elements.iter().for_each(|element| references(element, found)),
         _ => {}
     }
 }
@@ -39,10 +37,7 @@ fn every_reference_leads_to_a_schema() {
     assert!(!found.is_empty());
     for target in found {
         let pointer = target.strip_prefix('#').expect("within the document");
-        assert!(
-            document.pointer(pointer).is_some(),
-            "{target} leads nowhere"
-        );
+        assert!(document.pointer(pointer).is_some(), "{target} leads nowhere");
     }
 }
 
@@ -72,9 +67,7 @@ fn the_document_lists_exactly_the_routes_of_the_table() {
         }
     }
     let v1 = ROUTES.iter().filter(|row| row.path.starts_with("/api/v1/"));
-    let table: BTreeSet<String> = v1
-        .map(|row| format!("{} {}", row.method, row.path))
-        .collect();
+    let table: BTreeSet<String> = v1.map(|row| format!("{} {}", row.method, row.path)).collect();
     assert_eq!(listed, table);
 }
 
@@ -89,10 +82,7 @@ fn every_operation_says_with_what_it_may_be_refused() {
             let is_refused = |status: &u16| statuses.contains_key(&status.to_string());
             assert!(ANY.iter().all(is_refused), "{method} {path}");
             let is_done = |status: &String| ["1", "2", "3"].iter().any(|s| status.starts_with(s));
-            assert!(
-                statuses.keys().any(is_done),
-                "{method} {path}: {statuses:?}"
-            );
+            assert!(statuses.keys().any(is_done), "{method} {path}: {statuses:?}");
             assert!(!statuses.contains_key("default"), "{method} {path}");
         }
     }
@@ -130,10 +120,9 @@ impl<'a> SchemaChecker<'a> {
     fn resolve(&self, name: &'a str, schema: &'a Value) -> (&'a str, &'a Value) {
         match schema["$ref"].as_str() {
             None => (name, schema),
-            Some(target) => (
-                target.rsplit('/').next().unwrap_or(target),
-                self.document.pointer(&target[1..]).expect("a schema"),
-            ),
+            Some(target) => {
+                (target.rsplit('/').next().unwrap_or(target), self.document.pointer(&target[1..]).expect("a schema"))
+            }
         }
     }
 
@@ -175,27 +164,19 @@ impl<'a> SchemaChecker<'a> {
         if !kinds.iter().any(allowed) {
             return Err(format!("{name}: {value} is no {}", schema["type"]));
         }
-        if schema["enum"]
-            .as_array()
-            .is_some_and(|values| !values.contains(value))
-        {
+        if schema["enum"].as_array().is_some_and(|values| !values.contains(value)) {
             return Err(format!("{name}: {value} is not in {}", schema["enum"]));
         }
         match value {
-            Value::Array(elements) => elements
-                .iter()
-                .try_for_each(|element| self.check(name, &schema["items"], element)),
+            Value::Array(elements) => {
+                elements.iter().try_for_each(|element| self.check(name, &schema["items"], element))
+            }
             Value::Object(_) => self.check_members(name, schema, value),
             _ => Ok(()),
         }
     }
 
-    fn check_members(
-        &mut self,
-        name: &'a str,
-        schema: &'a Value,
-        value: &Value,
-    ) -> Result<(), String> {
+    fn check_members(&mut self, name: &'a str, schema: &'a Value, value: &Value) -> Result<(), String> {
         let parts = self.parts(name, schema);
         for (part, schema) in &parts {
             for required in schema["required"].as_array().into_iter().flatten() {
@@ -206,20 +187,14 @@ impl<'a> SchemaChecker<'a> {
             }
         }
         // An object of any kind.
-        if parts
-            .iter()
-            .all(|(_, schema)| schema["properties"].is_null())
-            && schema["additionalProperties"].is_null()
-        {
+        if parts.iter().all(|(_, schema)| schema["properties"].is_null()) && schema["additionalProperties"].is_null() {
             return Ok(());
         }
         for (key, member) in value.as_object().into_iter().flatten() {
             if member.is_null() {
                 return Err(format!("{name}: {key} is null; it has to be left out"));
             }
-            let described = parts
-                .iter()
-                .find_map(|(part, schema)| Some((*part, schema["properties"].get(key)?)));
+            let described = parts.iter().find_map(|(part, schema)| Some((*part, schema["properties"].get(key)?)));
             match described {
                 Some((part, property)) => {
                     self.met.insert(format!("{part}.{key}"));
@@ -251,15 +226,10 @@ fn own_properties(name: &str, schema: &Value, found: &mut BTreeSet<String>) {
 fn schemas_are_as_serde_writes() {
     let document = document_json();
     let schemas = &document["components"]["schemas"];
-    let mut judge = SchemaChecker {
-        document: &document,
-        met: BTreeSet::new(),
-    };
+    let mut judge = SchemaChecker { document: &document, met: BTreeSet::new() };
     for (name, value) in samples::samples() {
         assert!(schemas[name].is_object(), "{name} is not described");
-        judge
-            .check(name, &schemas[name], &value)
-            .expect("as the schema says");
+        judge.check(name, &schemas[name], &value).expect("as the schema says");
     }
     let mut described = BTreeSet::new();
     for (name, schema) in schemas.as_object().expect("schemas") {
@@ -277,8 +247,5 @@ fn the_pages_types_are_those_of_the_document() {
         std::fs::write(path, &types).expect("web/src/lib is writable");
     }
     let found = std::fs::read_to_string(path).expect("web/src/lib/types.ts");
-    assert!(
-        found == types,
-        "web/src/lib/types.ts is of another document; run `make types`"
-    );
+    assert!(found == types, "web/src/lib/types.ts is of another document; run `make types`");
 }

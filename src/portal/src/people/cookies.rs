@@ -33,26 +33,16 @@ fn session_cookie_name(secure: bool) -> &'static str {
 }
 
 fn signing_in_cookie_name(secure: bool) -> &'static str {
-    if secure {
-        SECURE_SIGNING_IN
-    } else {
-        PLAIN_SIGNING_IN
-    }
+    if secure { SECURE_SIGNING_IN } else { PLAIN_SIGNING_IN }
 }
 
 /// Returns the session secret sent by the browser, if any.
-pub fn session_cookie(
-    connection: &PortalConnection,
-    headers: &HeaderMap,
-) -> Result<Option<String>, Error> {
+pub fn session_cookie(connection: &PortalConnection, headers: &HeaderMap) -> Result<Option<String>, Error> {
     find_cookie(session_cookie_name(connection.secure), headers)
 }
 
 /// Returns the value that identifies a browser during a sign-in, if any.
-pub fn signing_in_cookie(
-    connection: &PortalConnection,
-    headers: &HeaderMap,
-) -> Result<Option<String>, Error> {
+pub fn signing_in_cookie(connection: &PortalConnection, headers: &HeaderMap) -> Result<Option<String>, Error> {
     find_cookie(signing_in_cookie_name(connection.secure), headers)
 }
 
@@ -69,37 +59,21 @@ fn find_cookie(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error>
         (Some(_), Some(_)) => Err(Error::BadRequest(format!(
             "the cookie {name} was sent twice; remove this site's cookies from the browser and sign in again"
         ))),
-        (Some(value), None) if value.len() <= LONGEST && !value.is_empty() => {
-            Ok(Some(value.to_owned()))
-        }
+        (Some(value), None) if value.len() <= LONGEST && !value.is_empty() => Ok(Some(value.to_owned())),
         _ => Ok(None),
     }
 }
 
-fn build_cookie(
-    secure: bool,
-    name: &str,
-    value: &str,
-    seconds: u64,
-    same_site: &str,
-) -> HeaderValue {
+fn build_cookie(secure: bool, name: &str, value: &str, seconds: u64, same_site: &str) -> HeaderValue {
     let secured = if secure { "; Secure" } else { "" };
-    let text = format!(
-        "{name}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite={same_site}{secured}"
-    );
+    let text = format!("{name}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite={same_site}{secured}");
     // Secrets consist of letters and digits.
     HeaderValue::from_str(&text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }
 
 /// Sets the session cookie for a number of seconds.
 pub fn set_session(secure: bool, secret: &str, seconds: u64) -> HeaderValue {
-    build_cookie(
-        secure,
-        session_cookie_name(secure),
-        secret,
-        seconds,
-        "Strict",
-    )
+    build_cookie(secure, session_cookie_name(secure), secret, seconds, "Strict")
 }
 
 /// Deletes the session cookie.
@@ -109,13 +83,7 @@ pub fn clear_session(secure: bool) -> HeaderValue {
 
 /// Sets the cookie that identifies the browser during a sign-in.
 pub fn set_signing_in(secure: bool, secret: &str) -> HeaderValue {
-    build_cookie(
-        secure,
-        signing_in_cookie_name(secure),
-        secret,
-        SIGNING_IN,
-        "Lax",
-    )
+    build_cookie(secure, signing_in_cookie_name(secure), secret, SIGNING_IN, "Lax")
 }
 
 /// Returns the token that requests changing something must send along with the session cookie.
@@ -140,9 +108,7 @@ pub fn check_visit(headers: &HeaderMap) -> Result<(), Error> {
     match header_text(headers, FETCH_DEST) {
         None | Some("document") => Ok(()),
         Some(other) => Err(Error::Foreign {
-            what: format!(
-                "this was requested by a page as part of itself ({other}), not by a person"
-            ),
+            what: format!("this was requested by a page as part of itself ({other}), not by a person"),
             next: "sign in from the portal's page".into(),
         }),
     }
@@ -150,23 +116,13 @@ pub fn check_visit(headers: &HeaderMap) -> Result<(), Error> {
 
 /// Refuses requests sent by another site's page. With `said`, the browser must state that the page is ours; without,
 /// a request that states nothing is not from a browser and passes.
-pub fn check_origin(
-    connection: &PortalConnection,
-    headers: &HeaderMap,
-    said: bool,
-) -> Result<(), Error> {
+pub fn check_origin(connection: &PortalConnection, headers: &HeaderMap, said: bool) -> Result<(), Error> {
     let own = origin(connection, headers);
     let origins = headers.get_all(header::ORIGIN).iter().count();
-    let (same, from) = match (
-        header_text(headers, "origin"),
-        header_text(headers, FETCH_SITE),
-    ) {
-        (Some(origin), site) => (
-            origins == 1
-                && origin.eq_ignore_ascii_case(&own)
-                && site.is_none_or(|site| site == "same-origin"),
-            origin,
-        ),
+    let (same, from) = match (header_text(headers, "origin"), header_text(headers, FETCH_SITE)) {
+        (Some(origin), site) => {
+            (origins == 1 && origin.eq_ignore_ascii_case(&own) && site.is_none_or(|site| site == "same-origin"), origin)
+        }
         (None, Some(site)) => (site == "same-origin", "another site"),
         (None, None) => (!said, "an unknown site"),
     };
@@ -182,12 +138,7 @@ pub fn check_origin(
 }
 
 /// Refuses a request with a session cookie that our own page would not have sent.
-pub fn check(
-    connection: &PortalConnection,
-    method: &Method,
-    headers: &HeaderMap,
-    secret: &str,
-) -> Result<(), Error> {
+pub fn check(connection: &PortalConnection, method: &Method, headers: &HeaderMap, secret: &str) -> Result<(), Error> {
     let reads = matches!(*method, Method::GET | Method::HEAD);
     let upgrades = headers::is_upgrade(headers);
     if reads && !upgrades {
@@ -220,10 +171,7 @@ mod tests {
 
     fn connection(secure: bool) -> PortalConnection {
         let peer = ConnectionPeer::Tcp("127.0.0.1:5000".parse().expect("an address"));
-        PortalConnection {
-            secure,
-            ..PortalConnection::without_tls(peer)
-        }
+        PortalConnection { secure, ..PortalConnection::without_tls(peer) }
     }
 
     fn headers(given: &[(&'static str, &str)]) -> HeaderMap {
@@ -238,8 +186,7 @@ mod tests {
     fn a_cookie_is_read_where_it_is_one() {
         let shown = |secure, lines: &[&str]| {
             let lines: Vec<_> = lines.iter().map(|line| ("cookie", *line)).collect();
-            session_cookie(&connection(secure), &headers(&lines))
-                .map_err(|error| error.problem().status)
+            session_cookie(&connection(secure), &headers(&lines)).map_err(|error| error.problem().status)
         };
         assert_eq!(shown(false, &["a=b; cloudroid=x"]), Ok(Some("x".into())));
         assert_eq!(shown(true, &["__Host-cloudroid=x"]), Ok(Some("x".into())));
@@ -247,10 +194,7 @@ mod tests {
         assert_eq!(shown(true, &["cloudroid=x"]), Ok(None));
         assert_eq!(shown(false, &["__Host-cloudroid=x"]), Ok(None));
         assert_eq!(shown(false, &["cloudroid="]), Ok(None));
-        assert_eq!(
-            shown(false, &[&format!("cloudroid={}", "x".repeat(1000))]),
-            Ok(None)
-        );
+        assert_eq!(shown(false, &[&format!("cloudroid={}", "x".repeat(1000))]), Ok(None));
         assert_eq!(shown(false, &["cloudroid=x; cloudroid=y"]), Err(400));
         assert_eq!(shown(false, &["cloudroid=x", "cloudroid=x"]), Err(400));
     }
@@ -264,10 +208,7 @@ mod tests {
         );
         let forgotten = clear_session(false);
         let text = forgotten.to_str().expect("text");
-        assert!(
-            text.starts_with("cloudroid=; ") && text.contains("Max-Age=0"),
-            "{text}"
-        );
+        assert!(text.starts_with("cloudroid=; ") && text.contains("Max-Age=0"), "{text}");
     }
 
     #[test]
@@ -277,10 +218,7 @@ mod tests {
             set.to_str().expect("text"),
             "__Host-cloudroid-oidc=x; Path=/; Max-Age=600; HttpOnly; SameSite=Lax; Secure"
         );
-        let lines = headers(&[(
-            "cookie",
-            "cloudroid=a; cloudroid-oidc=b; __Host-cloudroid-oidc=c",
-        )]);
+        let lines = headers(&[("cookie", "cloudroid=a; cloudroid-oidc=b; __Host-cloudroid-oidc=c")]);
         let known = |secure| signing_in_cookie(&connection(secure), &lines).expect("once");
         assert_eq!(known(false).as_deref(), Some("b"));
         assert_eq!(known(true).as_deref(), Some("c"));
@@ -305,47 +243,23 @@ mod tests {
         // Embedded in another site's page.
         assert!(!asks(Method::GET, &[host, ("sec-fetch-site", "same-site")]));
         assert!(asks(Method::DELETE, &[host, own, with]));
-        assert!(asks(
-            Method::POST,
-            &[host, ("sec-fetch-site", "same-origin"), with]
-        ));
+        assert!(asks(Method::POST, &[host, ("sec-fetch-site", "same-origin"), with]));
         assert!(asks(Method::GET, &[host, own, upgrade]));
         let other = csrf_token("another");
         for (method, given) in [
             (Method::DELETE, &[host, own][..]),
             (Method::DELETE, &[host, with]),
-            (
-                Method::DELETE,
-                &[host, own, (api::people::CSRF_HEADER, &other)],
-            ),
-            (
-                Method::DELETE,
-                &[host, ("origin", "https://evil.example"), with],
-            ),
-            (
-                Method::DELETE,
-                &[host, ("origin", "http://robots.lab:9090"), with],
-            ),
-            (
-                Method::DELETE,
-                &[host, ("origin", "https://robots.lab"), with],
-            ),
+            (Method::DELETE, &[host, own, (api::people::CSRF_HEADER, &other)]),
+            (Method::DELETE, &[host, ("origin", "https://evil.example"), with]),
+            (Method::DELETE, &[host, ("origin", "http://robots.lab:9090"), with]),
+            (Method::DELETE, &[host, ("origin", "https://robots.lab"), with]),
             (Method::DELETE, &[host, ("origin", "null"), with]),
             (Method::DELETE, &[host, own, own, with]),
-            (
-                Method::POST,
-                &[host, own, ("sec-fetch-site", "same-site"), with],
-            ),
+            (Method::POST, &[host, own, ("sec-fetch-site", "same-site"), with]),
             (Method::POST, &[host, ("sec-fetch-site", "none"), with]),
             (Method::GET, &[host, upgrade]),
-            (
-                Method::GET,
-                &[host, ("origin", "https://evil.example"), upgrade],
-            ),
-            (
-                Method::GET,
-                &[host, ("sec-fetch-site", "same-origin"), upgrade],
-            ),
+            (Method::GET, &[host, ("origin", "https://evil.example"), upgrade]),
+            (Method::GET, &[host, ("sec-fetch-site", "same-origin"), upgrade]),
         ] {
             assert!(!asks(method.clone(), given), "{method} {given:?}");
         }

@@ -23,9 +23,6 @@ pub struct IdentityProvider {
 impl IdentityProvider {
     /// Returns what the page needs for a link to the sign-in.
     pub fn link(&self) -> ProviderLink {
-        ProviderLink {
-            name: self.name.clone(),
-            path: LOGIN.to_owned(),
-        }
+        ProviderLink { name: self.name.clone(), path: LOGIN.to_owned() }
     }
 }

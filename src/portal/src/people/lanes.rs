@@ -104,10 +104,7 @@ pub struct HashSlot {
 impl HashSlots {
     /// Acquires a slot for a password that came from an address for an account, which need not exist.
     pub fn acquire(&self, from: IpAddr, account: &str) -> Result<HashSlot, Error> {
-        let holders = [
-            SlotOwner::Host(from.into()),
-            SlotOwner::Account(account.to_owned()),
-        ];
+        let holders = [SlotOwner::Host(from.into()), SlotOwner::Account(account.to_owned())];
         let mut counts = self.counts.lock();
         let is_full = |holder| counts.get(holder).is_some_and(|count| *count >= OF_EACH);
         if holders.iter().any(is_full) {
@@ -116,10 +113,7 @@ impl HashSlots {
         for holder in &holders {
             *counts.entry(holder.clone()).or_default() += 1;
         }
-        Ok(HashSlot {
-            counts: Arc::clone(&self.counts),
-            holders,
-        })
+        Ok(HashSlot { counts: Arc::clone(&self.counts), holders })
     }
 
     #[cfg(test)]

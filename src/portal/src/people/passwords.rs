@@ -127,11 +127,7 @@ fn argon2() -> Result<Argon2<'static>, password_hash::Error> {
 }
 
 /// Computes the hash of a password and a salt with the current parameters.
-fn compute(
-    password: &str,
-    salt: Salt<'_>,
-    memory: &mut [Block],
-) -> Result<Output, password_hash::Error> {
+fn compute(password: &str, salt: Salt<'_>, memory: &mut [Block]) -> Result<Output, password_hash::Error> {
     let mut decoded = [0; Salt::MAX_LENGTH];
     let salt = salt.decode_b64(&mut decoded)?;
     Output::init_with(Params::DEFAULT_OUTPUT_LEN, |out| {
@@ -162,21 +158,14 @@ fn dummy_hash(memory: &mut [Block]) -> Result<&'static str, password_hash::Error
 
 fn has_current_parameters(hash: &PasswordHash<'_>) -> bool {
     let params = Params::try_from(hash).ok();
-    let same = params.is_some_and(|params| {
-        (params.m_cost(), params.t_cost(), params.p_cost()) == (MEMORY, PASSES, LANES)
-    });
+    let same =
+        params.is_some_and(|params| (params.m_cost(), params.t_cost(), params.p_cost()) == (MEMORY, PASSES, LANES));
     same && hash.algorithm == Algorithm::Argon2id.ident()
         && hash.version == Some(Version::V0x13.into())
-        && hash
-            .hash
-            .is_some_and(|output| output.len() == Params::DEFAULT_OUTPUT_LEN)
+        && hash.hash.is_some_and(|output| output.len() == Params::DEFAULT_OUTPUT_LEN)
 }
 
-fn verify(
-    known: Option<&str>,
-    password: &str,
-    memory: &mut [Block],
-) -> Result<PasswordVerdict, password_hash::Error> {
+fn verify(known: Option<&str>, password: &str, memory: &mut [Block]) -> Result<PasswordVerdict, password_hash::Error> {
     let written = match known {
         Some(written) => written,
         None => dummy_hash(memory)?,
@@ -186,11 +175,7 @@ fn verify(
         let computed = compute(password, salt, memory)?;
         // Compared in constant time.
         let is_right = known.is_some() && parsed.hash == Some(computed);
-        return Ok(if is_right {
-            PasswordVerdict::Right
-        } else {
-            PasswordVerdict::Wrong
-        });
+        return Ok(if is_right { PasswordVerdict::Right } else { PasswordVerdict::Wrong });
     }
     match argon2()?.verify_password(password.as_bytes(), &parsed) {
         Ok(()) => hash(password, memory).map(PasswordVerdict::Rehashed),
@@ -242,9 +227,7 @@ impl Passwords {
         };
         let turn = lane.acquire().await?;
         before()?;
-        let Attempt {
-            known, password, ..
-        } = attempt;
+        let Attempt { known, password, .. } = attempt;
         let looking = move |memory: &mut [Block]| verify(known.as_deref(), &password, memory);
         run_hashing(turn, Some(held), looking).await
     }

@@ -25,8 +25,7 @@ pub const CALLBACK: &str = "/api/v1/oidc/callback";
 /// Maximum number of groups listed in a refusal.
 const NAMED: usize = 20;
 /// Content-Security-Policy of the pages: no scripts, styles or frames.
-const POLICY: &str =
-    "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
+const POLICY: &str = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
 /// Query of a sign-in.
 #[derive(Debug, Deserialize, IntoParams)]
@@ -53,8 +52,7 @@ pub struct CallbackQuery {
 }
 
 fn redirect(url: &str) -> Result<Response, Error> {
-    let location =
-        HeaderValue::from_str(url).map_err(|_| Error::Internal("redirecting a browser"))?;
+    let location = HeaderValue::from_str(url).map_err(|_| Error::Internal("redirecting a browser"))?;
     Ok((StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response())
 }
 
@@ -71,12 +69,7 @@ pub async fn login(
     }
 }
 
-async fn begin_sign_in(
-    app: &App,
-    caller: &Caller,
-    headers: &HeaderMap,
-    again: bool,
-) -> Result<Response, Error> {
+async fn begin_sign_in(app: &App, caller: &Caller, headers: &HeaderMap, again: bool) -> Result<Response, Error> {
     let known = app.provider.as_ref().ok_or(Error::NoProvider)?;
     let connection = caller.connection();
     // The provider sends the browser back to this origin, so the cookie must belong to it.
@@ -95,14 +88,10 @@ async fn begin_sign_in(
         };
     }
     check_confidential(&connection)?;
-    app.principals
-        .check_provider_sign_in(caller.peer.ip(), store::now())?;
+    app.principals.check_provider_sign_in(caller.peer.ip(), store::now())?;
     let browser = cookies::signing_in_cookie(&connection, headers)?;
     let earlier = cookies::session_cookie(&connection, headers)?;
-    let begun = known
-        .provider
-        .begin(browser.as_deref(), caller.peer.ip(), earlier)
-        .await?;
+    let begun = known.provider.begin(browser.as_deref(), caller.peer.ip(), earlier).await?;
     let cookie = cookies::set_signing_in(caller.secure, &begun.browser);
     Ok(([(header::SET_COOKIE, cookie)], redirect(&begun.url)?).into_response())
 }
@@ -128,8 +117,7 @@ pub async fn callback(
             if let Error::Provider(refused) = &error
                 && refused.is_guess()
             {
-                app.principals
-                    .record_failed_sign_in(caller.peer.ip(), store::now());
+                app.principals.record_failed_sign_in(caller.peer.ip(), store::now());
             }
             refuse(&app, &caller, &headers, CALLBACK, error)
         }
@@ -163,15 +151,10 @@ async fn complete_sign_in(
     let earlier = started.earlier.take();
     let code = asked("code").unwrap_or_default();
     let person = known.provider.finish(started, code).await?;
-    let granted = known
-        .roles
-        .grant_for_groups(&person.groups)
-        .ok_or_else(|| no_role_error(known, &person))?;
+    let granted = known.roles.grant_for_groups(&person.groups).ok_or_else(|| no_role_error(known, &person))?;
     let issuer = known.provider.issuer();
     let peer = caller.peer.to_string();
-    let begun = app
-        .principals
-        .begin_provider_session(issuer, &person, &granted, &peer)?;
+    let begun = app.principals.begin_provider_session(issuer, &person, &granted, &peer)?;
     Ok((begun, earlier))
 }
 
@@ -179,22 +162,11 @@ fn no_role_error(known: &IdentityProvider, person: &Person) -> Error {
     let plain = |text: &str| -> String { text.chars().filter(|c| !c.is_control()).collect() };
     let groups: Vec<String> = person.groups.iter().map(|group| plain(group)).collect();
     let has = match groups.len() {
-        0 => format!(
-            "{} gives none in the claim {}",
-            known.name, known.groups_claim
-        ),
+        0 => format!("{} gives none in the claim {}", known.name, known.groups_claim),
         1..=NAMED => format!("{} says {}", known.name, groups.join(", ")),
-        more => format!(
-            "{} lists {} and {} more",
-            known.name,
-            groups[..NAMED].join(", "),
-            more - NAMED
-        ),
+        more => format!("{} lists {} and {} more", known.name, groups[..NAMED].join(", "), more - NAMED),
     };
-    Error::NoRole {
-        who: access::principal::oidc_principal_name(&person.name),
-        has,
-    }
+    Error::NoRole { who: access::principal::oidc_principal_name(&person.name), has }
 }
 
 /// Refuses a sign-in, as an HTML page for browsers, and records it.
@@ -205,16 +177,13 @@ fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, path: &str, error: Er
         _ => "a person of the identity provider".to_owned(),
     };
     let did = format!("GET {path}");
-    app.audit
-        .record_throttled(caller, AccessAction::Enter, &did, &object, problem.status);
+    app.audit.record_throttled(caller, AccessAction::Enter, &did, &object, problem.status);
     if let Error::Provider(refused) = &error
         && refused.is_provider_fault()
     {
         tracing::warn!("sign-in failed: {refused}; {}", refused.next_step());
     }
-    let accept = headers
-        .get(header::ACCEPT)
-        .and_then(|value| value.to_str().ok());
+    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
     if !accept.is_some_and(|accept| accept.contains("text/html")) {
         return no_store(error);
     }
@@ -228,9 +197,7 @@ fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, path: &str, error: Er
     let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::BAD_REQUEST);
     let mut response = no_store(page(status, &body));
     if let Some(after) = problem.retry_after {
-        response
-            .headers_mut()
-            .insert(header::RETRY_AFTER, after.into());
+        response.headers_mut().insert(header::RETRY_AFTER, after.into());
     }
     response
 }

@@ -37,9 +37,7 @@ impl Principals {
         // Keeps uses that are not written yet.
         for known in &fresh.tokens {
             if let Some(before) = stored.find_token(known.id) {
-                known
-                    .last_used
-                    .fetch_max(before.last_used.load(Ordering::Relaxed), Ordering::Relaxed);
+                known.last_used.fetch_max(before.last_used.load(Ordering::Relaxed), Ordering::Relaxed);
             }
         }
         fresh.keep_uses(&stored);
@@ -59,31 +57,18 @@ impl Principals {
 
     /// Returns all tokens, including revoked ones.
     pub fn tokens(&self) -> Vec<api::access::Token> {
-        self.stored
-            .read()
-            .tokens
-            .iter()
-            .map(KnownToken::to_api_token)
-            .collect()
+        self.stored.read().tokens.iter().map(KnownToken::to_api_token).collect()
     }
 
     fn live_token(&self, name: &str) -> Result<api::access::Token, Error> {
         let tokens = self.tokens();
-        let of_name = tokens
-            .into_iter()
-            .find(|token| token.name == name && token.revoked.is_none());
+        let of_name = tokens.into_iter().find(|token| token.name == name && token.revoked.is_none());
         of_name.ok_or(Error::Internal("reading a token back"))
     }
 
     fn unknown_token(&self, name: &str) -> Error {
-        let live = self
-            .tokens()
-            .into_iter()
-            .filter(|token| token.revoked.is_none());
-        Error::UnknownToken {
-            name: name.to_owned(),
-            exists: live.map(|token| token.name).collect(),
-        }
+        let live = self.tokens().into_iter().filter(|token| token.revoked.is_none());
+        Error::UnknownToken { name: name.to_owned(), exists: live.map(|token| token.name).collect() }
     }
 
     /// Refuses a name held by another kind of principal, because rules and records identify all of them by name. A
@@ -122,25 +107,16 @@ impl Principals {
         let robot = new.robot.as_deref();
         self.check_name_is_free(&new.name, NameHolder::Token { robot })?;
         let end = |seconds: u64| {
-            let end = seconds
-                .checked_mul(1000)
-                .and_then(|length| length.checked_add(store::now()));
-            end.filter(|end| i64::try_from(*end).is_ok())
-                .ok_or_else(|| {
-                    Error::BadRequest(
-                        "the lifetime is too long; omit it for a token that never expires".into(),
-                    )
-                })
+            let end = seconds.checked_mul(1000).and_then(|length| length.checked_add(store::now()));
+            end.filter(|end| i64::try_from(*end).is_ok()).ok_or_else(|| {
+                Error::BadRequest("the lifetime is too long; omit it for a token that never expires".into())
+            })
         };
         let expires = new.lifetime.map(end).transpose()?;
         let secret = names::random(SECRET);
-        let scope = StoredScope {
-            services: new.services.clone(),
-            robot: new.robot.clone(),
-            classes: new.classes.clone(),
-        };
         let scope =
-            serde_json::to_string(&scope).map_err(record_error(format!("token {}", new.name)))?;
+            StoredScope { services: new.services.clone(), robot: new.robot.clone(), classes: new.classes.clone() };
+        let scope = serde_json::to_string(&scope).map_err(record_error(format!("token {}", new.name)))?;
         let record = self.state.add_token(&NewToken {
             name: &new.name,
             hash: &tokens::hash(&secret),
@@ -148,18 +124,12 @@ impl Principals {
             scope: &scope,
             expires,
         })?;
-        let known = record
-            .map(read_token)
-            .transpose()?
-            .ok_or_else(|| Error::TokenExists(new.name.clone()))?;
+        let known = record.map(read_token).transpose()?.ok_or_else(|| Error::TokenExists(new.name.clone()))?;
         if let Some(robot) = &new.robot {
             self.state.bind_robot(robot, &known.owner())?;
         }
         self.reload()?;
-        Ok(api::access::Secret {
-            token: known.to_api_token(),
-            secret,
-        })
+        Ok(api::access::Secret { token: known.to_api_token(), secret })
     }
 
     /// Replaces the secret of a token; connections using the old one end.
@@ -168,17 +138,12 @@ impl Principals {
         let rotated = self.state.rotate_token(name, &tokens::hash(&secret))?;
         rotated.ok_or_else(|| self.unknown_token(name))?;
         self.reload()?;
-        Ok(api::access::Secret {
-            token: self.live_token(name)?,
-            secret,
-        })
+        Ok(api::access::Secret { token: self.live_token(name)?, secret })
     }
 
     /// Revokes a token; connections using it end.
     pub fn revoke_token(&self, name: &str) -> Result<(), Error> {
-        self.state
-            .revoke_token(name)?
-            .ok_or_else(|| self.unknown_token(name))?;
+        self.state.revoke_token(name)?.ok_or_else(|| self.unknown_token(name))?;
         self.reload()?;
         Ok(self.release_robots()?)
     }
@@ -206,8 +171,7 @@ impl Principals {
             )));
         }
         let allow = serde_json::to_string(&new.allow).map_err(record_error("a rule".to_owned()))?;
-        self.state
-            .add_rule(&new.who.to_string(), new.services.as_str(), &allow)?;
+        self.state.add_rule(&new.who.to_string(), new.services.as_str(), &allow)?;
         Ok(self.reload()?)
     }
 
@@ -225,16 +189,13 @@ const MOST_RULES: usize = 1000;
 /// Checks a new token.
 fn check_token(new: &api::access::NewToken) -> Result<(), Error> {
     let refused = |words: String| Err(Error::BadRequest(words));
-    access::principal::check_name(&new.name)
-        .map_err(|error| Error::BadRequest(error.to_string()))?;
+    access::principal::check_name(&new.name).map_err(|error| Error::BadRequest(error.to_string()))?;
     if RESERVED.contains(&new.name.as_str()) {
         return refused(format!("{} is a reserved name; choose another", new.name));
     }
     let (role, scoped) = (new.role, new.role.is_scoped());
     if scoped && new.services.is_empty() {
-        return refused(format!(
-            "a {role} needs its services; give them with --service, or all with --service '*'"
-        ));
+        return refused(format!("a {role} needs its services; give them with --service, or all with --service '*'"));
     }
     let names_some = !new.services.is_empty() || !new.classes.is_empty();
     if !scoped && names_some {
@@ -250,16 +211,12 @@ fn check_token(new: &api::access::NewToken) -> Result<(), Error> {
             return refused("a robot's token is for one robot; give it with --robot".to_owned());
         }
         (Some(_), role) => {
-            return refused(format!(
-                "--robot is only for tokens of robots, but this one is for a {role}"
-            ));
+            return refused(format!("--robot is only for tokens of robots, but this one is for a {role}"));
         }
         (None, _) => {}
     }
     match new.lifetime {
-        Some(0) => {
-            refused("a token that expires at once is useless; give it a longer lifetime".to_owned())
-        }
+        Some(0) => refused("a token that expires at once is useless; give it a longer lifetime".to_owned()),
         _ => Ok(()),
     }
 }

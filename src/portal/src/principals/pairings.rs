@@ -9,9 +9,7 @@ use std::time::Duration;
 use access::{Principal, Role, Scope};
 use api::Millis;
 use api::machines::{NewPairing, Pairing, PairingState};
-use authority::{
-    Authority, CertificateRequest, IssuedRobotCertificate, VerifiedCertificate as Certificate,
-};
+use authority::{Authority, CertificateRequest, IssuedRobotCertificate, VerifiedCertificate as Certificate};
 use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
@@ -56,11 +54,7 @@ pub(super) fn read_pairing(record: PairingRecord) -> Result<StoredPairing, store
         principal: Arc::new(Principal {
             name: record.robot.clone(),
             roles: vec![Role::Robot],
-            scope: Scope {
-                services: scope.services,
-                robot: Some(record.robot.clone()),
-                classes: scope.classes,
-            },
+            scope: Scope { services: scope.services, robot: Some(record.robot.clone()), classes: scope.classes },
         }),
         robot: record.robot,
         created: record.created,
@@ -77,9 +71,7 @@ fn robot_owner(robot: &str) -> Owner {
 
 impl StoredPairing {
     fn to_pairing(&self) -> Pairing {
-        let Scope {
-            services, classes, ..
-        } = &self.principal.scope;
+        let Scope { services, classes, .. } = &self.principal.scope;
         let last = self.last_used.load(Ordering::Relaxed);
         Pairing {
             robot: self.robot.clone(),
@@ -120,18 +112,11 @@ impl StoredPrincipals {
     }
 
     /// Returns why the pairing no longer admits a connection whose certificate is valid until `until`.
-    pub(super) fn pairing_refusal(
-        &self,
-        id: i64,
-        until: Millis,
-        now: Millis,
-    ) -> Option<CertificateRefusal> {
+    pub(super) fn pairing_refusal(&self, id: i64, until: Millis, now: Millis) -> Option<CertificateRefusal> {
         let paired = self.find_pairing(id)?;
         let robot = paired.robot.clone();
         match () {
-            () if paired.revoked && self.live_pairing(&robot).is_some() => {
-                Some(CertificateRefusal::Replaced(robot))
-            }
+            () if paired.revoked && self.live_pairing(&robot).is_some() => Some(CertificateRefusal::Replaced(robot)),
             () if paired.revoked => Some(CertificateRefusal::Unpaired(robot)),
             () if paired.valid_until(until) <= now => Some(CertificateRefusal::Expired(robot)),
             () => None,
@@ -140,8 +125,7 @@ impl StoredPrincipals {
 
     /// Returns when the pairing's permission ends unless it is renewed.
     pub(super) fn pairing_end(&self, id: i64, until: Millis) -> Option<Millis> {
-        self.find_pairing(id)
-            .map(|paired| paired.valid_until(until))
+        self.find_pairing(id).map(|paired| paired.valid_until(until))
     }
 
     /// Returns the owners of paired robots' names.
@@ -191,11 +175,7 @@ impl Recogniser<'_> {
         }
         Ok(CallerIdentity {
             principal: Arc::clone(&paired.principal),
-            shown: Credential::Certificate {
-                pairing: paired.id,
-                key: paired.key.clone(),
-                until: shown.until,
-            },
+            shown: Credential::Certificate { pairing: paired.id, key: paired.key.clone(), until: shown.until },
             token: None,
             owner: Some(robot_owner(&paired.robot)),
         })
@@ -209,10 +189,7 @@ impl Principals {
         let due = stored.find_pairing(id).is_some_and(|paired| {
             let last = paired.last_used.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
-                && paired
-                    .last_used
-                    .compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed)
-                    .is_ok()
+                && paired.last_used.compare_exchange(last, now, Ordering::Relaxed, Ordering::Relaxed).is_ok()
         });
         drop(stored);
         if due && let Err(error) = self.state.record_pairing_use(id, now) {
@@ -253,8 +230,7 @@ impl Principals {
         let expires = store::now() + seconds * 1000;
         let code = names::random(::tls::CODE);
         let scope = self.encode_scope(new)?;
-        self.state
-            .add_pairing_code(&new.robot, &tokens::hash(&code), &scope, expires)?;
+        self.state.add_pairing_code(&new.robot, &tokens::hash(&code), &scope, expires)?;
         Ok((code, expires))
     }
 
@@ -262,10 +238,8 @@ impl Principals {
     pub fn pair_own(&self, new: &NewPairing) -> Result<(), Error> {
         check_pairing(new)?;
         self.check_name_is_free(&new.robot, NameHolder::Pairing)?;
-        self.state
-            .add_pairing(&new.robot, &self.encode_scope(new)?)?;
-        self.state
-            .bind_robot(&new.robot, &robot_owner(&new.robot))?;
+        self.state.add_pairing(&new.robot, &self.encode_scope(new)?)?;
+        self.state.bind_robot(&new.robot, &robot_owner(&new.robot))?;
         Ok(self.reload()?)
     }
 
@@ -281,19 +255,11 @@ impl Principals {
 
     /// Checks a pairing code that came from an address for a robot. An unknown code counts as a guess, like an
     /// unknown token.
-    pub fn check_code(
-        &self,
-        robot: &str,
-        code: &str,
-        from: IpAddr,
-        now: Millis,
-    ) -> Result<CodeRecord, Error> {
+    pub fn check_code(&self, robot: &str, code: &str, from: IpAddr, now: Millis) -> Result<CodeRecord, Error> {
         let known = self.state.pairing_code(&tokens::hash(code))?;
         let Some(known) = known.filter(|_| ::tls::is_code(code)) else {
             let mut guesses = self.guesses.lock();
-            guesses
-                .check(from, now)
-                .map_err(AuthenticationError::Slowed)?;
+            guesses.check(from, now).map_err(AuthenticationError::Slowed)?;
             guesses.record_failure(from, now);
             return Err(PairingCodeRefusal::Unknown.into());
         };
@@ -318,14 +284,9 @@ impl Principals {
         authority: &Authority,
         lifetime: Duration,
     ) -> Result<IssuedRobotCertificate, Error> {
-        let issued = authority
-            .issue(request, &code.robot, store::now(), lifetime)
-            .map_err(Error::Uncertifiable)?;
-        self.state
-            .use_pairing_code(code.id, request.key_hash(), issued.expires)?
-            .ok_or(PairingCodeRefusal::Used)?;
-        self.state
-            .bind_robot(&code.robot, &robot_owner(&code.robot))?;
+        let issued = authority.issue(request, &code.robot, store::now(), lifetime).map_err(Error::Uncertifiable)?;
+        self.state.use_pairing_code(code.id, request.key_hash(), issued.expires)?.ok_or(PairingCodeRefusal::Used)?;
+        self.state.bind_robot(&code.robot, &robot_owner(&code.robot))?;
         self.reload()?;
         Ok(issued)
     }
@@ -338,18 +299,12 @@ impl Principals {
         authority: &Authority,
         lifetime: Duration,
     ) -> Result<IssuedRobotCertificate, Error> {
-        let issued = authority
-            .issue(request, robot, store::now(), lifetime)
-            .map_err(Error::Uncertifiable)?;
+        let issued = authority.issue(request, robot, store::now(), lifetime).map_err(Error::Uncertifiable)?;
         // Frequent renewals do not each cause a write.
-        let lately = issued
-            .expires
-            .saturating_sub(lifetime.as_millis() as Millis / OFTEN);
+        let lately = issued.expires.saturating_sub(lifetime.as_millis() as Millis / OFTEN);
         let known = {
             let stored = self.stored.read();
-            let live = stored
-                .find_pairing(pairing)
-                .filter(|paired| !paired.revoked);
+            let live = stored.find_pairing(pairing).filter(|paired| !paired.revoked);
             live.and_then(|paired| paired.expires)
         };
         if known.is_none_or(|known| known < lately) {
@@ -366,28 +321,17 @@ impl Principals {
         let there = self.state.revoke_pairing(robot)?;
         self.reload()?;
         self.release_robots()?;
-        if there {
-            Ok(())
-        } else {
-            Err(self.unknown_pairing(robot)?)
-        }
+        if there { Ok(()) } else { Err(self.unknown_pairing(robot)?) }
     }
 
     /// Cancels a robot's pairing code.
     pub fn cancel_pairing(&self, robot: &str) -> Result<(), Error> {
-        if self.state.cancel_pairing_code(robot)? {
-            Ok(())
-        } else {
-            Err(self.unknown_pairing(robot)?)
-        }
+        if self.state.cancel_pairing_code(robot)? { Ok(()) } else { Err(self.unknown_pairing(robot)?) }
     }
 
     fn unknown_pairing(&self, robot: &str) -> Result<Error, Error> {
         let exists = self.pairings()?.into_iter();
-        Ok(Error::UnknownPairing {
-            name: robot.to_owned(),
-            exists: exists.map(|pairing| pairing.robot).collect(),
-        })
+        Ok(Error::UnknownPairing { name: robot.to_owned(), exists: exists.map(|pairing| pairing.robot).collect() })
     }
 }
 
@@ -404,9 +348,7 @@ fn check_pairing(new: &NewPairing) -> Result<(), Error> {
         );
     }
     match new.lifetime {
-        Some(0) => {
-            refused("a code that expires at once is useless; give a longer --ttl".to_owned())
-        }
+        Some(0) => refused("a code that expires at once is useless; give a longer --ttl".to_owned()),
         Some(seconds) if seconds > LONGEST_CODE => refused(
             "a pairing code is valid for at most 7d, since whoever finds it can act as the \
                 robot; give a shorter --ttl"

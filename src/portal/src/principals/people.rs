@@ -46,22 +46,16 @@ fn check_role(role: Role, services: &[Glob]) -> Result<(), Error> {
         );
     }
     match (role.is_scoped(), services.is_empty()) {
-        (true, true) => refused(format!(
-            "a {role} needs its services; give them with --service, or all with --service '*'"
-        )),
-        (false, false) => refused(format!(
-            "an {role} is for all services; omit --service, or choose another role"
-        )),
+        (true, true) => {
+            refused(format!("a {role} needs its services; give them with --service, or all with --service '*'"))
+        }
+        (false, false) => refused(format!("an {role} is for all services; omit --service, or choose another role")),
         _ => Ok(()),
     }
 }
 
 pub(super) fn encode_scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
-    let scope = StoredScope {
-        services: services.to_vec(),
-        robot: None,
-        classes: Vec::new(),
-    };
+    let scope = StoredScope { services: services.to_vec(), robot: None, classes: Vec::new() };
     serde_json::to_string(&scope).map_err(record_error(format!("account {name}")))
 }
 
@@ -93,9 +87,7 @@ impl Principals {
                 created: record.created,
                 last_login: record.last_login,
                 disabled: record.disabled,
-                sessions: sessions
-                    .filter(|session| session.record.account == Some(record.id))
-                    .count(),
+                sessions: sessions.filter(|session| session.record.account == Some(record.id)).count(),
             }
         })
         .collect()
@@ -117,18 +109,13 @@ impl Principals {
 
     /// Stores a new hash of the same password.
     pub fn rehash(&self, candidate: &mut Candidate, password: String) -> Result<(), Error> {
-        self.state
-            .rehash_password(candidate.id, &candidate.password, &password)?;
+        self.state.rehash_password(candidate.id, &candidate.password, &password)?;
         candidate.password = password;
         Ok(self.reload()?)
     }
 
     /// Starts a session after the password was verified; `None` if the account has changed meanwhile.
-    pub fn begin_session(
-        &self,
-        candidate: &Candidate,
-        peer: &str,
-    ) -> Result<Option<StartedSession>, Error> {
+    pub fn begin_session(&self, candidate: &Candidate, peer: &str) -> Result<Option<StartedSession>, Error> {
         let secret = names::random(SECRET);
         let hash = tokens::hash(&secret);
         let made = self.state.add_session(
@@ -150,11 +137,7 @@ impl Principals {
         self.reload()?;
         let expires = made.expires;
         let identity = KnownSession::read(made)?.recognise(store::now(), self.lasting)?;
-        Ok(Some(StartedSession {
-            secret,
-            identity,
-            expires,
-        }))
+        Ok(Some(StartedSession { secret, identity, expires }))
     }
 
     /// Returns when a session ends at the latest.
@@ -167,10 +150,7 @@ impl Principals {
     pub fn sessions(&self) -> Vec<SessionLine> {
         let now = store::now();
         let stored = self.stored.read();
-        let good = stored
-            .sessions
-            .values()
-            .filter(|known| known.recognise(now, self.lasting).is_ok());
+        let good = stored.sessions.values().filter(|known| known.recognise(now, self.lasting).is_ok());
         let mut lines: Vec<SessionLine> = good
             .map(|known| SessionLine {
                 id: known.record.id,
@@ -195,12 +175,7 @@ impl Principals {
     /// Ends the session with this secret, if there is one.
     pub fn end_session_by_secret(&self, secret: &str) -> Result<(), Error> {
         let hash = tokens::hash(secret);
-        let id = self
-            .stored
-            .read()
-            .sessions
-            .get(&hash)
-            .map(|known| known.record.id);
+        let id = self.stored.read().sessions.get(&hash).map(|known| known.record.id);
         id.map_or(Ok(()), |id| self.end_session(id))
     }
 
@@ -212,13 +187,9 @@ impl Principals {
 
     /// Checks a new account.
     pub fn check_account(&self, new: &NewAccount) -> Result<(), Error> {
-        access::principal::check_name(&new.name)
-            .map_err(|error| Error::BadRequest(error.to_string()))?;
+        access::principal::check_name(&new.name).map_err(|error| Error::BadRequest(error.to_string()))?;
         if RESERVED.contains(&&*new.name) {
-            return Err(Error::BadRequest(format!(
-                "{} is a reserved name; choose another",
-                new.name
-            )));
+            return Err(Error::BadRequest(format!("{} is a reserved name; choose another", new.name)));
         }
         check_role(new.role, &new.services)?;
         self.check_name_is_free(&new.name, NameHolder::Account)
@@ -228,57 +199,33 @@ impl Principals {
     pub fn create_account(&self, new: &NewAccount, password: &str) -> Result<(), Error> {
         self.check_account(new)?;
         let scope = encode_scope(&new.services, &new.name)?;
-        let made = self
-            .state
-            .add_account(&new.name, password, new.role.name(), &scope)?;
+        let made = self.state.add_account(&new.name, password, new.role.name(), &scope)?;
         self.reload()?;
-        if made {
-            Ok(())
-        } else {
-            Err(Error::AccountExists(new.name.clone()))
-        }
+        if made { Ok(()) } else { Err(Error::AccountExists(new.name.clone())) }
     }
 
     fn unknown_account(&self, name: &str) -> Error {
         Error::UnknownAccount {
             name: name.to_owned(),
-            exists: self
-                .accounts()
-                .into_iter()
-                .map(|known| known.name)
-                .collect(),
+            exists: self.accounts().into_iter().map(|known| known.name).collect(),
         }
     }
 
     /// Refuses the name of an account that does not exist.
     pub fn check_account_exists(&self, name: &str) -> Result<(), Error> {
-        if self.accounts().iter().any(|known| known.name == name) {
-            Ok(())
-        } else {
-            Err(self.unknown_account(name))
-        }
+        if self.accounts().iter().any(|known| known.name == name) { Ok(()) } else { Err(self.unknown_account(name)) }
     }
 
     /// Changes an account, including the hash of its password if given. All its sessions end.
-    pub fn change_account(
-        &self,
-        name: &str,
-        change: &AccountChange,
-        password: Option<&str>,
-    ) -> Result<(), Error> {
+    pub fn change_account(&self, name: &str, change: &AccountChange, password: Option<&str>) -> Result<(), Error> {
         self.check_account_exists(name)?;
         if change.role.is_none() && !change.services.is_empty() {
-            return Err(Error::BadRequest(
-                "services need a role; give the role, too".into(),
-            ));
+            return Err(Error::BadRequest("services need a role; give the role, too".into()));
         }
         if let Some(role) = change.role {
             check_role(role, &change.services)?;
         }
-        let scope = change
-            .role
-            .map(|_| encode_scope(&change.services, name))
-            .transpose()?;
+        let scope = change.role.map(|_| encode_scope(&change.services, name)).transpose()?;
         let is_known = self.state.edit_account(
             name,
             &AccountEdit {
@@ -288,11 +235,7 @@ impl Principals {
             },
         )?;
         self.reload()?;
-        if is_known {
-            Ok(())
-        } else {
-            Err(self.unknown_account(name))
-        }
+        if is_known { Ok(()) } else { Err(self.unknown_account(name)) }
     }
 
     /// Removes an account.

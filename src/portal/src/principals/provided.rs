@@ -16,21 +16,15 @@ impl Principals {
     /// Enables sessions of this provider's people, given its issuer identifier; without one, none of them has a
     /// session. Ends sessions that would start differently today, judged by the groups that their people had: those
     /// of another provider or with other permissions.
-    pub fn with_provider(
-        self,
-        provider: Option<(&str, &Roles)>,
-    ) -> Result<Principals, store::Error> {
+    pub fn with_provider(self, provider: Option<(&str, &Roles)>) -> Result<Principals, store::Error> {
         let people = self.state.federated_people()?;
         for session in self.state.sessions()? {
             let Some(id) = session.person else {
                 continue;
             };
             let person = people.iter().find(|person| person.id == id);
-            let groups: Vec<String> = session
-                .groups
-                .as_deref()
-                .and_then(|groups| serde_json::from_str(groups).ok())
-                .unwrap_or_default();
+            let groups: Vec<String> =
+                session.groups.as_deref().and_then(|groups| serde_json::from_str(groups).ok()).unwrap_or_default();
             let today = provider
                 .filter(|(issuer, _)| person.is_some_and(|person| person.issuer == *issuer))
                 .and_then(|(_, roles)| roles.grant_for_groups(&groups));
@@ -63,9 +57,7 @@ impl Principals {
         peer: &str,
     ) -> Result<StartedSession, Error> {
         let wanted = oidc_principal_name(&person.name);
-        let known = self
-            .state
-            .sign_in_federated_person(issuer, &person.subject, &wanted)?;
+        let known = self.state.sign_in_federated_person(issuer, &person.subject, &wanted)?;
         let secret = names::random(SECRET);
         let made = self.state.add_session(
             &NewSession {
@@ -84,11 +76,7 @@ impl Principals {
         self.reload()?;
         let expires = made.expires;
         let identity = KnownSession::read(made)?.recognise(store::now(), self.lasting)?;
-        Ok(StartedSession {
-            secret,
-            identity,
-            expires,
-        })
+        Ok(StartedSession { secret, identity, expires })
     }
 }
 

@@ -28,22 +28,13 @@ pub struct Recogniser<'a> {
 
 impl Recogniser<'_> {
     /// Identifies the caller by a token that came from an address.
-    pub fn recognise(
-        &self,
-        token: &str,
-        from: IpAddr,
-        now: Millis,
-    ) -> Result<CallerIdentity, AuthenticationError> {
+    pub fn recognise(&self, token: &str, from: IpAddr, now: Millis) -> Result<CallerIdentity, AuthenticationError> {
         self.recognise_with(token, from, now, || self.tokens.recognise(token))
     }
 
     /// Identifies the caller by the session secret of a browser. Session secrets cannot be guessed, so they are
     /// always looked up.
-    pub fn recognise_session(
-        &self,
-        secret: &str,
-        now: Millis,
-    ) -> Result<CallerIdentity, AuthenticationError> {
+    pub fn recognise_session(&self, secret: &str, now: Millis) -> Result<CallerIdentity, AuthenticationError> {
         let hash = tokens::hash(secret);
         self.stored.recognise_session(&hash, now, self.lasting)
     }
@@ -62,9 +53,7 @@ impl Recogniser<'_> {
             return Ok(identity);
         }
         let mut guesses = self.guesses.lock();
-        guesses
-            .check(from, now)
-            .map_err(AuthenticationError::Slowed)?;
+        guesses.check(from, now).map_err(AuthenticationError::Slowed)?;
         if let Some(hash) = configured() {
             return Ok(configured_identity(hash));
         }

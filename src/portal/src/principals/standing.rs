@@ -23,32 +23,21 @@ impl Principals {
     }
 
     /// Returns the access of a connection that looks into a servant of a service.
-    pub fn inside_access(
-        &self,
-        who: &CallerIdentity,
-        service: &str,
-        part: InsideRole,
-    ) -> ConnectionAccess {
+    pub fn inside_access(&self, who: &CallerIdentity, service: &str, part: InsideRole) -> ConnectionAccess {
         self.compute_access(who, |policy| match part {
             InsideRole::Acts => policy.grants(&who.principal, service),
             InsideRole::Looks => policy.observer_grants(&who.principal, service),
         })
     }
 
-    fn compute_access(
-        &self,
-        who: &CallerIdentity,
-        grants: impl FnOnce(&AccessPolicy) -> Grants,
-    ) -> ConnectionAccess {
+    fn compute_access(&self, who: &CallerIdentity, grants: impl FnOnce(&AccessPolicy) -> Grants) -> ConnectionAccess {
         let stored = self.stored.read();
         let over = match &who.shown {
             Credential::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
                 Some("a token is required since the first one was created".to_owned())
             }
             Credential::Stored { id, hash } => match stored.find_token(*id) {
-                Some(known) if known.hash == *hash => {
-                    known.refusal(store::now()).map(|over| over.to_string())
-                }
+                Some(known) if known.hash == *hash => known.refusal(store::now()).map(|over| over.to_string()),
                 _ => Some("this token was replaced by a new one".to_owned()),
             },
             Credential::Certificate { pairing, until, .. } => {
@@ -81,14 +70,8 @@ impl Principals {
     }
 
     /// Updates `standing` whenever the access of a connection changes; never returns.
-    pub async fn follow_access(
-        &self,
-        who: &CallerIdentity,
-        service: &str,
-        standing: &watch::Sender<ConnectionAccess>,
-    ) {
-        self.watch_access(who, || self.connection_access(who, service), standing)
-            .await;
+    pub async fn follow_access(&self, who: &CallerIdentity, service: &str, standing: &watch::Sender<ConnectionAccess>) {
+        self.watch_access(who, || self.connection_access(who, service), standing).await;
     }
 
     /// Updates `standing` whenever the access of a connection that looks into a servant changes; never returns.
@@ -99,8 +82,7 @@ impl Principals {
         part: InsideRole,
         standing: &watch::Sender<ConnectionAccess>,
     ) {
-        self.watch_access(who, || self.inside_access(who, service, part), standing)
-            .await;
+        self.watch_access(who, || self.inside_access(who, service, part), standing).await;
     }
 
     async fn watch_access(
@@ -119,9 +101,7 @@ impl Principals {
                 new
             });
             let expires = async {
-                let ends = self
-                    .expiry(who)
-                    .filter(|_| matches!(now, ConnectionAccess::Granted(_)));
+                let ends = self.expiry(who).filter(|_| matches!(now, ConnectionAccess::Granted(_)));
                 let Some(end) = ends else {
                     return std::future::pending().await;
                 };
@@ -145,9 +125,7 @@ impl Principals {
                 match &*told.borrow_and_update() {
                     ConnectionAccess::Ended(reason) => return reason.clone(),
                     ConnectionAccess::Granted(grants) if whole && !grants.is_everything() => {
-                        return format!(
-                            "a stub needs all of {service}, but is granted only {grants}"
-                        );
+                        return format!("a stub needs all of {service}, but is granted only {grants}");
                     }
                     ConnectionAccess::Granted(_) => {}
                 }

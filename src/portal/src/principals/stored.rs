@@ -82,10 +82,7 @@ pub struct SessionLifetimes {
 
 impl Default for SessionLifetimes {
     fn default() -> Self {
-        SessionLifetimes {
-            most: Duration::from_secs(12 * 3600),
-            idle: Duration::from_secs(3600),
-        }
+        SessionLifetimes { most: Duration::from_secs(12 * 3600), idle: Duration::from_secs(3600) }
     }
 }
 
@@ -107,10 +104,7 @@ pub struct KnownAccount {
 impl KnownAccount {
     pub(super) fn read(record: AccountRecord) -> Result<KnownAccount, store::Error> {
         let principal = read_principal(&record.name, &record.role, &record.scope, "account")?;
-        Ok(KnownAccount {
-            principal: Arc::new(principal),
-            record,
-        })
+        Ok(KnownAccount { principal: Arc::new(principal), record })
     }
 
     pub(super) fn is_live(&self) -> bool {
@@ -191,29 +185,16 @@ fn read_text<T: serde::de::DeserializeOwned>(text: &str, what: &str) -> Result<T
 }
 
 /// Builds the principal of a record.
-pub(super) fn read_principal(
-    name: &str,
-    role: &str,
-    scope: &str,
-    kind: &str,
-) -> Result<Principal, store::Error> {
+pub(super) fn read_principal(name: &str, role: &str, scope: &str, kind: &str) -> Result<Principal, store::Error> {
     let what = format!("{kind} {name}");
     let role: Role = read_text(role, &what)?;
     let scope: StoredScope = serde_json::from_str(scope).map_err(record_error(what))?;
     let scope = if role.is_scoped() {
-        Scope {
-            services: scope.services,
-            robot: scope.robot,
-            classes: scope.classes,
-        }
+        Scope { services: scope.services, robot: scope.robot, classes: scope.classes }
     } else {
         Scope::everything()
     };
-    Ok(Principal {
-        name: name.to_owned(),
-        roles: vec![role],
-        scope,
-    })
+    Ok(Principal { name: name.to_owned(), roles: vec![role], scope })
 }
 
 pub(super) fn read_token(record: TokenRecord) -> Result<KnownToken, store::Error> {
@@ -242,35 +223,17 @@ fn read_rule(record: RuleRecord) -> Result<(i64, AccessRule), store::Error> {
 impl StoredPrincipals {
     /// Loads everything from a database.
     pub fn load(state: &State) -> Result<StoredPrincipals, store::Error> {
-        let tokens = state
-            .tokens()?
-            .into_iter()
-            .map(read_token)
-            .collect::<Result<Vec<_>, _>>()?;
-        let pairings = state
-            .pairings()?
-            .into_iter()
-            .map(pairings::read_pairing)
-            .collect::<Result<Vec<_>, _>>()?;
+        let tokens = state.tokens()?.into_iter().map(read_token).collect::<Result<Vec<_>, _>>()?;
+        let pairings = state.pairings()?.into_iter().map(pairings::read_pairing).collect::<Result<Vec<_>, _>>()?;
         let accounts = state.accounts()?.into_iter().map(KnownAccount::read);
         let sessions = state.sessions()?.into_iter().map(|record| {
             let hash = record.hash.clone();
             Ok((hash, KnownSession::read(record)?))
         });
-        let rules = state
-            .rules()?
-            .into_iter()
-            .map(read_rule)
-            .collect::<Result<Vec<_>, _>>()?;
+        let rules = state.rules()?.into_iter().map(read_rule).collect::<Result<Vec<_>, _>>()?;
         Ok(StoredPrincipals {
-            by_hash: tokens
-                .iter()
-                .enumerate()
-                .map(|(at, known)| (known.hash.clone(), at))
-                .collect(),
-            policy: AccessPolicy {
-                rules: rules.iter().map(|(_, rule)| rule.clone()).collect(),
-            },
+            by_hash: tokens.iter().enumerate().map(|(at, known)| (known.hash.clone(), at)).collect(),
+            policy: AccessPolicy { rules: rules.iter().map(|(_, rule)| rule.clone()).collect() },
             accounts: accounts.collect::<Result<_, store::Error>>()?,
             sessions: sessions.collect::<Result<_, store::Error>>()?,
             names_provider: !state.federated_people()?.is_empty(),
@@ -282,10 +245,7 @@ impl StoredPrincipals {
 
     /// Returns true if there never was a token, an account, a paired robot or an identity provider.
     pub fn is_empty(&self) -> bool {
-        self.tokens.is_empty()
-            && self.accounts.is_empty()
-            && self.pairings.is_empty()
-            && !self.names_provider
+        self.tokens.is_empty() && self.accounts.is_empty() && self.pairings.is_empty() && !self.names_provider
     }
 
     /// Identifies the caller by the hash of a session's secret.
@@ -296,9 +256,7 @@ impl StoredPrincipals {
         lasting: SessionLifetimes,
     ) -> Result<CallerIdentity, AuthenticationError> {
         let known = self.sessions.get(hash);
-        known.map_or(Err(AuthenticationError::SessionOver), |known| {
-            known.recognise(now, lasting)
-        })
+        known.map_or(Err(AuthenticationError::SessionOver), |known| known.recognise(now, lasting))
     }
 
     pub(super) fn find_session(&self, id: i64) -> Option<&KnownSession> {
@@ -306,11 +264,7 @@ impl StoredPrincipals {
     }
 
     /// Identifies the caller by the hash of a token.
-    pub(super) fn recognise(
-        &self,
-        hash: &str,
-        now: Millis,
-    ) -> Result<Option<CallerIdentity>, AuthenticationError> {
+    pub(super) fn recognise(&self, hash: &str, now: Millis) -> Result<Option<CallerIdentity>, AuthenticationError> {
         let Some(known) = self.by_hash.get(hash).map(|at| &self.tokens[*at]) else {
             return Ok(None);
         };
@@ -319,10 +273,7 @@ impl StoredPrincipals {
         }
         Ok(Some(CallerIdentity {
             principal: Arc::clone(&known.principal),
-            shown: Credential::Stored {
-                id: known.id,
-                hash: known.hash.clone(),
-            },
+            shown: Credential::Stored { id: known.id, hash: known.hash.clone() },
             token: Some(known.hash.clone()),
             owner: Some(known.owner()),
         }))

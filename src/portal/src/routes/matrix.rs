@@ -43,10 +43,8 @@ fn cell_word(everywhere: bool, at_its_own: bool) -> &'static str {
 /// Returns the cell of a route that concerns services.
 fn at_services(principal: &Principal, action: AccessAction) -> &'static str {
     let at = |name, owner| {
-        let object = AccessObject {
-            robot: principal.scope.robot.as_deref(),
-            ..AccessObject::service(name, Some(owner))
-        };
+        let object =
+            AccessObject { robot: principal.scope.robot.as_deref(), ..AccessObject::service(name, Some(owner)) };
         decide(principal, action, &object).is_ok()
     };
     cell_word(at("theirs", "them"), at("mine", "me"))
@@ -59,10 +57,7 @@ fn cell(route: &Route, principal: &Principal) -> &'static str {
         Access::Connect if principal.roles.is_empty() => "auth",
         Access::Connect => at_services(principal, AccessAction::Connect),
         Access::May(action, of) => match of {
-            AccessTarget::Machine => cell_word(
-                decide(principal, action, &AccessObject::MACHINE).is_ok(),
-                false,
-            ),
+            AccessTarget::Machine => cell_word(decide(principal, action, &AccessObject::MACHINE).is_ok(), false),
             AccessTarget::Robot(_) => {
                 let at = |robot| check_robot(principal, action, robot).is_ok();
                 cell_word(at("them"), at("me"))
@@ -80,24 +75,12 @@ fn cell(route: &Route, principal: &Principal) -> &'static str {
 fn the_document_has_the_matrix_as_it_is_decided() {
     let columns = columns();
     let names: Vec<&str> = columns.iter().map(|(name, _)| *name).collect();
-    let mut matrix = format!(
-        "| method | address | {} |\n|---|---|{}\n",
-        names.join(" | "),
-        "---|".repeat(names.len())
-    );
+    let mut matrix = format!("| method | address | {} |\n|---|---|{}\n", names.join(" | "), "---|".repeat(names.len()));
     for route in ROUTES {
         let cells: Vec<&str> = columns.iter().map(|(_, who)| cell(route, who)).collect();
-        matrix += &format!(
-            "| {} | `{}` | {} |\n",
-            route.method,
-            route.path,
-            cells.join(" | ")
-        );
+        matrix += &format!("| {} | `{}` | {} |\n", route.method, route.path, cells.join(" | "));
     }
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/access.md");
     let document = std::fs::read_to_string(path).expect("docs/access.md");
-    assert!(
-        document.contains(&matrix),
-        "docs/access.md lacks:\n{matrix}"
-    );
+    assert!(document.contains(&matrix), "docs/access.md lacks:\n{matrix}");
 }

@@ -39,13 +39,7 @@ impl Listener {
         samples: watch::Receiver<Option<Arc<StateSample>>>,
         place: StreamSlot,
     ) -> Listener {
-        Listener {
-            app,
-            caller,
-            samples,
-            told: None,
-            _place: place,
-        }
+        Listener { app, caller, samples, told: None, _place: place }
     }
 
     /// Waits for the next update.
@@ -62,10 +56,7 @@ impl Listener {
             let Some(sample) = sample else { continue };
             let seen = self.visible_sample(&sample);
             let event = sample.events.last().map_or(0, |event| event.id);
-            let earlier = self
-                .told
-                .take()
-                .filter(|told| !has_missed_events(&sample, told.event));
+            let earlier = self.told.take().filter(|told| !has_missed_events(&sample, told.event));
             let name = match earlier {
                 Some(_) => "update",
                 None => "snapshot",
@@ -75,10 +66,7 @@ impl Listener {
             if earlier.is_some() && update == Update::default() {
                 continue;
             }
-            let update = Update {
-                time: store::now(),
-                ..update
-            };
+            let update = Update { time: store::now(), ..update };
             match sse::Event::default().event(name).json_data(&update) {
                 Ok(event) => return Some(event),
                 Err(error) => tracing::error!("an update for a page cannot be serialized: {error}"),
@@ -103,15 +91,9 @@ impl Listener {
         let is_own = |served: &Arc<Served>| caller.can_act_for_robot(&served.servant.robot);
         let machine = sample.machine.clone();
         StateSample {
-            machine: machine.filter(|_| {
-                caller
-                    .check_access(AccessAction::Look, &AccessObject::MACHINE)
-                    .is_ok()
-            }),
+            machine: machine.filter(|_| caller.check_access(AccessAction::Look, &AccessObject::MACHINE).is_ok()),
             services: filter_cloned(&sample.services, |one| sees(&one.name)),
-            servants: filter_cloned(&sample.servants, |one| {
-                is_own(one) && sees(&one.servant.service)
-            }),
+            servants: filter_cloned(&sample.servants, |one| is_own(one) && sees(&one.servant.service)),
             back_offs: if all {
                 Arc::clone(&sample.back_offs)
             } else {
@@ -122,9 +104,7 @@ impl Listener {
             events: if all {
                 Arc::clone(&sample.events)
             } else {
-                Arc::new(filter_cloned(&sample.events, |event| {
-                    is_visible(caller, event, &mut sees)
-                }))
+                Arc::new(filter_cloned(&sample.events, |event| is_visible(caller, event, &mut sees)))
             },
         }
     }
@@ -146,9 +126,7 @@ fn compute_update(seen: &StateSample, told: Option<&LastSent>) -> Update {
     let (earlier, last) = told.map_or((&nothing, 0), |told| (&told.seen, told.event));
     let (services, services_gone) = diff(&seen.services, &earlier.services, |one| &one.name);
     let (servants, servants_gone) = diff(&seen.servants, &earlier.servants, |one| &one.servant.id);
-    let is_new = |now: &Arc<api::stream::Machine>| {
-        earlier.machine.as_ref().is_none_or(|then| **then != **now)
-    };
+    let is_new = |now: &Arc<api::stream::Machine>| earlier.machine.as_ref().is_none_or(|then| **then != **now);
     Update {
         time: 0,
         machine: seen.machine.clone().filter(is_new),
@@ -156,8 +134,7 @@ fn compute_update(seen: &StateSample, told: Option<&LastSent>) -> Update {
         services_gone,
         servants,
         servants_gone,
-        back_offs: (told.is_none() || seen.back_offs != earlier.back_offs)
-            .then(|| (*seen.back_offs).clone()),
+        back_offs: (told.is_none() || seen.back_offs != earlier.back_offs).then(|| (*seen.back_offs).clone()),
         events: filter_cloned(&seen.events, |event| event.id > last),
     }
 }
@@ -165,11 +142,7 @@ fn compute_update(seen: &StateSample, told: Option<&LastSent>) -> Update {
 /// Returns new or changed items, and the names of those that have disappeared.
 fn diff<T>(now: &[Arc<T>], then: &[Arc<T>], name: fn(&T) -> &String) -> (Vec<Arc<T>>, Vec<String>) {
     let known: HashMap<&String, &Arc<T>> = then.iter().map(|one| (name(one), one)).collect();
-    let is_new = |one: &Arc<T>| {
-        known
-            .get(name(one))
-            .is_none_or(|same| !Arc::ptr_eq(same, one))
-    };
+    let is_new = |one: &Arc<T>| known.get(name(one)).is_none_or(|same| !Arc::ptr_eq(same, one));
     let there: HashMap<&String, ()> = now.iter().map(|one| (name(one), ())).collect();
     let gone = then.iter().map(|one| name(one));
     let gone = gone.filter(|name| !there.contains_key(name)).cloned();
@@ -196,10 +169,7 @@ mod tests {
     }
 
     fn sample(events: std::ops::Range<i64>) -> StateSample {
-        StateSample {
-            events: Arc::new(events.map(event).collect()),
-            ..StateSample::default()
-        }
+        StateSample { events: Arc::new(events.map(event).collect()), ..StateSample::default() }
     }
 
     #[test]
@@ -215,23 +185,11 @@ mod tests {
 
     #[test]
     fn events_are_told_once() {
-        let told = LastSent {
-            seen: sample(1..4),
-            event: 3,
-        };
-        let ids = |update: Update| {
-            update
-                .events
-                .iter()
-                .map(|event| event.id)
-                .collect::<Vec<_>>()
-        };
+        let told = LastSent { seen: sample(1..4), event: 3 };
+        let ids = |update: Update| update.events.iter().map(|event| event.id).collect::<Vec<_>>();
         assert_eq!(ids(compute_update(&sample(1..6), Some(&told))), [4, 5]);
         assert_eq!(ids(compute_update(&sample(1..4), None)), [1, 2, 3]);
-        assert_eq!(
-            compute_update(&sample(1..4), Some(&told)),
-            Update::default()
-        );
+        assert_eq!(compute_update(&sample(1..4), Some(&told)), Update::default());
     }
 
     #[test]

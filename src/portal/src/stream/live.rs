@@ -37,11 +37,7 @@ pub struct LiveSamples {
 
 impl Default for LiveSamples {
     fn default() -> LiveSamples {
-        LiveSamples {
-            newest: watch::Sender::new(None),
-            running: Mutex::new(false),
-            streams: Arc::default(),
-        }
+        LiveSamples { newest: watch::Sender::new(None), running: Mutex::new(false), streams: Arc::default() }
     }
 }
 
@@ -71,10 +67,7 @@ impl LiveSamples {
             return Err(Error::TooManyStreams { most: MOST });
         }
         *count += 1;
-        Ok(StreamSlot {
-            streams: Arc::clone(&self.streams),
-            who,
-        })
+        Ok(StreamSlot { streams: Arc::clone(&self.streams), who })
     }
 }
 
@@ -103,14 +96,10 @@ mod tests {
     #[test]
     fn one_principal_has_so_many_streams_and_no_more() {
         let live = LiveSamples::default();
-        let mut places: Vec<_> = (0..MOST)
-            .map(|_| live.acquire_slot_for("ada".into()).expect("room"))
-            .collect();
+        let mut places: Vec<_> = (0..MOST).map(|_| live.acquire_slot_for("ada".into()).expect("room")).collect();
         let refused = live.acquire_slot_for("ada".into()).map(|_| ());
         assert!(matches!(refused, Err(Error::TooManyStreams { most: MOST })));
-        let of_another = live
-            .acquire_slot_for("bob".into())
-            .expect("room of his own");
+        let of_another = live.acquire_slot_for("bob".into()).expect("room of his own");
         drop(places.pop());
         places.push(live.acquire_slot_for("ada".into()).expect("room again"));
         drop((places, of_another));

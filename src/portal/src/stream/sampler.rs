@@ -50,11 +50,7 @@ pub async fn run(app: Arc<App>) {
     }
 }
 
-async fn take_sample(
-    app: &App,
-    earlier: &StateSample,
-    looker: &mut ServantSampler,
-) -> Result<StateSample, Error> {
+async fn take_sample(app: &App, earlier: &StateSample, looker: &mut ServantSampler) -> Result<StateSample, Error> {
     let servants = looker.sample(app).await;
     let machine = looks::sample_machine(app, &servants).await?;
     let mut services = Vec::new();
@@ -68,21 +64,13 @@ async fn take_sample(
         machine: Some(Arc::new(machine)),
         services: reuse_unchanged(services, &earlier.services, |service| &service.name),
         servants: reuse_unchanged(servants, &earlier.servants, |served| &served.servant.id),
-        back_offs: if *earlier.back_offs == back_offs {
-            Arc::clone(&earlier.back_offs)
-        } else {
-            Arc::new(back_offs)
-        },
+        back_offs: if *earlier.back_offs == back_offs { Arc::clone(&earlier.back_offs) } else { Arc::new(back_offs) },
         events: newest_events(app, &earlier.events)?,
     })
 }
 
 /// Wraps the items in `Arc`, reusing the earlier allocation of those that are equal.
-fn reuse_unchanged<T: PartialEq>(
-    new: Vec<T>,
-    earlier: &[Arc<T>],
-    name: fn(&T) -> &String,
-) -> Vec<Arc<T>> {
+fn reuse_unchanged<T: PartialEq>(new: Vec<T>, earlier: &[Arc<T>], name: fn(&T) -> &String) -> Vec<Arc<T>> {
     let earlier: HashMap<&String, &Arc<T>> = earlier.iter().map(|one| (name(one), one)).collect();
     let keep = |one: T| match earlier.get(name(&one)) {
         Some(same) if ***same == one => Arc::clone(same),
@@ -98,11 +86,7 @@ fn newest_events(app: &App, earlier: &Arc<Vec<Arc<Event>>>) -> Result<Arc<Vec<Ar
         return Ok(Arc::clone(earlier));
     }
     let new = app.state.events(since, EVENTS as u32)?;
-    let mut all: Vec<_> = earlier
-        .iter()
-        .cloned()
-        .chain(new.into_iter().map(Arc::new))
-        .collect();
+    let mut all: Vec<_> = earlier.iter().cloned().chain(new.into_iter().map(Arc::new)).collect();
     let beyond = all.len().saturating_sub(EVENTS);
     Ok(Arc::new(all.split_off(beyond)))
 }

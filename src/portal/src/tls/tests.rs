@@ -1,6 +1,6 @@
 use rcgen::{
-    BasicConstraints, CertificateParams, CertificateRevocationListParams, CertifiedIssuer, DnType,
-    IsCa, KeyIdMethod, KeyPair, KeyUsagePurpose, RevokedCertParams, SerialNumber,
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, CertifiedIssuer, DnType, IsCa, KeyIdMethod,
+    KeyPair, KeyUsagePurpose, RevokedCertParams, SerialNumber,
 };
 use tokio::net::TcpListener;
 use tokio_rustls::TlsConnector;
@@ -88,24 +88,13 @@ async fn what_a_list_names_is_refused_until_another_list_does_not() {
     let server = own.der().clone();
     let tls = Tls::new(vec![certificate], key, own.der(), vec![lab.der().clone()]).expect("usable");
     assert_eq!(refusal(&tls, &server, robot(&lab, 7)).await, None);
-    tls.set_revocation_lists(vec![list(&lab, 7)])
-        .expect("a list");
-    let refused = refusal(&tls, &server, robot(&lab, 7))
-        .await
-        .expect("refused");
+    tls.set_revocation_lists(vec![list(&lab, 7)]).expect("a list");
+    let refused = refusal(&tls, &server, robot(&lab, 7)).await.expect("refused");
     assert!(refused.to_lowercase().contains("revoked"), "{refused}");
     assert_eq!(refusal(&tls, &server, robot(&lab, 8)).await, None);
-    assert_eq!(
-        refusal(&tls, &server, robot(&own, 7)).await,
-        None,
-        "of another authority"
-    );
-    tls.set_revocation_lists(vec![CertificateRevocationListDer::from(vec![1, 2])])
-        .expect_err("no list");
-    refusal(&tls, &server, robot(&lab, 7))
-        .await
-        .expect("the one before holds");
-    tls.set_revocation_lists(vec![list(&lab, 9)])
-        .expect("a list");
+    assert_eq!(refusal(&tls, &server, robot(&own, 7)).await, None, "of another authority");
+    tls.set_revocation_lists(vec![CertificateRevocationListDer::from(vec![1, 2])]).expect_err("no list");
+    refusal(&tls, &server, robot(&lab, 7)).await.expect("the one before holds");
+    tls.set_revocation_lists(vec![list(&lab, 9)]).expect("a list");
     assert_eq!(refusal(&tls, &server, robot(&lab, 7)).await, None);
 }

@@ -9,11 +9,7 @@ use super::*;
 fn status(name: &str) -> String {
     let text = std::fs::read_to_string("/proc/thread-self/status").expect("readable by its thread");
     let line = text.lines().find_map(|line| line.strip_prefix(name));
-    let words: Vec<&str> = line
-        .expect(name)
-        .trim_start_matches(':')
-        .split_whitespace()
-        .collect();
+    let words: Vec<&str> = line.expect(name).trim_start_matches(':').split_whitespace().collect();
     words.join(" ")
 }
 
@@ -49,10 +45,7 @@ fn a_confined_thread_has_no_rights_and_others_keep_theirs() {
         // SAFETY: no pointers.
         assert_ne!(unsafe { libc::syscall(libc::SYS_setresuid, 0, 0, 0) }, 0);
         let program = std::process::Command::new("cat").arg(&path).output();
-        assert!(
-            !program.expect("started").status.success(),
-            "a program reads it"
-        );
+        assert!(!program.expect("started").status.success(), "a program reads it");
         // A file that was opened before can still be read.
         assert_eq!(std::io::read_to_string(opened).expect("open"), "root's");
         // Threads that it starts are confined as well, and confining them again does nothing.
@@ -83,10 +76,7 @@ fn a_limited_thread_has_what_is_kept_and_cannot_get_the_rest_back() {
 #[test]
 fn an_account_is_somebody_but_root() {
     let account = |user, group| Account { user, group };
-    assert_eq!(
-        Account::find("4711").expect("a number"),
-        account(4711, 4711)
-    );
+    assert_eq!(Account::find("4711").expect("a number"), account(4711, 4711));
     let nobody = Account::find("nobody").expect("on every machine");
     assert!(nobody.user > 0 && nobody.group > 0, "{nobody:?}");
     for written in ["root", "0", "4294967295", "no such user", ""] {

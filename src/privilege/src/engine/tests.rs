@@ -70,10 +70,7 @@ fn work_is_done_with_the_rights_that_it_needs() {
             [awaited, run_sync(current), blocking]
         };
         let spans = handed_over.instrument(span).await;
-        assert!(
-            spans.iter().all(|span| span.as_ref() == Some(&caller)),
-            "{spans:?}"
-        );
+        assert!(spans.iter().all(|span| span.as_ref() == Some(&caller)), "{spans:?}");
         // Dropping the future ends the work that was handed over, and panics are propagated.
         let (dropped, heard) = (Arc::new(Notify::new()), Arc::new(Notify::new()));
         struct DropNotifier(Arc<Notify>);

@@ -11,18 +11,12 @@ fn plan(names: &[&str]) -> Plan {
         respawn_delay: 0.0,
         required: false,
     };
-    Plan {
-        nodes: names.iter().map(node).collect(),
-        ..Plan::default()
-    }
+    Plan { nodes: names.iter().map(node).collect(), ..Plan::default() }
 }
 
 fn options_with_params(params: &[&str]) -> PushOptions {
     PushOptions {
-        params: params
-            .iter()
-            .map(|key| ((*key).to_owned(), serde_json::json!(1)))
-            .collect(),
+        params: params.iter().map(|key| ((*key).to_owned(), serde_json::json!(1))).collect(),
         ..PushOptions::default()
     }
 }
@@ -50,10 +44,7 @@ fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
     let keys: Vec<&String> = plan.parameters.keys().collect();
     assert_eq!(keys, ["/costmap_2d/rate", "/costmap_2d_node/stays"]);
     let words = unused_parameters(&plan, &Interface::default(), &options).join("\n");
-    assert!(
-        words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"),
-        "{words}"
-    );
+    assert!(words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"), "{words}");
     // Somebody may still read it.
     let interface = Interface {
         parameters: vec![Parameter {
@@ -68,21 +59,13 @@ fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
 
 #[test]
 fn nodes_of_ros_2_keep_their_namespaces_and_are_renamed_alone() {
-    let flavour = Flavour {
-        ros: ros::flavour::Version::Ros2,
-        ..Flavour::default()
-    };
+    let flavour = Flavour { ros: ros::flavour::Version::Ros2, ..Flavour::default() };
     let mut plan = plan(&["/front/talk", "/back/talk", "/two", "/own"]);
     for (node, namespace) in plan.nodes.iter_mut().zip(["/front", "/back"]) {
         let words = ["--ros-args", "-r", &*format!("__ns:={namespace}")];
         node.argv.extend(words.map(str::to_owned));
     }
-    let said = found_names(&[
-        (0, &["/front/talker"]),
-        (1, &["/back/talker"]),
-        (2, &["/own"]),
-        (3, &["/chosen/own"]),
-    ]);
+    let said = found_names(&[(0, &["/front/talker"]), (1, &["/back/talker"]), (2, &["/own"]), (3, &["/chosen/own"])]);
     let given = PushOptions::default();
     apply_names(&mut plan, &flavour, &[0, 1, 2, 3], &said, &given);
     let told = |index: usize| {
@@ -98,27 +81,14 @@ fn nodes_of_ros_2_keep_their_namespaces_and_are_renamed_alone() {
 
 #[test]
 fn each_node_of_a_second_program_of_several_nodes_has_a_name_of_its_own() {
-    let flavour = Flavour {
-        ros: ros::flavour::Version::Ros2,
-        ..Flavour::default()
-    };
+    let flavour = Flavour { ros: ros::flavour::Version::Ros2, ..Flavour::default() };
     let mut twice = plan(&["/duet", "/duet_2", "/soloist"]);
     let key = |name: &str| format!("{name}/rate");
     for name in ["/duet", "/duet_2", "/soloist"] {
         twice.parameters.insert(key(name), ParamValue::Int(1));
     }
-    let said = found_names(&[
-        (0, &["/alto", "/tenor"]),
-        (1, &["/alto", "/tenor"]),
-        (2, &["/solo", "/tenor"]),
-    ]);
-    apply_names(
-        &mut twice,
-        &flavour,
-        &[0, 1, 2],
-        &said,
-        &options_with_params(&["rate"]),
-    );
+    let said = found_names(&[(0, &["/alto", "/tenor"]), (1, &["/alto", "/tenor"]), (2, &["/solo", "/tenor"])]);
+    apply_names(&mut twice, &flavour, &[0, 1, 2], &said, &options_with_params(&["rate"]));
     let rate = ["--ros-args", "-p", "rate:=1", "--"];
     let told = |index: usize| {
         let argv = &twice.nodes[index].argv;
@@ -137,23 +107,14 @@ fn each_node_of_a_second_program_of_several_nodes_has_a_name_of_its_own() {
 
 #[test]
 fn nodes_of_one_name_in_one_program_have_the_same_number() {
-    let flavour = Flavour {
-        ros: ros::flavour::Version::Ros2,
-        ..Flavour::default()
-    };
+    let flavour = Flavour { ros: ros::flavour::Version::Ros2, ..Flavour::default() };
     let mut plan = plan(&["/left/detector", "/detectors", "/detectors_2", "/odd"]);
     let said = found_names(&[
         (1, &["/left/detector", "/right/detector"]),
         (2, &["/left/detector", "/right/detector"]),
         (3, &["/odd_4711_1700000000123"]),
     ]);
-    apply_names(
-        &mut plan,
-        &flavour,
-        &[1, 2, 3],
-        &said,
-        &options_with_params(&[]),
-    );
+    apply_names(&mut plan, &flavour, &[1, 2, 3], &said, &options_with_params(&[]));
     let told = |index: usize| {
         let node: &NodeSpec = &plan.nodes[index];
         (node.name.as_str(), node.argv.join(" "))
@@ -167,10 +128,7 @@ fn nodes_of_one_name_in_one_program_have_the_same_number() {
 
 #[test]
 fn nodes_that_are_told_no_namespace_are_where_their_programs_put_them() {
-    let mut flavour = Flavour {
-        ros: ros::flavour::Version::Ros2,
-        ..Flavour::default()
-    };
+    let mut flavour = Flavour { ros: ros::flavour::Version::Ros2, ..Flavour::default() };
     let mut plan = plan(&["/see", "/front/hear", "/seen"]);
     let words = ["--ros-args", "-r", "__ns:=/front"];
     plan.nodes[1].argv.extend(words.map(str::to_owned));
@@ -178,10 +136,7 @@ fn nodes_that_are_told_no_namespace_are_where_their_programs_put_them() {
         plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
     }
     let marks = mark_nodes_without_namespace(&mut plan.clone(), &flavour);
-    let expected = [
-        ("/see", "/cloudroid_name_0"),
-        ("/seen", "/cloudroid_name_2"),
-    ];
+    let expected = [("/see", "/cloudroid_name_0"), ("/seen", "/cloudroid_name_2")];
     let expected = expected.map(|(node, mark)| (node.to_owned(), mark.to_owned()));
     assert_eq!(marks, expected.into());
     let moved = [("/see".to_owned(), "/camera/see".to_owned())];
@@ -196,25 +151,10 @@ fn nodes_that_are_told_no_namespace_are_where_their_programs_put_them() {
 
 #[test]
 fn parameters_that_no_node_of_ros_2_has_declared_are_told() {
-    let own = |name: &str| Parameter {
-        name: format!("/see/{name}"),
-        node: "/see".to_owned(),
-        ..Parameter::default()
-    };
-    let interface = Interface {
-        parameters: vec![own("rate"), own("camera.width")],
-        ..Interface::default()
-    };
-    for known in [
-        "rate",
-        "~rate",
-        "/rate",
-        "/see/rate",
-        "/see/camera/width",
-        "camera/width",
-        "camera",
-        "use_sim_time",
-    ] {
+    let own = |name: &str| Parameter { name: format!("/see/{name}"), node: "/see".to_owned(), ..Parameter::default() };
+    let interface = Interface { parameters: vec![own("rate"), own("camera.width")], ..Interface::default() };
+    for known in ["rate", "~rate", "/rate", "/see/rate", "/see/camera/width", "camera/width", "camera", "use_sim_time"]
+    {
         assert_eq!(describe_undeclared(&interface, known), None, "{known}");
     }
     for unknown in ["rat", "/see/rat", "/other/rate/x", "width"] {
@@ -240,27 +180,15 @@ fn nodes_of_ros_1_are_told_apart_by_their_namespaces() {
         .into(),
         ..Graph::default()
     };
-    let one = |name: &str, own: Option<&str>| NodeRename {
-        own: own.map(str::to_owned),
-        node: name.to_owned(),
-    };
+    let one = |name: &str, own: Option<&str>| NodeRename { own: own.map(str::to_owned), node: name.to_owned() };
     let planner = "below/planner";
     let expected = [
-        (
-            0,
-            vec![
-                one(planner, Some(planner)),
-                one("costmap_2d", Some("costmap_2d")),
-            ],
-        ),
+        (0, vec![one(planner, Some(planner)), one("costmap_2d", Some("costmap_2d"))]),
         (3, vec![one("talker", None)]),
         (5, vec![one("cpu_monitor", None)]),
     ];
     let host = "push-1-names";
-    assert_eq!(
-        names_in_graph(RosVersion::One, &graph, &[0, 3, 4, 5], host),
-        expected.into()
-    );
+    assert_eq!(names_in_graph(RosVersion::One, &graph, &[0, 3, 4, 5], host), expected.into());
 }
 
 #[test]
@@ -270,16 +198,10 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
     let graph = Graph {
         nodes: shown.map(|name| (name.to_owned(), String::new())).into(),
         enclaves: [
-            (
-                "/cloudroid_name_0",
-                names_of(&["/camera/detector", "/talker"]),
-            ),
+            ("/cloudroid_name_0", names_of(&["/camera/detector", "/talker"])),
             ("/cloudroid_name_1", names_of(&["/_worker", "/talker"])),
             ("/cloudroid_name_2", names_of(&["/push_1_names/ntp"])),
-            (
-                "/cloudroid_name_3",
-                names_of(&["/a", "/b_4711_1700000000123"]),
-            ),
+            ("/cloudroid_name_3", names_of(&["/a", "/b_4711_1700000000123"])),
             ("/other", names_of(&["/deaf"])),
         ]
         .map(|(enclave, nodes)| (enclave.to_owned(), nodes))
@@ -290,9 +212,7 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
     let told = |index: usize, all: &[usize]| {
         let mut names = names_in_graph(RosVersion::Two, &graph, all, host);
         let called = names.remove(&index).unwrap_or_default().into_iter();
-        called
-            .map(|called| (called.node, called.own.is_some()))
-            .collect::<Vec<_>>()
+        called.map(|called| (called.node, called.own.is_some())).collect::<Vec<_>>()
     };
     let all = [0, 1, 2, 3, 4];
     let own = |name: &str| (name.to_owned(), true);
@@ -302,10 +222,7 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
     assert_eq!(told(3, &all), [own("/a")]);
     assert_eq!(told(4, &all), []);
     // It ignored its mark.
-    assert_eq!(
-        told(4, &[4]),
-        [own("/camera/detector"), own("/deaf"), own("/talker")]
-    );
+    assert_eq!(told(4, &[4]), [own("/camera/detector"), own("/deaf"), own("/talker")]);
 }
 
 #[test]

@@ -19,10 +19,7 @@ pub(crate) struct RoomGuard<R = Permit> {
 
 impl<R> Clone for RoomGuard<R> {
     fn clone(&self) -> Self {
-        RoomGuard {
-            room: Arc::clone(&self.room),
-            _gone: self._gone.clone(),
-        }
+        RoomGuard { room: Arc::clone(&self.room), _gone: self._gone.clone() }
     }
 }
 
@@ -47,16 +44,8 @@ pub(crate) struct ProbeServant<R: Send + Sync + 'static = Permit> {
 }
 
 impl<R: Send + Sync + 'static> ProbeServant<R> {
-    pub(super) fn new(
-        servant: Arc<dyn ServantHandle>,
-        tasks: TaskTracker,
-        alive: RoomGuard<R>,
-    ) -> Self {
-        Self {
-            servant: Some(servant),
-            tasks,
-            alive,
-        }
+    pub(super) fn new(servant: Arc<dyn ServantHandle>, tasks: TaskTracker, alive: RoomGuard<R>) -> Self {
+        Self { servant: Some(servant), tasks, alive }
     }
 
     /// Stops the servant. If the caller is cancelled, it is stopped in the background and keeps its reservation until
@@ -140,10 +129,7 @@ mod tests {
             drop(alive);
             if is_ended {
                 let mut ending = Box::pin(probe.end());
-                assert!(
-                    ending.as_mut().now_or_never().is_none(),
-                    "it takes its time"
-                );
+                assert!(ending.as_mut().now_or_never().is_none(), "it takes its time");
                 // The push is cancelled.
                 drop(ending);
             } else {

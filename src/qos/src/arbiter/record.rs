@@ -102,12 +102,7 @@ impl<P> Record<P> {
     /// Records an output of `side` for a goal. Returns false if the output is not for the application, because the
     /// other side speaks for the node: the side that was first keeps speaking as long as it is among the active
     /// `sides`.
-    pub(crate) fn accept_output(
-        &mut self,
-        side: Responder,
-        output: usize,
-        sides: Responders,
-    ) -> bool {
+    pub(crate) fn accept_output(&mut self, side: Responder, output: usize, sides: Responders) -> bool {
         if self.kind != Kind::Goal || output == 0 {
             return true;
         }

@@ -28,8 +28,7 @@ impl<P: Clone> Governor<P> {
             // The path to the cloud keeps it in order with messages that await no answer. A call waits here: it may
             // fail before the link is back, and must not be executed after that.
             self.ask(now, id, Responder::Cloud);
-            self.arbiter
-                .replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
+            self.arbiter.replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
         }
         self.decide(now);
     }
@@ -78,26 +77,14 @@ impl<P: Clone> Governor<P> {
         }
     }
 
-    pub(super) fn give(
-        &mut self,
-        side: Responder,
-        request: Option<RequestId>,
-        channel: RequestChannel,
-        payload: P,
-    ) {
-        self.effects.push_back(Effect::Give {
-            side,
-            request,
-            channel,
-            payload,
-        });
+    pub(super) fn give(&mut self, side: Responder, request: Option<RequestId>, channel: RequestChannel, payload: P) {
+        self.effects.push_back(Effect::Give { side, request, channel, payload });
     }
 
     /// Sends the open requests to a side that has become available: calls always, inputs while they are fresh.
     pub(super) fn ask_open_requests(&mut self, now: Instant, side: Responder) {
         let is_fresh = |record: &Record<P>| !record.overdue && record.cloud != RequestLeg::LeftOut;
-        let wanted =
-            |record: &Record<P>| record.is_open() && (record.is_call() || is_fresh(record));
+        let wanted = |record: &Record<P>| record.is_open() && (record.is_call() || is_fresh(record));
         for id in self.arbiter.select(wanted) {
             self.ask(now, id, side);
         }
@@ -118,8 +105,7 @@ impl<P: Clone> Governor<P> {
         let t_max = record.deadline - record.asked_at;
         let quick = self.local_time.is_none_or(|time| 2 * time <= t_max);
         let busy = |record: &Record<P>| {
-            record.local == RequestLeg::Asked
-                && record.local_asked.is_some_and(|asked| now < asked + t_max)
+            record.local == RequestLeg::Asked && record.local_asked.is_some_and(|asked| now < asked + t_max)
         };
         if quick && self.arbiter.select(busy).is_empty() {
             self.ask(now, id, Responder::Local);

@@ -30,11 +30,7 @@ impl<P: Clone> Governor<P> {
         if let Some(metered) = &mut self.meter {
             let wanted = self.listened.contains(&metered.output);
             for meter in [&mut metered.cloud, &mut metered.delivered] {
-                if wanted {
-                    meter.start(now)
-                } else {
-                    meter.stop()
-                }
+                if wanted { meter.start(now) } else { meter.stop() }
             }
         }
     }

@@ -32,10 +32,7 @@ impl<P: Clone> Governor<P> {
             // The cloud carries it out, and its result comes when the link is back.
             RequestLeg::Lost if record.kind == Kind::Goal => return,
             RequestLeg::NotAsked | RequestLeg::Lost if !self.link && record.overdue => {
-                format!(
-                    "the link is down and did not recover within {:?}",
-                    record.deadline - record.asked_at
-                )
+                format!("the link is down and did not recover within {:?}", record.deadline - record.asked_at)
             }
             _ => return,
         };
@@ -46,11 +43,7 @@ impl<P: Clone> Governor<P> {
     pub(super) fn give_up(&mut self, request: RequestId, channel: RequestChannel, reason: String) {
         if self.arbiter.fail(request) {
             self.counts.failed += 1;
-            self.effects.push_back(Effect::Fail {
-                request,
-                channel,
-                reason,
-            });
+            self.effects.push_back(Effect::Fail { request, channel, reason });
         }
     }
 
@@ -63,11 +56,7 @@ impl<P: Clone> Governor<P> {
         if record.is_open() && (record.missed || record.is_call() || !record.overdue) {
             self.counts.failed += 1;
             let reason = "no answer arrived before the request was discarded".to_owned();
-            self.effects.push_back(Effect::Fail {
-                request,
-                channel: record.channel,
-                reason,
-            });
+            self.effects.push_back(Effect::Fail { request, channel: record.channel, reason });
         }
     }
 }

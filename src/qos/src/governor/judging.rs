@@ -14,13 +14,7 @@ use crate::sla::Measure;
 const PHASES_APART: Duration = Duration::from_millis(20);
 
 impl<P: Clone> Governor<P> {
-    pub(super) fn on_answer(
-        &mut self,
-        now: Instant,
-        side: Responder,
-        id: RequestId,
-        output: usize,
-    ) -> DeliveryVerdict {
+    pub(super) fn on_answer(&mut self, now: Instant, side: Responder, id: RequestId, output: usize) -> DeliveryVerdict {
         let sides = self.sides();
         let record = self.arbiter.get_mut(id);
         if record.is_some_and(|record| !record.accept_output(side, output, sides)) {
@@ -148,8 +142,7 @@ impl<P: Clone> Governor<P> {
             _ => None,
         };
         let newest = self.effects.iter_mut().rev().find_map(answered);
-        let Some((outcome, t)) = newest.and_then(|outcome| outcome.cloud.map(|t| (outcome, t)))
-        else {
+        let Some((outcome, t)) = newest.and_then(|outcome| outcome.cloud.map(|t| (outcome, t))) else {
             return;
         };
         if t.abs_diff(phases.total()) > PHASES_APART.max(t / 5) {

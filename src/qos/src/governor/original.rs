@@ -27,10 +27,7 @@ impl<P: Clone> Governor<P> {
 
     pub(super) fn decide(&mut self, now: Instant) {
         for event in self.decider.decide(&self.satisfaction, !self.away) {
-            let (feed, stop) = (
-                matches!(event, QosEvent::Feed(_)),
-                matches!(event, QosEvent::Stop(_)),
-            );
+            let (feed, stop) = (matches!(event, QosEvent::Feed(_)), matches!(event, QosEvent::Stop(_)));
             self.push_event(now, event);
             if feed {
                 self.ask_open_requests(now, Responder::Local);
@@ -63,9 +60,7 @@ impl<P: Clone> Governor<P> {
     /// for before.
     pub(super) fn on_local_lost(&mut self, now: Instant) {
         let reason = RequestLeg::Failed("the local original ended".into());
-        let lost = self
-            .arbiter
-            .replace_legs(Responder::Local, &RequestLeg::Asked, &reason);
+        let lost = self.arbiter.replace_legs(Responder::Local, &RequestLeg::Asked, &reason);
         for stream in &mut self.pairs {
             stream.queues[Responder::Local.index()].waiting.clear();
         }

@@ -43,19 +43,11 @@ impl<P: Clone> Governor<P> {
                 "no response time set; the local original takes over {} s after the link is lost",
                 after.as_secs_f64()
             ),
-            _ => format!(
-                "Q {:.1}, threshold {:.1}",
-                self.satisfaction.q(),
-                self.satisfaction.threshold()
-            ),
+            _ => format!("Q {:.1}, threshold {:.1}", self.satisfaction.q(), self.satisfaction.threshold()),
         };
         let who = match (self.link, self.decider.is_fed(), self.decider.state()) {
-            (true, false, _) if self.sla.is_link_based() || !self.satisfaction.wants_local() => {
-                "the cloud answers"
-            }
-            (true, false, LocalState::Missing) => {
-                "the cloud is slow, and there is no local original"
-            }
+            (true, false, _) if self.sla.is_link_based() || !self.satisfaction.wants_local() => "the cloud answers",
+            (true, false, LocalState::Missing) => "the cloud is slow, and there is no local original",
             (true, false, _) if self.sla.local == LocalPolicy::None => {
                 "the cloud is slow, the local original is disabled"
             }
@@ -66,17 +58,12 @@ impl<P: Clone> Governor<P> {
             (true, true, _) if self.sla.is_link_based() => "the cloud takes over again",
             (true, true, _) => "the cloud is slow, so both are asked and the first answer is used",
             (false, true, _) => "the link is down, the local original answers",
-            (false, false, LocalState::Missing) => {
-                "the link is down, and there is no local original: nobody answers"
-            }
+            (false, false, LocalState::Missing) => "the link is down, and there is no local original: nobody answers",
             (false, false, _) => "the link is down, the local original does not answer yet",
         };
         match self.phases.dominant() {
             Some((phase, share)) => {
-                format!(
-                    "{who} ({q}); {:.0}% of the cloud's response time is {phase}",
-                    share * 100.0
-                )
+                format!("{who} ({q}); {:.0}% of the cloud's response time is {phase}", share * 100.0)
             }
             None => format!("{who} ({q})"),
         }

@@ -39,11 +39,7 @@ impl PairState {
     }
 
     pub(super) fn describe(&self) -> String {
-        TopicPair {
-            by: Some(self.by),
-            ..self.pair.clone()
-        }
-        .to_string()
+        TopicPair { by: Some(self.by), ..self.pair.clone() }.to_string()
     }
 
     /// Returns true if the input was sent with a stamp before the node was found not to copy stamps.
@@ -53,11 +49,7 @@ impl PairState {
 
     /// Returns the time until which an overdue input may turn out to have been skipped. An input sent to a busy node is
     /// waited for until T_max after the node's last answer, and at most T_max longer than its own deadline.
-    pub(super) fn left_out_deadline<P>(
-        &self,
-        id: RequestId,
-        record: &Record<P>,
-    ) -> Option<Instant> {
+    pub(super) fn left_out_deadline<P>(&self, id: RequestId, record: &Record<P>) -> Option<Instant> {
         let t_max = record.deadline - record.asked_at;
         let passed_over = |queue: &OutstandingInputs| queue.passed_over_since(id, record.asked_at);
         let heard = self.queues.iter().filter_map(passed_over).max();
@@ -104,10 +96,7 @@ impl<P: Clone> Governor<P> {
         // Goals of ROS 2 are calls; their feedback is published on a topic.
         let of_action = topic.strip_suffix("/_action/feedback");
         if let (Some(action), Some(key @ CorrelationKey::Goal(_))) = (of_action, &key) {
-            return self
-                .arbiter
-                .find_by_key(&action.into(), key)
-                .map(|id| (id, 1));
+            return self.arbiter.find_by_key(&action.into(), key).map(|id| (id, 1));
         }
         for stream in &mut self.pairs {
             let Some(output) = stream.pair.outputs.iter().position(|name| name == topic) else {
@@ -128,8 +117,7 @@ impl<P: Clone> Governor<P> {
                     if !stamp.is_zero() && *stamp < first)
                 };
                 let counts = stream.first.is_some_and(|first| !is_of_earlier(first));
-                if let Some(unmatched) = stream.unmatched.as_mut().filter(|_| output == 0 && counts)
-                {
+                if let Some(unmatched) = stream.unmatched.as_mut().filter(|_| output == 0 && counts) {
                     *unmatched += 1;
                     stream.queues[side.index()].heard = Some(now);
                 }

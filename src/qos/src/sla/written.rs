@@ -137,13 +137,7 @@ impl RawSla {
         }
         if let Some(stop) = &self.safe_stop {
             check_absolute("safe_stop.topic", &stop.topic)?;
-            if stop
-                .type_name
-                .split('/')
-                .filter(|part| !part.is_empty())
-                .count()
-                != 2
-            {
+            if stop.type_name.split('/').filter(|part| !part.is_empty()).count() != 2 {
                 return Err(SlaError::new(
                     "safe_stop.type",
                     format!("{:?} is not written as package/Type", stop.type_name),
@@ -195,10 +189,7 @@ impl RawMeasure {
                     t_desire: frame_interval("measure.frames_per_second.desire", rate.desire)?,
                     t_max: frame_interval("measure.frames_per_second.min", rate.min)?,
                 };
-                let measure = Measure::FramesPerSecond {
-                    output: rate.output,
-                    over: rate.over,
-                };
+                let measure = Measure::FramesPerSecond { output: rate.output, over: rate.over };
                 Ok((measure, times))
             }
             Self::Age(age) => {
@@ -211,19 +202,13 @@ impl RawMeasure {
                         format!("{max:?} is below desire ({desire:?}); raise it"),
                     ));
                 }
-                let times = Times {
-                    t_desire: desire,
-                    t_max: max,
-                };
+                let times = Times { t_desire: desire, t_max: max };
                 Ok((Measure::Age { output: age.output }, times))
             }
             Self::Link(link) => {
                 let after = link.after.duration();
                 // Requests wait as long as their callers do.
-                let times = Times {
-                    t_desire: LONGEST,
-                    t_max: LONGEST,
-                };
+                let times = Times { t_desire: LONGEST, t_max: LONGEST };
                 Ok((Measure::Link { after }, times))
             }
         }
@@ -253,10 +238,7 @@ fn check_absolute(field: &str, topic: &str) -> Result<(), SlaError> {
     if topic.len() > 1 && topic.starts_with('/') {
         return Ok(());
     }
-    Err(SlaError::new(
-        field,
-        format!("{topic:?} is not an absolute topic name; begin it with a slash"),
-    ))
+    Err(SlaError::new(field, format!("{topic:?} is not an absolute topic name; begin it with a slash")))
 }
 
 /// Checks a topic name that may be empty, which stands for the output that answers the first detected request.
@@ -280,8 +262,5 @@ fn check_positive(field: &str, value: f64) -> Result<(), SlaError> {
     if value.is_finite() && value > 0.0 && (4.0 * value).is_normal() {
         return Ok(());
     }
-    Err(SlaError::new(
-        field,
-        format!("{value} is not a positive number"),
-    ))
+    Err(SlaError::new(field, format!("{value} is not a positive number")))
 }

@@ -21,41 +21,26 @@ impl ComponentWorld {
     }
 
     /// Creates a servant in which nodes are already running.
-    fn with_nodes(
-        system: Arc<MemorySystem>,
-        plugins: &[&str],
-        started: StubNodesDouble,
-        patience: Duration,
-    ) -> Self {
+    fn with_nodes(system: Arc<MemorySystem>, plugins: &[&str], started: StubNodesDouble, patience: Duration) -> Self {
         let component = |plugin: &&str| Component {
             package: "talk".to_owned(),
             plugin: (*plugin).to_owned(),
             ..Component::default()
         };
         let components = plugins.iter().map(component).collect();
-        let wanted = ComponentPlan {
-            patience,
-            ..ComponentPlan::new([("/box".to_owned(), components)].into(), registry())
-        };
+        let wanted =
+            ComponentPlan { patience, ..ComponentPlan::new([("/box".to_owned(), components)].into(), registry()) };
         let events = Arc::<RecordedEvents>::default();
         let bus: Arc<dyn Bus> = system.join("/cloudroid_bridge");
-        let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) =
-            (Arc::new(started), events.clone());
+        let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) = (Arc::new(started), events.clone());
         let components = ComponentLoader::start(&bus, &nodes, &observer, wanted);
-        Self {
-            system,
-            events,
-            components: components.expect("something is loaded"),
-        }
+        Self { system, events, components: components.expect("something is loaded") }
     }
 
     /// Waits until the container is past loading and returns its state.
     async fn load(&self) -> ContainerLoad {
         let mut loads = self.components.loads();
-        let over = |all: &Loads| {
-            all.get("/box")
-                .is_some_and(|it| *it != ContainerLoad::Loading)
-        };
+        let over = |all: &Loads| all.get("/box").is_some_and(|it| *it != ContainerLoad::Loading);
         let all = timeout(LONG, loads.wait_for(over)).await.expect("in time");
         all.expect("followed")["/box"].clone()
     }
@@ -66,32 +51,17 @@ async fn what_the_revision_loads_is_loaded_when_its_container_appears() {
     let world = ComponentWorld::new(&["talk::Talker"], StubNodesDouble::default(), LONG);
     assert!(world.components.loads().borrow().is_empty());
     let container = MemoryContainer::start(&world.system, "/box").await;
-    assert_eq!(
-        world.load().await,
-        ContainerLoad::Loaded(vec!["/talker".to_owned()])
-    );
+    assert_eq!(world.load().await, ContainerLoad::Loaded(vec!["/talker".to_owned()]));
     assert_eq!(container.names(), ["/talker"]);
     // The daemon was restarted while the servant went on.
-    let again = ComponentWorld::with_nodes(
-        world.system.clone(),
-        &["talk::Talker"],
-        StubNodesDouble::default(),
-        LONG,
-    );
-    assert_eq!(
-        again.load().await,
-        ContainerLoad::Loaded(vec!["/talker".to_owned()])
-    );
+    let again = ComponentWorld::with_nodes(world.system.clone(), &["talk::Talker"], StubNodesDouble::default(), LONG);
+    assert_eq!(again.load().await, ContainerLoad::Loaded(vec!["/talker".to_owned()]));
     assert_eq!(container.loaded.lock().asked.len(), 1, "it was there");
 }
 
 #[tokio::test]
 async fn what_is_not_loaded_is_an_event_with_the_containers_words() {
-    let world = ComponentWorld::new(
-        &["talk::Talker", "talk::Walker"],
-        StubNodesDouble::default(),
-        LONG,
-    );
+    let world = ComponentWorld::new(&["talk::Talker", "talk::Walker"], StubNodesDouble::default(), LONG);
     let _container = MemoryContainer::start(&world.system, "/box").await;
     let words = "the component container /box does not load talk::Walker of package talk: Failed to find class with \
                  the \
@@ -109,10 +79,7 @@ async fn a_container_that_serves_nothing_is_told_with_how_long_was_waited() {
     let ContainerLoad::Refused(words) = world.load().await else {
         panic!("it loads nothing");
     };
-    assert!(
-        words.contains("did not serve /box/_container/load_node within 100ms"),
-        "{words}"
-    );
+    assert!(words.contains("did not serve /box/_container/load_node within 100ms"), "{words}");
 }
 
 #[tokio::test]

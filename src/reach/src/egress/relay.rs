@@ -42,18 +42,12 @@ impl Relays {
                 }
             }
         }
-        Relays {
-            _listeners: listeners,
-        }
+        Relays { _listeners: listeners }
     }
 }
 
 async fn relay_connections(listener: TcpListener, route: Route) {
-    let far = Arc::new(RelayTarget {
-        route,
-        told: Mutex::default(),
-        told_full: AtomicBool::new(false),
-    });
+    let far = Arc::new(RelayTarget { route, told: Mutex::default(), told_full: AtomicBool::new(false) });
     let room = Arc::new(Semaphore::new(CONNECTIONS));
     // Aborted together with the listener.
     let mut connections = JoinSet::new();
@@ -172,11 +166,7 @@ mod tests {
     async fn a_wildcard_never_reaches_this_machine() {
         // Another notation of 127.0.0.1 that only the resolver understands.
         for host in ["localhost", "127.1"] {
-            assert_eq!(
-                fetch_through_relay(host, |port| format!("*:{port}")).await,
-                "",
-                "{host}"
-            );
+            assert_eq!(fetch_through_relay(host, |port| format!("*:{port}")).await, "", "{host}");
         }
     }
 
@@ -217,11 +207,7 @@ mod tests {
 
     #[tokio::test]
     async fn this_machine_is_reached_where_it_is_named() {
-        for (host, named) in [
-            ("localhost", "localhost"),
-            ("127.0.0.1", "127.0.0.1"),
-            ("127.0.0.1", "127.0.0.0/8"),
-        ] {
+        for (host, named) in [("localhost", "localhost"), ("127.0.0.1", "127.0.0.1"), ("127.0.0.1", "127.0.0.0/8")] {
             let heard = fetch_through_relay(host, |port| format!("{named}:{port}")).await;
             assert_eq!(heard, "of the host", "{host} by {named}");
         }

@@ -47,10 +47,7 @@ impl ActionEndpoint {
     }
 
     pub(super) fn is_service(self) -> bool {
-        matches!(
-            self,
-            ActionEndpoint::SendGoal | ActionEndpoint::CancelGoal | ActionEndpoint::GetResult
-        )
+        matches!(self, ActionEndpoint::SendGoal | ActionEndpoint::CancelGoal | ActionEndpoint::GetResult)
     }
 
     /// Returns the type of the ROS 1 topic for an action of this type.

@@ -18,9 +18,9 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, CallFate, Digest, FailureReason, GoalEnd, GoalError, GoalEvents,
-    GoalOutcome, MatchedPeers, MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType,
-    Subscription, TopicPeer, WireType, message_queue,
+    ActionClient, BusError, CallFate, Digest, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, MatchedPeers,
+    MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType, Subscription, TopicPeer, WireType,
+    message_queue,
 };
 use ros::ros2::actions::ActionInterfaces;
 use ros::ros2::actions::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
@@ -69,12 +69,7 @@ struct Listeners {
 
 impl GoalTopics {
     fn build_message(&self, of: &Arc<WireType>, bytes: Bytes, latching: bool) -> SerializedMessage {
-        SerializedMessage {
-            bytes,
-            wire_type: Arc::clone(of),
-            publisher: self.node.clone(),
-            latching,
-        }
+        SerializedMessage { bytes, wire_type: Arc::clone(of), publisher: self.node.clone(), latching }
     }
 }
 
@@ -90,9 +85,7 @@ impl Listeners {
 impl GoalServerTopics for GoalTopics {
     fn publish_feedback(&self, message: Bytes) {
         let message = self.build_message(&self.feedback, message, false);
-        self.state
-            .lock()
-            .publish(ActionEndpoint::Feedback, &message);
+        self.state.lock().publish(ActionEndpoint::Feedback, &message);
     }
 
     fn publish_status(&self, message: Bytes) {
@@ -123,11 +116,7 @@ impl ActionParts {
         let goals = GoalServer::new(name, of, published, budget.clone());
         let forgets = Arc::clone(&goals);
         let forgetting = tokio::spawn(async move { forgets.expire_results().await });
-        let peer = TopicPeer {
-            id: node.clone(),
-            connected: true,
-            offer: None,
-        };
+        let peer = TopicPeer { id: node.clone(), connected: true, offer: None };
         Ok(Arc::new(ActionParts {
             parts,
             node,
@@ -136,10 +125,7 @@ impl ActionParts {
             budget: budget.clone(),
             canceling: Mutex::default(),
             notices: notices.clone(),
-            matched: watch::Sender::new(MatchedPeers {
-                peers: vec![peer],
-                refused: Vec::new(),
-            }),
+            matched: watch::Sender::new(MatchedPeers { peers: vec![peer], refused: Vec::new() }),
             _forgetting: AbortOnDropHandle::new(forgetting),
         }))
     }
@@ -176,11 +162,7 @@ impl ActionParts {
         }
         let (sender, messages) = message_queue(qos.depth);
         let mut state = self.goals.topics().state.lock();
-        if let Some(status) = state
-            .status
-            .as_ref()
-            .filter(|_| end == ActionEndpoint::Status && qos.is_latching())
-        {
+        if let Some(status) = state.status.as_ref().filter(|_| end == ActionEndpoint::Status && qos.is_latching()) {
             sender.send(status.clone());
         }
         state.all.push((end, sender));
@@ -217,10 +199,7 @@ impl ActionParts {
                 _ => Ok(self.goals.result(&request).await),
             }
         };
-        let late = |_| BusError::Timeout {
-            what: format!("service {name}"),
-            after: patience,
-        };
+        let late = |_| BusError::Timeout { what: format!("service {name}"), after: patience };
         timeout(patience, answer).await.map_err(late)?
     }
 
@@ -255,15 +234,12 @@ impl ActionParts {
             answer: Mutex::new(Some(answer)),
             permit: Mutex::new(Some(permit)),
         };
-        self.client
-            .send_goal_with_events(&id, goal, Arc::new(events));
+        self.client.send_goal_with_events(&id, goal, Arc::new(events));
         match answered.await {
             Ok(Ok(answer)) => Ok(answer),
-            Ok(Err(reason)) => Err(BusError::CallFailed {
-                service: name.to_owned(),
-                reason: reason.into(),
-                fate: CallFate::Unknown,
-            }),
+            Ok(Err(reason)) => {
+                Err(BusError::CallFailed { service: name.to_owned(), reason: reason.into(), fate: CallFate::Unknown })
+            }
             Err(_) => Err(BusError::Closed),
         }
     }
@@ -288,9 +264,7 @@ impl ActionParts {
         });
         let asked: Vec<_> = asked.collect();
         let ends: Vec<String> = join_all(asked).await.into_iter().flatten().collect();
-        let canceled = self
-            .goals
-            .cancel(&wanted, |id| ends.iter().any(|it| it == id));
+        let canceled = self.goals.cancel(&wanted, |id| ends.iter().any(|it| it == id));
         canceled.answer
     }
 
@@ -361,8 +335,7 @@ impl GoalEvents for PartsGoalEvents {
             "its node did not accept it when it was free for it".clone_into(&mut why);
         }
         if !why.is_empty() {
-            self.parts
-                .notify_robot(&format!("goal {} ended: {why}", self.id));
+            self.parts.notify_robot(&format!("goal {} ended: {why}", self.id));
         }
         if refused {
             return self.answer_once(|| match outcome {
@@ -371,19 +344,14 @@ impl GoalEvents for PartsGoalEvents {
             });
         }
         goals.end_goal(&self.id, &end);
-        self.parts
-            .resolve_cancel(&self.id, outcome == Some(GoalOutcome::Canceled));
+        self.parts.resolve_cancel(&self.id, outcome == Some(GoalOutcome::Canceled));
         // The sender learns of the end from the result.
         self.answer_once(|| Ok(goals.answer(&self.begun, true)));
     }
 }
 
 fn aborted_end() -> GoalEnd {
-    GoalEnd {
-        outcome: GoalOutcome::Aborted,
-        text: String::new(),
-        result: Bytes::new(),
-    }
+    GoalEnd { outcome: GoalOutcome::Aborted, text: String::new(), result: Bytes::new() }
 }
 
 impl GroupEvents for PartsGoalEvents {

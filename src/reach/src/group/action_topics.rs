@@ -14,9 +14,8 @@ use budget::{Budget, Exceeded, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, MatchedPeers,
-    MessageSender, PeerId, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription,
-    TopicPeer, WireType, message_queue,
+    ActionClient, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome, MatchedPeers, MessageSender, PeerId,
+    Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, TopicPeer, WireType, message_queue,
 };
 use ros::codec::Time;
 use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
@@ -96,18 +95,11 @@ impl ActionTopics {
         let types = types.map(|(end, topic)| {
             let type_name = end.type_name(&of.name);
             let found = registry.message(&type_name);
-            let found = found.map_err(|error| BusError::Protocol {
-                what: topic,
-                reason: error.to_string(),
-            })?;
+            let found = found.map_err(|error| BusError::Protocol { what: topic, reason: error.to_string() })?;
             Ok((end, Arc::new(WireType::from_message(&found))))
         });
         let node = PeerId::from(node);
-        let peer = TopicPeer {
-            id: node.clone(),
-            connected: true,
-            offer: None,
-        };
+        let peer = TopicPeer { id: node.clone(), connected: true, offer: None };
         Ok(Arc::new(ActionTopics {
             name: name.to_owned(),
             of: Arc::clone(of),
@@ -116,10 +108,7 @@ impl ActionTopics {
             client: GroupClient::new(group, robot, name, of),
             state: Mutex::default(),
             budget: budget.clone(),
-            matched: watch::Sender::new(MatchedPeers {
-                peers: vec![peer],
-                refused: Vec::new(),
-            }),
+            matched: watch::Sender::new(MatchedPeers { peers: vec![peer], refused: Vec::new() }),
             numbers: Default::default(),
         }))
     }
@@ -175,10 +164,7 @@ impl ActionTopics {
         of: &WireType,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.check_type(end, of)?;
-        Ok(Box::new(ClientTopicPublisher {
-            topics: Arc::clone(self),
-            end,
-        }))
+        Ok(Box::new(ClientTopicPublisher { topics: Arc::clone(self), end }))
     }
 
     fn publish_to_listeners(&self, state: &mut State, end: ActionEndpoint, bytes: Bytes) {
@@ -188,9 +174,7 @@ impl ActionTopics {
             publisher: self.node.clone(),
             latching: false,
         };
-        state
-            .listeners
-            .retain(|(_, listener)| !listener.is_closed());
+        state.listeners.retain(|(_, listener)| !listener.is_closed());
         for (_, listener) in state.listeners.iter().filter(|(of, _)| *of == end) {
             listener.send(message.clone());
         }
@@ -212,27 +196,17 @@ impl ActionTopics {
             return;
         };
         if goal.id.is_empty() {
-            let number = self
-                .numbers
-                .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            let number = self.numbers.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
             goal.id = format!("{}-{number}", self.name);
         }
         if goal.id.len() > LONGEST_ID {
-            tracing::debug!(
-                "a goal of {} has an id of {} bytes",
-                self.name,
-                goal.id.len()
-            );
+            tracing::debug!("a goal of {} has an id of {} bytes", self.name, goal.id.len());
             return;
         }
         let id = goal.id.clone();
         {
             let mut state = self.state.lock();
-            if state
-                .goals
-                .get(&id)
-                .is_some_and(|goal| goal.ended.is_none())
-            {
+            if state.goals.get(&id).is_some_and(|goal| goal.ended.is_none()) {
                 tracing::debug!("a goal of {} has the id of another, {id}", self.name);
                 return;
             }
@@ -245,21 +219,13 @@ impl ActionTopics {
                 Err(rejection) => (None, Some(rejection.to_string())),
             };
             let known = TopicGoal {
-                state: GoalState {
-                    goal,
-                    status: ActionlibStatus::Active,
-                    text: String::new(),
-                },
+                state: GoalState { goal, status: ActionlibStatus::Active, text: String::new() },
                 permit,
                 ended: None,
             };
             state.goals.insert(id.clone(), known);
             if let Some(text) = refused {
-                let end = GoalEnd {
-                    outcome: GoalOutcome::Rejected,
-                    text,
-                    result: self.empty_result(),
-                };
+                let end = GoalEnd { outcome: GoalOutcome::Rejected, text, result: self.empty_result() };
                 return self.record_end(&mut state, &id, end);
             }
             self.publish_status(&mut state);
@@ -338,18 +304,12 @@ impl State {
     fn check_capacity(&self) -> Result<(), GoalRejection> {
         let goals = self.goals.values();
         let count = goals.filter(|goal| goal.ended.is_none()).count();
-        if count < GOALS {
-            Ok(())
-        } else {
-            Err(GoalRejection::TooMany(count))
-        }
+        if count < GOALS { Ok(()) } else { Err(GoalRejection::TooMany(count)) }
     }
 
     /// Forgets the oldest ended goals if there are too many.
     fn prune_ended(&mut self) {
-        let ended = |goals: &HashMap<String, TopicGoal>| {
-            goals.values().filter(|goal| goal.ended.is_some()).count()
-        };
+        let ended = |goals: &HashMap<String, TopicGoal>| goals.values().filter(|goal| goal.ended.is_some()).count();
         while ended(&self.goals) > ENDED {
             let over = self.goals.iter();
             let over = over.filter_map(|(id, goal)| Some((goal.ended?, id)));
@@ -370,11 +330,7 @@ async fn publish_status_periodically(topics: Weak<ActionTopics>) {
         };
         let mut state = topics.state.lock();
         topics.publish_status(&mut state);
-        if !state
-            .listeners
-            .iter()
-            .any(|(end, _)| *end == ActionEndpoint::Status)
-        {
+        if !state.listeners.iter().any(|(end, _)| *end == ActionEndpoint::Status) {
             state.ticking = false;
             return;
         }
@@ -416,8 +372,7 @@ impl GoalEvents for TopicsGoalEvents {
             return;
         };
         let bytes = messages::write_state(Time::now(), &known.state, &feedback);
-        self.topics
-            .publish_to_listeners(&mut state, ActionEndpoint::Feedback, bytes);
+        self.topics.publish_to_listeners(&mut state, ActionEndpoint::Feedback, bytes);
     }
 
     fn on_ended(&self, end: Result<GoalEnd, GoalError>) {

@@ -10,9 +10,8 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    NodeParameters, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
-    WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, NodeParameters,
+    Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::watch;
@@ -69,10 +68,7 @@ impl GroupBus {
     }
 
     /// Returns the action and part to which a service belongs; `None` for a regular service.
-    fn find_action_service(
-        &self,
-        service: &str,
-    ) -> Result<Option<(ActionEndpoint, Arc<ActionParts>)>, BusError> {
+    fn find_action_service(&self, service: &str) -> Result<Option<(ActionEndpoint, Arc<ActionParts>)>, BusError> {
         let view = self.view();
         let Some((action, end)) = view.find_action_service(service) else {
             return Ok(None);
@@ -91,28 +87,16 @@ impl GroupBus {
             return Ok(known.clone());
         }
         let of = self.registry.action(&action.type_name);
-        let of = of.map_err(|error| BusError::Protocol {
-            what: format!("action {name}"),
-            reason: error.to_string(),
-        })?;
+        let of =
+            of.map_err(|error| BusError::Protocol { what: format!("action {name}"), reason: error.to_string() })?;
         let (group, names) = (&self.group, (&**name, &**node));
         let made = match group.ros {
-            RosVersion::One => ActionBackend::One(ActionTopics::new(
-                group,
-                self.robot,
-                names,
-                &of,
-                &self.registry,
-                &self.budget,
-            )?),
-            RosVersion::Two => ActionBackend::Two(ActionParts::new(
-                group,
-                self.robot,
-                names,
-                &of,
-                &self.budget,
-                &self.notices,
-            )?),
+            RosVersion::One => {
+                ActionBackend::One(ActionTopics::new(group, self.robot, names, &of, &self.registry, &self.budget)?)
+            }
+            RosVersion::Two => {
+                ActionBackend::Two(ActionParts::new(group, self.robot, names, &of, &self.budget, &self.notices)?)
+            }
         };
         actions.insert(key, made.clone());
         Ok(made)
@@ -152,9 +136,7 @@ impl GroupBus {
             stays
         });
         self.graph.send_modify(|graph| {
-            let next = self
-                .group
-                .build_graph(&view, &self.registry, graph.generation + 1);
+            let next = self.group.build_graph(&view, &self.registry, graph.generation + 1);
             *graph = Arc::new(next);
         });
         *now = Arc::new(view);
@@ -164,10 +146,7 @@ impl GroupBus {
 impl Drop for GroupBus {
     /// Goals outlive their senders, or their results would be lost with a connection, but not their robot's place.
     fn drop(&mut self) {
-        self.actions
-            .get_mut()
-            .values()
-            .for_each(|action| action.cancel_all());
+        self.actions.get_mut().values().for_each(|action| action.cancel_all());
     }
 }
 
@@ -181,9 +160,7 @@ impl ServantGroup {
         budget: &Budget,
         notices: &Notices,
     ) -> (Arc<GroupBus>, Arc<GroupBus>) {
-        let robot = self
-            .robots
-            .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        let robot = self.robots.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         let bus = |view: &Arc<GroupView>, generation| {
             let graph = self.build_graph(view, registry, generation);
             Arc::new(GroupBus {
@@ -202,11 +179,7 @@ impl ServantGroup {
 
     /// Creates the first of the two buses.
     #[cfg(test)]
-    pub(super) fn create_bus(
-        self: &Arc<Self>,
-        registry: &Arc<Registry>,
-        budget: &Budget,
-    ) -> Arc<dyn Bus> {
+    pub(super) fn create_bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
         let (notices, _) = tokio::sync::mpsc::unbounded_channel();
         self.create_buses(registry, budget, &notices).0
     }
@@ -216,10 +189,7 @@ impl ServantGroup {
             RosVersion::One => Default::default(),
             RosVersion::Two => node_ends::collect_node_ends(view, &self.interface, registry),
         };
-        Graph {
-            ends,
-            ..view.graph(self.ros, generation)
-        }
+        Graph { ends, ..view.graph(self.ros, generation) }
     }
 
     fn find_service(&self, name: &str) -> Option<&package::interface::Service> {
@@ -252,32 +222,18 @@ impl Bus for GroupBus {
         self.graph.subscribe()
     }
 
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError> {
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
         match self.find_topic(topic)? {
-            (end, ActionBackend::One(topics)) if !end.is_published_by_clients() => {
-                topics.subscribe(end, &of, qos)
-            }
+            (end, ActionBackend::One(topics)) if !end.is_published_by_clients() => topics.subscribe(end, &of, qos),
             (end, ActionBackend::Two(parts)) => parts.subscribe(end, &of, qos),
             // Contains goals of others.
             _ => Err(BusError::NotShared(format!("listening to {topic}"))),
         }
     }
 
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        _qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError> {
+    async fn advertise(&self, topic: &str, of: WireType, _qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
         match self.find_topic(topic)? {
-            (end, ActionBackend::One(topics)) if end.is_published_by_clients() => {
-                topics.advertise(end, &of)
-            }
+            (end, ActionBackend::One(topics)) if end.is_published_by_clients() => topics.advertise(end, &of),
             _ => Err(BusError::NotShared(format!("publishing {topic}"))),
         }
     }
@@ -294,9 +250,7 @@ impl Bus for GroupBus {
         }
         let known = self.find_service(service)?;
         let group = &self.group;
-        group
-            .call(self.robot, &known.name, digest, request, timeout)
-            .await
+        group.call(self.robot, &known.name, digest, request, timeout).await
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
@@ -309,11 +263,7 @@ impl Bus for GroupBus {
             let servant = servant.ok_or_else(|| BusError::NoService(service.to_owned()))?;
             return servant.bus.service_type(&known.name).await;
         }
-        Ok(node_ends::service_type(
-            self.group.ros,
-            known,
-            &self.registry,
-        ))
+        Ok(node_ends::service_type(self.group.ros, known, &self.registry))
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
@@ -332,11 +282,7 @@ impl Bus for GroupBus {
         Err(BusError::NotShared(format!("serving {service}")))
     }
 
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError> {
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         let view = self.view();
         let Some(known) = view.actions.get(action) else {
             return Err(BusError::NotShared(format!("action {action}")));

@@ -225,10 +225,8 @@ impl Dispatcher {
     pub fn leave(&mut self, member: Member) -> Vec<DispatchOrder> {
         self.servants.remove(&member);
         let had = self.requests.iter();
-        let had: Vec<Ticket> = had
-            .filter(|(_, request)| request.at.contains(&member))
-            .map(|(ticket, _)| *ticket)
-            .collect();
+        let had: Vec<Ticket> =
+            had.filter(|(_, request)| request.at.contains(&member)).map(|(ticket, _)| *ticket).collect();
         let mut orders = Vec::new();
         for ticket in had.into_iter().rev() {
             orders.push(DispatchOrder::Drop(ticket, member));
@@ -243,12 +241,7 @@ impl Dispatcher {
         self.tickets += 1;
         let ticket = self.tickets;
         let lane = self.lane_for(kind);
-        let request = QueuedRequest {
-            robot,
-            lane,
-            at: BTreeSet::new(),
-            lost: 0,
-        };
+        let request = QueuedRequest { robot, lane, at: BTreeSet::new(), lost: 0 };
         self.requests.insert(ticket, request);
         let queue = self.waiting.entry((robot, lane)).or_default();
         queue.push_back(ticket);
@@ -274,11 +267,7 @@ impl Dispatcher {
             AttemptOutcome::Answered => {
                 let mut others = self.remove(ticket);
                 others.remove(&member);
-                orders.extend(
-                    others
-                        .into_iter()
-                        .map(|other| DispatchOrder::Drop(ticket, other)),
-                );
+                orders.extend(others.into_iter().map(|other| DispatchOrder::Drop(ticket, other)));
             }
             AttemptOutcome::NotTaken => {
                 self.pause(member, lane);
@@ -305,9 +294,7 @@ impl Dispatcher {
     /// Withdraws a request for whose response nobody waits any more.
     pub fn withdraw(&mut self, ticket: Ticket) -> Vec<DispatchOrder> {
         let at = self.remove(ticket).into_iter();
-        let mut orders: Vec<DispatchOrder> = at
-            .map(|member| DispatchOrder::Drop(ticket, member))
-            .collect();
+        let mut orders: Vec<DispatchOrder> = at.map(|member| DispatchOrder::Drop(ticket, member)).collect();
         orders.extend(self.dispatch_waiting());
         orders
     }
@@ -315,10 +302,7 @@ impl Dispatcher {
     /// Returns the current load.
     pub fn load(&self) -> GroupLoad {
         let waiting = self.waiting.values().map(VecDeque::len).sum();
-        GroupLoad {
-            waiting,
-            under_way: self.requests.len() - waiting,
-        }
+        GroupLoad { waiting, under_way: self.requests.len() - waiting }
     }
 
     /// Returns the number of requests a servant is working on.
@@ -418,20 +402,11 @@ impl Dispatcher {
             .map(|(member, servant)| (*member, servant))
             .collect();
         let is_call = self.calls.contains(&lane);
-        let wanted = if is_call {
-            self.rules.replicas.min(open.len())
-        } else {
-            1
-        };
+        let wanted = if is_call { self.rules.replicas.min(open.len()) } else { 1 };
         if is_call {
             open.retain(|(_, servant)| servant.calls < self.rules.window);
         } else {
-            let of = |servant: &ServantState| {
-                servant
-                    .goals
-                    .get(&lane)
-                    .map(|goals| (goals.robot, goals.ahead))
-            };
+            let of = |servant: &ServantState| servant.goals.get(&lane).map(|goals| (goals.robot, goals.ahead));
             let own = open.iter().find_map(|(member, servant)| {
                 let (has, ahead) = of(servant)?;
                 (has == robot).then_some((*member, ahead))
@@ -459,10 +434,7 @@ impl Dispatcher {
     }
 
     fn has_servant(&self, robot: RobotNumber, lane: Lane) -> bool {
-        let mut open = self
-            .servants
-            .values()
-            .filter(|servant| servant.is_available(lane));
+        let mut open = self.servants.values().filter(|servant| servant.is_available(lane));
         open.any(|servant| servant.goals.get(&lane).is_some_and(|of| of.robot == robot))
     }
 
@@ -470,9 +442,7 @@ impl Dispatcher {
     fn dispatch_waiting(&mut self) -> Vec<DispatchOrder> {
         let mut orders = Vec::new();
         let mut turns = std::mem::take(&mut self.turns);
-        while let Some(key) =
-            turns.take(|(robot, lane)| !self.pick_servants(*robot, *lane).is_empty())
-        {
+        while let Some(key) = turns.take(|(robot, lane)| !self.pick_servants(*robot, *lane).is_empty()) {
             let places = self.pick_servants(key.0, key.1);
             let queue = self.waiting.get_mut(&key);
             let Some(ticket) = queue.and_then(VecDeque::pop_front) else {
@@ -493,12 +463,7 @@ impl Dispatcher {
         orders
     }
 
-    fn start_attempt(
-        &mut self,
-        ticket: Ticket,
-        (robot, lane): (RobotNumber, Lane),
-        member: Member,
-    ) {
+    fn start_attempt(&mut self, ticket: Ticket, (robot, lane): (RobotNumber, Lane), member: Member) {
         if let Some(request) = self.requests.get_mut(&ticket) {
             request.at.insert(member);
         }
@@ -509,11 +474,7 @@ impl Dispatcher {
                 servant.calls += 1;
                 return;
             }
-            let goals = servant.goals.entry(lane).or_insert(ServantGoals {
-                robot,
-                count: 0,
-                ahead: 0,
-            });
+            let goals = servant.goals.entry(lane).or_insert(ServantGoals { robot, count: 0, ahead: 0 });
             // The first goal was its regular turn.
             goals.ahead += usize::from(others && goals.count > 0);
             goals.count += 1;

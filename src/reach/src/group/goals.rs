@@ -11,9 +11,7 @@ use futures_util::StreamExt;
 use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
 use parking_lot::Mutex;
-use ros::bus::{
-    ActionClient, BusError, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome,
-};
+use ros::bus::{ActionClient, BusError, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 use ros::codec::default_message;
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
@@ -71,12 +69,7 @@ pub(super) struct GroupClient {
 }
 
 impl GroupClient {
-    pub(super) fn new(
-        group: &Arc<ServantGroup>,
-        robot: RobotNumber,
-        name: &str,
-        of: &Arc<ActionDef>,
-    ) -> GroupClient {
+    pub(super) fn new(group: &Arc<ServantGroup>, robot: RobotNumber, name: &str, of: &Arc<ActionDef>) -> GroupClient {
         GroupClient {
             group: Arc::clone(group),
             robot,
@@ -88,37 +81,25 @@ impl GroupClient {
     }
 
     /// Sends a goal like [`ActionClient::send_goal`], with the events of a group.
-    pub(super) fn send_goal_with_events(
-        &self,
-        id: &str,
-        goal: Bytes,
-        events: Arc<dyn GroupEvents>,
-    ) {
+    pub(super) fn send_goal_with_events(&self, id: &str, goal: Bytes, events: Arc<dyn GroupEvents>) {
         let (wishes, wished) = watch::channel(0);
         {
             let mut goals = self.goals.lock();
             let refused = match goals.len() {
                 _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
-                MOST.. => Some(format!(
-                    "{MOST} goals of this robot have not ended; wait for one of them"
-                )),
+                MOST.. => Some(format!("{MOST} goals of this robot have not ended; wait for one of them")),
                 _ => None,
             };
             if let Some(text) = refused {
-                let end = GoalEnd {
-                    outcome: GoalOutcome::Rejected,
-                    text,
-                    result: default_message(&self.of.result).into(),
-                };
+                let end =
+                    GoalEnd { outcome: GoalOutcome::Rejected, text, result: default_message(&self.of.result).into() };
                 // In a task, because the sender may hold a lock that the receiver needs.
                 tokio::spawn(async move { events.on_ended(Ok(end)) });
                 return;
             }
             goals.insert(id.to_owned(), wishes);
         }
-        let errand = self
-            .group
-            .begin_request(self.robot, Kind::Goal(Arc::clone(&self.name)));
+        let errand = self.group.begin_request(self.robot, Kind::Goal(Arc::clone(&self.name)));
         let goal = GroupGoal {
             // Robots, and nodes of one robot, choose ids independently.
             id: format!("{}-{id}", errand.ticket),
@@ -149,13 +130,9 @@ impl ActionClient for GroupClient {
             loop {
                 let now = members.borrow_and_update().clone();
                 // A servant that is going away returns an error; others may still answer.
-                let clients = now
-                    .values()
-                    .filter_map(|servant| servant.action(&self.name, &self.of).ok());
+                let clients = now.values().filter_map(|servant| servant.action(&self.name, &self.of).ok());
                 let clients: Vec<_> = clients.collect();
-                let opened = clients
-                    .iter()
-                    .map(|client| client.wait_for_server(patience));
+                let opened = clients.iter().map(|client| client.wait_for_server(patience));
                 let mut opened: FuturesUnordered<_> = opened.collect();
                 tokio::select! {
                     Some(ready) = opened.next() => return ready,
@@ -163,12 +140,9 @@ impl ActionClient for GroupClient {
                 }
             }
         };
-        timeout(patience, any).await.unwrap_or_else(|_| {
-            Err(BusError::Timeout {
-                what: format!("action {}", self.name),
-                after: patience,
-            })
-        })
+        timeout(patience, any)
+            .await
+            .unwrap_or_else(|_| Err(BusError::Timeout { what: format!("action {}", self.name), after: patience }))
     }
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
@@ -235,8 +209,7 @@ impl GoalEvents for GoalUpdateSender {
 }
 
 /// An attempt to connect to a servant for the goal.
-type SendAttempt =
-    BoxFuture<'static, (Arc<MemberServant>, Result<Arc<dyn ActionClient>, BusError>)>;
+type SendAttempt = BoxFuture<'static, (Arc<MemberServant>, Result<Arc<dyn ActionClient>, BusError>)>;
 
 impl GroupGoal {
     /// Follows the goal from its request to its end.
@@ -355,12 +328,7 @@ impl GroupGoal {
         }
     }
 
-    fn fail_goal(
-        &self,
-        group: &ServantGroup,
-        last: Option<&MemberServant>,
-        why: LossReason,
-    ) -> GoalError {
+    fn fail_goal(&self, group: &ServantGroup, last: Option<&MemberServant>, why: LossReason) -> GoalError {
         group.counts.failed.fetch_add(1, Ordering::Relaxed);
         GoalError::GivenUp(FailureReason::new(describe_loss(last, why)))
     }

@@ -50,11 +50,7 @@ impl NameResolver {
             RosVersion::One => ros1_remaps(node, argv),
             RosVersion::Two => ros2_remaps(node, argv),
         };
-        NameResolver {
-            version,
-            node: node.to_owned(),
-            remaps,
-        }
+        NameResolver { version, node: node.to_owned(), remaps }
     }
 
     /// Returns the name that the program wrote for the registered `name`.
@@ -72,9 +68,7 @@ impl NameResolver {
 
     fn name_before_remap(&self, name: &str, what: NameKind) -> Option<&str> {
         let mut remaps = self.remaps.iter().filter(|remap| remap.applies_to(what));
-        remaps
-            .find(|remap| remap.to == name)
-            .map(|remap| remap.from.as_str())
+        remaps.find(|remap| remap.to == name).map(|remap| remap.from.as_str())
     }
 
     /// Resolves a name written by the program, without remappings.
@@ -108,18 +102,12 @@ impl NameResolver {
 
     /// Translates the name of a topic or service of an action, given its suffix. In ROS 1 it is remapped on its own or
     /// with its action: `/count` and `/goal`.
-    pub(super) fn endpoint_name_on(
-        &self,
-        robot: &NameResolver,
-        action: &str,
-        end: &str,
-        what: NameKind,
-    ) -> String {
+    pub(super) fn endpoint_name_on(&self, robot: &NameResolver, action: &str, end: &str, what: NameKind) -> String {
         let before = match self.version {
             // If all five topics were remapped, they determine the action's name.
-            RosVersion::One => self
-                .name_before_remap(&format!("{action}{end}"), what)
-                .and_then(|topic| topic.strip_suffix(end)),
+            RosVersion::One => {
+                self.name_before_remap(&format!("{action}{end}"), what).and_then(|topic| topic.strip_suffix(end))
+            }
             RosVersion::Two => None,
         };
         let action = self.action_name_on(robot, before.unwrap_or(action));
@@ -136,14 +124,9 @@ impl NameRemap {
 fn ros1_remaps(node: &str, argv: &[String]) -> Vec<NameRemap> {
     let remaps = argv.iter().filter_map(|argument| argument.split_once(":="));
     // `__name:=` and `_parameter:=` are not remappings.
-    let remaps =
-        remaps.filter(|(from, to)| !from.is_empty() && !from.starts_with('_') && !to.is_empty());
+    let remaps = remaps.filter(|(from, to)| !from.is_empty() && !from.starts_with('_') && !to.is_empty());
     let resolved = |name| ros1::names::resolve(name, node);
-    let remaps = remaps.map(|(from, to)| NameRemap {
-        from: resolved(from),
-        to: resolved(to),
-        of: None,
-    });
+    let remaps = remaps.map(|(from, to)| NameRemap { from: resolved(from), to: resolved(to), of: None });
     // In ROS 1 the last match counts.
     remaps.rev().collect()
 }
@@ -163,11 +146,7 @@ fn ros2_remaps(node: &str, argv: &[String]) -> Vec<NameRemap> {
             RemapTarget::Name => None,
             RemapTarget::Node | RemapTarget::Namespace => return None,
         };
-        rule.applies_to(last).then(|| NameRemap {
-            from: resolved(&rule.from),
-            to: resolved(&rule.to),
-            of,
-        })
+        rule.applies_to(last).then(|| NameRemap { from: resolved(&rule.from), to: resolved(&rule.to), of })
     });
     remaps.collect()
 }
@@ -206,34 +185,15 @@ mod tests {
             (("/w", &[]), ("/r1/x", &["work:=plan"]), "/work", "/r1/plan"),
             (("/w", &[]), ("/r1/x", &["work:=/plan"]), "/work", "/plan"),
             (("/w", &[]), ("/x", &["~set:=/put"]), "/w/set", "/put"),
-            (
-                ("/w", &[]),
-                ("/r1/x", &["/work:=/plan"]),
-                "/work",
-                "/r1/work",
-            ),
+            (("/w", &[]), ("/r1/x", &["/work:=/plan"]), "/work", "/r1/work"),
             // The deployer's remappings, which do not apply on the robot.
             (("/w", &["work:=/plan"]), ("/x", &[]), "/plan", "/work"),
-            (
-                ("/w", &["work:=/plan"]),
-                ("/r1/x", &["work:=mine"]),
-                "/plan",
-                "/r1/mine",
-            ),
+            (("/w", &["work:=/plan"]), ("/r1/x", &["work:=mine"]), "/plan", "/r1/mine"),
             // Not remappings.
-            (
-                ("/w", &[]),
-                ("/x", &["_work:=1", "3", "__name:=y"]),
-                "/work",
-                "/work",
-            ),
+            (("/w", &[]), ("/x", &["_work:=1", "3", "__name:=y"]), "/work", "/work"),
         ] {
             let (from, to) = (names(deployed.0, deployed.1), names(robot.0, robot.1));
-            assert_eq!(
-                from.service_name_on(&to, name),
-                expected,
-                "{deployed:?} {robot:?} {name}"
-            );
+            assert_eq!(from.service_name_on(&to, name), expected, "{deployed:?} {robot:?} {name}");
         }
     }
 
@@ -243,19 +203,9 @@ mod tests {
             (&[][..], &[][..], "/count", "/r1/count/goal"),
             (&[], &["count:=tally"], "/count", "/r1/tally/goal"),
             (&[], &["count/goal:=/tally/goal"], "/count", "/tally/goal"),
-            (
-                &[],
-                &["count/result:=/tally/result"],
-                "/count",
-                "/r1/count/goal",
-            ),
+            (&[], &["count/result:=/tally/result"], "/count", "/r1/count/goal"),
             (&["count:=/tally"], &[], "/tally", "/r1/count/goal"),
-            (
-                &["count/goal:=/tally/goal"],
-                &[],
-                "/tally",
-                "/r1/count/goal",
-            ),
+            (&["count/goal:=/tally/goal"], &[], "/tally", "/r1/count/goal"),
         ] {
             let (from, to) = (names("/w", deployed), names("/r1/x", robot));
             let topic = from.endpoint_name_on(&to, action, "/goal", NameKind::Topic);
@@ -265,23 +215,15 @@ mod tests {
 
     #[test]
     fn names_round_trip_between_command_lines() {
-        let lines: [(&str, &[&str]); 4] = [
-            ("/w", &[]),
-            ("/lab/w", &["work:=/plan"]),
-            ("/w", &["~set:=put", "work:=there"]),
-            ("/a/b/c", &["x:=y"]),
-        ];
+        let lines: [(&str, &[&str]); 4] =
+            [("/w", &[]), ("/lab/w", &["work:=/plan"]), ("/w", &["~set:=put", "work:=there"]), ("/a/b/c", &["x:=y"])];
         for one in lines {
             for other in lines {
                 let (one, other) = (names(one.0, one.1), names(other.0, other.1));
                 for written in ["work", "~set", "sub/work", "x"] {
                     let name = one.apply_remaps(one.resolve(written), NameKind::Service);
                     let there = one.service_name_on(&other, &name);
-                    assert_eq!(
-                        other.service_name_on(&one, &there),
-                        name,
-                        "{one:?} {other:?}"
-                    );
+                    assert_eq!(other.service_name_on(&one, &there), name, "{one:?} {other:?}");
                 }
             }
         }
@@ -302,40 +244,20 @@ mod tests {
             (("/w", ""), ("/r1/x", "-r work:=/plan"), "/work", "/plan"),
             (("/w", ""), ("/r1/x", "-r work:=plan"), "/work", "/r1/plan"),
             (("/w", ""), ("/r1/x", "-r ~/own:=put"), "/w/own", "/r1/put"),
-            (
-                ("/w", ""),
-                ("/w", "-r work:=one -r /work:=two"),
-                "/work",
-                "/one",
-            ),
+            (("/w", ""), ("/w", "-r work:=one -r /work:=two"), "/work", "/one"),
             (("/w", ""), ("/w", "-r work:=~/mine"), "/work", "/w/mine"),
             // Rules for services, for topics, and for one node of the process.
             (("/w", ""), ("/w", "-r rosservice://work:=x"), "/work", "/x"),
-            (
-                ("/w", ""),
-                ("/w", "-r rostopic://work:=x"),
-                "/work",
-                "/work",
-            ),
+            (("/w", ""), ("/w", "-r rostopic://work:=x"), "/work", "/work"),
             (("/w", ""), ("/w", "-r w:work:=x"), "/work", "/x"),
             (("/w", ""), ("/w", "-r other:work:=x"), "/work", "/work"),
             // The deployer's rules, which do not apply on the robot.
             (("/w", "-r work:=/plan"), ("/x", ""), "/plan", "/work"),
-            (
-                ("/w", "-r work:=/plan"),
-                ("/r1/x", "-r work:=mine"),
-                "/plan",
-                "/r1/mine",
-            ),
-            (
-                ("/w", "-p work:=1"),
-                ("/x", "-r __ns:=/y"),
-                "/work",
-                "/work",
-            ),
+            (("/w", "-r work:=/plan"), ("/r1/x", "-r work:=mine"), "/plan", "/r1/mine"),
+            (("/w", "-p work:=1"), ("/x", "-r __ns:=/y"), "/work", "/work"),
         ] {
-            let [from, to] = [deployed, robot]
-                .map(|(node, rules)| names_two(node, &format!("/opt/w --ros-args {rules}")));
+            let [from, to] =
+                [deployed, robot].map(|(node, rules)| names_two(node, &format!("/opt/w --ros-args {rules}")));
             let found = from.service_name_on(&to, name);
             assert_eq!(found, expected, "{deployed:?} {robot:?} {name}");
         }
@@ -347,11 +269,7 @@ mod tests {
         let (from, end) = (names_two("/w", ""), "/_action/send_goal");
         for (rules, action, expected) in [
             ("", "/r1/count", "/r1/count/_action/send_goal"),
-            (
-                "-r count:=tally",
-                "/r1/count",
-                "/r1/count/_action/send_goal",
-            ),
+            ("-r count:=tally", "/r1/count", "/r1/count/_action/send_goal"),
             ("-r count/_action/send_goal:=zz", "/r1/count", "/r1/zz"),
         ] {
             let to = names_two("/r1/x", &format!("--ros-args {rules}"));

@@ -45,15 +45,9 @@ pub(super) fn collect_node_ends(
         for (end, name) in &action.ends {
             let name = name.clone();
             match end {
-                ActionEndpoint::SendGoal => {
-                    drop(node.services.insert(name, parts.send_goal.1.clone()))
-                }
-                ActionEndpoint::CancelGoal => {
-                    drop(node.services.insert(name, parts.cancel_goal.1.clone()))
-                }
-                ActionEndpoint::GetResult => {
-                    drop(node.services.insert(name, parts.get_result.1.clone()))
-                }
+                ActionEndpoint::SendGoal => drop(node.services.insert(name, parts.send_goal.1.clone())),
+                ActionEndpoint::CancelGoal => drop(node.services.insert(name, parts.cancel_goal.1.clone())),
+                ActionEndpoint::GetResult => drop(node.services.insert(name, parts.get_result.1.clone())),
                 ActionEndpoint::Feedback => {
                     let of = (parts.feedback.1.clone(), ActionInterfaces::feedback_qos());
                     node.publishers.insert(name, of);

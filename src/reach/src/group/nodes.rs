@@ -47,20 +47,13 @@ impl SharedNodes {
         place: &str,
         observer: Arc<dyn Observer>,
     ) -> SharedNodes {
-        SharedNodes {
-            bus,
-            recorded,
-            told: RobotEvents::new(place, observer),
-            linked: Mutex::default(),
-        }
+        SharedNodes { bus, recorded, told: RobotEvents::new(place, observer), linked: Mutex::default() }
     }
 
     /// Updates the bus to show what the stubs' nodes currently provide.
     fn update_view(&self, linked: &BTreeMap<String, SharedStubNode>) {
         let mut all = GroupView::default();
-        linked
-            .values()
-            .for_each(|node| all.merge(node.view.clone()));
+        linked.values().for_each(|node| all.merge(node.view.clone()));
         self.bus.set_view(all);
     }
 
@@ -79,26 +72,17 @@ impl SharedNodes {
 }
 
 /// Finds the group's node that corresponds to a stub's node.
-fn find_group_node<'a>(
-    recorded: &'a RecordedRevision,
-    node: &NodeLaunch,
-) -> Result<&'a NodeSpec, NodeError> {
+fn find_group_node<'a>(recorded: &'a RecordedRevision, node: &NodeLaunch) -> Result<&'a NodeSpec, NodeError> {
     find_program(recorded, node)?;
     let all: Vec<&NodeSpec> = nodes_running(recorded, &node.executable).collect();
     let last = |name: &str| name.rsplit('/').next().unwrap_or_default().to_owned();
-    let same = all
-        .iter()
-        .find(|planned| planned.name == node.name)
-        .or_else(|| {
-            let mut named = all.iter();
-            named.find(|planned| last(&planned.name) == last(&node.name))
-        });
+    let same = all.iter().find(|planned| planned.name == node.name).or_else(|| {
+        let mut named = all.iter();
+        named.find(|planned| last(&planned.name) == last(&node.name))
+    });
     match (same, &all[..]) {
         (Some(planned), _) | (None, [planned]) => Ok(planned),
-        (None, []) => Err(NodeError::NotRun {
-            service: recorded.service.clone(),
-            executable: node.executable.clone(),
-        }),
+        (None, []) => Err(NodeError::NotRun { service: recorded.service.clone(), executable: node.executable.clone() }),
         (None, several) => Err(NodeError::Ambiguous {
             service: recorded.service.clone(),
             executable: node.executable.clone(),
@@ -120,23 +104,17 @@ fn unused_settings<'a>(
     };
     match recorded.flavour.ros.ros_version() {
         RosVersion::One => unused_settings_ros1(recorded, planned, hello),
-        RosVersion::Two => unused_settings_ros2(planned, &hello.node.argv, |name| {
-            value(&format!("{}/{name}", planned.name))
-        }),
+        RosVersion::Two => {
+            unused_settings_ros2(planned, &hello.node.argv, |name| value(&format!("{}/{name}", planned.name)))
+        }
     }
 }
 
-fn unused_settings_ros1(
-    recorded: &RecordedRevision,
-    planned: &NodeSpec,
-    hello: &Hello,
-) -> BTreeSet<String> {
+fn unused_settings_ros1(recorded: &RecordedRevision, planned: &NodeSpec, hello: &Hello) -> BTreeSet<String> {
     let deployed = |name: &str| recorded.parameters.get(&format!("{}/{name}", planned.name));
     let mut given = BTreeSet::new();
     if let Some(own) = parameters_below(&hello.parameters, &hello.node.name) {
-        let own = own
-            .iter()
-            .filter(|(name, value)| *name != OF_STUBS && deployed(name) != Some(*value));
+        let own = own.iter().filter(|(name, value)| *name != OF_STUBS && deployed(name) != Some(*value));
         given.extend(own.map(|(name, _)| format!("~{name}")));
     }
     let other = hello.node.argv.iter();
@@ -176,9 +154,7 @@ fn unused_settings_ros2<'a>(
         same.unwrap_or_else(is_it)
     };
     let given = parts(argv).into_iter().filter_map(|part| match part.kind {
-        Kind::Parameter(of) => {
-            (!known(&of.name, &of.value)).then(|| format!("the parameter {}", of.name))
-        }
+        Kind::Parameter(of) => (!known(&of.name, &of.value)).then(|| format!("the parameter {}", of.name)),
         Kind::Own | Kind::Setting => {
             let words = part.words.join(" ");
             let same = deployed.iter().any(|other| other.words == part.words);
@@ -190,10 +166,7 @@ fn unused_settings_ros2<'a>(
 }
 
 /// Returns the parameters below a node's name.
-fn parameters_below<'a>(
-    all: &'a BTreeMap<String, ParamValue>,
-    node: &str,
-) -> Option<&'a BTreeMap<String, ParamValue>> {
+fn parameters_below<'a>(all: &'a BTreeMap<String, ParamValue>, node: &str) -> Option<&'a BTreeMap<String, ParamValue>> {
     names::parts(node).try_fold(all, |at, part| match at.get(part) {
         Some(ParamValue::Map(below)) => Some(below),
         _ => None,
@@ -208,15 +181,10 @@ impl NodeController for SharedNodes {
 
     async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), NodeError> {
         let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
-        self.told
-            .observer()
-            .check_stub(node.revision, &node.image)?;
+        self.told.observer().check_stub(node.revision, &node.image)?;
         let view = self.node_view(node)?;
         tenant.take_over();
-        let linked = SharedStubNode {
-            view,
-            exit: watch::Sender::new(None),
-        };
+        let linked = SharedStubNode { view, exit: watch::Sender::new(None) };
         let mut all = self.linked.lock();
         all.insert(node.name.clone(), linked);
         self.update_view(&all);
@@ -387,10 +355,7 @@ mod tests {
                     argv: argv.iter().map(|&argument| argument.to_owned()).collect(),
                     ..node("/r1/chef", "cook")
                 },
-                parameters: parameters
-                    .map(|all| ("r1".to_owned(), all))
-                    .into_iter()
-                    .collect(),
+                parameters: parameters.map(|all| ("r1".to_owned(), all)).into_iter().collect(),
                 ..Hello::default()
             };
             let recorded = test_revision(&[COOK]);
@@ -402,8 +367,7 @@ mod tests {
 
     #[test]
     fn unused_settings_of_a_ros_2_robot_are_named() {
-        let words =
-            |line: &str| -> Vec<String> { line.split_whitespace().map(str::to_owned).collect() };
+        let words = |line: &str| -> Vec<String> { line.split_whitespace().map(str::to_owned).collect() };
         let mut recorded = test_revision(&[COOK]);
         recorded.flavour.ros = Version::Ros2;
         let deployed = "--ros-args -r __node:=cook -p salt:=3 -p oil:=1 -p oil:=2 --";
@@ -416,26 +380,13 @@ mod tests {
             ("--ros-args -p pan:=\"hot\"", &[]),
             ("--ros-args -p pan:=\"cold\"", &["the parameter pan"]),
             ("--ros-args -p oil:=1", &["the parameter oil"]),
-            (
-                "--ros-args -p use_sim_time:=true",
-                &["the parameter use_sim_time"],
-            ),
+            ("--ros-args -p use_sim_time:=true", &["the parameter use_sim_time"]),
             ("--fast", &["the argument \"--fast\""]),
-            (
-                "--ros-args --log-level debug",
-                &["the argument \"--log-level debug\""],
-            ),
+            ("--ros-args --log-level debug", &["the argument \"--log-level debug\""]),
         ] {
-            let hello = Hello {
-                node: NodeLaunch {
-                    argv: words(line),
-                    ..node("/r1/chef", "cook")
-                },
-                ..Hello::default()
-            };
-            let given: Vec<String> = unused_settings(&recorded, &hello, value)
-                .into_iter()
-                .collect();
+            let hello =
+                Hello { node: NodeLaunch { argv: words(line), ..node("/r1/chef", "cook") }, ..Hello::default() };
+            let given: Vec<String> = unused_settings(&recorded, &hello, value).into_iter().collect();
             assert_eq!(given, expected, "{line}");
         }
     }

@@ -47,10 +47,7 @@ pub fn open_seat(
 }
 
 /// Forwards notices to the robot as long as it has this place.
-async fn forward_notices(
-    mut noticed: mpsc::UnboundedReceiver<(String, String)>,
-    reach: Weak<InProcess>,
-) {
+async fn forward_notices(mut noticed: mpsc::UnboundedReceiver<(String, String)>, reach: Weak<InProcess>) {
     while let Some((node, what)) = noticed.recv().await {
         let Some(reach) = reach.upgrade() else {
             return;

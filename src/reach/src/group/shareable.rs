@@ -88,30 +88,17 @@ pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Uns
     for topic in topics.filter(|topic| !UNNEEDED.contains(&&*plain_type_name(&topic.type_name))) {
         let transforms = TRANSFORMS.contains(&&*plain_type_name(&topic.type_name));
         let (verb, of) = match topic.direction {
-            Direction::Input if transforms => (
-                "subscribes to",
-                "it would see the transforms of all robots as one tree",
-            ),
-            Direction::Input => (
-                "subscribes to",
-                "one robot's messages would reach all robots",
-            ),
-            Direction::Output if transforms => {
-                ("publishes", "its transforms would be in every robot's tree")
+            Direction::Input if transforms => {
+                ("subscribes to", "it would see the transforms of all robots as one tree")
             }
-            Direction::Output if topic.latched => (
-                "publishes, latched,",
-                "its last result for one robot would be latched for all robots",
-            ),
-            Direction::Output => (
-                "publishes",
-                "its results for one robot would reach all robots",
-            ),
+            Direction::Input => ("subscribes to", "one robot's messages would reach all robots"),
+            Direction::Output if transforms => ("publishes", "its transforms would be in every robot's tree"),
+            Direction::Output if topic.latched => {
+                ("publishes, latched,", "its last result for one robot would be latched for all robots")
+            }
+            Direction::Output => ("publishes", "its results for one robot would reach all robots"),
         };
-        found.push(format!(
-            "it {verb} {} ({}): {of}",
-            topic.name, topic.type_name
-        ));
+        found.push(format!("it {verb} {} ({}): {of}", topic.name, topic.type_name));
     }
     let of_clients = |node: &str| {
         let mut services = interface.services.iter();
@@ -119,9 +106,7 @@ pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Uns
     };
     for parameter in &interface.parameters {
         let mut nodes = parameter.written_by.iter();
-        if let Some(node) = nodes
-            .find(|node| !(of_clients(node) && parameter.name.starts_with(&format!("{node}/"))))
-        {
+        if let Some(node) = nodes.find(|node| !(of_clients(node) && parameter.name.starts_with(&format!("{node}/")))) {
             found.push(format!(
                 "its node {node} writes the parameter {}: it would hold data of all robots' requests",
                 parameter.name
@@ -129,14 +114,11 @@ pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Uns
         }
     }
     for need in &interface.needs {
-        found.push(format!(
-            "it calls {}, which each robot serves itself",
-            need.name
-        ));
+        found.push(format!("it calls {}, which each robot serves itself", need.name));
     }
     // Invalid definitions were refused before.
-    let registry = Registry::with_definitions(ros, &interface.definitions)
-        .unwrap_or_else(|_| Registry::for_version(ros));
+    let registry =
+        Registry::with_definitions(ros, &interface.definitions).unwrap_or_else(|_| Registry::for_version(ros));
     let shown = shared_interface(interface);
     for service in &shown.services {
         let of = registry.service(&service.type_name);
@@ -151,11 +133,7 @@ pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Uns
     if found.is_empty() && shown.services.is_empty() && shown.actions.is_empty() {
         found.push("it has neither a service nor an action".to_owned());
     }
-    if found.is_empty() {
-        Ok(())
-    } else {
-        Err(Unshareable(found))
-    }
+    if found.is_empty() { Ok(()) } else { Err(Unshareable(found)) }
 }
 
 /// Returns whether a message has no fields except empty messages such as std_msgs/Empty.
@@ -183,10 +161,7 @@ pub fn shared_interface(interface: &Interface) -> Interface {
     Interface {
         topics: Vec::new(),
         parameters: Vec::new(),
-        services: services
-            .filter(|service| !administers(&service.type_name))
-            .cloned()
-            .collect(),
+        services: services.filter(|service| !administers(&service.type_name)).cloned().collect(),
         ..interface.clone()
     }
 }
@@ -240,47 +215,26 @@ mod tests {
     fn interfaces_that_leak_between_robots_are_refused_with_the_findings() {
         let topic = |name: &str, of: &str, direction: &str| {
             let latched = name == "/map";
-            let topic =
-                json!({ "name": name, "type": of, "direction": direction, "latched": latched });
+            let topic = json!({ "name": name, "type": of, "direction": direction, "latched": latched });
             findings(|it| push_item(it, "topics", topic)).join("; ")
         };
         for (name, of, direction, expected) in [
-            (
-                "/image",
-                "sensor_msgs/Image",
-                "input",
-                "it subscribes to /image (sensor_msgs/Image)",
-            ),
+            ("/image", "sensor_msgs/Image", "input", "it subscribes to /image (sensor_msgs/Image)"),
             (
                 "/map",
                 "nav_msgs/OccupancyGrid",
                 "output",
                 "it publishes, latched, /map (nav_msgs/OccupancyGrid): its last result",
             ),
-            (
-                "/found",
-                "x_msgs/Found",
-                "output",
-                "it publishes /found (x_msgs/Found): its results",
-            ),
+            ("/found", "x_msgs/Found", "output", "it publishes /found (x_msgs/Found): its results"),
             (
                 "/tf",
                 "tf2_msgs/TFMessage",
                 "input",
                 "it subscribes to /tf (tf2_msgs/TFMessage): it would see the transforms of all robots",
             ),
-            (
-                "/tf_static",
-                "tf/tfMessage",
-                "output",
-                "it publishes /tf_static (tf/tfMessage): its transforms",
-            ),
-            (
-                "/clock",
-                "rosgraph_msgs/Clock",
-                "input",
-                "it subscribes to /clock",
-            ),
+            ("/tf_static", "tf/tfMessage", "output", "it publishes /tf_static (tf/tfMessage): its transforms"),
+            ("/clock", "rosgraph_msgs/Clock", "input", "it subscribes to /clock"),
         ] {
             let found = topic(name, of, direction);
             assert!(found.starts_with(expected), "{found}");
@@ -330,8 +284,7 @@ mod tests {
 
     /// A shareable interface of ROS 2.
     fn interface_ros2(change: impl FnOnce(&mut Value)) -> Interface {
-        let topic =
-            |name: &str, of: &str| json!({ "name": name, "type": of, "direction": "output" });
+        let topic = |name: &str, of: &str| json!({ "name": name, "type": of, "direction": "output" });
         let service = |name: &str, of: &str| json!({ "name": name, "type": of, "node": "/adder" });
         let mut interface = json!({
             "topics": [
@@ -386,34 +339,20 @@ mod tests {
     #[test]
     fn unshareable_interfaces_of_ros_2_are_refused() {
         for (name, of, direction, expected) in [
-            (
-                "/image",
-                "sensor_msgs/msg/Image",
-                "input",
-                "it subscribes to /image (sensor_msgs/msg/Image)",
-            ),
+            ("/image", "sensor_msgs/msg/Image", "input", "it subscribes to /image (sensor_msgs/msg/Image)"),
             (
                 "/tf",
                 "tf2_msgs/msg/TFMessage",
                 "input",
                 "it subscribes to /tf (tf2_msgs/msg/TFMessage): it would see the transforms of all",
             ),
-            (
-                "/clock",
-                "rosgraph_msgs/msg/Clock",
-                "input",
-                "it subscribes to /clock",
-            ),
+            ("/clock", "rosgraph_msgs/msg/Clock", "input", "it subscribes to /clock"),
         ] {
             let topic = json!({ "name": name, "type": of, "direction": direction });
             let found = findings_ros2(|it| push_item(it, "topics", topic)).join("; ");
             assert!(found.starts_with(expected), "{found}");
         }
-        for of in [
-            "x_msgs/srv/Reset",
-            "x_msgs/srv/Clear",
-            "std_srvs/srv/SetBool",
-        ] {
+        for of in ["x_msgs/srv/Reset", "x_msgs/srv/Clear", "std_srvs/srv/SetBool"] {
             let service = json!({ "name": "/reset", "type": of });
             let found = findings_ros2(|it| push_item(it, "services", service)).join("; ");
             assert!(found.starts_with("it serves /reset"), "{of}: {found}");

@@ -55,76 +55,43 @@ impl GroupView {
             node => node.to_owned(),
         };
         let services = interface.services.iter().map(|service| {
-            let shown = ViewEntry {
-                of: service.name.clone(),
-                node: named(&service.node),
-            };
+            let shown = ViewEntry { of: service.name.clone(), node: named(&service.node) };
             (service.name.clone(), shown)
         });
         let actions = interface.actions.iter().map(|action| {
             let shown = ViewAction {
-                shown: ViewEntry {
-                    of: action.name.clone(),
-                    node: named(&action.node),
-                },
+                shown: ViewEntry { of: action.name.clone(), node: named(&action.node) },
                 type_name: action.type_name.clone(),
                 ends: action_endpoints(version, &action.name),
             };
             (action.name.clone(), shown)
         });
-        GroupView {
-            services: services.collect(),
-            actions: actions.collect(),
-        }
+        GroupView { services: services.collect(), actions: actions.collect() }
     }
 
     /// Creates the view of one of its nodes under the names that it would have on the robot.
-    pub(super) fn for_node(
-        version: RosVersion,
-        interface: &Interface,
-        alias: &NodeAlias<'_>,
-    ) -> GroupView {
-        let NodeAlias {
-            deployed, robot, ..
-        } = alias;
+    pub(super) fn for_node(version: RosVersion, interface: &Interface, alias: &NodeAlias<'_>) -> GroupView {
+        let NodeAlias { deployed, robot, .. } = alias;
         let its = |node: &str| node == alias.node || (alias.only && node.is_empty());
-        let shown = |name: &str| ViewEntry {
-            of: name.to_owned(),
-            node: alias.name.to_owned(),
-        };
+        let shown = |name: &str| ViewEntry { of: name.to_owned(), node: alias.name.to_owned() };
         let services = interface.services.iter();
-        let services = services
-            .filter(|service| its(&service.node))
-            .map(|service| {
-                let name = deployed.service_name_on(robot, &service.name);
-                (name, shown(&service.name))
-            });
+        let services = services.filter(|service| its(&service.node)).map(|service| {
+            let name = deployed.service_name_on(robot, &service.name);
+            (name, shown(&service.name))
+        });
         let actions = interface.actions.iter();
         let actions = actions.filter(|action| its(&action.node)).map(|action| {
             let ends = action_endpoints(version, &action.name).into_iter();
             let ends = ends.map(|(end, name)| {
                 let suffix = &name[action.name.len()..];
-                let what = if end.is_service() {
-                    NameKind::Service
-                } else {
-                    NameKind::Topic
-                };
-                (
-                    end,
-                    deployed.endpoint_name_on(robot, &action.name, suffix, what),
-                )
+                let what = if end.is_service() { NameKind::Service } else { NameKind::Topic };
+                (end, deployed.endpoint_name_on(robot, &action.name, suffix, what))
             });
-            let shown = ViewAction {
-                shown: shown(&action.name),
-                type_name: action.type_name.clone(),
-                ends: ends.collect(),
-            };
+            let shown =
+                ViewAction { shown: shown(&action.name), type_name: action.type_name.clone(), ends: ends.collect() };
             (deployed.action_name_on(robot, &action.name), shown)
         });
-        GroupView {
-            services: services.collect(),
-            actions: actions.collect(),
-        }
+        GroupView { services: services.collect(), actions: actions.collect() }
     }
 
     /// Adds another view. Its entries win, like those of the node that registers last.
@@ -154,9 +121,8 @@ impl GroupView {
     /// Returns the view as a graph; for ROS 2 without the endpoints of nodes, which require types.
     pub(super) fn graph(&self, version: RosVersion, generation: u64) -> Graph {
         let services = self.services.iter();
-        let services: BTreeMap<String, String> = services
-            .map(|(name, shown)| (name.clone(), shown.node.clone()))
-            .collect();
+        let services: BTreeMap<String, String> =
+            services.map(|(name, shown)| (name.clone(), shown.node.clone())).collect();
         // In ROS 2 they are hidden from the graph.
         let topics_of = |action: &ViewAction| -> Vec<(ActionEndpoint, String)> {
             match version {
@@ -176,22 +142,13 @@ impl GroupView {
         });
         let topics = self.actions.values().flat_map(|action| {
             topics_of(action).into_iter().map(|(end, topic)| {
-                let mut ends = TopicNodes {
-                    type_name: end.type_name(&action.type_name),
-                    ..TopicNodes::default()
-                };
-                let here = if end.is_published_by_clients() {
-                    &mut ends.subscribers
-                } else {
-                    &mut ends.publishers
-                };
+                let mut ends = TopicNodes { type_name: end.type_name(&action.type_name), ..TopicNodes::default() };
+                let here = if end.is_published_by_clients() { &mut ends.subscribers } else { &mut ends.publishers };
                 here.push(action.shown.node.clone());
                 (topic, ends)
             })
         });
-        let nodes = services
-            .values()
-            .chain(self.actions.values().map(|action| &action.shown.node));
+        let nodes = services.values().chain(self.actions.values().map(|action| &action.shown.node));
         Graph {
             generation,
             nodes: nodes.map(|node| (node.clone(), String::new())).collect(),

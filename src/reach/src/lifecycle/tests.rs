@@ -1,9 +1,7 @@
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{
-    FailureReason, Publisher, QosProfile, ServiceHandler, ServiceType, WireFormat, WireType,
-};
+use ros::bus::{FailureReason, Publisher, QosProfile, ServiceHandler, ServiceType, WireFormat, WireType};
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
@@ -28,19 +26,11 @@ struct LifecycleWorld {
 
 impl LifecycleWorld {
     fn new(started: StubNodesDouble) -> Self {
-        let (system, events) = (
-            Arc::<MemorySystem>::default(),
-            Arc::<RecordedEvents>::default(),
-        );
+        let (system, events) = (Arc::<MemorySystem>::default(), Arc::<RecordedEvents>::default());
         let bus: Arc<dyn Bus> = system.join("/cloudroid_bridge");
-        let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) =
-            (Arc::new(started), events.clone());
+        let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) = (Arc::new(started), events.clone());
         let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer);
-        Self {
-            system,
-            events,
-            lifecycles: lifecycles.expect("ROS 2"),
-        }
+        Self { system, events, lifecycles: lifecycles.expect("ROS 2") }
     }
 
     async fn wait_stages(&self, wanted: impl Fn(&Stages) -> bool) -> Stages {
@@ -52,20 +42,14 @@ impl LifecycleWorld {
     /// Waits until the node is shown in this state and nobody is about to change it.
     async fn wait_stage(&self, state: &str) -> LifecycleStage {
         let over = |stage: &LifecycleStage| stage.state == state && !stage.begins;
-        let all = self
-            .wait_stages(|all| all.get(NODE).is_some_and(over))
-            .await;
+        let all = self.wait_stages(|all| all.get(NODE).is_some_and(over)).await;
         all[NODE].clone()
     }
 }
 
 /// Returns the stage of a node without anything special.
 fn settled_stage(state: &str) -> LifecycleStage {
-    LifecycleStage {
-        state: state.to_owned(),
-        refused: None,
-        begins: false,
-    }
+    LifecycleStage { state: state.to_owned(), refused: None, begins: false }
 }
 
 /// A lifecycle node.
@@ -148,20 +132,14 @@ impl Staged {
         });
         let mut serving = Vec::new();
         // The last of them makes it recognizable as a lifecycle node.
-        for (part, of) in [
-            ("get_state", "lifecycle_msgs/srv/GetState"),
-            ("change_state", "lifecycle_msgs/srv/ChangeState"),
-        ] {
+        for (part, of) in
+            [("get_state", "lifecycle_msgs/srv/GetState"), ("change_state", "lifecycle_msgs/srv/ChangeState")]
+        {
             let (name, handler) = (format!("{NODE}/{part}"), Arc::new(Part(life.clone())));
             let served = node.serve(&name, service(of), handler).await;
             serving.push(served.expect("served"));
         }
-        Self {
-            life,
-            changes: changes.expect("advertised"),
-            _serving: serving,
-            _node: node,
-        }
+        Self { life, changes: changes.expect("advertised"), _serving: serving, _node: node }
     }
 
     /// Simulates a transition triggered by somebody else.
@@ -200,10 +178,7 @@ async fn a_node_begins_as_it_appears_and_its_states_are_told() {
     let waited = timeout(LONG, watchers.wait_for(watched)).await;
     waited.expect("in time").expect("advertised");
     node.transition(ACTIVE, INACTIVE);
-    assert_eq!(
-        world.wait_stage("inactive").await,
-        settled_stage("inactive")
-    );
+    assert_eq!(world.wait_stage("inactive").await, settled_stage("inactive"));
     assert!(world.events.0.lock().is_empty());
 
     drop(node);
@@ -219,18 +194,12 @@ async fn what_a_node_refuses_is_an_event_and_stands_until_it_is_active() {
     let node = Staged::start(&world, true, 2).await;
     let words = "the lifecycle node /sentry does not activate: /sentry did not activate, and is inactive now; see its \
         log: often a parameter (--param) or a device is missing";
-    let refused = LifecycleStage {
-        refused: Some(words.to_owned()),
-        ..settled_stage("inactive")
-    };
+    let refused = LifecycleStage { refused: Some(words.to_owned()), ..settled_stage("inactive") };
     assert_eq!(world.wait_stage("inactive").await, refused);
     let events = world.events.0.lock().clone();
     assert_eq!(events, [("lifecycle-refused".to_owned(), words.to_owned())]);
     node.transition(INACTIVE, UNCONFIGURED);
-    let unconfigured = LifecycleStage {
-        state: "unconfigured".to_owned(),
-        ..refused
-    };
+    let unconfigured = LifecycleStage { state: "unconfigured".to_owned(), ..refused };
     assert_eq!(world.wait_stage("unconfigured").await, unconfigured);
     node.transition(UNCONFIGURED, ACTIVE);
     assert_eq!(world.wait_stage("active").await, settled_stage("active"));
@@ -241,16 +210,10 @@ async fn what_a_node_refuses_is_an_event_and_stands_until_it_is_active() {
 async fn a_node_that_a_stub_has_started_is_left_to_the_robot() {
     let world = LifecycleWorld::new(StubNodesDouble::node(NODE));
     let node = Staged::start(&world, false, 2).await;
-    assert_eq!(
-        world.wait_stage("unconfigured").await,
-        settled_stage("unconfigured")
-    );
+    assert_eq!(world.wait_stage("unconfigured").await, settled_stage("unconfigured"));
     assert!(node.requested_transitions().is_empty());
     node.transition(UNCONFIGURED, INACTIVE);
-    assert_eq!(
-        world.wait_stage("inactive").await,
-        settled_stage("inactive")
-    );
+    assert_eq!(world.wait_stage("inactive").await, settled_stage("inactive"));
     assert!(node.requested_transitions().is_empty());
 }
 
@@ -261,9 +224,6 @@ async fn a_node_that_a_manager_drives_is_left_to_it() {
     let change = service("lifecycle_msgs/srv/ChangeState");
     let _client = manager.seek("/sentry/change_state", change);
     let node = Staged::start(&world, false, 2).await;
-    assert_eq!(
-        world.wait_stage("unconfigured").await,
-        settled_stage("unconfigured")
-    );
+    assert_eq!(world.wait_stage("unconfigured").await, settled_stage("unconfigured"));
     assert!(node.requested_transitions().is_empty());
 }

@@ -60,9 +60,6 @@ mod tests {
             assert!(attempts.is_newest(&number.to_string(), 1));
         }
         assert_eq!(attempts.last.lock().len(), REMEMBERED);
-        assert!(
-            !attempts.is_newest("mine", 1),
-            "it was heard of again and again"
-        );
+        assert!(!attempts.is_newest("mine", 1), "it was heard of again and again");
     }
 }

@@ -8,16 +8,11 @@ use super::state::{Hub, NodeLink, RobotMachine};
 use link::control::{FromCloud, Hello};
 
 /// Remedy, for messages.
-pub(super) const NEXT: &str =
-    "give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)";
+pub(super) const NEXT: &str = "give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)";
 
 impl RobotMachine {
     pub(super) fn from_hello(hello: &Hello) -> Self {
-        Self {
-            id: hello.machine.clone(),
-            host: hello.host.clone(),
-            roscore: hello.roscore.clone(),
-        }
+        Self { id: hello.machine.clone(), host: hello.host.clone(), roscore: hello.roscore.clone() }
     }
 
     /// Returns whether it is neither the same machine nor one with the same Master.
@@ -47,9 +42,7 @@ impl Hub {
     /// Returns one link for each other machine that is connected as the same robot.
     pub(super) fn find_duplicates(&self, link: &NodeLink) -> Vec<Arc<NodeLink>> {
         let links = self.links.lock();
-        let others = links
-            .values()
-            .filter(|other| other.is_connected() && link.machine.is_other_robot(&other.machine));
+        let others = links.values().filter(|other| other.is_connected() && link.machine.is_other_robot(&other.machine));
         others.cloned().collect()
     }
 
@@ -72,10 +65,7 @@ impl Hub {
             );
             self.nodes.warn("duplicate-robot", &text);
             for side in [link, &other] {
-                side.session.send_control(&FromCloud::Notice {
-                    warning: true,
-                    text: text.clone(),
-                });
+                side.session.send_control(&FromCloud::Notice { warning: true, text: text.clone() });
             }
         }
     }

@@ -60,12 +60,7 @@ impl GivenInputs {
         if self.recent.len() == RECENT {
             self.recent.pop_front();
         }
-        self.recent.push_back(GivenInput {
-            channel,
-            mark,
-            way,
-            over: false,
-        });
+        self.recent.push_back(GivenInput { channel, mark, way, over: false });
     }
 
     /// Returns the input answered by an output with this mark that was published at `born`: the one with the same
@@ -79,10 +74,7 @@ impl GivenInputs {
         let (channel, mut way) = (self.recent[at].channel, self.recent[at].way);
         if !self.recent[at].over {
             // Another input with the same stamp, such as the camera_info of an image, was answered with this one.
-            self.recent
-                .iter_mut()
-                .filter(|input| same(input))
-                .for_each(|input| input.over = true);
+            self.recent.iter_mut().filter(|input| same(input)).for_each(|input| input.over = true);
             let earlier = self.recent.iter_mut().take(at);
             let left_out = earlier.filter(|input| input.channel == channel && !input.over);
             for input in left_out {
@@ -124,13 +116,7 @@ mod tests {
     }
 
     fn way(given: i64) -> InputTiming {
-        InputTiming {
-            born: given - 10,
-            serialise: 0,
-            left: given - 9,
-            taken: given - 1,
-            given,
-        }
+        InputTiming { born: given - 10, serialise: 0, left: given - 9, taken: given - 1, given }
     }
 
     #[test]
@@ -171,11 +157,7 @@ mod tests {
         all.match_output(mark(1), 150);
         all.match_output(mark(4), 450);
         all.match_output(mark(4), 460);
-        assert_eq!(
-            all.skipped_inputs(),
-            (4, 2),
-            "2 and 3 of the topic that is answered"
-        );
+        assert_eq!(all.skipped_inputs(), (4, 2), "2 and 3 of the topic that is answered");
         // A late answer does not change what was counted.
         all.match_output(mark(2), 470);
         assert_eq!(all.skipped_inputs(), (4, 2));

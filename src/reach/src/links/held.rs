@@ -97,10 +97,7 @@ impl HoldGuard {
                 }
             });
         }
-        Self {
-            link: Arc::clone(link),
-            number,
-        }
+        Self { link: Arc::clone(link), number }
     }
 }
 
@@ -119,11 +116,7 @@ mod tests {
     use super::*;
 
     fn call(size: usize, at: i64) -> HeldRecord {
-        let record = Record::Call {
-            id: 0,
-            service: 1,
-            request: Bytes::from(vec![0; size]),
-        };
+        let record = Record::Call { id: 0, service: 1, request: Bytes::from(vec![0; size]) };
         let held = Budget::without_limit().permit();
         HeldRecord { record, held, at }
     }

@@ -30,10 +30,7 @@ const KEPT: usize = 10;
 /// Factor of the warm-up time for which a registered node is awaited while nobody is connected.
 const ALONE: u32 = 10;
 /// Limit on what waits until the topic is advertised and the node connected.
-const WAITING: RingBounds = RingBounds {
-    messages: 256,
-    bytes: 32 << 20,
-};
+const WAITING: RingBounds = RingBounds { messages: 256, bytes: 32 << 20 };
 
 /// Channels by number.
 #[derive(Default)]
@@ -103,13 +100,8 @@ impl InputChannels {
                 drops.add(&channel.topic, Cause::Early, lost.messages);
             }
         }
-        let answered = InputTiming {
-            born: data.born,
-            serialise: data.serialise,
-            left: data.left,
-            taken: arrived,
-            given: now(),
-        };
+        let answered =
+            InputTiming { born: data.born, serialise: data.serialise, left: data.left, taken: arrived, given: now() };
         Some((mark, answered))
     }
 
@@ -158,8 +150,7 @@ impl InputChannels {
         });
         let mut matched = publisher.matched_subscribers();
         let mut connected = async |count: usize, patience: Duration| {
-            let reached =
-                matched.wait_for(|now| now.connected_count_except(bridge::INSIDE) >= count);
+            let reached = matched.wait_for(|now| now.connected_count_except(bridge::INSIDE) >= count);
             tokio::time::timeout(patience, reached).await.is_ok()
         };
         let warm_up = hub.options.warm_up;
@@ -279,23 +270,12 @@ mod tests {
 
     fn graph_asking(qos: QosProfile) -> Graph {
         let of = WireType::with_name("std_msgs/msg/String").with_version(RosVersion::Two);
-        let ends = NodeEntities {
-            subscribers: [("/scan".to_owned(), (of, qos))].into(),
-            ..NodeEntities::default()
-        };
-        Graph {
-            ends: [("/see".to_owned(), ends)].into(),
-            ..Graph::default()
-        }
+        let ends = NodeEntities { subscribers: [("/scan".to_owned(), (of, qos))].into(), ..NodeEntities::default() };
+        Graph { ends: [("/see".to_owned(), ends)].into(), ..Graph::default() }
     }
 
     fn input(latching: bool, qos: Option<link::control::WireQos>) -> InputChannel {
-        InputChannel {
-            topic: "/scan".to_owned(),
-            latching,
-            qos,
-            ..InputChannel::default()
-        }
+        InputChannel { topic: "/scan".to_owned(), latching, qos, ..InputChannel::default() }
     }
 
     #[test]
@@ -308,26 +288,11 @@ mod tests {
             ..QosProfile::keep_last(5)
         };
         let offered = offered_qos(&input(false, None), RosVersion::Two, &graph_asking(asked));
-        assert_eq!(
-            offered,
-            QosProfile {
-                reliability: QosReliability::Reliable,
-                depth: QUEUE,
-                ..asked
-            }
-        );
+        assert_eq!(offered, QosProfile { reliability: QosReliability::Reliable, depth: QUEUE, ..asked });
         // The robot's publisher may offer more.
-        let told = link::control::WireQos {
-            transient_local: true,
-            depth: 3,
-            deadline: Some(0.05),
-            ..Default::default()
-        };
-        let offered = offered_qos(
-            &input(false, Some(told)),
-            RosVersion::Two,
-            &graph_asking(asked),
-        );
+        let told =
+            link::control::WireQos { transient_local: true, depth: 3, deadline: Some(0.05), ..Default::default() };
+        let offered = offered_qos(&input(false, Some(told)), RosVersion::Two, &graph_asking(asked));
         assert_eq!(offered.deadline, Some(Duration::from_millis(50)));
         assert!(offered.is_latching());
         assert_eq!(offered.depth, 3);
@@ -337,16 +302,10 @@ mod tests {
     fn old_maps_are_not_given_to_newcomers_for_ever() {
         let graph = Graph::default();
         let of = |latching, version| offered_qos(&input(latching, None), version, &graph);
-        assert_eq!(
-            of(true, RosVersion::Two),
-            QosProfile::keep_last(KEPT).latching(true)
-        );
+        assert_eq!(of(true, RosVersion::Two), QosProfile::keep_last(KEPT).latching(true));
         assert_eq!(of(false, RosVersion::Two), QosProfile::keep_last(QUEUE));
         // Subscribers of ROS 1 receive the last one, regardless of the queue length.
-        assert_eq!(
-            of(true, RosVersion::One),
-            QosProfile::keep_last(QUEUE).latching(true)
-        );
+        assert_eq!(of(true, RosVersion::One), QosProfile::keep_last(QUEUE).latching(true));
     }
 
     #[test]

@@ -18,9 +18,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{
-    BusError, FailureReason, Lender, LentService, RosVersion, ServiceHandler, ServiceType,
-};
+use ros::bus::{BusError, FailureReason, Lender, LentService, RosVersion, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
@@ -94,12 +92,7 @@ struct RobotCalls {
 
 impl RobotServices {
     pub(super) fn new(answers: bool) -> Self {
-        Self {
-            answers,
-            names: Mutex::default(),
-            told: watch::Sender::new(0),
-            calls: Mutex::default(),
-        }
+        Self { answers, names: Mutex::default(), told: watch::Sender::new(0), calls: Mutex::default() }
     }
 
     /// Completes a call with the robot's response.
@@ -138,9 +131,7 @@ impl RobotServices {
 }
 
 fn link_lost_error() -> FailureReason {
-    FailureReason::new(
-        "the link to the robot was lost during this call: the robot may or may not have executed it",
-    )
+    FailureReason::new("the link to the robot was lost during this call: the robot may or may not have executed it")
 }
 
 impl NodeLink {
@@ -161,11 +152,7 @@ impl NodeLink {
                 _ => None,
             };
             let after = match of {
-                Some(served)
-                    if before
-                        .as_ref()
-                        .is_some_and(|before| before.is_same_as(&served)) =>
-                {
+                Some(served) if before.as_ref().is_some_and(|before| before.is_same_as(&served)) => {
                     return;
                 }
                 Some(served) => Some(make_service(&hub, self, served)),
@@ -173,14 +160,11 @@ impl NodeLink {
             };
             // For nodes, a service of the same type is the one to which they are connected, regardless of its server or
             // channel. If it were withdrawn for a moment, calls made in that moment would never be answered.
-            let stays = |before: &RobotService, after: &RobotService| {
-                before.service_type == after.service_type
-            };
+            let stays = |before: &RobotService, after: &RobotService| before.service_type == after.service_type;
             let after = match (before, after) {
-                (Some(before), Some(after)) if stays(&before, &after) => Some(RobotService {
-                    gone: before.gone.clone(),
-                    ..after
-                }),
+                (Some(before), Some(after)) if stays(&before, &after) => {
+                    Some(RobotService { gone: before.gone.clone(), ..after })
+                }
                 (Some(before), after) => {
                     before.gone.send_replace(true);
                     after
@@ -188,10 +172,7 @@ impl NodeLink {
                 (None, after) => after,
             };
             *known = match after {
-                Some(there) => State::There {
-                    there: Arc::new(there),
-                    asked: now,
-                },
+                Some(there) => State::There { there: Arc::new(there), asked: now },
                 None => State::NotThere { since: now },
             };
         }
@@ -236,10 +217,7 @@ impl NodeLink {
                 return LookupState::Known(None);
             }
             // The next lookup waits no longer than this one has.
-            Some(State::Asked {
-                since,
-                in_vain: true,
-            }) => {
+            Some(State::Asked { since, in_vain: true }) => {
                 if since.elapsed() > ANSWERS {
                     *since = Instant::now();
                     self.report_lookup(service);
@@ -256,10 +234,7 @@ impl NodeLink {
             }
         }
         let since = Instant::now();
-        let asked = State::Asked {
-            since,
-            in_vain: false,
-        };
+        let asked = State::Asked { since, in_vain: false };
         names.insert(service.to_owned(), asked);
         self.report_lookup(service);
         LookupState::Wait
@@ -315,18 +290,14 @@ fn make_service(hub: &Hub, link: &NodeLink, served: ServiceChannel) -> RobotServ
             text: format!(
                 "the clocks differ, but stamps in calls of {} are not converted: the image has no definition of {} \
                     with {}; push the package with the Debian package that contains it (--with DEB)",
-                served.name, of.name, describe_type(&of)
+                served.name,
+                of.name,
+                describe_type(&of)
             ),
         });
     }
     let (request, response) = types::call_stamps(known.as_deref());
-    RobotService {
-        channel: served.channel,
-        service_type: of,
-        request,
-        response,
-        gone: watch::Sender::new(false),
-    }
+    RobotService { channel: served.channel, service_type: of, request, response, gone: watch::Sender::new(false) }
 }
 
 /// Describes what distinguishes a type from others with its name, in the terms of its ROS version.
@@ -340,9 +311,7 @@ fn describe_type(of: &ServiceType) -> String {
 /// Starts lending the robot's services to the servant, when the first link begins.
 pub(super) async fn start_lending(hub: &Arc<Hub>) {
     let lender = Arc::new(HubLender(Arc::downgrade(hub)));
-    let begun = hub
-        .lends
-        .get_or_try_init(|| async { hub.bus.lending()?.lend(lender).await });
+    let begun = hub.lends.get_or_try_init(|| async { hub.bus.lending()?.lend(lender).await });
     match begun.await {
         Ok(()) | Err(BusError::NotOffered(_)) => {}
         Err(error) => {
@@ -367,9 +336,7 @@ impl Hub {
         let graph = self.bus.graph().borrow().clone();
         let links = self.links.lock();
         let mut links = links.values();
-        links
-            .find(|link| graph.is_in_process(&link.node, node))
-            .cloned()
+        links.find(|link| graph.is_in_process(&link.node, node)).cloned()
     }
 }
 
@@ -409,12 +376,8 @@ impl ServiceHandler for RobotServiceHandler {
         let has = |link: &NodeLink| link.lent.find_known(&self.service);
         let link = hub.route_link(caller, |link| has(link).is_some());
         let found = link.and_then(|link| Some((has(&link)?, link)));
-        let (there, link) = found.ok_or_else(|| {
-            FailureReason::new(format!(
-                "no node on the robot serves {} any more",
-                self.service
-            ))
-        })?;
+        let (there, link) = found
+            .ok_or_else(|| FailureReason::new(format!("no node on the robot serves {} any more", self.service)))?;
         if there.service_type != self.of {
             return Err(FailureReason::new(format!(
                 "{} is served on the robot with {} now, not {} as when it was connected to",

@@ -98,8 +98,7 @@ impl MirrorState {
     /// Queries types that are not announced and waits a moment for new ones.
     async fn inquire(&mut self, hub: &Hub, seen: &NodeEndpointSet) {
         let services = seen.services.keys().collect();
-        self.inquiries
-            .retain(&services, &seen.outputs.keys().collect());
+        self.inquiries.retain(&services, &seen.outputs.keys().collect());
         let before = self.inquiries.count();
         for (service, told) in &seen.services {
             if told.is_none() {
@@ -159,12 +158,7 @@ impl MirrorState {
     }
 
     /// Returns name and hash of an input's type.
-    fn input_type(
-        &mut self,
-        link: &NodeLink,
-        hub: &Hub,
-        declared: &DeclaredType,
-    ) -> (String, String) {
+    fn input_type(&mut self, link: &NodeLink, hub: &Hub, declared: &DeclaredType) -> (String, String) {
         match declared {
             DeclaredType::Named(name) => {
                 let known = hub.registry.message(name).ok();
@@ -175,13 +169,7 @@ impl MirrorState {
                 // The robot's publishers do not announce definitions, but its end needs them.
                 if let Some(known) = types::find_message(&hub.registry, of) {
                     let definition = known.full_text().into();
-                    self.send_type(
-                        link,
-                        &WireType {
-                            definition,
-                            ..of.clone()
-                        },
-                    );
+                    self.send_type(link, &WireType { definition, ..of.clone() });
                 }
                 (of.name.clone(), of.digest.to_string())
             }
@@ -223,9 +211,7 @@ impl MirrorState {
         };
         let channel = match known {
             // The server was found after the client: more is now known about the same type.
-            Some((channel, before)) if before.name == of.name && before.is_compatible_with(&of) => {
-                channel
-            }
+            Some((channel, before)) if before.name == of.name && before.is_compatible_with(&of) => channel,
             before => {
                 if let Some((channel, _)) = before {
                     link.services.lock().remove(&channel);
@@ -238,9 +224,7 @@ impl MirrorState {
         let (request, response) = types::call_stamps(known.as_deref());
         let service = NodeService {
             name: name.to_owned(),
-            sizes: hub
-                .inputs
-                .for_input(name, known.as_ref().map(|of| &*of.request)),
+            sizes: hub.inputs.for_input(name, known.as_ref().map(|of| &*of.request)),
             request,
             response,
         };

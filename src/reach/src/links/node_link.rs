@@ -15,9 +15,7 @@ use super::lent::RobotServices;
 use super::node_time;
 use super::outputs::Outputs;
 use super::requests::RequestLog;
-use super::state::{
-    HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine,
-};
+use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine};
 use super::unsent::UnsentCounter;
 use super::{LinkStatus, mirror, seen};
 use crate::FlowCounts;
@@ -87,9 +85,7 @@ impl NodeLink {
         let printing = Arc::clone(&link);
         link.spawn(async move {
             while let Some((error, text)) = lines.recv().await {
-                printing
-                    .session
-                    .send_control(&FromCloud::Line { error, text });
+                printing.session.send_control(&FromCloud::Line { error, text });
             }
         });
         link.spawn(report_drops(Arc::clone(&link)));
@@ -135,10 +131,7 @@ impl NodeLink {
             node: self.node.clone(),
             up: self.session.is_up(),
             round_trip: self.session.round_trip().map(milliseconds),
-            clock: self
-                .session
-                .clock()
-                .map(|sample| milliseconds(sample.offset)),
+            clock: self.session.clock().map(|sample| milliseconds(sample.offset)),
             throughput: self.session.throughput(),
             drops: self.local_drops(),
             dropped,
@@ -156,19 +149,13 @@ impl NodeLink {
 
     pub(super) fn flow(&self) -> FlowCounts {
         let (inputs, outputs) = self.outputs.flow();
-        FlowCounts {
-            node: self.node.clone(),
-            inputs,
-            outputs,
-        }
+        FlowCounts { node: self.node.clone(), inputs, outputs }
     }
 
     fn duplicates(&self) -> Vec<String> {
         let hub = self.hub.upgrade();
         let duplicates = hub.map(|hub| hub.find_duplicates(self)).unwrap_or_default();
-        let names = duplicates
-            .iter()
-            .map(|duplicate| duplicate.machine.name().to_owned());
+        let names = duplicates.iter().map(|duplicate| duplicate.machine.name().to_owned());
         let mut names: Vec<String> = names.collect();
         names.sort();
         names.dedup();
@@ -205,28 +192,16 @@ impl NodeLink {
             ends.is_none_or(|ends| !ends.publishers.is_empty())
         };
         let listening = self.listening.lock();
-        listening
-            .iter()
-            .filter(|topic| !fed(topic))
-            .cloned()
-            .collect()
+        listening.iter().filter(|topic| !fed(topic)).cloned().collect()
     }
 
     /// Calls a service of the node. The request is charged to the robot until it is answered.
     fn call(self: &Arc<Self>, call: ReceivedCall) {
-        let ReceivedCall {
-            id,
-            service,
-            request,
-            held,
-            taken,
-        } = call;
+        let ReceivedCall { id, service, request, held, taken } = call;
         let known = self.services.lock().get(&service).cloned();
         let (Some(service), Some(hub)) = (known, self.hub.upgrade()) else {
             let gone = format!("{} does not serve this any more", self.node);
-            return self
-                .session
-                .answer(id, taken, Err(FailureReason::new(gone)));
+            return self.session.answer(id, taken, Err(FailureReason::new(gone)));
         };
         let link = Arc::clone(self);
         // Not aborted with the link: the node answers a call that it has accepted, even if nobody receives the
@@ -240,9 +215,7 @@ impl NodeLink {
             service.sizes.record(&request);
             let request = link.shift_stamps(&hub, Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;
-            let called = called.map(|response| {
-                link.shift_stamps(&hub, Direction::Out, &service.response, response)
-            });
+            let called = called.map(|response| link.shift_stamps(&hub, Direction::Out, &service.response, response));
             link.session.answer(
                 id,
                 taken,
@@ -279,13 +252,7 @@ impl SessionHandler<FromRobot> for NodeLink {
 }
 
 impl NodeLink {
-    fn dispatch_record(
-        &self,
-        this: &Arc<Self>,
-        record: Record<FromRobot>,
-        held: Permit,
-        arrived: i64,
-    ) {
+    fn dispatch_record(&self, this: &Arc<Self>, record: Record<FromRobot>, held: Permit, arrived: i64) {
         match record {
             Record::Answer { id, response, .. } => self.lent.resolve_call(id, response),
             // A call that waits for it must not wait for other control messages.
@@ -317,11 +284,7 @@ impl NodeLink {
                     }
                     _ => None,
                 };
-                let _ = self.orders.send(QueuedOrder {
-                    told,
-                    hold,
-                    _held: held,
-                });
+                let _ = self.orders.send(QueuedOrder { told, hold, _held: held });
             }
         }
     }
@@ -343,23 +306,9 @@ impl NodeLink {
                     self.outputs.record_input(channel, mark, answered);
                 }
             }
-            Record::Call {
-                id,
-                service,
-                request,
-            } => self.call(ReceivedCall {
-                id,
-                service,
-                request,
-                held,
-                taken: at,
-            }),
+            Record::Call { id, service, request } => self.call(ReceivedCall { id, service, request, held, taken: at }),
             Record::Control(told) => {
-                let _ = self.orders.send(QueuedOrder {
-                    told,
-                    hold: None,
-                    _held: held,
-                });
+                let _ = self.orders.send(QueuedOrder { told, hold: None, _held: held });
             }
             Record::Answer { .. } => {}
         }
@@ -367,17 +316,12 @@ impl NodeLink {
 
     /// Gives queued records to the node that need not wait any longer.
     pub(super) fn drain_held(self: &Arc<Self>) {
-        self.held
-            .drain_ready(|arrival| self.deliver_to_node(arrival));
+        self.held.drain_ready(|arrival| self.deliver_to_node(arrival));
     }
 }
 
 /// Processes control messages of the robot one after the other.
-async fn process_orders(
-    link: Arc<NodeLink>,
-    hub: Arc<Hub>,
-    mut orders: mpsc::UnboundedReceiver<QueuedOrder>,
-) {
+async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<QueuedOrder>) {
     // A node that is slow to connect to one topic does not delay others.
     let mut opening: HashMap<u32, AbortOnDropHandle<()>> = HashMap::new();
     let turns = Arc::new(Semaphore::new(OPENING));
@@ -408,8 +352,7 @@ async fn process_orders(
                 link.session.on_peer_closed(channel);
             }
             FromRobot::Listeners { channel, count } => {
-                link.outputs
-                    .set_listeners(&link, &hub, (channel, count), hold);
+                link.outputs.set_listeners(&link, &hub, (channel, count), hold);
             }
             FromRobot::Parameters(changes) => hub.parameters.apply_changes(&hub, changes).await,
             FromRobot::Requests(requests) => {
@@ -437,11 +380,7 @@ async fn process_orders(
 }
 
 /// Forwards signals from the robot to the node in order.
-async fn forward_signals(
-    link: Arc<NodeLink>,
-    hub: Arc<Hub>,
-    mut signals: mpsc::UnboundedReceiver<i32>,
-) {
+async fn forward_signals(link: Arc<NodeLink>, hub: Arc<Hub>, mut signals: mpsc::UnboundedReceiver<i32>) {
     while let Some(signal) = signals.recv().await {
         if let Err(error) = hub.nodes.signal(&link.node, signal).await {
             let reason = error.to_string();

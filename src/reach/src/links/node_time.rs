@@ -23,10 +23,7 @@ impl NodeTime {
     /// Returns the time source announced in the robot's hello. In ROS 2 this is the only parameter that it contains.
     pub(super) fn from_hello(hello: &Hello) -> Self {
         let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
-        Self {
-            kept: hello.keep_stamps,
-            simulated: AtomicBool::new(simulated),
-        }
+        Self { kept: hello.keep_stamps, simulated: AtomicBool::new(simulated) }
     }
 
     fn set_simulated(&self, simulated: bool) {
@@ -45,13 +42,7 @@ impl NodeLink {
     }
 
     /// Converts the stamps of a message to the other side's time.
-    pub(super) fn shift_stamps(
-        &self,
-        hub: &Hub,
-        direction: Direction,
-        stamps: &Stamps,
-        message: Bytes,
-    ) -> Bytes {
+    pub(super) fn shift_stamps(&self, hub: &Hub, direction: Direction, stamps: &Stamps, message: Bytes) -> Bytes {
         match self.skew(hub) {
             Some(skew) => skew.apply(direction, stamps, message),
             None => message,
@@ -80,8 +71,7 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
         let Ok(Some(node)) = answers.await.map(|graph| node_to_ask(&graph, &link.node)) else {
             return;
         };
-        let is_another =
-            |graph: &Arc<Graph>| node_to_ask(graph, &link.node).as_ref() != Some(&node);
+        let is_another = |graph: &Arc<Graph>| node_to_ask(graph, &link.node).as_ref() != Some(&node);
         let followed = tokio::select! {
             followed = follow_life(&link, &node, parameters) => followed,
             _ = graphs.wait_for(is_another) => continue,
@@ -110,11 +100,7 @@ fn node_to_ask(graph: &Graph, node: &str) -> Option<String> {
 }
 
 /// Follows one run of the node, or until the bus is closed.
-async fn follow_life(
-    link: &NodeLink,
-    node: &str,
-    parameters: &dyn NodeParameters,
-) -> Result<(), BusError> {
+async fn follow_life(link: &NodeLink, node: &str, parameters: &dyn NodeParameters) -> Result<(), BusError> {
     let mut events = parameters.watch(Some(node)).await?;
     let asked = [SIMULATED.to_owned()];
     let held = parameters.get(node, &asked).await?;

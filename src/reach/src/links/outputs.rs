@@ -6,9 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{
-    Bus, Graph, MatchedPeers, PeerId, QosProfile, Subscription, WireType, wait_for_connected,
-};
+use ros::bus::{Bus, Graph, MatchedPeers, PeerId, QosProfile, Subscription, WireType, wait_for_connected};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::Instrument;
@@ -57,12 +55,7 @@ impl Drop for OutputChannelState {
 impl Outputs {
     /// Adds an output that was announced to the robot.
     pub(super) fn add(&self, channel: u32, topic: &str, stamps: Stamps) {
-        let fresh = OutputChannelState {
-            topic: topic.to_owned(),
-            stamps,
-            expected: 0,
-            reading: None,
-        };
+        let fresh = OutputChannelState { topic: topic.to_owned(), stamps, expected: 0, reading: None };
         self.channels.lock().insert(channel, fresh);
     }
 
@@ -133,17 +126,12 @@ impl Outputs {
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = async move {
             let before = match bus.publisher_reports() {
-                Some(hearing) => hearing
-                    .reported_connections(&topic)
-                    .await
-                    .unwrap_or_default(),
+                Some(hearing) => hearing.reported_connections(&topic).await.unwrap_or_default(),
                 None => BTreeSet::new(),
             };
             // As a whole: if it were destructured, its guard would stay behind and end the subscription.
             let subscription = &mut { subscribe(&*bus, &topic).await };
-            reader
-                .drops
-                .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
+            reader.drops.watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
             let publishers = subscription.matched.clone();
             let connected = async {
                 let heard = wait_heard(&*bus, &reader.node, &topic, publishers, before);
@@ -170,10 +158,8 @@ impl Outputs {
                     };
                     // Other nodes of the servant have links of their own.
                     if own.is_own(&message.publisher, |node| hub.is_of_link(&reader, node)) {
-                        let quality =
-                            DeliveryMode::for_type(&message.wire_type.name, message.latching);
-                        let bytes =
-                            reader.shift_stamps(&hub, Direction::Out, &stamps, message.bytes);
+                        let quality = DeliveryMode::for_type(&message.wire_type.name, message.latching);
+                        let bytes = reader.shift_stamps(&hub, Direction::Out, &stamps, message.bytes);
                         reader.send_output(channel, bytes, message.latching, quality);
                     }
                 }
@@ -294,11 +280,7 @@ impl NodeLink {
             born,
             left: 0,
             serialise: 0,
-            answered: self
-                .outputs
-                .given
-                .lock()
-                .match_output(stamp_mark(&message), born),
+            answered: self.outputs.given.lock().match_output(stamp_mark(&message), born),
             message,
         };
         self.session.publish(data, quality);
@@ -320,15 +302,9 @@ mod tests {
         assert!(!own.is_own(&peer("/bass", 1), is_of));
         assert!(own.is_own(&peer("/tenor", 1), gone) && !own.is_own(&peer("/tenor", 2), gone));
         // Nothing of it was received yet.
-        let there = |id: PeerId| TopicPeer {
-            id,
-            connected: true,
-            offer: None,
-        };
-        let present = MatchedPeers {
-            peers: vec![there(peer("/tenor", 2)), there(peer("/bass", 2))],
-            ..MatchedPeers::default()
-        };
+        let there = |id: PeerId| TopicPeer { id, connected: true, offer: None };
+        let present =
+            MatchedPeers { peers: vec![there(peer("/tenor", 2)), there(peer("/bass", 2))], ..MatchedPeers::default() };
         own.add_present(&present, is_of);
         assert!(own.is_own(&peer("/tenor", 2), gone) && !own.is_own(&peer("/bass", 2), gone));
         for number in 0..2 * REMEMBERED as u64 {

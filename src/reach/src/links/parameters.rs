@@ -52,11 +52,7 @@ impl ParameterMirror {
     }
 
     /// Applies changes made on the robot.
-    pub(super) async fn apply_changes(
-        &self,
-        hub: &Hub,
-        changes: Vec<(String, Option<ParamValue>)>,
-    ) {
+    pub(super) async fn apply_changes(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
         for (key, value) in changes {
             if key.trim_start_matches('/') == SIMULATED {
                 hub.set_simulated(value == Some(ParamValue::Bool(true)));
@@ -115,9 +111,7 @@ impl ParameterMirror {
         let links = hub.links.lock();
         let owner = links.values().find(|link| key.starts_with(&link.node));
         match owner.or_else(|| links.values().next()) {
-            Some(link) => link
-                .session
-                .send_control(&FromCloud::Parameters(vec![(key, value)])),
+            Some(link) => link.session.send_control(&FromCloud::Parameters(vec![(key, value)])),
             None => self.keep_change(hub, key, value),
         }
     }
@@ -149,17 +143,11 @@ impl ParameterMirror {
 fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
     match value {
         ParamValue::String(text) => ParamValue::String(hub.nodes.translate(node, text)),
-        ParamValue::List(items) => ParamValue::List(
-            items
-                .iter()
-                .map(|item| translate_value(hub, node, item))
-                .collect(),
-        ),
+        ParamValue::List(items) => {
+            ParamValue::List(items.iter().map(|item| translate_value(hub, node, item)).collect())
+        }
         ParamValue::Map(members) => ParamValue::Map(
-            members
-                .iter()
-                .map(|(name, member)| (name.clone(), translate_value(hub, node, member)))
-                .collect(),
+            members.iter().map(|(name, member)| (name.clone(), translate_value(hub, node, member))).collect(),
         ),
         other => other.clone(),
     }

@@ -55,16 +55,10 @@ impl RequestLog {
         let max = max.map_or(Ok(Duration::ZERO), Duration::try_from_secs_f64);
         let settled = max.map(|max| max.saturating_add(REPORT)).ok();
         let stood = state.connected.map(|at| now.saturating_duration_since(at));
-        let stood = stood
-            .zip(settled)
-            .is_some_and(|(stood, settled)| stood >= settled);
+        let stood = stood.zip(settled).is_some_and(|(stood, settled)| stood >= settled);
         let mut news = Vec::new();
         for request in told {
-            news.extend(
-                state
-                    .classify(&request, stood)
-                    .map(|new| (request.clone(), new)),
-            );
+            news.extend(state.classify(&request, stood).map(|new| (request.clone(), new)));
             match state.last.iter_mut().find(|known| known.id == request.id) {
                 Some(known) => *known = request,
                 None => state.last.push_back(request),
@@ -108,23 +102,13 @@ mod tests {
     const SECOND: Duration = Duration::from_secs(1);
 
     fn request(id: u64, total: Option<f64>) -> RequestTiming {
-        RequestTiming {
-            id,
-            total,
-            ..RequestTiming::default()
-        }
+        RequestTiming { id, total, ..RequestTiming::default() }
     }
 
-    fn record_updates(
-        requests: &RequestLog,
-        told: &[(u64, Option<f64>)],
-        now: Instant,
-    ) -> Vec<(u64, RequestUpdate)> {
+    fn record_updates(requests: &RequestLog, told: &[(u64, Option<f64>)], now: Instant) -> Vec<(u64, RequestUpdate)> {
         let told = told.iter().map(|(id, total)| request(*id, *total));
         let news = requests.record(told.collect(), Some(0.3), now);
-        news.into_iter()
-            .map(|(request, new)| (request.id, new))
-            .collect()
+        news.into_iter().map(|(request, new)| (request.id, new)).collect()
     }
 
     #[test]
@@ -134,39 +118,24 @@ mod tests {
         requests.on_connected(began);
         let now = began + SECOND * 3;
         let told = [(1, Some(5.0)), (2, None), (3, None)];
-        assert_eq!(
-            record_updates(&requests, &told, now),
-            [(1, Answered), (2, Late), (3, Late)]
-        );
+        assert_eq!(record_updates(&requests, &told, now), [(1, Answered), (2, Late), (3, Late)]);
         // Meanwhile the local original's answer is used, and then the cloud's arrives.
         let told = [(1, Some(5.0)), (2, None), (3, Some(900.0))];
         assert_eq!(record_updates(&requests, &told, now), [(3, AnsweredLate)]);
         assert_eq!(record_updates(&requests, &[(3, Some(900.0))], now), []);
         assert_eq!(requests.last().len(), 3);
         // After so many others that it is no longer kept.
-        let others: Vec<_> = (10..10 + 2 * REQUESTS as u64)
-            .map(|id| (id, Some(1.0)))
-            .collect();
+        let others: Vec<_> = (10..10 + 2 * REQUESTS as u64).map(|id| (id, Some(1.0))).collect();
         assert_eq!(record_updates(&requests, &others, now).len(), others.len());
-        assert_eq!(
-            record_updates(&requests, &[(2, Some(2000.0))], now),
-            [(2, AnsweredLate)]
-        );
+        assert_eq!(record_updates(&requests, &[(2, Some(2000.0))], now), [(2, AnsweredLate)]);
     }
 
     #[test]
     fn requests_late_while_the_link_was_down_are_not_reported() {
         let (requests, began) = (RequestLog::default(), Instant::now());
-        assert_eq!(
-            record_updates(&requests, &[(1, None)], began),
-            [],
-            "nothing is connected"
-        );
+        assert_eq!(record_updates(&requests, &[(1, None)], began), [], "nothing is connected");
         requests.on_connected(began);
-        assert_eq!(
-            record_updates(&requests, &[(2, None)], began + SECOND * 2),
-            []
-        );
+        assert_eq!(record_updates(&requests, &[(2, None)], began + SECOND * 2), []);
         assert_eq!(
             record_updates(&requests, &[(2, Some(3000.0))], began + SECOND * 2),
             [(2, RequestUpdate::Answered)],
@@ -175,10 +144,7 @@ mod tests {
         let late = record_updates(&requests, &[(3, None)], began + SECOND * 3);
         assert_eq!(late, [(3, RequestUpdate::Late)]);
         requests.on_connected(began + SECOND * 9);
-        assert_eq!(
-            record_updates(&requests, &[(4, None)], began + SECOND * 10),
-            []
-        );
+        assert_eq!(record_updates(&requests, &[(4, None)], began + SECOND * 10), []);
         assert_eq!(requests.last().len(), 4, "all are shown");
         // Robots are not trusted.
         for max in [f64::NAN, -1.0, f64::INFINITY, 1e300] {

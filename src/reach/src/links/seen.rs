@@ -70,9 +70,7 @@ impl NodeEndpointSet {
         let ends = graph.merged_endpoints(&graph.process_nodes(node));
         let declared = |topics: &BTreeMap<String, (WireType, QosProfile)>| {
             let topics = topics.iter();
-            topics
-                .map(|(topic, (of, qos))| (topic.clone(), DeclaredType::Told(of.clone(), *qos)))
-                .collect()
+            topics.map(|(topic, (of, qos))| (topic.clone(), DeclaredType::Told(of.clone(), *qos))).collect()
         };
         let mut inputs: BTreeMap<String, DeclaredType> = declared(&ends.subscribers);
         inputs.remove(OWN_EVENTS);
@@ -80,9 +78,7 @@ impl NodeEndpointSet {
         Self {
             outputs: declared(&ends.publishers),
             inputs,
-            services: services
-                .map(|(name, of)| (name.clone(), Some(of.clone())))
-                .collect(),
+            services: services.map(|(name, of)| (name.clone(), Some(of.clone()))).collect(),
         }
     }
 }
@@ -108,17 +104,14 @@ pub(super) fn unmet_lookups(graph: &Graph, node: &str) -> Vec<String> {
     let is_it = |other: &String| nodes.contains(other);
     let services = graph.sought.iter();
     let services = services
-        .filter(|(service, nodes)| {
-            nodes.iter().any(is_it) && !graph.services.contains_key(*service)
-        })
+        .filter(|(service, nodes)| nodes.iter().any(is_it) && !graph.services.contains_key(*service))
         .map(|(service, _)| service.clone());
     // Actions of ROS 2, whose topics and services are hidden; those of ROS 1 consist of topics.
-    let actions = graph.actions.iter().filter(|(_, ends)| {
-        ends.topics.is_empty() && ends.servers.is_empty() && ends.clients.iter().any(is_it)
-    });
-    services
-        .chain(actions.map(|(action, _)| action.clone()))
-        .collect()
+    let actions = graph
+        .actions
+        .iter()
+        .filter(|(_, ends)| ends.topics.is_empty() && ends.servers.is_empty() && ends.clients.iter().any(is_it));
+    services.chain(actions.map(|(action, _)| action.clone())).collect()
 }
 
 #[cfg(test)]
@@ -129,11 +122,7 @@ mod tests {
 
     fn topic_with_both(topic: &str) -> (String, TopicNodes) {
         let nodes = || vec!["/see".to_owned(), "/other".to_owned()];
-        let ends = TopicNodes {
-            type_name: "std_msgs/String".to_owned(),
-            publishers: nodes(),
-            subscribers: nodes(),
-        };
+        let ends = TopicNodes { type_name: "std_msgs/String".to_owned(), publishers: nodes(), subscribers: nodes() };
         (topic.to_owned(), ends)
     }
 
@@ -150,10 +139,7 @@ mod tests {
         assert_eq!(seen.inputs["/fib/goal"], named);
         assert_eq!(seen.services, [("/set".to_owned(), None)].into());
         assert_eq!(named.qos(), None);
-        assert_eq!(
-            NodeEndpointSet::from_graph(&graph, "/nobody", RosVersion::One),
-            NodeEndpointSet::default()
-        );
+        assert_eq!(NodeEndpointSet::from_graph(&graph, "/nobody", RosVersion::One), NodeEndpointSet::default());
     }
 
     #[test]
@@ -163,11 +149,7 @@ mod tests {
         let topic = |name: &str, qos| (name.to_owned(), (of("std_msgs/msg/String"), qos));
         let get_result = ServiceType::new("test_msgs/action/Fibonacci_GetResult", "*");
         let ends = NodeEntities {
-            publishers: [
-                topic("/map", latching),
-                topic("/parameter_events", QosProfile::keep_last(10)),
-            ]
-            .into(),
+            publishers: [topic("/map", latching), topic("/parameter_events", QosProfile::keep_last(10))].into(),
             subscribers: [
                 topic("/scan", QosProfile::keep_last(5)),
                 topic("/parameter_events", QosProfile::keep_last(10)),
@@ -183,8 +165,7 @@ mod tests {
             ..Graph::default()
         };
         let seen = NodeEndpointSet::from_graph(&graph, "/see", RosVersion::Two);
-        let names =
-            |topics: &BTreeMap<String, DeclaredType>| topics.keys().cloned().collect::<Vec<_>>();
+        let names = |topics: &BTreeMap<String, DeclaredType>| topics.keys().cloned().collect::<Vec<_>>();
         assert_eq!(names(&seen.outputs), ["/map", "/parameter_events"]);
         assert_eq!(names(&seen.inputs), ["/scan"]);
         let told = seen.outputs["/map"].qos().expect("it is told");
@@ -208,19 +189,12 @@ mod tests {
         let graph = |process: &[String]| Graph {
             ends: [
                 ("/see".to_owned(), node(&["/found"], &["/image"])),
-                (
-                    "/tell".to_owned(),
-                    node(&["/said", "/found"], &[OWN_EVENTS]),
-                ),
+                ("/tell".to_owned(), node(&["/said", "/found"], &[OWN_EVENTS])),
                 ("/other".to_owned(), node(&["/others"], &[])),
             ]
             .into(),
             sought: [("/map".to_owned(), vec!["/tell".to_owned()])].into(),
-            enclaves: [(
-                "/cloudroid_link/see".to_owned(),
-                process.iter().cloned().collect(),
-            )]
-            .into(),
+            enclaves: [("/cloudroid_link/see".to_owned(), process.iter().cloned().collect())].into(),
             ..Graph::default()
         };
         let one = graph(&nodes()[..1]);
@@ -232,15 +206,8 @@ mod tests {
         assert_eq!(seen.inputs.keys().collect::<Vec<_>>(), ["/image"]);
         assert_eq!(unmet_lookups(&two, "/see"), ["/map"]);
         let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
-        let see = NodeEndpoints {
-            outputs: names(&["/found"]),
-            inputs: names(&["/image"]),
-            ..NodeEndpoints::default()
-        };
-        let tell = NodeEndpoints {
-            outputs: names(&["/found", "/said"]),
-            ..NodeEndpoints::default()
-        };
+        let see = NodeEndpoints { outputs: names(&["/found"]), inputs: names(&["/image"]), ..NodeEndpoints::default() };
+        let tell = NodeEndpoints { outputs: names(&["/found", "/said"]), ..NodeEndpoints::default() };
         let [one, other] = nodes();
         assert_eq!(owners(&two, "/see"), [(one, see), (other, tell)].into());
     }
@@ -248,11 +215,7 @@ mod tests {
     #[test]
     fn unmet_lookups_are_services_and_actions() {
         let see = || vec!["/see".to_owned()];
-        let action = |servers| ActionNodes {
-            servers,
-            clients: see(),
-            ..ActionNodes::default()
-        };
+        let action = |servers| ActionNodes { servers, clients: see(), ..ActionNodes::default() };
         let graph = Graph {
             sought: [
                 ("/map".to_owned(), see()),
@@ -261,11 +224,7 @@ mod tests {
             ]
             .into(),
             services: [("/lent".to_owned(), "/cloudroid_bridge".to_owned())].into(),
-            actions: [
-                ("/go".to_owned(), action(Vec::new())),
-                ("/stay".to_owned(), action(see())),
-            ]
-            .into(),
+            actions: [("/go".to_owned(), action(Vec::new())), ("/stay".to_owned(), action(see()))].into(),
             ..Graph::default()
         };
         assert_eq!(unmet_lookups(&graph, "/see"), ["/map", "/go"]);

@@ -95,10 +95,7 @@ fn hello(node: &str, attempt: u64) -> Hello {
         attempt,
         machine: "m1".into(),
         host: "rover".into(),
-        node: NodeLaunch {
-            name: node.into(),
-            ..NodeLaunch::default()
-        },
+        node: NodeLaunch { name: node.into(), ..NodeLaunch::default() },
         next: 1,
         ..Hello::default()
     }
@@ -114,20 +111,14 @@ async fn send_hello(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, 
 async fn serve_hello(
     hub: &Arc<Hub>,
     hello: &Hello,
-) -> (
-    WebSocket<DuplexStream>,
-    Welcome,
-    JoinHandle<DisconnectReason>,
-) {
+) -> (WebSocket<DuplexStream>, Welcome, JoinHandle<DisconnectReason>) {
     let (robot, cloud) = duplex(1 << 16);
     let hub = Arc::clone(hub);
     let serving = tokio::spawn(async move { hub.serve(cloud, b"").await });
     let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
     let mut held = Budget::without_limit().permit();
-    let welcome = receive_open(&mut socket, "welcome", &mut held)
-        .await
-        .unwrap();
+    let welcome = receive_open(&mut socket, "welcome", &mut held).await.unwrap();
     (socket, welcome, serving)
 }
 
@@ -135,15 +126,8 @@ fn resuming(attempt: u64, welcome: &Welcome) -> Hello {
     let Welcome::Accepted { session, next, .. } = welcome else {
         panic!("{welcome:?}");
     };
-    let resume = Resume {
-        session: session.clone(),
-        received: next - 1,
-        ahead: Vec::new(),
-    };
-    Hello {
-        resume: Some(resume),
-        ..hello("/detect", attempt)
-    }
+    let resume = Resume { session: session.clone(), received: next - 1, ahead: Vec::new() };
+    Hello { resume: Some(resume), ..hello("/detect", attempt) }
 }
 
 /// Reads until the cloud closes the connection; returns the reason.
@@ -167,48 +151,30 @@ fn many_parameters() -> BTreeMap<String, ParamValue> {
 #[tokio::test]
 async fn parameters_of_a_hello_count_until_they_are_set() {
     let budget = Budget::new("robot x", 64 << 20);
-    let options = HubOptions {
-        budget: budget.clone(),
-        ..HubOptions::default()
-    };
+    let options = HubOptions { budget: budget.clone(), ..HubOptions::default() };
     let (hub, _nodes) = hub_with(options).await;
     let mut hello = hello("/detect", 1);
     hello.parameters = many_parameters();
     let (_socket, welcome) = send_hello(&hub, &hello).await;
     assert!(matches!(welcome, Welcome::Accepted { .. }), "{welcome:?}");
-    assert!(
-        budget.used_bytes() < 1 << 20,
-        "{} bytes are held",
-        budget.used_bytes()
-    );
+    assert!(budget.used_bytes() < 1 << 20, "{} bytes are held", budget.used_bytes());
 }
 
 #[tokio::test]
 async fn parameters_that_are_set_before_there_is_a_link_are_paid_for() {
     let budget = Budget::new("servant s1", 1 << 20);
-    let options = HubOptions {
-        budget: budget.clone(),
-        ..HubOptions::default()
-    };
+    let options = HubOptions { budget: budget.clone(), ..HubOptions::default() };
     let (hub, _nodes) = hub_with(options).await;
     let parameters = &hub.parameters;
     let text = || Some(ParamValue::String("x".repeat(10_000)));
     for _ in 0..1000 {
         parameters.report_change(&hub, "/again".into(), text());
     }
-    assert!(
-        budget.used_bytes() < 20_000,
-        "{} bytes: one is kept",
-        budget.used_bytes()
-    );
+    assert!(budget.used_bytes() < 20_000, "{} bytes: one is kept", budget.used_bytes());
     for number in 0..1000 {
         parameters.report_change(&hub, format!("/more/{number}"), text());
     }
-    assert!(
-        budget.refusal_count() > 800,
-        "{} were refused",
-        budget.refusal_count()
-    );
+    assert!(budget.refusal_count() > 800, "{} were refused", budget.refusal_count());
     let untold = parameters.take_pending();
     assert!((90..=104).contains(&untold.len()), "{}", untold.len());
     assert_eq!(budget.used_bytes(), 0, "whoever tells them pays for them");
@@ -224,10 +190,7 @@ async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
         (4 << 20, long, "do not fit into the memory for robot x"),
         (64 << 20, wordy, "a hello without parameters of 10485"),
     ] {
-        let options = HubOptions {
-            budget: Budget::new("robot x", room),
-            ..HubOptions::default()
-        };
+        let options = HubOptions { budget: Budget::new("robot x", room), ..HubOptions::default() };
         let (hub, nodes) = hub_with(options).await;
         let (robot, cloud) = duplex(1 << 16);
         tokio::spawn(async move { hub.serve(cloud, b"").await });
@@ -248,10 +211,7 @@ async fn a_hello_that_was_overtaken_does_not_displace_the_later_one() {
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
     read_until_close(first).await;
     let (_, late) = send_hello(&hub, &resuming(2, &welcome)).await;
-    assert!(
-        matches!(late, Welcome::Refused { again: true, .. }),
-        "{late:?}"
-    );
+    assert!(matches!(late, Welcome::Refused { again: true, .. }), "{late:?}");
     // A hello without a session would have started another one.
     let (_, late) = send_hello(&hub, &hello("/detect", 2)).await;
     assert!(matches!(late, Welcome::Refused { .. }), "{late:?}");
@@ -266,11 +226,7 @@ async fn a_hello_that_was_overtaken_does_not_displace_the_later_one() {
 async fn a_robot_of_another_ros_is_refused_for_good() {
     let (hub, nodes) = hub().await;
     for (ros, refused) in [(0, false), (1, false), (2, true), (3, true)] {
-        let hello = Hello {
-            ros,
-            run: format!("life in ROS {ros}"),
-            ..hello("/detect", 1)
-        };
+        let hello = Hello { ros, run: format!("life in ROS {ros}"), ..hello("/detect", 1) };
         match send_hello(&hub, &hello).await.1 {
             Welcome::Accepted { .. } => assert!(!refused, "{ros}"),
             Welcome::Refused { reason, again } => {
@@ -280,10 +236,7 @@ async fn a_robot_of_another_ros_is_refused_for_good() {
             }
         }
     }
-    assert!(
-        nodes.is_running("/detect").await,
-        "it is not ended for them"
-    );
+    assert!(nodes.is_running("/detect").await, "it is not ended for them");
 }
 
 #[tokio::test]
@@ -304,16 +257,9 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
     let (_copy, welcome) = send_hello(&hub, &of("/other", "rover2", "b")).await;
     assert!(matches!(welcome, Welcome::Accepted { .. }));
     let warnings = nodes.warnings.lock().clone();
-    assert_eq!(
-        warnings.len(),
-        2,
-        "one for each other machine: {warnings:?}"
-    );
+    assert_eq!(warnings.len(), 2, "one for each other machine: {warnings:?}");
     let told = "rover1 runs /one, rover2 runs /other";
-    assert!(
-        warnings.iter().any(|text| text.contains(told)),
-        "{warnings:?}"
-    );
+    assert!(warnings.iter().any(|text| text.contains(told)), "{warnings:?}");
     for link in hub.status() {
         let duplicates = match link.node.as_str() {
             "/other" => vec!["computer in the arm", "rover1"],
@@ -326,10 +272,7 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
     let Welcome::Refused { reason, again } = refused else {
         panic!("{refused:?}");
     };
-    assert!(
-        reason.contains("another machine (rover1)") && !again,
-        "{reason}"
-    );
+    assert!(reason.contains("another machine (rover1)") && !again, "{reason}");
 }
 
 /// Only reports a test that hangs.
@@ -341,20 +284,14 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let (_detect, welcome) = send_hello(&hub, &hello("/detect", 1)).await;
     // One node never finishes starting …
     nodes.stuck.lock().insert("/starting".into());
-    let starting = Hello {
-        run: "another life".into(),
-        ..hello("/starting", 1)
-    };
+    let starting = Hello { run: "another life".into(), ..hello("/starting", 1) };
     let (robot, cloud) = duplex(1 << 16);
     let serving = Arc::clone(&hub);
     tokio::spawn(async move { serving.serve(cloud, b"").await });
     let mut starting_socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut starting_socket, &starting).await.unwrap();
     // … and another never finishes ending, after its robot has left it.
-    let another = Hello {
-        run: "a third life".into(),
-        ..hello("/ending", 1)
-    };
+    let another = Hello { run: "a third life".into(), ..hello("/ending", 1) };
     let begun = timeout(PATIENCE, send_hello(&hub, &another)).await;
     let (mut ending, _) = begun.expect("others hold it up");
     nodes.stuck.lock().insert("/ending".into());
@@ -362,10 +299,7 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let _ = std::future::poll_fn(|cx| ending.poll_flush(cx)).await;
     let mut signals = nodes.signals.subscribe();
     let told = signals.wait_for(|signals| signals.contains(&("/ending".into(), 2)));
-    timeout(PATIENCE, told)
-        .await
-        .expect("it is asked to end")
-        .unwrap();
+    timeout(PATIENCE, told).await.expect("it is asked to end").unwrap();
     let back = resuming(2, &welcome);
     let resumed = send_hello(&hub, &back);
     let (_, welcome) = timeout(PATIENCE, resumed).await.expect("others hold it up");
@@ -374,10 +308,7 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
 
 #[tokio::test]
 async fn a_link_whose_connection_is_dropped_ends_with_its_node() {
-    let options = HubOptions {
-        grace: Duration::ZERO,
-        ..HubOptions::default()
-    };
+    let options = HubOptions { grace: Duration::ZERO, ..HubOptions::default() };
     let (hub, nodes) = hub_with(options).await;
     let (_socket, _, serving) = serve_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
@@ -423,11 +354,7 @@ async fn a_link_that_is_taken_up_as_its_grace_ends_goes_on() {
 #[tokio::test]
 async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     // The node does not connect to its input, like a stopped process.
-    let (hub, nodes) = hub_with(HubOptions {
-        warm_up: PATIENCE * 10,
-        ..HubOptions::default()
-    })
-    .await;
+    let (hub, nodes) = hub_with(HubOptions { warm_up: PATIENCE * 10, ..HubOptions::default() }).await;
     let (_robot, _) = send_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
     let held = || Budget::without_limit().permit();
@@ -445,10 +372,7 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
     let mut signals = nodes.signals.subscribe();
     let both = signals.wait_for(|signals| signals.len() == 2);
     let both = timeout(PATIENCE, both).await.expect("they wait").unwrap();
-    assert_eq!(
-        *both,
-        [("/detect".to_owned(), 2), ("/detect".to_owned(), 15)]
-    );
+    assert_eq!(*both, [("/detect".to_owned(), 2), ("/detect".to_owned(), 15)]);
 }
 
 #[tokio::test]
@@ -465,9 +389,7 @@ async fn asking_how_a_link_is_doing_holds_up_no_connection() {
         sender.send(own).expect("it is awaited");
         asked.status()
     });
-    let state = std::path::Path::new("/proc")
-        .join(thread.recv().expect("it runs"))
-        .join("stat");
+    let state = std::path::Path::new("/proc").join(thread.recv().expect("it runs")).join("stat");
     let asleep = || std::fs::read_to_string(&state).is_ok_and(|state| state.contains(") S "));
     while !asleep() {
         std::thread::yield_now();
@@ -475,31 +397,20 @@ async fn asking_how_a_link_is_doing_holds_up_no_connection() {
     // … while a connection begins and ends.
     let (sender, over) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let (_, cloud) = duplex(1 << 16);
         let mut socket = WebSocket::new(cloud, b"", MAX_FRAME, MAX_RECORD);
-        runtime
-            .expect("a runtime")
-            .block_on(link.session.run(&mut socket, &*link));
+        runtime.expect("a runtime").block_on(link.session.run(&mut socket, &*link));
         let _ = sender.send(());
     });
-    over.recv_timeout(PATIENCE)
-        .expect("the connection waits for whoever asks");
+    over.recv_timeout(PATIENCE).expect("the connection waits for whoever asks");
     drop(held);
     assert_eq!(asking.join().expect("no panic").node, "/detect");
 }
 
 #[test]
 fn a_robot_may_tell_any_number_for_its_t_max() {
-    let max_age = |max| {
-        session_options(&SlaTargets {
-            max: Some(max),
-            ..SlaTargets::default()
-        })
-        .max_age
-    };
+    let max_age = |max| session_options(&SlaTargets { max: Some(max), ..SlaTargets::default() }).max_age;
     assert_eq!(max_age(0.3), Some(Duration::from_millis(300)));
     for max in [1e300, f64::INFINITY, f64::NAN, -1.0, 0.0, 1e-300] {
         assert_eq!(max_age(max), None, "{max}");

@@ -16,18 +16,11 @@ pub(super) fn find_message(registry: &Registry, of: &WireType) -> Option<Arc<Mes
 /// Returns the definition of a service type, if the image has the same type.
 pub(super) fn find_service(registry: &Registry, of: &ServiceType) -> Option<Arc<ServiceDef>> {
     let known = registry.service(&of.name).ok()?;
-    ServiceType::from_service(&known)
-        .is_compatible_with(of)
-        .then_some(known)
+    ServiceType::from_service(&known).is_compatible_with(of).then_some(known)
 }
 
 /// Returns the positions of the stamps in requests and responses; none if the type is unknown.
 pub(super) fn call_stamps(of: Option<&ServiceDef>) -> (Stamps, Stamps) {
-    let known = of.map(|of| {
-        (
-            Stamps::for_type(&of.request),
-            Stamps::for_type(&of.response),
-        )
-    });
+    let known = of.map(|of| (Stamps::for_type(&of.request), Stamps::for_type(&of.response)));
     known.unwrap_or_default()
 }

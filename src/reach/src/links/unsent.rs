@@ -36,13 +36,8 @@ impl UnsentCounter {
     /// Returns the number in the last minute.
     pub(super) fn last_minute(&self) -> u64 {
         let state = self.0.lock();
-        let lately = state
-            .reports
-            .iter()
-            .filter(|(at, _)| at.elapsed() <= LATELY);
-        lately
-            .map(|(_, more)| more)
-            .fold(0, |sum, more| sum.saturating_add(*more))
+        let lately = state.reports.iter().filter(|(at, _)| at.elapsed() <= LATELY);
+        lately.map(|(_, more)| more).fold(0, |sum, more| sum.saturating_add(*more))
     }
 }
 

@@ -38,20 +38,13 @@ pub(super) struct OwnNodes(Mutex<OwnNodesStage>);
 impl OwnNodes {
     /// Waits until none is running. `take_over` is called once to determine whether there are any to end. The future
     /// may be dropped meanwhile: the next caller continues.
-    pub(super) async fn end_once<F>(
-        &self,
-        take_over: impl FnOnce() -> bool,
-        ending: impl FnOnce() -> F,
-    ) where
+    pub(super) async fn end_once<F>(&self, take_over: impl FnOnce() -> bool, ending: impl FnOnce() -> F)
+    where
         F: Future<Output = ()>,
     {
         let mut stage = self.0.lock().await;
         if *stage == OwnNodesStage::Running {
-            *stage = if take_over() {
-                OwnNodesStage::Ending
-            } else {
-                OwnNodesStage::Ended
-            };
+            *stage = if take_over() { OwnNodesStage::Ending } else { OwnNodesStage::Ended };
         }
         if *stage == OwnNodesStage::Ending {
             ending().await;
@@ -75,11 +68,7 @@ async fn end_node(container: &dyn ServantHandle, node: &str) {
             return;
         }
     }
-    tracing::warn!(
-        servant = container.id(),
-        node,
-        "a node of the revision does not end"
-    );
+    tracing::warn!(servant = container.id(), node, "a node of the revision does not end");
 }
 
 #[cfg(test)]
@@ -94,11 +83,8 @@ mod tests {
     #[tokio::test]
     async fn the_second_stub_waits_for_what_the_first_one_ends_even_if_that_one_goes_away() {
         let planned = Arc::new(OwnNodes::default());
-        let (asked, begun, over) = (
-            Arc::new(AtomicUsize::new(0)),
-            Arc::new(Semaphore::new(0)),
-            Arc::new(Semaphore::new(0)),
-        );
+        let (asked, begun, over) =
+            (Arc::new(AtomicUsize::new(0)), Arc::new(Semaphore::new(0)), Arc::new(Semaphore::new(0)));
         let stub = || {
             let (planned, asked) = (Arc::clone(&planned), Arc::clone(&asked));
             let (begun, over) = (Arc::clone(&begun), Arc::clone(&over));
@@ -129,9 +115,7 @@ mod tests {
     async fn where_stubs_were_first_there_is_nothing_to_end() {
         let planned = OwnNodes::default();
         for _ in 0..2 {
-            planned
-                .end_once(|| false, || async { panic!("none was started") })
-                .await;
+            planned.end_once(|| false, || async { panic!("none was started") }).await;
         }
     }
 }

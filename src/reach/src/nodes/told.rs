@@ -75,11 +75,7 @@ impl RobotEvents {
             decisions.1
         };
         if count > DECISIONS.0 {
-            tracing::debug!(
-                servant = self.servant,
-                ?decision,
-                "one of too many decisions"
-            );
+            tracing::debug!(servant = self.servant, ?decision, "one of too many decisions");
             return;
         }
         let known = KINDS.iter().find(|kind| **kind == decision.kind);
@@ -91,13 +87,8 @@ impl RobotEvents {
         };
         let robot = tenant.robot();
         let message = format!("robot {robot}: {node}: {text}{ago}");
-        let level = if decision.warning {
-            Level::Warning
-        } else {
-            Level::Info
-        };
-        self.observer
-            .record_event(level, kind, &message, Some(robot));
+        let level = if decision.warning { Level::Warning } else { Level::Info };
+        self.observer.record_event(level, kind, &message, Some(robot));
         let why = match kind {
             "local-takes-over" | "local-answers-too" => Some(&*text),
             "local-hands-back" | "cloud-answers-alone" => None,
@@ -113,7 +104,6 @@ impl RobotEvents {
     pub(crate) fn warn(&self, kind: &str, text: &str) {
         let tenant = self.tenant();
         let robot = tenant.as_ref().map(|tenant| tenant.robot());
-        self.observer
-            .record_event(Level::Warning, kind, text, robot);
+        self.observer.record_event(Level::Warning, kind, text, robot);
     }
 }

@@ -28,27 +28,14 @@ pub(super) struct OutputListeners {
 }
 
 impl OutputListeners {
-    pub(super) async fn open(
-        bus: &Arc<dyn Bus>,
-        interface: &Interface,
-    ) -> Result<OutputListeners, Error> {
+    pub(super) async fn open(bus: &Arc<dyn Bus>, interface: &Interface) -> Result<OutputListeners, Error> {
         let (sender, said) = mpsc::unbounded_channel();
-        let mut ears = OutputListeners {
-            topics: Vec::new(),
-            said,
-            answering: None,
-            tasks: Vec::new(),
-        };
+        let mut ears = OutputListeners { topics: Vec::new(), said, answering: None, tasks: Vec::new() };
         // Latched outputs are states, not responses.
-        let outputs = interface
-            .topics
-            .iter()
-            .filter(|topic| topic.direction == Direction::Output && !topic.latched);
+        let outputs = interface.topics.iter().filter(|topic| topic.direction == Direction::Output && !topic.latched);
         for (number, topic) in outputs.enumerate() {
-            let subscription = bus
-                .subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE))
-                .await
-                .map_err(trial_error)?;
+            let subscription =
+                bus.subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE)).await.map_err(trial_error)?;
             let task = tokio::spawn(listen(number, subscription, sender.clone()));
             ears.tasks.push(task.abort_handle());
             ears.topics.push((topic.clone(), 0, Bytes::new()));
@@ -99,10 +86,7 @@ impl OutputListeners {
         let shown = |topic: &Topic, last: &Bytes| {
             let of_type = registry.message(&topic.type_name).ok()?;
             let mut json = Vec::new();
-            let options = JsonOptions {
-                max_bytes: LONGEST_SHOWN,
-                ..JsonOptions::default()
-            };
+            let options = JsonOptions { max_bytes: LONGEST_SHOWN, ..JsonOptions::default() };
             to_json(&of_type, last, &mut json, &options).ok()?;
             serde_json::from_slice(&json).ok()
         };
@@ -125,11 +109,7 @@ impl Drop for OutputListeners {
     }
 }
 
-async fn listen(
-    number: usize,
-    mut subscription: Subscription,
-    said: mpsc::UnboundedSender<(usize, Instant, Bytes)>,
-) {
+async fn listen(number: usize, mut subscription: Subscription, said: mpsc::UnboundedSender<(usize, Instant, Bytes)>) {
     while let Some(message) = subscription.messages.recv().await {
         if said.send((number, Instant::now(), message.bytes)).is_err() {
             return;

@@ -71,12 +71,7 @@ impl ReplayClock {
         };
         // A recording of one message has no rate.
         let scale = if recorded.is_finite() { scale } else { 0.0 };
-        ReplayClock {
-            began: Instant::now(),
-            length,
-            scale,
-            pace: (scale > 0.0).then(|| recorded / scale),
-        }
+        ReplayClock { began: Instant::now(), length, scale, pace: (scale > 0.0).then(|| recorded / scale) }
     }
 
     /// Returns the intended requests per second.
@@ -132,9 +127,6 @@ mod tests {
         // One message has no rate.
         let clock = ReplayClock::new(Duration::ZERO, 1, RequestGap::Recorded);
         assert_eq!(clock.pace(), None);
-        assert_eq!(
-            ReplayClock::new(Duration::ZERO, 1, RequestGap::Rate(5.0)).pace(),
-            None
-        );
+        assert_eq!(ReplayClock::new(Duration::ZERO, 1, RequestGap::Rate(5.0)).pace(), None);
     }
 }

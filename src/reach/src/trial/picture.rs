@@ -87,11 +87,7 @@ impl Picture {
                 [] => [0; 3],
             })
             .collect();
-        Ok(Picture {
-            width: frame.width,
-            height: frame.height,
-            rgb,
-        })
+        Ok(Picture { width: frame.width, height: frame.height, rgb })
     }
 
     /// Returns the message with the current time as its stamp. (sensor_msgs/Image: header, height, width, encoding,
@@ -107,9 +103,7 @@ impl Picture {
     /// terminating zero.
     fn to_ros2_message(&self) -> Bytes {
         const HEADER: [u8; 4] = [0, 1, 0, 0];
-        let now = SystemTime::now()
-            .duration_since(UNIX_EPOCH)
-            .unwrap_or_default();
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let mut out = Vec::with_capacity(self.rgb.len() + 64);
         out.extend_from_slice(&HEADER);
         let mut word = |value: u32, text: &str| {
@@ -132,9 +126,7 @@ impl Picture {
     }
 
     fn to_ros1_message(&self, sequence: usize) -> Bytes {
-        let now = SystemTime::now()
-            .duration_since(UNIX_EPOCH)
-            .unwrap_or_default();
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let mut out = Vec::with_capacity(self.rgb.len() + 64);
         let mut word = |value: u32, text: &str| {
             out.extend_from_slice(&value.to_le_bytes());
@@ -221,17 +213,11 @@ mod tests {
                 "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n\
                  uint32 step\nuint8[] data\n",
             ),
-            (
-                "std_msgs/msg/Header",
-                "builtin_interfaces/Time stamp\nstring frame_id\n",
-            ),
+            ("std_msgs/msg/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
         ];
         let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
         let registry = Registry::with_definitions(RosVersion::Two, &definitions.into());
-        let image = registry
-            .expect("valid")
-            .message("sensor_msgs/msg/Image")
-            .expect("defined");
+        let image = registry.expect("valid").message("sensor_msgs/msg/Image").expect("defined");
         let picture = Picture::read(&png(&[7, 9])).expect("a picture");
         let message = picture.message(0, RosVersion::Two);
         let mut json = Vec::new();
@@ -239,10 +225,7 @@ mod tests {
         let seen: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
         assert_eq!(seen["header"]["frame_id"], "camera");
         assert_eq!((&seen["height"], &seen["width"]), (&1.into(), &2.into()));
-        assert_eq!(
-            (&seen["encoding"], &seen["step"]),
-            (&"rgb8".into(), &6.into())
-        );
+        assert_eq!((&seen["encoding"], &seen["step"]), (&"rgb8".into(), &6.into()));
         assert_eq!(seen["data"], "BwcHCQkJ");
     }
 

@@ -86,23 +86,13 @@ impl<'a> ReplayPlan<'a> {
         material: &'a Material,
         request: Option<&str>,
     ) -> Result<ReplayPlan<'a>, Error> {
-        let inputs: Vec<&Topic> = interface
-            .topics
-            .iter()
-            .filter(|topic| topic.direction == Direction::Input)
-            .collect();
+        let inputs: Vec<&Topic> = interface.topics.iter().filter(|topic| topic.direction == Direction::Input).collect();
         let nothing = |what: &str| {
-            let known: Vec<String> = inputs
-                .iter()
-                .map(|topic| format!("{} ({})", topic.name, topic.type_name))
-                .collect();
+            let known: Vec<String> =
+                inputs.iter().map(|topic| format!("{} ({})", topic.name, topic.type_name)).collect();
             Error::Trial(format!(
                 "{what}; its inputs are: {}",
-                if known.is_empty() {
-                    "none".to_owned()
-                } else {
-                    known.join(", ")
-                }
+                if known.is_empty() { "none".to_owned() } else { known.join(", ") }
             ))
         };
         let mut plan = ReplayPlan {
@@ -115,29 +105,23 @@ impl<'a> ReplayPlan<'a> {
         };
         match material {
             Material::Pictures(pictures) => {
-                let eyes = inputs
-                    .iter()
-                    .filter(|topic| picture::TYPES.contains(&topic.type_name.as_str()));
+                let eyes = inputs.iter().filter(|topic| picture::TYPES.contains(&topic.type_name.as_str()));
                 for topic in eyes {
                     plan.inputs.push(PlannedInput::new(topic, registry)?);
                 }
                 if plan.inputs.is_empty() {
-                    return Err(nothing(
-                        "the service has no input of type sensor_msgs/Image",
-                    ));
+                    return Err(nothing("the service has no input of type sensor_msgs/Image"));
                 }
-                plan.choose_request(request)
-                    .ok_or_else(|| unfed_error(request, &nothing))?;
+                plan.choose_request(request).ok_or_else(|| unfed_error(request, &nothing))?;
                 let eyes = plan.inputs.len();
                 for (number, picture) in pictures.iter().enumerate() {
                     // With several inputs, the one of the requests is last, because its response is awaited.
                     let others = (0..eyes).filter(|eye| *eye != plan.request);
-                    plan.items
-                        .extend(others.chain([plan.request]).map(|input| PlannedMessage {
-                            input,
-                            content: PlannedContent::Picture(picture),
-                            at: Duration::from_secs(number as u64),
-                        }));
+                    plan.items.extend(others.chain([plan.request]).map(|input| PlannedMessage {
+                        input,
+                        content: PlannedContent::Picture(picture),
+                        at: Duration::from_secs(number as u64),
+                    }));
                 }
                 plan.length = Duration::from_secs(pictures.len() as u64);
             }
@@ -175,8 +159,7 @@ impl<'a> ReplayPlan<'a> {
                         )
                     }));
                 }
-                plan.choose_request(request)
-                    .ok_or_else(|| unfed_error(request, &nothing))?;
+                plan.choose_request(request).ok_or_else(|| unfed_error(request, &nothing))?;
                 // The next round begins after one more pause of average length.
                 if let Some(pauses) = u32::try_from(plan.items.len() - 1).ok().filter(|n| *n > 0) {
                     plan.length += plan.length / pauses;
@@ -225,21 +208,13 @@ impl<'a> ReplayPlan<'a> {
         registry: &Registry,
         message: &BagMessage,
     ) -> Result<Option<usize>, Error> {
-        let of_type = || {
-            inputs
-                .iter()
-                .filter(|topic| topic.type_name == message.wire_type.name)
-        };
+        let of_type = || inputs.iter().filter(|topic| topic.type_name == message.wire_type.name);
         let named = of_type().find(|topic| *topic.name == *message.topic);
         let alone = || of_type().next().filter(|_| of_type().count() == 1);
         let Some(input) = named.or_else(alone) else {
             return Ok(None);
         };
-        if let Some(known) = self
-            .inputs
-            .iter()
-            .position(|known| known.topic == input.name)
-        {
+        if let Some(known) = self.inputs.iter().position(|known| known.topic == input.name) {
             return Ok(Some(known));
         }
         let found = PlannedInput::new(input, registry)?;
@@ -257,9 +232,7 @@ impl<'a> ReplayPlan<'a> {
 
 fn unfed_error(request: Option<&str>, nothing: &dyn Fn(&str) -> Error) -> Error {
     let request = request.unwrap_or_default();
-    nothing(&format!(
-        "nothing that was given goes to an input {request}"
-    ))
+    nothing(&format!("nothing that was given goes to an input {request}"))
 }
 
 /// Returns the stamp of a message whose type begins with a header.
@@ -268,9 +241,9 @@ pub(super) fn stamp(type_name: &str, bytes: &[u8], registry: &Registry) -> Optio
 }
 
 fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
-    let known = registry.message(&topic.type_name).map_err(|error| {
-        Error::Trial(format!("the type of {} is not known: {error}", topic.name))
-    })?;
+    let known = registry
+        .message(&topic.type_name)
+        .map_err(|error| Error::Trial(format!("the type of {} is not known: {error}", topic.name)))?;
     Ok(WireType::from_message(&known))
 }
 
@@ -279,10 +252,7 @@ fn describe_other_types(inputs: &[&Topic], recorded: &[BagMessage]) -> String {
     let there = inputs.iter().filter_map(|input| {
         let mut recorded = recorded.iter();
         let of_name = recorded.find(|message| *message.topic == *input.name)?;
-        Some(format!(
-            "; {} is {} there",
-            input.name, of_name.wire_type.name
-        ))
+        Some(format!("; {} is {} there", input.name, of_name.wire_type.name))
     });
     there.collect()
 }
@@ -346,10 +316,7 @@ mod tests {
         ]);
         let plan = plan(&material, None).expect("a plan");
         assert_eq!(plan.inputs.len(), 1);
-        assert_eq!(
-            (plan.inputs[0].topic.as_str(), plan.items.len()),
-            ("/name", 2)
-        );
+        assert_eq!((plan.inputs[0].topic.as_str(), plan.items.len()), ("/name", 2));
         assert_eq!(plan.unused, ["/tf"]);
         assert_eq!(plan.source_topics(0), ["/chatter"]);
     }
@@ -362,21 +329,12 @@ mod tests {
             error.map(|error| error.to_string()).unwrap_or_default()
         };
         let text = refused(recorded_message("/tf", "tf2_msgs/TFMessage", "x"), None);
-        assert!(
-            text.contains("it has /tf); its inputs are: /name (std_msgs/String)"),
-            "{text}"
-        );
+        assert!(text.contains("it has /tf); its inputs are: /name (std_msgs/String)"), "{text}");
         let text = refused(recorded_message("/name", "std_msgs/Int8", "x"), None);
-        assert!(
-            text.contains("(it has /name); /name is std_msgs/Int8 there; its inputs are: /name"),
-            "{text}"
-        );
+        assert!(text.contains("(it has /name); /name is std_msgs/Int8 there; its inputs are: /name"), "{text}");
         let text = refused(recorded_message("/name", "std_msgs/String", "other"), None);
         assert!(text.contains("recorded with another definition"), "{text}");
-        let text = refused(
-            recorded_message("/name", "std_msgs/String", STRING),
-            Some("/count"),
-        );
+        let text = refused(recorded_message("/name", "std_msgs/String", STRING), Some("/count"));
         assert!(text.contains("goes to an input /count"), "{text}");
     }
 
@@ -393,10 +351,7 @@ mod tests {
         let registry = Registry::with_definitions(RosVersion::Two, &interface.definitions);
         let registry = registry.expect("valid");
         let of = WireType::from_message(&registry.message("std_msgs/msg/String").expect("defined"));
-        let material = Material::Bag(vec![BagMessage {
-            wire_type: Arc::new(of),
-            ..recorded_message("/name", "", "")
-        }]);
+        let material = Material::Bag(vec![BagMessage { wire_type: Arc::new(of), ..recorded_message("/name", "", "") }]);
         let plan = ReplayPlan::new(&interface, &registry, &material, None).expect("a plan");
         assert!(plan.inputs[0].qos.is_latching());
         // Of the other ROS version.
@@ -427,12 +382,7 @@ mod tests {
         assert_eq!(millis(plan.length), 1100 + 1100 / 3);
         assert_eq!((plan.request, plan.requests()), (1, 2));
         assert_eq!(plan.items(false).count(), 4);
-        let inputs: Vec<usize> = plan
-            .items(true)
-            .skip(3)
-            .take(3)
-            .map(|item| item.input)
-            .collect();
+        let inputs: Vec<usize> = plan.items(true).skip(3).take(3).map(|item| item.input).collect();
         assert_eq!(inputs, [1, 0, 1]);
     }
 }

@@ -3,8 +3,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use ros::bus::{
-    ActionClient, ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome,
-    RosVersion,
+    ActionClient, ActionHandler, Bus, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, RosVersion,
 };
 use ros::ros2::Ros2Bus;
 use ros::schema::{ActionDef, Registry};
@@ -32,10 +31,7 @@ fn nested_action() -> Arc<ActionDef> {
     let part = "Builtins nested_field_no_pkg\nBasicTypes nested_field\nbuiltin_interfaces/Time nested_different_pkg\n";
     let action = format!("{part}---\n{part}---\n{part}");
     for (key, text) in [
-        (
-            "test_msgs/msg/Builtins",
-            "builtin_interfaces/Duration duration_value\nbuiltin_interfaces/Time time_value\n",
-        ),
+        ("test_msgs/msg/Builtins", "builtin_interfaces/Duration duration_value\nbuiltin_interfaces/Time time_value\n"),
         (
             "test_msgs/msg/BasicTypes",
             "bool bool_value\nbyte byte_value\nchar char_value\nfloat32 float32_value\nfloat64 float64_value\n\
@@ -46,16 +42,12 @@ fn nested_action() -> Arc<ActionDef> {
     ] {
         registry.insert(key, text).expect("a definition");
     }
-    registry
-        .action("test_msgs/NestedMessage")
-        .expect("an action")
+    registry.action("test_msgs/NestedMessage").expect("an action")
 }
 
 async fn next<T>(events: &mut mpsc::UnboundedReceiver<T>) -> T {
     let event = timeout(LONG, events.recv()).await;
-    event
-        .expect("something happens")
-        .expect("its sender is there")
+    event.expect("something happens").expect("its sender is there")
 }
 
 /// Events for the sender of a goal, with sequences as JSON.
@@ -157,15 +149,9 @@ async fn numbers_of_all_sizes_come_back_as_feedback_and_result() {
         r#""int64_value":-13,"uint64_value":14},"nested_different_pkg":{"sec":15,"nanosec":16}}"#
     );
     let (told, mut hears) = mpsc::unbounded_channel();
-    let events = Events {
-        told,
-        of: of.clone(),
-    };
+    let events = Events { told, of: of.clone() };
     client.send_goal("numbers", cdr(&of.goal, sent), Arc::new(events));
-    assert_eq!(
-        next(&mut hears).await,
-        ClientGoalEvent::Feedback(sent.to_owned())
-    );
+    assert_eq!(next(&mut hears).await, ClientGoalEvent::Feedback(sent.to_owned()));
     let ended = ClientGoalEvent::Ended(Ok((GoalOutcome::Succeeded, sent.to_owned())));
     assert_eq!(next(&mut hears).await, ended);
 }
@@ -186,10 +172,7 @@ async fn goals_of_a_node_are_cancelled_if_it_agrees() {
     next(&mut told).await;
     client.cancel_goal("order 13");
     let (feedback, finished) = wait_end(&mut told).await;
-    assert_eq!(
-        (feedback, finished.unwrap().0),
-        (11, GoalOutcome::Succeeded)
-    );
+    assert_eq!((feedback, finished.unwrap().0), (11, GoalOutcome::Succeeded));
 
     // Two goals at a time, of which one is abandoned with its client.
     let other = bus.action_client(ACTION, &fibonacci()).unwrap();
@@ -200,10 +183,7 @@ async fn goals_of_a_node_are_cancelled_if_it_agrees() {
     drop(other);
     let (_, finished) = wait_end(&mut told).await;
     assert_eq!(finished.unwrap().0, GoalOutcome::Succeeded);
-    assert_eq!(
-        timeout(LONG, async { while of_other.recv().await.is_some() {} }).await,
-        Ok(())
-    );
+    assert_eq!(timeout(LONG, async { while of_other.recv().await.is_some() {} }).await, Ok(()));
 }
 
 #[tokio::test]
@@ -218,11 +198,7 @@ async fn goals_end_with_a_node_that_is_killed() {
     let (_, lost) = wait_end(&mut told).await;
     assert_eq!(lost, Err("action server /fib is gone".to_owned()));
     // Its own lease is 20 s.
-    assert!(
-        begun.elapsed() < Duration::from_secs(10),
-        "{:?}",
-        begun.elapsed()
-    );
+    assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", begun.elapsed());
 }
 
 /// Events of a handler.
@@ -284,11 +260,7 @@ async fn numbers_of_all_sizes_come_back_to_a_node() {
     assert!(server.publish_feedback(&id, same.clone()));
     let expected = [json!(-123_456_789_012_i64), json!(true), json!(7)];
     assert_eq!(peer.wait_for("echoed").await, expected);
-    let end = GoalEnd {
-        outcome: GoalOutcome::Succeeded,
-        text: String::new(),
-        result: same,
-    };
+    let end = GoalEnd { outcome: GoalOutcome::Succeeded, text: String::new(), result: same };
     assert!(server.end_goal(&id, end));
     assert_eq!(peer.wait_for("echo").await, expected);
 }
@@ -327,11 +299,7 @@ async fn goals_of_a_node_are_carried_out() {
     assert_eq!(id.replace('-', ""), told);
     assert!(server.publish_feedback(&id, sequence("[0,1]")));
     assert_eq!(peer.wait_for("feedback").await, [json!([0, 1])]);
-    let result = |outcome, json: &str| GoalEnd {
-        outcome,
-        text: String::new(),
-        result: sequence(json),
-    };
+    let result = |outcome, json: &str| GoalEnd { outcome, text: String::new(), result: sequence(json) };
     assert!(server.end_goal(&id, result(GoalOutcome::Succeeded, "[0,1,1]")));
     assert_eq!(peer.wait_for("ended").await, [json!(4), json!([0, 1, 1])]);
 

@@ -6,9 +6,7 @@ use ros::bus::{Bus, QosProfile, wait_for_connected};
 use serde_json::json as value;
 use tokio::time::timeout;
 
-use super::lab::{
-    LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
-};
+use super::lab::{LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph};
 use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
@@ -27,9 +25,7 @@ async fn messages_go_there_and_back() {
     let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
     let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
     for matched in [ping.matched_subscribers(), pong.matched.clone()] {
-        timeout(LONG, wait_for_connected(matched, 1))
-            .await
-            .expect("somebody");
+        timeout(LONG, wait_for_connected(matched, 1)).await.expect("somebody");
     }
     for number in 0..10 {
         ping.publish(string_message(&number.to_string()));
@@ -58,9 +54,7 @@ async fn it_is_answered() {
     let lab = Lab::new();
     let mut peer = peer(&lab).await;
     let bus = lab.join(NODE).await;
-    let served = bus
-        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
-        .await;
+    let served = bus.serve("/ask", set_bool_type(), Arc::new(CallerEchoService)).await;
     let _served = served.unwrap();
     for (number, data) in [true, false].into_iter().enumerate() {
         let answer = peer.obey(&format!("call {data}")).await;

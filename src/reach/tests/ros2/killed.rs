@@ -32,15 +32,10 @@ async fn soon(what: &str, mut holds: impl FnMut() -> bool) {
 async fn a_node_that_is_killed_amid_a_picture_is_gone_with_what_it_began() {
     let lab = Lab::new();
     let budget = Budget::new("samples", LIMIT);
-    let options = JoinOptions {
-        budget: budget.clone(),
-        ..JoinOptions::in_domain(0, "/cloudroid_bridge")
-    };
+    let options = JoinOptions { budget: budget.clone(), ..JoinOptions::in_domain(0, "/cloudroid_bridge") };
     let bus = lab.join_with(options).await;
     let of = string_type();
-    let heard = bus
-        .subscribe("/picture", of, QosProfile::keep_last(1))
-        .await;
+    let heard = bus.subscribe("/picture", of, QosProfile::keep_last(1)).await;
     let mut pictures = heard.unwrap();
     for _ in 0..2 {
         let mut painter = lab.node("painter.py", &[]).await;

@@ -47,9 +47,7 @@ impl Sockets for LabNamespace {
     }
 
     async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
-        self.0
-            .run(ros::net::list_interfaces)
-            .map_err(io::Error::other)?
+        self.0.run(ros::net::list_interfaces).map_err(io::Error::other)?
     }
 
     async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
@@ -65,9 +63,7 @@ pub struct Lab {
 impl Lab {
     pub fn new() -> Self {
         let network = NetNs::create().expect("a network namespace");
-        Self {
-            network: Arc::new(network),
-        }
+        Self { network: Arc::new(network) }
     }
 
     /// Joins with a node of ours.
@@ -77,10 +73,7 @@ impl Lab {
 
     /// Joins with interfaces other than `lo`.
     pub async fn join_network(&self, node: &str, network: DiscoveryNetwork) -> Arc<Ros2Bus> {
-        let options = JoinOptions {
-            network,
-            ..JoinOptions::in_domain(0, node)
-        };
+        let options = JoinOptions { network, ..JoinOptions::in_domain(0, node) };
         self.join_with(options).await
     }
 
@@ -102,19 +95,11 @@ impl Lab {
     }
 
     /// Starts a node with these additional environment variables.
-    pub async fn node_with(
-        &self,
-        program: &str,
-        arguments: &[&str],
-        environment: &[(&str, &str)],
-    ) -> Peer {
+    pub async fn node_with(&self, program: &str, arguments: &[&str], environment: &[(&str, &str)]) -> Peer {
         let prefix = std::env::var_os("CLOUDROID_ROS2_PREFIX");
-        let prefix = prefix.expect(
-            "CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test",
-        );
-        let script = Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("tests/ros2")
-            .join(program);
+        let prefix =
+            prefix.expect("CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test");
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2").join(program);
         let mut command = Command::new("unshare");
         command
             .args(["--mount", "sh", "-c", WITHIN, "sh"])
@@ -133,11 +118,8 @@ impl Lab {
         });
         let mut child = spawned.expect("a namespace").expect("a node");
         let lines = child.stdout.take().expect("its output");
-        let mut peer = Peer {
-            orders: child.stdin.take().expect("its input"),
-            lines: BufReader::new(lines).lines(),
-            child,
-        };
+        let mut peer =
+            Peer { orders: child.stdin.take().expect("its input"), lines: BufReader::new(lines).lines(), child };
         peer.wait_for("ready").await;
         peer
     }

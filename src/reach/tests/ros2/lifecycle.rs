@@ -1,9 +1,7 @@
 use std::sync::Arc;
 
 use ros::bus::{Bus, ParamValue};
-use ros::ros2::lifecycle::{
-    BeginOutcome, LifecycleNode, State, StateChange, StateChanges, Transition, begin_all,
-};
+use ros::ros2::lifecycle::{BeginOutcome, LifecycleNode, State, StateChange, StateChanges, Transition, begin_all};
 use tokio::time::timeout;
 
 use super::lab::{LONG, Lab};
@@ -29,14 +27,9 @@ async fn a_node_is_configured_and_activated() {
     let labels: Vec<&str> = known.iter().map(|(label, _)| &**label).collect();
     assert_eq!(labels, ["configure", "shutdown"]);
 
-    node.change_state(Transition::Configure, LONG)
-        .await
-        .unwrap();
+    node.change_state(Transition::Configure, LONG).await.unwrap();
     assert_eq!(node.state().await.unwrap(), State::Inactive);
-    let again = node
-        .change_state(Transition::Configure, LONG)
-        .await
-        .unwrap_err();
+    let again = node.change_state(Transition::Configure, LONG).await.unwrap_err();
     assert_eq!(
         again.to_string(),
         "service /lab/staged/change_state failed: /lab/staged did not configure, and is inactive now"
@@ -44,17 +37,12 @@ async fn a_node_is_configured_and_activated() {
     let parameters = bus.node_parameters().unwrap();
     let broken = |value| vec![("broken".to_owned(), Some(ParamValue::Bool(value)))];
     parameters.set(STAGED, broken(true)).await.unwrap();
-    node.change_state(Transition::Activate, LONG)
-        .await
-        .unwrap_err();
+    node.change_state(Transition::Activate, LONG).await.unwrap_err();
     parameters.set(STAGED, broken(false)).await.unwrap();
 
     let mut changes = node.watch().await.unwrap();
     node.change_state(Transition::Activate, LONG).await.unwrap();
-    for (from, to) in [
-        (State::Inactive, State::Activating),
-        (State::Activating, State::Active),
-    ] {
+    for (from, to) in [(State::Inactive, State::Activating), (State::Activating, State::Active)] {
         assert_eq!(next(&mut changes).await, StateChange { from, to });
     }
     assert_eq!(node.state().await.unwrap(), State::Active);
@@ -71,16 +59,10 @@ async fn a_node_begins_when_nobody_else_drives_it() {
     let broken = |value| vec![("broken".to_owned(), Some(ParamValue::Bool(value)))];
     parameters.set(STAGED, broken(true)).await.unwrap();
     let refused = begin_all(&shown, LONG).await.unwrap_err();
-    assert_eq!(
-        (&*refused.node, refused.transition),
-        (STAGED, Transition::Activate)
-    );
+    assert_eq!((&*refused.node, refused.transition), (STAGED, Transition::Activate));
     // It was configured by then, so it is left to whoever configured it.
     let all = begin_all(&shown, LONG).await.unwrap();
-    assert_eq!(
-        all,
-        [(STAGED.to_owned(), BeginOutcome::Left(State::Inactive))]
-    );
+    assert_eq!(all, [(STAGED.to_owned(), BeginOutcome::Left(State::Inactive))]);
 
     let lab = Lab::new();
     let (bus, _nodes) = tuned_node(&lab).await;

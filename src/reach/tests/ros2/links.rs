@@ -11,22 +11,15 @@ use serde_json::{Value, json as value};
 use tokio::time::timeout;
 
 use super::actions::fibonacci;
-use super::lab::{
-    LONG, Lab, cdr, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
-};
-use super::robot::{
-    CloudRequest, LinkedRobot, RunTracker, expect_refusal, find_output, find_service, hello, hub,
-};
+use super::lab::{LONG, Lab, cdr, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph};
+use super::robot::{CloudRequest, LinkedRobot, RunTracker, expect_refusal, find_output, find_service, hello, hub};
 use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
 const PEER: &str = "/lab/peer";
 const DEFINITIONS: [(&str, &str); 2] = [
     ("std_msgs/msg/String", "string data"),
-    (
-        "std_srvs/srv/SetBool",
-        "bool data\n---\nbool success\nstring message\n",
-    ),
+    ("std_srvs/srv/SetBool", "bool data\n---\nbool success\nstring message\n"),
 ];
 const GET_PARAMETERS: [(&str, &str); 2] = [
     (
@@ -36,18 +29,11 @@ const GET_PARAMETERS: [(&str, &str); 2] = [
          bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
          string_array_value\n",
     ),
-    (
-        "rcl_interfaces/srv/GetParameters",
-        "string[] names\n---\nParameterValue[] values\n",
-    ),
+    ("rcl_interfaces/srv/GetParameters", "string[] names\n---\nParameterValue[] values\n"),
 ];
 
 /// Connects a link of this node, whose robot's end waits until its graph satisfies a condition.
-async fn connect_robot(
-    bus: &Arc<Ros2Bus>,
-    node: &str,
-    wanted: impl Fn(&Graph) -> bool,
-) -> (LinkedRobot, Graph) {
+async fn connect_robot(bus: &Arc<Ros2Bus>, node: &str, wanted: impl Fn(&Graph) -> bool) -> (LinkedRobot, Graph) {
     let nodes = Arc::new(RunTracker::default());
     let hub = hub(Arc::clone(bus) as _, nodes, &DEFINITIONS);
     let robot = LinkedRobot::connect(&hub, &hello(node)).await;
@@ -99,25 +85,14 @@ async fn the_robot_is_told_all_that_a_node_has_with_its_quality_of_service() {
             (&*input.topic, latching, input.feed)
         })
         .collect();
-    assert_eq!(
-        inputs,
-        [
-            ("/late", true, true),
-            ("/ping", false, true),
-            ("/strict", false, true)
-        ]
-    );
+    assert_eq!(inputs, [("/late", true, true), ("/ping", false, true), ("/strict", false, true)]);
     // The stub matches responses by their contents.
     let of = string_type();
     assert_eq!(graph.inputs[0].md5, of.digest.as_str());
     let told = robot.definition(&of.name, of.digest.as_str());
     assert_eq!(told.as_deref(), Some(&*of.definition));
     let set = find_service(&graph, "/set").expect("it is served");
-    assert!(
-        set.service_type(RosVersion::Two)
-            .is_compatible_with(&set_bool_type()),
-        "{set:?}"
-    );
+    assert!(set.service_type(RosVersion::Two).is_compatible_with(&set_bool_type()), "{set:?}");
     assert_eq!(set.halves.len(), 2);
     for own in ["get_parameters", "set_parameters", "describe_parameters"] {
         let name = format!("{PEER}/{own}");
@@ -150,10 +125,7 @@ async fn messages_calls_and_parameters_go_through_a_link() {
         }
         for number in some {
             let (channel, message) = robot.next_message().await;
-            assert_eq!(
-                (channel, text(&message)),
-                (pong.channel, number.to_string())
-            );
+            assert_eq!((channel, text(&message)), (pong.channel, number.to_string()));
         }
     }
     // Later subscribers receive the history.
@@ -171,9 +143,7 @@ async fn messages_calls_and_parameters_go_through_a_link() {
     for (key, text) in GET_PARAMETERS {
         registry.insert(key, text).expect("a definition");
     }
-    let get = registry
-        .service("rcl_interfaces/srv/GetParameters")
-        .unwrap();
+    let get = registry.service("rcl_interfaces/srv/GetParameters").unwrap();
     let asked = cdr(&get.request, r#"{"names":["use_sim_time"]}"#);
     let answer = robot.call(find_service(&graph, &parameters).unwrap(), asked);
     let answer: Value = serde_json::from_str(&json(&get.response, &answer.await.unwrap())).unwrap();
@@ -188,8 +158,7 @@ async fn a_whole_goal_goes_through_a_link_by_the_parts_of_its_action() {
     let lab = Lab::new();
     let _server = lab.node("fibonacci.py", &["server"]).await;
     let bus = lab.join(NODE).await;
-    let parts =
-        ["send_goal", "get_result", "cancel_goal"].map(|part| format!("/fib/_action/{part}"));
+    let parts = ["send_goal", "get_result", "cancel_goal"].map(|part| format!("/fib/_action/{part}"));
     let (mut robot, graph) = connect_robot(&bus, "/lab/fibonacci", |graph| {
         let is_told = |part: &String| find_service(graph, part).is_some();
         parts.iter().all(is_told)
@@ -213,10 +182,7 @@ async fn a_whole_goal_goes_through_a_link_by_the_parts_of_its_action() {
     let asked = cdr(&services.get_result.request, &asked);
     let result = robot.call(find_service(&graph, &parts[1]).unwrap(), asked);
     let result = json(&services.get_result.response, &result.await.unwrap());
-    assert_eq!(
-        result,
-        r#"{"status":4,"result":{"sequence":[0,1,1,2,3,5]}}"#
-    );
+    assert_eq!(result, r#"{"status":4,"result":{"sequence":[0,1,1,2,3,5]}}"#);
     let (channel, first) = robot.next_message().await;
     assert_eq!(channel, feedback.channel);
     let first: Value = serde_json::from_str(&json(&of.action_feedback, &first)).unwrap();
@@ -256,10 +222,7 @@ async fn a_service_that_is_looked_for_is_lent_until_it_is_gone_or_the_servant_ha
     robot.send_lent("/ask", Some((5, &of)));
     peer.tell("call true").await;
     answer_call(&mut robot, 5).await;
-    assert_eq!(
-        peer.wait_for("call").await,
-        [value!(true), value!("the robot")]
-    );
+    assert_eq!(peer.wait_for("call").await, [value!(true), value!("the robot")]);
     let here = |graph: &ros::bus::Graph| graph.services.get("/ask").cloned();
     wait_graph(&bus, |graph| here(graph).as_deref() == Some(NODE)).await;
     // Once gone, it is looked up again for as long as there is a client.
@@ -268,16 +231,10 @@ async fn a_service_that_is_looked_for_is_lent_until_it_is_gone_or_the_servant_ha
     robot.send_lent("/ask", Some((6, &of)));
     peer.tell("call false").await;
     answer_call(&mut robot, 6).await;
-    assert_eq!(
-        peer.wait_for("call").await,
-        [value!(false), value!("the robot")]
-    );
+    assert_eq!(peer.wait_for("call").await, [value!(false), value!("the robot")]);
     // The servant's own server takes precedence.
     let other = lab.join("/other").await;
-    let _own = other
-        .serve("/ask", of, Arc::new(CallerEchoService))
-        .await
-        .unwrap();
+    let _own = other.serve("/ask", of, Arc::new(CallerEchoService)).await.unwrap();
     wait_graph(&bus, |graph| here(graph).as_deref() == Some("/other")).await;
     // A request to the lent service at the moment of its removal is lost, as always in ROS 2.
     while peer.obey("servers_of /ask").await != [value!(["/other"])] {}
@@ -305,8 +262,7 @@ async fn run_robot(robot: &mut LinkedRobot, own: &Arc<Ros2Bus>, graph: &Graph) {
     let mut reading = tokio::task::JoinSet::new();
     let inputs = graph.inputs.iter().filter(|input| input.feed);
     for (channel, input) in (1..).zip(inputs) {
-        let qos = QosProfile::keep_last(100)
-            .latching(input.qos.as_ref().is_some_and(|it| it.transient_local));
+        let qos = QosProfile::keep_last(100).latching(input.qos.as_ref().is_some_and(|it| it.transient_local));
         let heard = own.subscribe(&input.topic, WireType::any(), qos).await;
         let heard = heard.expect("a subscription");
         robot.open_input(InputChannel {
@@ -365,13 +321,7 @@ async fn a_node_in_the_cloud_sends_goals_to_a_server_on_the_robot() {
     let (cloud, field) = (Lab::new(), Lab::new());
     let _server = field.node("fibonacci.py", &["server"]).await;
     let own = field.join("/stub").await;
-    wait_graph(&own, |graph| {
-        graph
-            .actions
-            .get("/fib")
-            .is_some_and(|action| !action.servers.is_empty())
-    })
-    .await;
+    wait_graph(&own, |graph| graph.actions.get("/fib").is_some_and(|action| !action.servers.is_empty())).await;
     let mut client = cloud.node("fibonacci.py", &["client"]).await;
     let bus = cloud.join(NODE).await;
     let (mut robot, graph) = connect_robot(&bus, "/lab/fibonacci", |graph| {
@@ -414,14 +364,8 @@ async fn who_serves_and_how_it_calls_itself_is_seen() {
     let _peer = lab.peer().await;
     let (one, other) = (lab.join("/one").await, lab.join("/other").await);
     one.set_label("vision for rover");
-    let _serving = one
-        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
-        .await
-        .unwrap();
-    wait_graph(&other, |graph| {
-        graph.services.contains_key("/ask") && graph.services.contains_key("/set")
-    })
-    .await;
+    let _serving = one.serve("/ask", set_bool_type(), Arc::new(CallerEchoService)).await.unwrap();
+    wait_graph(&other, |graph| graph.services.contains_key("/ask") && graph.services.contains_key("/set")).await;
     let ours = one.provider("/ask").await.unwrap();
     let theirs = other.provider("/ask").await.unwrap();
     for found in [&ours, &theirs] {
@@ -440,10 +384,7 @@ async fn robots_of_ros_1_are_refused_by_name() {
     let bus = lab.join(NODE).await;
     let hub = hub(bus, Arc::new(RunTracker::default()), &[]);
     for ros in [0, 1] {
-        let of_one = Hello {
-            ros,
-            ..hello("/see")
-        };
+        let of_one = Hello { ros, ..hello("/see") };
         let (reason, again) = expect_refusal(&hub, &of_one).await;
         assert!(!again, "{reason}");
         for part in ["service vision uses ROS 2", "this robot uses ROS 1", "push"] {
@@ -462,10 +403,7 @@ async fn a_node_goes_on_when_another_daemon_takes_its_link_up() {
     let begins = async |run: &str| {
         let bus = lab.join(NODE).await;
         let hub = hub(bus, Arc::clone(&nodes) as _, &[]);
-        let hello = Hello {
-            run: run.to_owned(),
-            ..hello("/see")
-        };
+        let hello = Hello { run: run.to_owned(), ..hello("/see") };
         let robot = timeout(LONG, LinkedRobot::connect(&hub, &hello)).await;
         robot.expect("a link");
         nodes.starts("/see")

@@ -12,20 +12,14 @@ use ros::{DiscoveryNetwork, InterfaceSelection};
 use serde_json::json as value;
 use tokio::time::timeout;
 
-use super::lab::{
-    LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
-};
+use super::lab::{LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph};
 use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
 
 /// Returns the network options of a stub on a robot.
 pub fn robot_network() -> DiscoveryNetwork {
-    DiscoveryNetwork {
-        interfaces: InterfaceSelection::All,
-        well_known: true,
-        ..DiscoveryNetwork::default()
-    }
+    DiscoveryNetwork { interfaces: InterfaceSelection::All, well_known: true, ..DiscoveryNetwork::default() }
 }
 
 fn ip(lab: &Lab, arguments: &str) {
@@ -41,15 +35,9 @@ fn cable(here: &Lab, there: &Lab, network: u8) {
     let name = format!("cable{network}");
     let other = there.network.as_fd().as_raw_fd();
     let other = format!("/proc/{}/fd/{other}", std::process::id());
-    ip(
-        here,
-        &format!("link add {name} type veth peer name {name} netns {other}"),
-    );
+    ip(here, &format!("link add {name} type veth peer name {name} netns {other}"));
     for (lab, host) in [(here, 1), (there, 2)] {
-        ip(
-            lab,
-            &format!("addr add 10.{network}.0.{host}/24 dev {name}"),
-        );
+        ip(lab, &format!("addr add 10.{network}.0.{host}/24 dev {name}"));
         ip(lab, &format!("link set {name} up"));
     }
     for lab in [here, there] {
@@ -88,9 +76,7 @@ pub async fn converse(bus: &Ros2Bus) -> Subscription {
     let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
     let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
     for matched in [ping.matched_subscribers(), pong.matched.clone()] {
-        timeout(LONG, wait_for_connected(matched, 1))
-            .await
-            .expect("somebody");
+        timeout(LONG, wait_for_connected(matched, 1)).await.expect("somebody");
     }
     for number in 0..10 {
         ping.publish(string_message(&number.to_string()));
@@ -108,9 +94,7 @@ pub async fn call_each_other(bus: &Ros2Bus, peer: &mut Peer, answer: &[serde_jso
     let answered = bus.call("/set", request(true), LONG).await.unwrap();
     let expected = r#"{"success":true,"message":"set"}"#;
     assert_eq!(json(&set_bool().response, &answered), expected);
-    let served = bus
-        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
-        .await;
+    let served = bus.serve("/ask", set_bool_type(), Arc::new(CallerEchoService)).await;
     let _served = served.unwrap();
     let told = peer.obey("call true").await;
     assert_eq!(told[..answer.len()], *answer);
@@ -170,10 +154,7 @@ async fn nodes_in_two_networks_are_heard() {
     cable(&robot, &right, 78);
     let (_one, _two) = tokio::join!(left.peer(), right.node("cyclone.py", &[]));
     let bus = robot.join_network(NODE, robot_network()).await;
-    let ping = bus
-        .advertise("/ping", string_type(), QosProfile::keep_last(10))
-        .await
-        .unwrap();
+    let ping = bus.advertise("/ping", string_type(), QosProfile::keep_last(10)).await.unwrap();
     let both = timeout(LONG, wait_for_connected(ping.matched_subscribers(), 2)).await;
     both.expect("one in each network");
 }
@@ -196,11 +177,8 @@ async fn peers_are_told_where_there_is_no_multicast() {
     let (robot, other) = machines();
     let narrow = [("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")];
     let mut peer = other.node_with("peer.py", &[], &narrow).await;
-    let network = DiscoveryNetwork {
-        multicast: false,
-        peers: vec![SocketAddr::from(([10, 77, 0, 2], 0))],
-        ..robot_network()
-    };
+    let network =
+        DiscoveryNetwork { multicast: false, peers: vec![SocketAddr::from(([10, 77, 0, 2], 0))], ..robot_network() };
     let bus = robot.join_network(NODE, network).await;
     converse(&bus).await;
     call_each_other(&bus, &mut peer, &[value!(true), value!("/lab/peer")]).await;
@@ -210,10 +188,7 @@ async fn peers_are_told_where_there_is_no_multicast() {
 async fn whoever_is_to_be_alone_is() {
     let robot = Lab::new();
     let mut peer = robot.peer().await;
-    let network = DiscoveryNetwork {
-        alone: true,
-        ..DiscoveryNetwork::default()
-    };
+    let network = DiscoveryNetwork { alone: true, ..DiscoveryNetwork::default() };
     let alone = robot.join_network(NODE, network).await;
     // The peer discovers newcomers, so it would have discovered this one.
     let bus = robot.join("/seen").await;

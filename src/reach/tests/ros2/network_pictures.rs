@@ -19,18 +19,14 @@ async fn count_received(reliability: QosReliability) -> u64 {
         QosReliability::BestEffort => "best_effort",
     };
     let mut viewer = other.node("network_pictures.py", &[wish]).await;
-    let bus = robot
-        .join_network("/cloudroid_bridge", robot_network())
-        .await;
+    let bus = robot.join_network("/cloudroid_bridge", robot_network()).await;
     let qos = QosProfile {
         reliability,
         // None is replaced by a later one.
         ..QosProfile::keep_last(PICTURES as usize)
     };
     let out = bus.advertise("/picture", string_type(), qos).await.unwrap();
-    timeout(LONG, wait_for_connected(out.matched_subscribers(), 1))
-        .await
-        .expect("a viewer");
+    timeout(LONG, wait_for_connected(out.matched_subscribers(), 1)).await.expect("a viewer");
     let fill = "x".repeat(BYTES);
     let mut camera = tokio::time::interval(Duration::from_secs(1) / 30);
     for number in 0..PICTURES {

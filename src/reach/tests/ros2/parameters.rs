@@ -1,9 +1,6 @@
 use std::sync::Arc;
 
-use ros::bus::{
-    Bus, BusError, DoubleRange, FailureReason, IntegerRange, ParamValue, ParameterEvent,
-    ParameterKind,
-};
+use ros::bus::{Bus, BusError, DoubleRange, FailureReason, IntegerRange, ParamValue, ParameterEvent, ParameterKind};
 use ros::ros2::Ros2Bus;
 use tokio::time::timeout;
 
@@ -72,10 +69,7 @@ async fn parameters_of_a_node_are_listed_read_and_described() {
     let found: Vec<bool> = values.iter().map(Option::is_some).collect();
     assert_eq!(found, [true, false, false, true]);
     let nowhere = parameters.get("/lab/nobody", &some).await;
-    assert!(
-        matches!(nowhere, Err(BusError::NoService(_))),
-        "{nowhere:?}"
-    );
+    assert!(matches!(nowhere, Err(BusError::NoService(_))), "{nowhere:?}");
 
     let asked = names(&["speed", "level", "serial", "any", "nothing"]);
     let described = parameters.describe(TUNED, &asked).await.unwrap();
@@ -83,10 +77,7 @@ async fn parameters_of_a_node_are_listed_read_and_described() {
         panic!("{described:?}");
     };
     assert_eq!((&*speed.name, speed.kind), ("speed", ParameterKind::Double));
-    assert_eq!(
-        (&*speed.description, &*speed.constraints),
-        ("how fast", "not on stairs")
-    );
+    assert_eq!((&*speed.description, &*speed.constraints), ("how fast", "not on stairs"));
     let (from, to, step) = (0.0, 100.0, 0.5);
     assert_eq!(speed.double_range, Some(DoubleRange { from, to, step }));
     let (from, to, step) = (-1, 9, 2);
@@ -120,28 +111,15 @@ async fn parameters_of_a_node_are_set_if_it_agrees() {
     assert_eq!(set[1], Err(FailureReason::new("too fast")));
     let asked = names(&["speed", "serial", "doubles", "blob", "texts", "count"]);
     let values = parameters.get(TUNED, &asked).await.unwrap();
-    let expected = [
-        Double(2.0),
-        text("x1"),
-        list([Double(1.0), Double(2.0)]),
-        Binary(vec![7, 8]),
-        list([]),
-        Int(5),
-    ];
+    let expected = [Double(2.0), text("x1"), list([Double(1.0), Double(2.0)]), Binary(vec![7, 8]), list([]), Int(5)];
     assert_eq!(values, expected.map(Some));
 
     let both = |speed| {
         let change = |name: &str, value| (name.to_owned(), Some(value));
         vec![change("count", Int(6)), change("speed", Int(speed))]
     };
-    let refused = parameters
-        .set_atomically(TUNED, both(12))
-        .await
-        .unwrap_err();
-    assert_eq!(
-        refused.to_string(),
-        "service /lab/tuned/set_parameters_atomically failed: too fast"
-    );
+    let refused = parameters.set_atomically(TUNED, both(12)).await.unwrap_err();
+    assert_eq!(refused.to_string(), "service /lab/tuned/set_parameters_atomically failed: too fast");
     let count = names(&["count"]);
     assert_eq!(parameters.get(TUNED, &count).await.unwrap(), [Some(Int(5))]);
     parameters.set_atomically(TUNED, both(3)).await.unwrap();
@@ -157,17 +135,11 @@ async fn changes_of_parameters_are_told() {
     let mut of_all = parameters.watch(None).await.unwrap();
     let change = |name: &str, value| vec![(name.to_owned(), Some(value))];
     let broken = change("broken", ParamValue::Bool(true));
-    assert_eq!(
-        parameters.set("/lab/staged", broken).await.unwrap(),
-        [Ok(())]
-    );
+    assert_eq!(parameters.set("/lab/staged", broken).await.unwrap(), [Ok(())]);
     let staged = timeout(LONG, of_all.next()).await.expect("an event");
     let staged = staged.expect("the bus is open");
     assert_eq!(staged.node, "/lab/staged");
-    assert_eq!(
-        staged.changed,
-        [("broken".to_owned(), ParamValue::Bool(true))]
-    );
+    assert_eq!(staged.changed, [("broken".to_owned(), ParamValue::Bool(true))]);
     let level = change("level", ParamValue::Int(3));
     parameters.set(TUNED, level).await.unwrap();
     let tuned = timeout(LONG, of_tuned.next()).await.expect("an event");

@@ -25,9 +25,7 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
     let mut back = None;
     let sizes = [(640, 480), (1920, 1080)];
     for (width, height) in sizes.into_iter().flat_map(|size| [size; ROUNDS]) {
-        camera
-            .tell(&format!("show {width} {height} {AT_ONCE}"))
-            .await;
+        camera.tell(&format!("show {width} {height} {AT_ONCE}")).await;
         let mut pictures: Vec<SerializedMessage> = Vec::new();
         while pictures.len() < AT_ONCE {
             let next = timeout(LONG, heard.messages.recv()).await;
@@ -39,17 +37,12 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
             u32::from_le_bytes(word) as usize
         };
         assert!(pictures.iter().map(number).eq(0..AT_ONCE));
-        assert!(
-            pictures
-                .iter()
-                .all(|picture| picture.bytes.len() > width * height * 3)
-        );
+        assert!(pictures.iter().all(|picture| picture.bytes.len() > width * height * 3));
         camera.wait_for("show").await;
         if back.is_none() {
             let of = WireType::clone(&pictures[0].wire_type);
             let publisher = bus.advertise("/seen", of, qos).await.unwrap();
-            let connected =
-                timeout(LONG, wait_for_connected(publisher.matched_subscribers(), 1)).await;
+            let connected = timeout(LONG, wait_for_connected(publisher.matched_subscribers(), 1)).await;
             connected.expect("somebody who looks");
             back = Some(publisher);
         }

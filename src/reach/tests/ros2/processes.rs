@@ -23,10 +23,7 @@ const DEFINITIONS: [(&str, &str); 3] = [
          bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
          string_array_value\n",
     ),
-    (
-        "rcl_interfaces/srv/GetParameters",
-        "string[] names\n---\nParameterValue[] values\n",
-    ),
+    ("rcl_interfaces/srv/GetParameters", "string[] names\n---\nParameterValue[] values\n"),
 ];
 
 fn names(names: &[&str]) -> BTreeSet<String> {
@@ -49,18 +46,10 @@ async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
     // A node of another process.
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let hub = hub(
-        Arc::clone(&bus) as _,
-        Arc::new(RunTracker::default()),
-        &DEFINITIONS,
-    );
+    let hub = hub(Arc::clone(&bus) as _, Arc::new(RunTracker::default()), &DEFINITIONS);
     let mut robot = LinkedRobot::connect(&hub, &hello("/alto")).await;
     let graph = robot.wait_graph(songs).await;
-    let NodeEndpoints {
-        outputs,
-        inputs,
-        services,
-    } = &graph.nodes["/low/tenor"];
+    let NodeEndpoints { outputs, inputs, services } = &graph.nodes["/low/tenor"];
     let published = ["/low/tenor/song", "/parameter_events", "/rosout", "/songs"];
     assert_eq!(*outputs, names(&published));
     assert_eq!(*inputs, names(&["/low/tenor/note"]));
@@ -83,22 +72,16 @@ async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
     });
     robot.publish(1, string_message("c"));
     for _ in 0..2 {
-        let heard: Value =
-            serde_json::from_str(&json(&string(), &robot.next_message().await.1)).unwrap();
+        let heard: Value = serde_json::from_str(&json(&string(), &robot.next_message().await.1)).unwrap();
         assert_eq!(heard["data"], "/low/tenor: c");
     }
     let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in DEFINITIONS {
         registry.insert(key, text).expect("a definition");
     }
-    let get = registry
-        .service("rcl_interfaces/srv/GetParameters")
-        .unwrap();
+    let get = registry.service("rcl_interfaces/srv/GetParameters").unwrap();
     let asked = cdr(&get.request, r#"{"names":["pitch"]}"#);
-    let answer = robot.call(
-        find_service(&graph, "/low/tenor/get_parameters").unwrap(),
-        asked,
-    );
+    let answer = robot.call(find_service(&graph, "/low/tenor/get_parameters").unwrap(), asked);
     let answer: Value = serde_json::from_str(&json(&get.response, &answer.await.unwrap())).unwrap();
     assert_eq!(answer["values"][0]["string_value"], "tenor", "{answer}");
     // Services that the second node looks up are looked up on the robot; unmet ones are in this link's status.
@@ -122,19 +105,13 @@ async fn nodes_that_a_bus_stands_for_are_nodes_to_rclpy() {
     let lab = Lab::new();
     let mut peer = lab.node("duet.py", &[]).await;
     let bus = lab.join("/ears").await;
-    let ears = NodeNames {
-        publishes: names(&["/log"]),
-        ..NodeNames::default()
-    };
+    let ears = NodeNames { publishes: names(&["/log"]), ..NodeNames::default() };
     let mouth = NodeNames {
         publishes: names(&["/log", "/said"]),
         subscribes: names(&["/words"]),
         serves: names(&["/face/mouth/shut"]),
     };
-    let nodes = [
-        ("/ears".to_owned(), ears),
-        ("/face/mouth".to_owned(), mouth),
-    ];
+    let nodes = [("/ears".to_owned(), ears), ("/face/mouth".to_owned(), mouth)];
     let qos = QosProfile::keep_last(1);
     let _log = bus.advertise("/log", string_type(), qos).await.unwrap();
     let _said = bus.advertise("/said", string_type(), qos).await.unwrap();
@@ -142,19 +119,10 @@ async fn nodes_that_a_bus_stands_for_are_nodes_to_rclpy() {
     let of = ServiceType::new("std_srvs/srv/SetBool", "*");
     let shut = Arc::new(super::services::CallerEchoService);
     let _shut = bus.serve("/face/mouth/shut", of, shut).await.unwrap();
-    assert_eq!(
-        ends(&mut peer, "ears", "/").await,
-        value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]])
-    );
+    assert_eq!(ends(&mut peer, "ears", "/").await, value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]]));
     bus.set_represented_nodes(nodes.into());
-    assert_eq!(
-        ends(&mut peer, "mouth", "/face").await,
-        value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]])
-    );
-    assert_eq!(
-        ends(&mut peer, "ears", "/").await,
-        value!([["/log"], [], []])
-    );
+    assert_eq!(ends(&mut peer, "mouth", "/face").await, value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]]));
+    assert_eq!(ends(&mut peer, "ears", "/").await, value!([["/log"], [], []]));
     // There is one publisher of the topic that both have.
     let publishers = peer.obey("publishers /log").await;
     assert_eq!(publishers.len(), 1, "{publishers:?}");

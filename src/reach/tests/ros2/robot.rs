@@ -9,8 +9,7 @@ use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::clock::now;
 use link::control::{
-    Exit, FromCloud, FromRobot, Graph, Hello, InputChannel, NodeLaunch, OutputChannel,
-    ServiceChannel, Welcome,
+    Exit, FromCloud, FromRobot, Graph, Hello, InputChannel, NodeLaunch, OutputChannel, ServiceChannel, Welcome,
 };
 use link::record::{Data, Record};
 use link::session::{receive_open, send_open};
@@ -76,11 +75,7 @@ impl NodeController for RunTracker {
 }
 
 /// Creates a hub on a bus with these definitions.
-pub fn hub(
-    bus: Arc<dyn Bus>,
-    nodes: Arc<dyn NodeController>,
-    definitions: &[(&str, &str)],
-) -> Arc<Hub> {
+pub fn hub(bus: Arc<dyn Bus>, nodes: Arc<dyn NodeController>, definitions: &[(&str, &str)]) -> Arc<Hub> {
     let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in definitions {
         registry.insert(key, text).expect("a definition");
@@ -106,10 +101,7 @@ pub fn hello(node: &str) -> Hello {
         ros: 2,
         run: "run".to_owned(),
         next: 1,
-        node: NodeLaunch {
-            name: node.to_owned(),
-            ..NodeLaunch::default()
-        },
+        node: NodeLaunch { name: node.to_owned(), ..NodeLaunch::default() },
         lends: true,
         ..Hello::default()
     }
@@ -143,20 +135,14 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
         match record {
             Record::Data(data) => drop(self.heard.send((data.channel, data.message))),
             Record::Answer { id, response, .. } => drop(self.answers.send((id, response))),
-            Record::Call {
-                id,
-                service,
-                request,
-            } => drop(self.asked.send(CloudRequest::Call(id, service, request))),
+            Record::Call { id, service, request } => drop(self.asked.send(CloudRequest::Call(id, service, request))),
             Record::Control(FromCloud::Lookup { service }) => {
                 drop(self.asked.send(CloudRequest::Lookup(service)));
             }
             Record::Control(FromCloud::Graph(graph)) => drop(self.graph.send_replace(graph)),
-            Record::Control(FromCloud::Type {
-                name,
-                md5,
-                definition,
-            }) => drop(self.types.lock().insert((name, md5), definition)),
+            Record::Control(FromCloud::Type { name, md5, definition }) => {
+                drop(self.types.lock().insert((name, md5), definition))
+            }
             Record::Control(_) => {}
         }
     }
@@ -175,13 +161,7 @@ impl LinkedRobot {
     /// Connects for the node that the hello names.
     pub async fn connect(hub: &Arc<Hub>, hello: &Hello) -> Self {
         let (mut socket, welcome) = send_hello(hub, hello).await;
-        let Welcome::Accepted {
-            received,
-            ahead,
-            next,
-            ..
-        } = welcome
-        else {
+        let Welcome::Accepted { received, ahead, next, .. } = welcome else {
             panic!("{welcome:?}");
         };
         let session = Arc::new(RobotSession::new(SessionOptions {
@@ -203,13 +183,7 @@ impl LinkedRobot {
         });
         let (running, hearing) = (Arc::clone(&session), Arc::clone(&ear));
         tokio::spawn(async move { running.run(&mut socket, &*hearing).await });
-        Self {
-            session,
-            asked,
-            ear,
-            heard: hears,
-            answers: answered,
-        }
+        Self { session, asked, ear, heard: hears, answers: answered }
     }
 
     /// Waits until the node's graph satisfies a condition; returns the graph.
@@ -262,11 +236,7 @@ impl LinkedRobot {
     }
 
     /// Calls a service on behalf of a node of the robot.
-    pub async fn call(
-        &mut self,
-        served: &ServiceChannel,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn call(&mut self, served: &ServiceChannel, request: Bytes) -> Result<Bytes, FailureReason> {
         let called = self.session.call(served.channel, request);
         loop {
             let answer = timeout(LONG, self.answers.recv()).await;

@@ -18,18 +18,9 @@ use super::lab::{LONG, Lab, wait_graph};
 const DEFINITIONS: [(&str, &str); 6] = [
     ("std_msgs/msg/Int32", "int32 data\n"),
     ("std_msgs/msg/String", "string data\n"),
-    (
-        "std_srvs/srv/SetBool",
-        "bool data\n---\nbool success\nstring message\n",
-    ),
-    (
-        "std_srvs/srv/Trigger",
-        "---\nbool success\nstring message\n",
-    ),
-    (
-        "test_msgs/action/Fibonacci",
-        "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
-    ),
+    ("std_srvs/srv/SetBool", "bool data\n---\nbool success\nstring message\n"),
+    ("std_srvs/srv/Trigger", "---\nbool success\nstring message\n"),
+    ("test_msgs/action/Fibonacci", "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"),
     ("x_msgs/action/Count", "int32 order\n---\n---\n"),
 ];
 
@@ -56,11 +47,7 @@ impl BridgedServant {
             registry.insert(name, text).expect("a definition");
         }
         // Longer than any wait of a test, so that a test which waits for a timeout fails.
-        let options = BridgeOptions {
-            action_timeout: 2 * LONG,
-            call_timeout: 2 * LONG,
-            ..BridgeOptions::default()
-        };
+        let options = BridgeOptions { action_timeout: 2 * LONG, call_timeout: 2 * LONG, ..BridgeOptions::default() };
         let bridge = Bridge::new(bus.clone(), Arc::new(registry), options);
         Self { bus, bridge }
     }
@@ -139,14 +126,9 @@ impl RosbridgeRobot {
                 }
             }
         });
-        let message = next
-            .await
-            .unwrap_or_else(|_| panic!("{awaited} should come"));
+        let message = next.await.unwrap_or_else(|_| panic!("{awaited} should come"));
         let (spoken, heard) = match message {
-            Message::Text(text) => (
-                RosbridgeFormat::Json,
-                serde_json::from_str(&text).expect("JSON"),
-            ),
+            Message::Text(text) => (RosbridgeFormat::Json, serde_json::from_str(&text).expect("JSON")),
             Message::Binary(bytes) => (RosbridgeFormat::Cbor, from_cbor(&bytes)),
             other => panic!("{other:?} instead of {awaited}"),
         };
@@ -163,19 +145,16 @@ impl RosbridgeRobot {
 
     /// Calls a service; returns the response.
     async fn call(&mut self, service: &str, args: Value) -> Value {
-        self.send(json!({"op": "call_service", "service": service, "args": args}))
-            .await;
+        self.send(json!({"op": "call_service", "service": service, "args": args})).await;
         let answer = self.receive("service_response").await;
         assert_eq!(answer["result"], true, "{answer}");
         answer["values"].clone()
     }
 
     async fn send_goal(&mut self, id: &str, order: i32) {
-        self.send(
-            json!({"op": "send_action_goal", "id": id, "action": "/fib", "feedback": true,
-            "action_type": "test_msgs/Fibonacci", "args": {"order": order}}),
-        )
-        .await;
+        self.send(json!({"op": "send_action_goal", "id": id, "action": "/fib", "feedback": true,
+            "action_type": "test_msgs/Fibonacci", "args": {"order": order}}))
+            .await;
     }
 }
 
@@ -207,8 +186,7 @@ fn from_cbor(bytes: &[u8]) -> Value {
 
 fn has_peer(graph: &Graph) -> bool {
     let topics = ["/ping", "/pong", "/map", "/scan", "/strict"];
-    topics.iter().all(|topic| graph.topics.contains_key(*topic))
-        && graph.services.contains_key("/set")
+    topics.iter().all(|topic| graph.topics.contains_key(*topic)) && graph.services.contains_key("/set")
 }
 
 fn serves_fib(graph: &Graph) -> bool {
@@ -225,39 +203,23 @@ async fn messages_go_both_ways_in_the_quality_that_is_said() {
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         let qos = json!({"reliability": "reliable", "durability": "volatile", "depth": 5});
-        robot
-            .subscribe(json!({"topic": "/pong", "type": "std_msgs/msg/String", "qos": qos}))
-            .await;
-        robot
-            .send(
-                json!({"op": "advertise", "topic": "/ping", "type": "std_msgs/String", "qos": qos}),
-            )
-            .await;
+        robot.subscribe(json!({"topic": "/pong", "type": "std_msgs/msg/String", "qos": qos})).await;
+        robot.send(json!({"op": "advertise", "topic": "/ping", "type": "std_msgs/String", "qos": qos})).await;
         for data in ["one", "two", "three"] {
-            robot
-                .send(json!({"op": "publish", "topic": "/ping", "msg": {"data": data}}))
-                .await;
+            robot.send(json!({"op": "publish", "topic": "/ping", "msg": {"data": data}})).await;
             let heard = robot.receive("publish").await;
             assert_eq!(heard["msg"]["data"], data, "{heard}");
         }
-        robot
-            .send(json!({"op": "unsubscribe", "topic": "/pong"}))
-            .await;
+        robot.send(json!({"op": "unsubscribe", "topic": "/pong"})).await;
         // What was kept, without specifying its type.
         robot.subscribe(json!({"topic": "/map"})).await;
         assert_eq!(robot.receive("publish").await["msg"]["data"], "kept");
         let kept = json!({"durability": "transient_local", "depth": 1});
-        robot
-            .send(json!({"op": "advertise", "topic": "/late", "type": "std_msgs/String", "qos": kept}))
-            .await;
-        robot
-            .send(json!({"op": "publish", "topic": "/late", "msg": {"data": "later"}}))
-            .await;
+        robot.send(json!({"op": "advertise", "topic": "/late", "type": "std_msgs/String", "qos": kept})).await;
+        robot.send(json!({"op": "publish", "topic": "/late", "msg": {"data": "later"}})).await;
         assert_eq!(peer.wait_for("late").await, [json!("later")]);
         // It requests more than is offered, and is told.
-        robot
-            .subscribe(json!({"topic": "/scan", "qos": {"reliability": "reliable"}}))
-            .await;
+        robot.subscribe(json!({"topic": "/scan", "qos": {"reliability": "reliable"}})).await;
         assert_eq!(robot.receive("publish").await["msg"]["data"], "seen");
     }
 }
@@ -271,10 +233,8 @@ async fn a_node_that_demands_more_is_named_with_both_profiles() {
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         robot
-            .send(
-                json!({"op": "advertise", "topic": "/strict", "type": "std_msgs/String",
-                "qos": {"reliability": "best_effort"}}),
-            )
+            .send(json!({"op": "advertise", "topic": "/strict", "type": "std_msgs/String",
+                "qos": {"reliability": "best_effort"}}))
             .await;
         assert_eq!(
             robot.refusal().await,
@@ -290,14 +250,10 @@ async fn whoever_says_another_type_is_told_both_at_once() {
     let lab = Lab::new();
     let servant = BridgedServant::start(&lab).await;
     let mut early = servant.robot(RosbridgeFormat::Json).await;
+    early.subscribe(json!({"topic": "/pong", "type": "std_msgs/Int32"})).await;
     early
-        .subscribe(json!({"topic": "/pong", "type": "std_msgs/Int32"}))
-        .await;
-    early
-        .send(
-            json!({"op": "send_action_goal", "id": "early", "action": "/fib",
-            "action_type": "x_msgs/Count", "args": {"order": 1}}),
-        )
+        .send(json!({"op": "send_action_goal", "id": "early", "action": "/fib",
+            "action_type": "x_msgs/Count", "args": {"order": 1}}))
         .await;
     let _peer = lab.peer().await;
     let told = early.refusal().await;
@@ -313,15 +269,11 @@ async fn whoever_says_another_type_is_told_both_at_once() {
                         has";
     assert_eq!(early.receive("action_result").await["values"], other_action);
 
-    servant
-        .wait_graph(|graph| has_peer(graph) && serves_fib(graph))
-        .await;
+    servant.wait_graph(|graph| has_peer(graph) && serves_fib(graph)).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         for (op, topic) in [("subscribe", "/pong"), ("advertise", "/ping")] {
-            robot
-                .send(json!({"op": op, "topic": topic, "type": "std_msgs/Int32"}))
-                .await;
+            robot.send(json!({"op": op, "topic": topic, "type": "std_msgs/Int32"})).await;
             assert_eq!(
                 robot.refusal().await,
                 format!(
@@ -338,10 +290,8 @@ async fn whoever_says_another_type_is_told_both_at_once() {
             "service /set has type std_srvs/srv/SetBool, not std_srvs/srv/Trigger; use the type that it has"
         );
         robot
-            .send(
-                json!({"op": "send_action_goal", "id": "goal", "action": "/fib",
-                "action_type": "x_msgs/action/Count", "args": {"order": 3}}),
-            )
+            .send(json!({"op": "send_action_goal", "id": "goal", "action": "/fib",
+                "action_type": "x_msgs/action/Count", "args": {"order": 3}}))
             .await;
         let told = robot.receive("action_result").await;
         assert_eq!(
@@ -368,38 +318,20 @@ async fn services_are_called_both_ways() {
         let answer = robot.call("/lab/_box/set", json!([false])).await;
         assert_eq!(answer, json!({"success": false, "message": "set"}));
 
-        robot
-            .send_first(
-                "advertise_service",
-                json!({"service": "/ask", "type": "std_srvs/SetBool"}),
-            )
-            .await;
+        robot.send_first("advertise_service", json!({"service": "/ask", "type": "std_srvs/SetBool"})).await;
         peer.tell("call true").await;
         let asked = robot.receive("call_service").await;
         assert_eq!(
             (&asked["service"], &asked["type"], &asked["args"]),
-            (
-                &json!("/ask"),
-                &json!("std_srvs/srv/SetBool"),
-                &json!({"data": true})
-            )
+            (&json!("/ask"), &json!("std_srvs/srv/SetBool"), &json!({"data": true}))
         );
         robot
-            .send(
-                json!({"op": "service_response", "id": asked["id"], "service": "/ask",
-                "values": {"success": true, "message": "by a robot"}, "result": true}),
-            )
+            .send(json!({"op": "service_response", "id": asked["id"], "service": "/ask",
+                "values": {"success": true, "message": "by a robot"}, "result": true}))
             .await;
-        assert_eq!(
-            peer.wait_for("call").await,
-            [json!(true), json!("by a robot")]
-        );
-        robot
-            .send(json!({"op": "unadvertise_service", "service": "/ask"}))
-            .await;
-        servant
-            .wait_graph(|graph| !graph.services.contains_key("/ask"))
-            .await;
+        assert_eq!(peer.wait_for("call").await, [json!(true), json!("by a robot")]);
+        robot.send(json!({"op": "unadvertise_service", "service": "/ask"})).await;
+        servant.wait_graph(|graph| !graph.services.contains_key("/ask")).await;
     }
 }
 
@@ -411,12 +343,7 @@ async fn goals_are_sent_to_a_node() {
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         robot.send_goal("five", 5).await;
-        for sequence in [
-            json!([0, 1, 1]),
-            json!([0, 1, 1, 2]),
-            json!([0, 1, 1, 2, 3]),
-            json!([0, 1, 1, 2, 3, 5]),
-        ] {
+        for sequence in [json!([0, 1, 1]), json!([0, 1, 1, 2]), json!([0, 1, 1, 2, 3]), json!([0, 1, 1, 2, 3, 5])] {
             let told = robot.receive("action_feedback").await;
             assert_eq!(told["values"]["sequence"], sequence, "{told}");
         }
@@ -428,18 +355,13 @@ async fn goals_are_sent_to_a_node() {
 
         robot.send_goal("long", 100_000).await;
         robot.receive("action_feedback").await;
-        robot
-            .send(json!({"op": "cancel_action_goal", "id": "long", "action": "/fib"}))
-            .await;
+        robot.send(json!({"op": "cancel_action_goal", "id": "long", "action": "/fib"})).await;
         assert_eq!(robot.receive_goal_end().await["status"], 5);
         robot.send_goal("aborted", 7).await;
         assert_eq!(robot.receive_goal_end().await["status"], 6);
         robot.send_goal("refused", -1).await;
         let refused = robot.receive("action_result").await;
-        assert_eq!(
-            (&refused["values"], &refused["result"]),
-            (&json!("the goal was rejected"), &json!(false))
-        );
+        assert_eq!((&refused["values"], &refused["result"]), (&json!("the goal was rejected"), &json!(false)));
     }
 }
 
@@ -449,12 +371,7 @@ async fn goals_of_a_node_come_to_a_robot() {
     let servant = BridgedServant::start(&lab).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
-        robot
-            .send_first(
-                "advertise_action",
-                json!({"action": "/fib", "type": "test_msgs/action/Fibonacci"}),
-            )
-            .await;
+        robot.send_first("advertise_action", json!({"action": "/fib", "type": "test_msgs/action/Fibonacci"})).await;
         let mut node = lab.node("fibonacci.py", &["client"]).await;
         assert_eq!(node.obey("there").await, [json!(true)]);
         for (status, sequence) in [(4, json!([0, 1, 1])), (5, json!([0]))] {
@@ -506,27 +423,21 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
         .await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
-        let mut asks =
-            async |what: &str, args: Value| robot.call(&format!("/rosapi/{what}"), args).await;
+        let mut asks = async |what: &str, args: Value| robot.call(&format!("/rosapi/{what}"), args).await;
         let version = asks("get_ros_version", json!({})).await;
         assert_eq!(version, json!({"version": 2, "distro": "jazzy"}));
 
         let topics = asks("topics", json!({})).await;
         let named = topics["topics"].as_array().expect("names").iter();
         let typed = named.zip(topics["types"].as_array().expect("types"));
-        let of_ping = typed
-            .filter(|(name, _)| **name == "/ping")
-            .collect::<Vec<_>>();
+        let of_ping = typed.filter(|(name, _)| **name == "/ping").collect::<Vec<_>>();
         assert_eq!(of_ping, [(&json!("/ping"), &json!("std_msgs/msg/String"))]);
         for type_name in ["std_msgs/String", "std_msgs/msg/String"] {
             let of_type = asks("topics_for_type", json!({"type": type_name})).await;
             let of_type = of_type["topics"].as_array().expect("names");
             assert!(of_type.contains(&json!("/pong")), "{of_type:?}");
         }
-        assert_eq!(
-            asks("subscribers", json!({"topic": "/ping"})).await,
-            json!({"subscribers": ["/lab/peer"]})
-        );
+        assert_eq!(asks("subscribers", json!({"topic": "/ping"})).await, json!({"subscribers": ["/lab/peer"]}));
 
         let services = asks("services", json!({})).await;
         let services = services["services"].as_array().expect("names");
@@ -534,21 +445,12 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
         let hidden = |name: &Value| name.as_str().is_some_and(|name| name.contains("/_"));
         assert!(!services.iter().any(hidden), "{services:?}");
         let set = json!({"service": "/set"});
-        assert_eq!(
-            asks("service_type", set.clone()).await,
-            json!({"type": "std_srvs/srv/SetBool"})
-        );
-        assert_eq!(
-            asks("service_node", set).await,
-            json!({"node": "/lab/peer"})
-        );
+        assert_eq!(asks("service_type", set.clone()).await, json!({"type": "std_srvs/srv/SetBool"}));
+        assert_eq!(asks("service_node", set).await, json!({"node": "/lab/peer"}));
         let actions = asks("action_servers", json!({})).await;
         let actions = actions["action_servers"].as_array().expect("names");
         assert!(actions.contains(&json!("/fib")), "{actions:?}");
-        assert_eq!(
-            asks("action_type", json!({"action": "/fib"})).await,
-            json!({"type": "test_msgs/action/Fibonacci"})
-        );
+        assert_eq!(asks("action_type", json!({"action": "/fib"})).await, json!({"type": "test_msgs/action/Fibonacci"}));
 
         let nodes = asks("nodes", json!({})).await;
         let nodes = nodes["nodes"].as_array().expect("names");
@@ -561,10 +463,7 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
 
         let speed = json!({"name": "/lab/tuned:speed"});
         let got = asks("get_param", speed.clone()).await;
-        assert_eq!(
-            (&got["value"], &got["successful"]),
-            (&json!("1.5"), &json!(true))
-        );
+        assert_eq!((&got["value"], &got["successful"]), (&json!("1.5"), &json!(true)));
         let set = json!({"name": "/lab/tuned:speed", "value": "2.5"});
         assert_eq!(asks("set_param", set).await["successful"], true);
         assert_eq!(asks("get_param", speed.clone()).await["value"], "2.5");
@@ -573,10 +472,7 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
         assert_eq!(asks("has_param", speed).await, json!({"exists": true}));
         let names = asks("get_param_names", json!({})).await;
         let names = names["names"].as_array().expect("names");
-        assert!(
-            names.contains(&json!("/lab/tuned:arm.joint.gain")),
-            "{names:?}"
-        );
+        assert!(names.contains(&json!("/lab/tuned:arm.joint.gain")), "{names:?}");
 
         // The node's own message.
         robot
@@ -586,10 +482,7 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
         let refused = robot.receive("service_response").await;
         assert_eq!(
             (&refused["result"], &refused["values"]),
-            (
-                &json!(false),
-                &json!("node /lab/tuned refuses speed: too fast")
-            )
+            (&json!(false), &json!("node /lab/tuned refuses speed: too fast"))
         );
     }
 }

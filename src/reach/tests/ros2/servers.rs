@@ -38,8 +38,7 @@ impl LocalDiscoveryServer {
 
     async fn start(&self, lab: &Lab) -> Peer {
         let arguments = [self.place.to_string(), self.at.to_string()];
-        lab.node("server.py", &arguments.each_ref().map(String::as_str))
-            .await
+        lab.node("server.py", &arguments.each_ref().map(String::as_str)).await
     }
 }
 
@@ -48,13 +47,7 @@ fn server_environment(servers: &[&LocalDiscoveryServer]) -> (String, DiscoveryNe
     let addresses = servers.iter().map(|server| server.address().to_string());
     let network = DiscoveryNetwork {
         multicast: false,
-        servers: servers
-            .iter()
-            .map(|server| DiscoveryServer {
-                place: server.place,
-                at: server.address(),
-            })
-            .collect(),
+        servers: servers.iter().map(|server| DiscoveryServer { place: server.place, at: server.address() }).collect(),
         well_known: true,
         ..DiscoveryNetwork::default()
     };
@@ -106,9 +99,7 @@ async fn a_server_comes_later_and_ends_and_comes_again() {
     let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
     let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
     for matched in [ping.matched_subscribers(), pong.matched.clone()] {
-        timeout(LONG, wait_for_connected(matched, 1))
-            .await
-            .expect("somebody");
+        timeout(LONG, wait_for_connected(matched, 1)).await.expect("somebody");
     }
     running.kill_and_wait().await;
     // Existing matches remain; no new participants are found.
@@ -129,10 +120,7 @@ async fn a_server_comes_later_and_ends_and_comes_again() {
 #[tokio::test]
 async fn of_several_servers_each_suffices() {
     let lab = Lab::new();
-    let servers = [
-        LocalDiscoveryServer::local(0),
-        LocalDiscoveryServer::local(1),
-    ];
+    let servers = [LocalDiscoveryServer::local(0), LocalDiscoveryServer::local(1)];
     let both = [&servers[0], &servers[1]];
     let mut second = servers[1].start(&lab).await;
     let bus = join(&lab, &both).await;
@@ -151,10 +139,7 @@ async fn a_server_and_a_node_on_another_machine() {
     let server = LocalDiscoveryServer::new(0, Ipv4Addr::new(10, 77, 0, 2));
     let _running = server.start(&other).await;
     let mut peer = node(&other, "peer.py", &[&server]).await;
-    let network = DiscoveryNetwork {
-        interfaces: InterfaceSelection::All,
-        ..server_environment(&[&server]).1
-    };
+    let network = DiscoveryNetwork { interfaces: InterfaceSelection::All, ..server_environment(&[&server]).1 };
     let bus = robot.join_network(NODE, network).await;
     let pong = converse(&bus).await;
     call_each_other(&bus, &mut peer, &[value!(true), value!(PEER)]).await;

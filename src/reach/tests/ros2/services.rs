@@ -35,10 +35,7 @@ async fn a_node_answers_calls() {
     wait_graph(&bus, |graph| graph.services.contains_key("/set")).await;
     let told = bus.service_type("/set").await.unwrap();
     let ours = set_bool_type();
-    assert_eq!(
-        (&told.name, &told.request, &told.response),
-        (&ours.name, &ours.request, &ours.response)
-    );
+    assert_eq!((&told.name, &told.request, &told.response), (&ours.name, &ours.request, &ours.response));
     for number in 0..100 {
         let data = number % 2 == 0;
         let answer = bus.call("/set", request(data), LONG).await.unwrap();
@@ -56,10 +53,7 @@ async fn a_call_waits_until_both_ends_know_each_other() {
         let bus = lab.join(NODE).await;
         wait_graph(&bus, |graph| graph.services.contains_key("/set")).await;
         let answer = bus.call("/set", request(true), LONG).await.unwrap();
-        assert_eq!(
-            json(&set_bool().response, &answer),
-            r#"{"success":true,"message":"set"}"#
-        );
+        assert_eq!(json(&set_bool().response, &answer), r#"{"success":true,"message":"set"}"#);
         bus.close().await;
     }
 }
@@ -69,10 +63,7 @@ async fn a_node_is_answered() {
     let lab = Lab::new();
     let mut peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let _served = bus
-        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
-        .await
-        .unwrap();
+    let _served = bus.serve("/ask", set_bool_type(), Arc::new(CallerEchoService)).await.unwrap();
     for data in [true, false] {
         let answer = peer.obey(&format!("call {data}")).await;
         assert_eq!(answer, [json!(data), json!("/lab/peer")]);
@@ -91,20 +82,7 @@ async fn a_server_that_is_killed_while_it_works_is_noticed() {
     let begun = Instant::now();
     peer.kill();
     let failed = call.await.unwrap();
-    assert!(
-        matches!(
-            failed,
-            Err(BusError::CallFailed {
-                fate: CallFate::Unknown,
-                ..
-            })
-        ),
-        "{failed:?}"
-    );
+    assert!(matches!(failed, Err(BusError::CallFailed { fate: CallFate::Unknown, .. })), "{failed:?}");
     // Its own lease is 20 s; its ports are checked five times a second.
-    assert!(
-        begun.elapsed() < Duration::from_secs(2),
-        "{:?}",
-        begun.elapsed()
-    );
+    assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
 }

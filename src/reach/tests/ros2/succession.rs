@@ -22,11 +22,7 @@ struct ParticipantNotes(Mutex<Vec<ParticipantPrefix>>);
 
 #[async_trait]
 impl Succession for ParticipantNotes {
-    async fn record_join(
-        &self,
-        _node: &str,
-        participant: ParticipantPrefix,
-    ) -> Vec<ParticipantPrefix> {
+    async fn record_join(&self, _node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix> {
         let mut noted = self.0.lock();
         let earlier = noted.clone();
         noted.push(participant);
@@ -46,10 +42,8 @@ impl ServiceHandler for NamedService {
 }
 
 async fn join(lab: &Lab, notes: &Arc<ParticipantNotes>) -> Arc<Ros2Bus> {
-    let options = JoinOptions {
-        succession: Some(Arc::clone(notes) as _),
-        ..JoinOptions::in_domain(0, "/cloudroid_bridge")
-    };
+    let options =
+        JoinOptions { succession: Some(Arc::clone(notes) as _), ..JoinOptions::in_domain(0, "/cloudroid_bridge") };
     lab.join_with(options).await
 }
 
@@ -90,10 +84,7 @@ async fn a_killed_daemon_is_not_waited_for(program: &str) {
     let mut peer = lab.node(program, &[]).await;
     let notes = Arc::default();
     let kill = start_mortal(&lab, &notes);
-    assert_eq!(
-        expect_answer(&mut peer).await,
-        [json!(true), json!("first")]
-    );
+    assert_eq!(expect_answer(&mut peer).await, [json!(true), json!("first")]);
     kill();
     assert_eq!(peer.obey("served").await, [json!(true)]);
     let begun = Instant::now();
@@ -109,10 +100,7 @@ async fn a_killed_daemon_is_not_waited_for(program: &str) {
     assert!(after < Duration::from_secs(4), "{after:?}");
     let served = second.serve("/ask", set_bool_type(), Arc::new(NamedService("second")));
     let _served = served.await.unwrap();
-    assert_eq!(
-        expect_answer(&mut peer).await,
-        [json!(true), json!("second")]
-    );
+    assert_eq!(expect_answer(&mut peer).await, [json!(true), json!("second")]);
 }
 
 #[tokio::test]

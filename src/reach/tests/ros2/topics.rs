@@ -1,6 +1,4 @@
-use ros::bus::{
-    Bus, MatchedPeers, QosProfile, QosReliability, SerializedMessage, Subscription, WireType,
-};
+use ros::bus::{Bus, MatchedPeers, QosProfile, QosReliability, SerializedMessage, Subscription, WireType};
 use ros::bus::{RosVersion, wait_for_connected};
 use ros::schema::MessageType;
 use serde_json::json as value;
@@ -13,9 +11,7 @@ const NODE: &str = "/cloudroid_bridge";
 
 async fn next(subscription: &mut Subscription) -> SerializedMessage {
     let message = timeout(LONG, subscription.messages.recv()).await;
-    message
-        .expect("a message should come")
-        .expect("the bus is open")
+    message.expect("a message should come").expect("the bus is open")
 }
 
 /// Ignores padding.
@@ -69,10 +65,7 @@ async fn messages_go_there_and_back() {
     let shown = value!([[NODE, "std_msgs/msg/String", digest]]);
     assert_eq!(value!(peer.obey("publishers_of /ping").await), shown);
     wait_graph(&bus, |graph| {
-        let ends = graph
-            .topics
-            .get("/ping")
-            .map(|it| (&it.publishers[..], &it.subscribers[..]));
+        let ends = graph.topics.get("/ping").map(|it| (&it.publishers[..], &it.subscribers[..]));
         ends == Some((&[NODE.to_owned()], &["/lab/peer".to_owned()]))
     })
     .await;
@@ -87,10 +80,7 @@ async fn what_was_published_before_is_heard_by_both_sides() {
     let mut map = bus.subscribe("/map", string_type(), latched).await.unwrap();
     let message = next(&mut map).await;
     assert_eq!((&*text(&message), message.latching), ("kept", true));
-    let late = bus
-        .advertise("/late", string_type(), latched)
-        .await
-        .unwrap();
+    let late = bus.advertise("/late", string_type(), latched).await.unwrap();
     late.publish(string_message("from the bus"));
     assert_eq!(peer.wait_for("late").await, [value!("from the bus")]);
 }
@@ -113,10 +103,7 @@ async fn a_subscriber_that_asks_for_more_and_one_of_another_type_are_said() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let less = QosProfile {
-        reliability: QosReliability::BestEffort,
-        ..QosProfile::keep_last(1)
-    };
+    let less = QosProfile { reliability: QosReliability::BestEffort, ..QosProfile::keep_last(1) };
     let strict = bus.advertise("/strict", string_type(), less).await.unwrap();
     let told = wait_until(strict.matched_subscribers(), |matched| {
         let mut refused = matched.refused.iter();
@@ -131,16 +118,9 @@ async fn a_subscriber_that_asks_for_more_and_one_of_another_type_are_said() {
     );
     let other = MessageType::parse_full_text(RosVersion::Two, "std_msgs/msg/String", "string text");
     let of = WireType::from_message(&other.unwrap());
-    let pong = bus
-        .subscribe("/pong", of, QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let pong = bus.subscribe("/pong", of, QosProfile::keep_last(1)).await.unwrap();
     let told = wait_until(pong.matched.clone(), |matched| !matched.refused.is_empty()).await;
-    assert!(
-        told.refused[0]
-            .why
-            .starts_with("its type is std_msgs/msg/String RIHS01_")
-    );
+    assert!(told.refused[0].why.starts_with("its type is std_msgs/msg/String RIHS01_"));
 }
 
 #[tokio::test]
@@ -148,10 +128,7 @@ async fn a_node_that_is_killed_is_noticed() {
     let lab = Lab::new();
     let mut peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let pong = bus
-        .subscribe("/pong", string_type(), QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let pong = bus.subscribe("/pong", string_type(), QosProfile::keep_last(1)).await.unwrap();
     wait_connected(pong.matched.clone()).await;
     wait_graph(&bus, |graph| graph.nodes.contains_key("/lab/peer")).await;
     let begun = std::time::Instant::now();
@@ -159,9 +136,5 @@ async fn a_node_that_is_killed_is_noticed() {
     wait_until(pong.matched.clone(), |matched| matched.peers.is_empty()).await;
     wait_graph(&bus, |graph| !graph.nodes.contains_key("/lab/peer")).await;
     // Its own lease is 20 s; its ports are checked five times a second.
-    assert!(
-        begun.elapsed() < std::time::Duration::from_secs(2),
-        "{:?}",
-        begun.elapsed()
-    );
+    assert!(begun.elapsed() < std::time::Duration::from_secs(2), "{:?}", begun.elapsed());
 }

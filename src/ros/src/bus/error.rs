@@ -46,9 +46,7 @@ pub enum BusError {
         fate: CallFate,
     },
     /// The item is not offered to this robot because it shares the nodes with other robots.
-    #[error(
-        "{0} is not offered: robots share this service, and can use only its services and actions"
-    )]
+    #[error("{0} is not offered: robots share this service, and can use only its services and actions")]
     NotShared(String),
     /// No answer arrived in time.
     #[error("{what} did not answer within {after:?}")]

@@ -76,8 +76,7 @@ impl Graph {
     /// Returns true if `other` is a node of the process of `node` (see [`process_nodes`](Self::process_nodes)).
     pub fn is_in_process(&self, node: &str, other: &str) -> bool {
         let marked = || self.enclave_nodes(node);
-        node == other
-            || marked().is_some_and(|nodes| nodes.contains(other) && !self.is_ambiguous(other))
+        node == other || marked().is_some_and(|nodes| nodes.contains(other) && !self.is_ambiguous(other))
     }
 
     /// Returns the further nodes of that process that are not attributed to it because another process has a node of
@@ -125,10 +124,8 @@ pub struct NodeEntities {
 impl NodeEntities {
     /// Merges the endpoints of another node; if the types for a name differ, the first one is kept.
     fn merge(&mut self, other: &NodeEntities) {
-        let sides = [
-            (&mut self.publishers, &other.publishers, true),
-            (&mut self.subscribers, &other.subscribers, false),
-        ];
+        let sides =
+            [(&mut self.publishers, &other.publishers, true), (&mut self.subscribers, &other.subscribers, false)];
         for (topics, others, publishes) in sides {
             for (topic, (of, qos)) in others {
                 let known = topics.entry(topic.clone());
@@ -136,15 +133,10 @@ impl NodeEntities {
                 known.1 = crate::ros2::merge_qos(known.1, *qos, publishes);
             }
         }
-        let sides = [
-            (&mut self.services, &other.services),
-            (&mut self.clients, &other.clients),
-        ];
+        let sides = [(&mut self.services, &other.services), (&mut self.clients, &other.clients)];
         for (services, others) in sides {
             for (service, of) in others {
-                services
-                    .entry(service.clone())
-                    .or_insert_with(|| of.clone());
+                services.entry(service.clone()).or_insert_with(|| of.clone());
             }
         }
     }
@@ -210,10 +202,7 @@ mod tests {
 
     #[test]
     fn nodes_of_one_process_are_known_by_its_enclave_and_seen_as_one() {
-        let weak = QosProfile {
-            reliability: QosReliability::BestEffort,
-            ..QosProfile::keep_last(5)
-        };
+        let weak = QosProfile { reliability: QosReliability::BestEffort, ..QosProfile::keep_last(5) };
         let topic = |name: &str, qos| (name.to_owned(), (WireType::any(), qos));
         let set = ServiceType::new("std_srvs/srv/SetBool", "*");
         let ears = NodeEntities {
@@ -231,12 +220,8 @@ mod tests {
         let mark = crate::ros2::process::enclave_for("/ears").expect("a mark");
         let graph = Graph {
             enclaves: [(mark, named(&["/ears", "/mouth"]))].into(),
-            ends: [
-                ("/ears".to_owned(), ears),
-                ("/mouth".to_owned(), mouth.clone()),
-                ("/nose".to_owned(), mouth),
-            ]
-            .into(),
+            ends: [("/ears".to_owned(), ears), ("/mouth".to_owned(), mouth.clone()), ("/nose".to_owned(), mouth)]
+                .into(),
             ..Graph::default()
         };
         let nodes: BTreeSet<String> = graph.process_nodes("/ears");
@@ -248,10 +233,7 @@ mod tests {
         // The strongest QoS that is offered, and the weakest that is requested.
         let log = all.publishers["/log"].1;
         assert!(log.is_latching() && log.reliability == QosReliability::Reliable);
-        assert_eq!(
-            all.subscribers["/scan"].1.reliability,
-            QosReliability::BestEffort
-        );
+        assert_eq!(all.subscribers["/scan"].1.reliability, QosReliability::BestEffort);
         assert_eq!(all.services, [("/mouth/set".to_owned(), set)].into());
     }
     #[test]
@@ -273,11 +255,7 @@ mod tests {
         assert_eq!(graph.process_nodes("/left"), named(&["/bass", "/left"]));
         assert_eq!(graph.process_nodes("/right"), named(&["/right"]));
         assert!(graph.is_in_process("/left", "/bass") && graph.is_in_process("/right", "/right"));
-        for (node, other) in [
-            ("/left", "/tenor"),
-            ("/right", "/tenor"),
-            ("/left", "/right"),
-        ] {
+        for (node, other) in [("/left", "/tenor"), ("/right", "/tenor"), ("/left", "/right")] {
             assert!(!graph.is_in_process(node, other), "{node} {other}");
         }
         let shared: BTreeSet<String> = named(&["/right", "/tenor"]);

@@ -141,9 +141,7 @@ impl MatchedPeers {
 
 /// Waits until at least `count` peers are connected; returns at once if the local endpoint is gone.
 pub async fn wait_for_connected(mut matched: watch::Receiver<MatchedPeers>, count: usize) {
-    let _ = matched
-        .wait_for(|matched| matched.connected_count() >= count)
-        .await;
+    let _ = matched.wait_for(|matched| matched.connected_count() >= count).await;
 }
 
 #[cfg(test)]
@@ -153,14 +151,8 @@ mod tests {
     #[test]
     fn an_end_with_a_guid_stays_itself_when_its_node_becomes_known() {
         let guid = u128::from(u64::MAX) + 1;
-        assert_eq!(
-            PeerId::new("/talker", guid),
-            PeerId::new("01.0f|1.c1", guid)
-        );
-        assert_ne!(
-            PeerId::new("/talker", guid),
-            PeerId::new("/talker", guid + 1)
-        );
+        assert_eq!(PeerId::new("/talker", guid), PeerId::new("01.0f|1.c1", guid));
+        assert_ne!(PeerId::new("/talker", guid), PeerId::new("/talker", guid + 1));
         assert_ne!(PeerId::new("/a", 1), PeerId::new("/b", 1));
         assert!(PeerId::new("/a", 1) < PeerId::new("/b", 0));
     }

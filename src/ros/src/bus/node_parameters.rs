@@ -12,27 +12,14 @@ pub trait NodeParameters: Send + Sync {
     /// Sets parameters, or deletes those without a value, one after the other. Returns for each whether the node
     /// accepted the change, or its reason. A value is converted to the type of the node's parameter where that is
     /// lossless (`1` becomes `1.0`).
-    async fn set(
-        &self,
-        node: &str,
-        changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), FailureReason>>, BusError>;
+    async fn set(&self, node: &str, changes: Vec<ParamChange>) -> Result<Vec<Result<(), FailureReason>>, BusError>;
     /// Sets parameters like [`set`](Self::set), but all or none; the error carries the node's reason.
     async fn set_atomically(&self, node: &str, changes: Vec<ParamChange>) -> Result<(), BusError>;
     /// Lists the parameters of a node: those below the prefixes (all if there are none), with names of at most `depth`
     /// levels beyond the prefix (0 for any number).
-    async fn list(
-        &self,
-        node: &str,
-        prefixes: &[String],
-        depth: u64,
-    ) -> Result<ParameterNames, BusError>;
+    async fn list(&self, node: &str, prefixes: &[String], depth: u64) -> Result<ParameterNames, BusError>;
     /// Returns the node's descriptions of its parameters, in the order requested; `None` for a missing parameter.
-    async fn describe(
-        &self,
-        node: &str,
-        names: &[String],
-    ) -> Result<Vec<Option<ParameterDescription>>, BusError>;
+    async fn describe(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParameterDescription>>, BusError>;
     /// Watches changes from the time this returns: those of one node, which must exist, or of all nodes.
     async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError>;
 }

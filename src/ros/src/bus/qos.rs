@@ -69,11 +69,7 @@ impl QosProfile {
 
     /// Returns the profile, made transient-local if `latching` and volatile otherwise.
     pub const fn latching(mut self, latching: bool) -> Self {
-        self.durability = if latching {
-            QosDurability::TransientLocal
-        } else {
-            QosDurability::Volatile
-        };
+        self.durability = if latching { QosDurability::TransientLocal } else { QosDurability::Volatile };
         self
     }
 

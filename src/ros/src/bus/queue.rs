@@ -22,12 +22,7 @@ pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
         ready: Notify::new(),
         dropped: Arc::default(),
     });
-    (
-        MessageSender {
-            shared: shared.clone(),
-        },
-        MessageReceiver { shared },
-    )
+    (MessageSender { shared: shared.clone() }, MessageReceiver { shared })
 }
 
 struct State {
@@ -129,18 +124,13 @@ impl Drop for MessageReceiver {
 
 impl fmt::Debug for MessageReceiver {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("MessageReceiver")
-            .field("waiting", &self.len())
-            .finish_non_exhaustive()
+        formatter.debug_struct("MessageReceiver").field("waiting", &self.len()).finish_non_exhaustive()
     }
 }
 
 impl fmt::Debug for MessageSender {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("MessageSender")
-            .finish_non_exhaustive()
+        formatter.debug_struct("MessageSender").finish_non_exhaustive()
     }
 }
 
@@ -153,12 +143,7 @@ mod tests {
 
     fn message(bytes: Bytes) -> SerializedMessage {
         let wire_type = WireType::with_name("p/T");
-        SerializedMessage {
-            bytes,
-            wire_type: Arc::new(wire_type),
-            publisher: "/p".into(),
-            latching: false,
-        }
+        SerializedMessage { bytes, wire_type: Arc::new(wire_type), publisher: "/p".into(), latching: false }
     }
 
     #[tokio::test]

@@ -124,17 +124,8 @@ pub struct WireType {
 
 impl WireType {
     /// Creates a type of the ROS 1 format.
-    pub fn new(
-        name: impl Into<String>,
-        digest: impl Into<Digest>,
-        definition: impl Into<String>,
-    ) -> Self {
-        Self {
-            name: name.into(),
-            format: WireFormat::Ros1,
-            digest: digest.into(),
-            definition: definition.into(),
-        }
+    pub fn new(name: impl Into<String>, digest: impl Into<Digest>, definition: impl Into<String>) -> Self {
+        Self { name: name.into(), format: WireFormat::Ros1, digest: digest.into(), definition: definition.into() }
     }
 
     /// Returns the type with the format of the given ROS version.
@@ -249,18 +240,11 @@ impl ServiceType {
     /// Returns the error for `what` having this type at the peer and `ours` here. It names what differs: the type names
     /// or else the digests.
     pub fn mismatch(&self, ours: &ServiceType, what: String) -> BusError {
-        let pairs = [
-            (&self.digest, &ours.digest),
-            (&self.request, &ours.request),
-            (&self.response, &ours.response),
-        ];
+        let pairs = [(&self.digest, &ours.digest), (&self.request, &ours.request), (&self.response, &ours.response)];
         let differ = |(theirs, ours): &(&Digest, &Digest)| !theirs.is_compatible_with(ours);
         let digests = pairs.into_iter().find(differ);
         let (theirs, ours) = match digests.filter(|_| self.name == ours.name) {
-            Some((theirs, of_ours)) => (
-                format!("{} {theirs}", self.name),
-                format!("{} {of_ours}", ours.name),
-            ),
+            Some((theirs, of_ours)) => (format!("{} {theirs}", self.name), format!("{} {of_ours}", ours.name)),
             None => (self.name.clone(), ours.name.clone()),
         };
         BusError::TypeMismatch { what, theirs, ours }
@@ -279,47 +263,27 @@ mod tests {
         };
         let (string, empty) = (of("string data"), of(""));
         assert!(string.schema().is_ok() && empty.schema().is_ok());
-        let untold = WireType {
-            definition: String::new(),
-            ..string
-        };
-        assert_eq!(
-            untold.schema().err(),
-            Some(SchemaError::Unknown("a/msg/B".to_owned()))
-        );
+        let untold = WireType { definition: String::new(), ..string };
+        assert_eq!(untold.schema().err(), Some(SchemaError::Unknown("a/msg/B".to_owned())));
     }
 
     #[test]
     fn services_agree_by_what_is_known_of_them() {
-        let known = |request: &str| ServiceType {
-            request: Digest::from(request),
-            ..ServiceType::new("a/srv/B", "*")
-        };
-        assert!(
-            known("x").is_compatible_with(&known("x"))
-                && known("x").is_compatible_with(&known("*"))
-        );
+        let known = |request: &str| ServiceType { request: Digest::from(request), ..ServiceType::new("a/srv/B", "*") };
+        assert!(known("x").is_compatible_with(&known("x")) && known("x").is_compatible_with(&known("*")));
         assert!(!known("x").is_compatible_with(&known("y")));
         assert!(!ServiceType::new("a/B", "x").is_compatible_with(&ServiceType::new("a/B", "y")));
     }
 
     #[test]
     fn types_are_told_by_what_they_differ_in() {
-        let of = |name: &str, request: &str| ServiceType {
-            request: Digest::from(request),
-            ..ServiceType::new(name, "*")
-        };
+        let of =
+            |name: &str, request: &str| ServiceType { request: Digest::from(request), ..ServiceType::new(name, "*") };
         let told = |theirs: ServiceType, ours: ServiceType| {
             assert!(!theirs.matches(&ours));
             theirs.mismatch(&ours, "service /x".to_owned()).to_string()
         };
-        assert_eq!(
-            told(of("a/srv/B", "x"), of("c/srv/D", "y")),
-            "service /x is a/srv/B there and c/srv/D here"
-        );
-        assert_eq!(
-            told(of("a/srv/B", "x"), of("a/srv/B", "y")),
-            "service /x is a/srv/B x there and a/srv/B y here"
-        );
+        assert_eq!(told(of("a/srv/B", "x"), of("c/srv/D", "y")), "service /x is a/srv/B there and c/srv/D here");
+        assert_eq!(told(of("a/srv/B", "x"), of("a/srv/B", "y")), "service /x is a/srv/B x there and a/srv/B y here");
     }
 }

@@ -11,17 +11,8 @@ use crate::schema::MessageType;
 use crate::schema::plan::Members;
 
 /// Appends the message that the CBOR map describes.
-pub(crate) fn read(
-    message: &MessageType,
-    cbor: &[u8],
-    out: &mut Vec<u8>,
-    options: &FillOptions,
-) -> Result<(), Fault> {
-    let mut input = Cbor {
-        input: cbor,
-        at: 0,
-        scratch: Vec::new(),
-    };
+pub(crate) fn read(message: &MessageType, cbor: &[u8], out: &mut Vec<u8>, options: &FillOptions) -> Result<(), Fault> {
+    let mut input = Cbor { input: cbor, at: 0, scratch: Vec::new() };
     fill(&mut input, message, out, options)?;
     if input.at < cbor.len() {
         return Err(input.invalid("more follows the message"));
@@ -92,9 +83,7 @@ impl ValueInput for Cbor<'_> {
             (SIMPLE, 22 | 23) => {
                 return T::from_non_finite(f64::NAN).ok_or_else(|| type_mismatch(T::NAME, head));
             }
-            (SIMPLE, _) => {
-                Number::Float(head_to_float(head).ok_or_else(|| type_mismatch(T::NAME, head))?)
-            }
+            (SIMPLE, _) => Number::Float(head_to_float(head).ok_or_else(|| type_mismatch(T::NAME, head))?),
             _ => return Err(type_mismatch(T::NAME, head)),
         };
         T::from_number(number)
@@ -122,8 +111,7 @@ impl ValueInput for Cbor<'_> {
                 let mut text = std::mem::take(&mut self.scratch);
                 text.clear();
                 self.string(head, &mut text)?;
-                let decoded = base64_simd::forgiving_decode_to_vec(&text)
-                    .map_err(|_| CodecErrorKind::Base64)?;
+                let decoded = base64_simd::forgiving_decode_to_vec(&text).map_err(|_| CodecErrorKind::Base64)?;
                 out.extend_from_slice(&decoded);
                 self.scratch = text;
             }
@@ -138,11 +126,7 @@ impl ValueInput for Cbor<'_> {
     fn typed_array<T: Wire>(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault> {
         let before = self.at;
         let head = self.read_head()?;
-        let layout = if head.major == TAG {
-            ElementLayout::from_tag(head.value)
-        } else {
-            None
-        };
+        let layout = if head.major == TAG { ElementLayout::from_tag(head.value) } else { None };
         let Some(layout) = layout else {
             self.at = before;
             return Ok(false);
@@ -174,11 +158,7 @@ impl ValueInput for Cbor<'_> {
 impl<'a> Cbor<'a> {
     #[cold]
     fn invalid(&self, reason: &'static str) -> Fault {
-        CodecErrorKind::Cbor {
-            at: self.at,
-            reason,
-        }
-        .into()
+        CodecErrorKind::Cbor { at: self.at, reason }.into()
     }
 
     #[inline]
@@ -201,26 +181,18 @@ impl<'a> Cbor<'a> {
 
     fn take(&mut self, size: u64) -> Result<&'a [u8], Fault> {
         let rest = &self.input[self.at..];
-        let size = usize::try_from(size)
-            .ok()
-            .filter(|size| *size <= rest.len());
+        let size = usize::try_from(size).ok().filter(|size| *size <= rest.len());
         let size = size.ok_or_else(|| self.invalid("a string longer than the input"))?;
         self.at += size;
         Ok(&rest[..size])
     }
 
-    fn open_container(
-        &mut self,
-        major: u8,
-        expected: &'static str,
-    ) -> Result<RemainingItems, Fault> {
+    fn open_container(&mut self, major: u8, expected: &'static str) -> Result<RemainingItems, Fault> {
         let head = self.read_untagged_head()?;
         if head.major != major {
             return Err(type_mismatch(expected, head));
         }
-        Ok(RemainingItems(
-            (head.info != INDEFINITE).then_some(head.value),
-        ))
+        Ok(RemainingItems((head.info != INDEFINITE).then_some(head.value)))
     }
 
     /// Returns true if another item (or pair) follows; skips the break after the last one.

@@ -32,35 +32,15 @@ impl ItemHead {
         let (major, info) = (first & 0xe0, first & 0x1f);
         let (value, width) = match info {
             0..=23 => (Some(u64::from(info)), 0),
-            24 => (
-                rest.first_chunk()
-                    .map(|bytes| u8::from_be_bytes(*bytes).into()),
-                1,
-            ),
-            25 => (
-                rest.first_chunk()
-                    .map(|bytes| u16::from_be_bytes(*bytes).into()),
-                2,
-            ),
-            26 => (
-                rest.first_chunk()
-                    .map(|bytes| u32::from_be_bytes(*bytes).into()),
-                4,
-            ),
-            27 => (
-                rest.first_chunk().map(|bytes| u64::from_be_bytes(*bytes)),
-                8,
-            ),
+            24 => (rest.first_chunk().map(|bytes| u8::from_be_bytes(*bytes).into()), 1),
+            25 => (rest.first_chunk().map(|bytes| u16::from_be_bytes(*bytes).into()), 2),
+            26 => (rest.first_chunk().map(|bytes| u32::from_be_bytes(*bytes).into()), 4),
+            27 => (rest.first_chunk().map(|bytes| u64::from_be_bytes(*bytes)), 8),
             INDEFINITE if matches!(major, BYTES | TEXT | ARRAY | MAP | SIMPLE) => (Some(0), 0),
             _ => return Err("a reserved head"),
         };
         let value = value.ok_or("the input ends here")?;
-        Ok(ItemHead {
-            major,
-            info,
-            value,
-            size: 1 + width,
-        })
+        Ok(ItemHead { major, info, value, size: 1 + width })
     }
 
     pub(crate) fn is_break(self) -> bool {
@@ -91,11 +71,9 @@ pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
                 }
                 None
             }
-            BYTES | TEXT if indefinite => Some(OpenItem {
-                left: None,
-                chunks: Some(head.major),
-                ..OpenItem::default()
-            }),
+            BYTES | TEXT if indefinite => {
+                Some(OpenItem { left: None, chunks: Some(head.major), ..OpenItem::default() })
+            }
             BYTES | TEXT => {
                 let length = usize::try_from(head.value).unwrap_or(usize::MAX);
                 if length > input.len() - at {
@@ -104,23 +82,10 @@ pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
                 at += length;
                 None
             }
-            ARRAY | MAP if indefinite => Some(OpenItem {
-                left: None,
-                map: head.major == MAP,
-                ..OpenItem::default()
-            }),
-            ARRAY => Some(OpenItem {
-                left: Some(head.value),
-                ..OpenItem::default()
-            }),
-            MAP => Some(OpenItem {
-                left: Some(head.value.saturating_mul(2)),
-                ..OpenItem::default()
-            }),
-            TAG => Some(OpenItem {
-                left: Some(1),
-                ..OpenItem::default()
-            }),
+            ARRAY | MAP if indefinite => Some(OpenItem { left: None, map: head.major == MAP, ..OpenItem::default() }),
+            ARRAY => Some(OpenItem { left: Some(head.value), ..OpenItem::default() }),
+            MAP => Some(OpenItem { left: Some(head.value.saturating_mul(2)), ..OpenItem::default() }),
+            TAG => Some(OpenItem { left: Some(1), ..OpenItem::default() }),
             _ => None,
         };
         if let Some(level) = opened {

@@ -39,18 +39,14 @@ impl OutputFormat for Cbor<'_> {
             Scalar::U8 | Scalar::U16 | Scalar::U32 | Scalar::U64 => {
                 write_head(self.out, UNSIGNED, read_unsigned(bytes))
             }
-            Scalar::I8 | Scalar::I16 | Scalar::I32 | Scalar::I64 => {
-                self.integer(read_signed(bytes))
-            }
+            Scalar::I8 | Scalar::I16 | Scalar::I32 | Scalar::I64 => self.integer(read_signed(bytes)),
             Scalar::F32 => self.float::<4, 5>(26, bytes),
             Scalar::F64 => self.float::<8, 9>(27, bytes),
             Scalar::Time => self.time([b"\x64secs", b"\x65nsecs"], [Scalar::U32; 2], bytes),
             Scalar::Duration => self.time([b"\x64secs", b"\x65nsecs"], [Scalar::I32; 2], bytes),
-            Scalar::Time2 | Scalar::Duration2 => self.time(
-                [b"\x63sec", b"\x67nanosec"],
-                [Scalar::I32, Scalar::U32],
-                bytes,
-            ),
+            Scalar::Time2 | Scalar::Duration2 => {
+                self.time([b"\x63sec", b"\x67nanosec"], [Scalar::I32, Scalar::U32], bytes)
+            }
         }
     }
 

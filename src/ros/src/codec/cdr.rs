@@ -49,12 +49,7 @@ pub(crate) struct Cdr<'a, const BIG: bool> {
 
 impl<'a, const BIG: bool> Cdr<'a, BIG> {
     pub(crate) fn new(body: &'a [u8]) -> Self {
-        Cdr {
-            body,
-            at: 0,
-            one: [0; 8],
-            turned: Vec::new(),
-        }
+        Cdr { body, at: 0, one: [0; 8], turned: Vec::new() }
     }
 
     /// Skips padding and takes `size` bytes. `alignment` is a power of two.
@@ -63,10 +58,7 @@ impl<'a, const BIG: bool> Cdr<'a, BIG> {
         let begin = (self.at + alignment - 1) & !(alignment - 1);
         let end = begin.saturating_add(size);
         let Some(taken) = self.body.get(begin..end) else {
-            return Err(CodecErrorKind::Truncated {
-                missing: end - self.body.len(),
-            }
-            .into());
+            return Err(CodecErrorKind::Truncated { missing: end - self.body.len() }.into());
         };
         self.at = end;
         Ok(taken)
@@ -127,11 +119,7 @@ fn push_utf8<const BIG: bool>(units: &[u8], out: &mut Vec<u8>) {
 
 #[inline]
 fn word<const BIG: bool>(bytes: [u8; 4]) -> u32 {
-    if BIG {
-        u32::from_be_bytes(bytes)
-    } else {
-        u32::from_le_bytes(bytes)
-    }
+    if BIG { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) }
 }
 
 impl<const BIG: bool> SerializedReader for Cdr<'_, BIG> {

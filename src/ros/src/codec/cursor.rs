@@ -20,12 +20,7 @@ impl<'a> MessageCursor<'a> {
             RosVersion::Two => split_header(bytes).ok()?.1,
         };
         let origin = (version == RosVersion::Two).then_some(HEADER.len());
-        Some(Self {
-            bytes,
-            at: origin.unwrap_or(0),
-            origin,
-            big_endian,
-        })
+        Some(Self { bytes, at: origin.unwrap_or(0), origin, big_endian })
     }
 
     /// Returns the offset of the next value or its padding.

@@ -19,9 +19,7 @@ pub(crate) fn eight_digits(chunk: [u8; 8]) -> Option<u64> {
 #[cold]
 pub(crate) fn many_digits(text: &[u8]) -> (u64, bool) {
     let mut digits = text.iter().filter(|byte| byte.is_ascii_digit());
-    let value = digits.try_fold(0u64, |value, digit| {
-        value.checked_mul(10)?.checked_add(u64::from(digit - b'0'))
-    });
+    let value = digits.try_fold(0u64, |value, digit| value.checked_mul(10)?.checked_add(u64::from(digit - b'0')));
     (value.unwrap_or_default(), value.is_none())
 }
 

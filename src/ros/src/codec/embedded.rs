@@ -21,22 +21,14 @@ const LARGEST: usize = 8;
 /// Returns a message that consists of the bytes `before` and the message of type `of` that begins at byte `at` of the
 /// body of `bytes` and ends it. `None` if there is no such message, which is fully checked only if the values have to
 /// be padded anew.
-pub(crate) fn extract_embedded(
-    of: &MessageType,
-    bytes: &[u8],
-    at: usize,
-    before: &[u8],
-) -> Option<Bytes> {
+pub(crate) fn extract_embedded(of: &MessageType, bytes: &[u8], at: usize, before: &[u8]) -> Option<Bytes> {
     let (body, big_endian) = split_header(bytes).ok()?;
     let mut out = Vec::with_capacity(bytes.len() + before.len() + LARGEST);
     out.extend_from_slice(&HEADER);
     out[1] = u8::from(!big_endian);
     out.extend_from_slice(before);
     let first = first_alignment(of);
-    let (from, to) = (
-        at.next_multiple_of(first),
-        before.len().next_multiple_of(first),
-    );
+    let (from, to) = (at.next_multiple_of(first), before.len().next_multiple_of(first));
     let shift = from.abs_diff(to);
     if shift % LARGEST == 0 || shift % largest_alignment(of, &mut HashSet::new()) == 0 {
         let values = body.get(from..)?;
@@ -79,16 +71,10 @@ fn largest_alignment<'a>(of: &'a MessageType, seen: &mut HashSet<&'a str>) -> us
             Kind::Text(_) | Kind::Texts(..) | Kind::Bytes(_) => Scalar::U32.alignment(),
             Kind::Struct(inner) | Kind::Structs(inner, _) => {
                 let length = match member.kind {
-                    Kind::Structs(_, Count::Variable | Count::Bounded(_)) => {
-                        Scalar::U32.alignment()
-                    }
+                    Kind::Structs(_, Count::Variable | Count::Bounded(_)) => Scalar::U32.alignment(),
                     _ => 1,
                 };
-                if seen.insert(inner.name()) {
-                    largest_alignment(inner, seen).max(length)
-                } else {
-                    length
-                }
+                if seen.insert(inner.name()) { largest_alignment(inner, seen).max(length) } else { length }
             }
         };
         largest = largest.max(alignment);
@@ -135,13 +121,9 @@ impl<'a> ValueCopier<'a> {
                     self.copy(size, scalar.alignment()).map(drop)
                 }
             },
-            Kind::Texts(text, count) => {
-                (0..self.length(*count)?).try_for_each(|_| self.value(&Kind::Text(*text)))
-            }
+            Kind::Texts(text, count) => (0..self.length(*count)?).try_for_each(|_| self.value(&Kind::Text(*text))),
             Kind::Struct(inner) => self.message(inner),
-            Kind::Structs(inner, count) => {
-                (0..self.length(*count)?).try_for_each(|_| self.message(inner))
-            }
+            Kind::Structs(inner, count) => (0..self.length(*count)?).try_for_each(|_| self.message(inner)),
         }
     }
 
@@ -160,11 +142,8 @@ impl<'a> ValueCopier<'a> {
             return Some(length);
         }
         let word: [u8; 4] = self.copy(4, 4)?.try_into().ok()?;
-        let length = if self.from.is_big_endian() {
-            u32::from_be_bytes(word)
-        } else {
-            u32::from_le_bytes(word)
-        } as usize;
+        let length =
+            if self.from.is_big_endian() { u32::from_be_bytes(word) } else { u32::from_le_bytes(word) } as usize;
         (length <= self.from.remaining()).then_some(length)
     }
 }

@@ -30,11 +30,7 @@ impl fmt::Display for CodecError {
 impl CodecError {
     /// Creates an error of input that belongs to no message type.
     pub(crate) fn from_input(kind: CodecErrorKind) -> CodecError {
-        CodecError {
-            type_name: String::new(),
-            path: String::new(),
-            kind,
-        }
+        CodecError { type_name: String::new(), path: String::new(), kind }
     }
 }
 
@@ -104,9 +100,7 @@ pub enum CodecErrorKind {
         found: usize,
     },
     /// The representation is not one that ROS 2 nodes use.
-    #[error(
-        "serialized as representation {0:#06x}, of which only plain CDR is read (0x0000 and 0x0001)"
-    )]
+    #[error("serialized as representation {0:#06x}, of which only plain CDR is read (0x0000 and 0x0001)")]
     Representation(
         /// First two bytes of the message (DDS-XTypes 1.3, table 60).
         u16,
@@ -164,10 +158,7 @@ enum Segment {
 impl From<CodecErrorKind> for Fault {
     #[cold]
     fn from(kind: CodecErrorKind) -> Fault {
-        Fault(Box::new(FaultDetails {
-            kind,
-            place: Vec::new(),
-        }))
+        Fault(Box::new(FaultDetails { kind, place: Vec::new() }))
     }
 }
 
@@ -201,11 +192,7 @@ impl Fault {
                 Segment::Index(index) => path.push_str(&format!("[{index}]")),
             }
         }
-        CodecError {
-            type_name: message.name().to_owned(),
-            path,
-            kind: self.0.kind,
-        }
+        CodecError { type_name: message.name().to_owned(), path, kind: self.0.kind }
     }
 }
 

@@ -75,15 +75,7 @@ fn fill_body<I: ValueInput, L: OutputLayout>(
     options: &FillOptions,
     (layout, end): (L, usize),
 ) -> Result<(), Fault> {
-    let mut filler = Filler {
-        input,
-        out,
-        layout,
-        options,
-        end,
-        places: Vec::new(),
-        scratch: Vec::new(),
-    };
+    let mut filler = Filler { input, out, layout, options, end, places: Vec::new(), scratch: Vec::new() };
     filler.message(message)?;
     filler.check_room(0)
 }
@@ -117,8 +109,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
             }
             let begin = self.out.len();
             let member = &members[index];
-            self.field(plan.header, member)
-                .map_err(|fault| fault.in_field(&member.name))?;
+            self.field(plan.header, member).map_err(|fault| fault.in_field(&member.name))?;
             let place = (begin, self.out.len());
             match self.places.get_mut(base + index) {
                 None => self.places.push(place),
@@ -144,9 +135,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
     #[inline]
     fn field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
         match &member.kind {
-            Kind::Scalar(
-                scalar @ (Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2),
-            ) => {
+            Kind::Scalar(scalar @ (Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2)) => {
                 let default = if in_header { self.options.now } else { None };
                 self.time(*scalar, default.unwrap_or_default())
             }
@@ -164,9 +153,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
             Kind::Scalars(scalar, count) => self.scalars(*scalar, *count),
             Kind::Texts(text, count) => self.elements(*count, |filler| filler.text(*text)),
             Kind::Struct(message) => self.message(message),
-            Kind::Structs(message, count) => {
-                self.elements(*count, |filler| filler.message(message))
-            }
+            Kind::Structs(message, count) => self.elements(*count, |filler| filler.message(message)),
         }
     }
 
@@ -192,10 +179,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
     }
 
     fn scalars(&mut self, scalar: Scalar, count: Count) -> Result<(), Fault> {
-        if matches!(
-            scalar,
-            Scalar::Bool | Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2
-        ) {
+        if matches!(scalar, Scalar::Bool | Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2) {
             return self.elements(count, |filler| filler.scalar(scalar));
         }
         let begin = self.begin_count(count);
@@ -234,10 +218,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
             if found == most {
                 return Err(too_many(count, found + 1));
             }
-            self.input
-                .number::<T>()
-                .map_err(|fault| fault.at_index(found))?
-                .put(self.out);
+            self.input.number::<T>().map_err(|fault| fault.at_index(found))?.put(self.out);
             found += 1;
         }
         // Without elements there is no padding.
@@ -247,11 +228,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
         Ok(found)
     }
 
-    fn elements(
-        &mut self,
-        count: Count,
-        mut element: impl FnMut(&mut Self) -> Result<(), Fault>,
-    ) -> Result<(), Fault> {
+    fn elements(&mut self, count: Count, mut element: impl FnMut(&mut Self) -> Result<(), Fault>) -> Result<(), Fault> {
         let begin = self.begin_count(count);
         let most = count.max_count();
         let mut array = self.input.begin_array("a list")?;
@@ -260,9 +237,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
             if found == most {
                 return Err(too_many(count, found + 1));
             }
-            element(self)
-                .and_then(|()| self.check_room(0))
-                .map_err(|fault| fault.at_index(found))?;
+            element(self).and_then(|()| self.check_room(0)).map_err(|fault| fault.at_index(found))?;
             found += 1;
         }
         self.end_count(count, begin, found)
@@ -302,14 +277,9 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
         self.put_time(if is_time { default } else { Time::default() });
         let mut object = self.input.begin_object()?;
         let mut expected = 0;
-        while let Some(index) = self
-            .input
-            .next_member(&mut object, &TIME_MEMBERS, expected)?
-        {
+        while let Some(index) = self.input.next_member(&mut object, &TIME_MEMBERS, expected)? {
             let part = match (scalar, index % 2) {
-                (Scalar::Time, _) | (Scalar::Time2 | Scalar::Duration2, 1) => {
-                    self.input.number::<u32>()
-                }
+                (Scalar::Time, _) | (Scalar::Time2 | Scalar::Duration2, 1) => self.input.number::<u32>(),
                 _ => self.input.number::<i32>().map(|part| part as u32),
             };
             let part = part.map_err(|fault| fault.in_field(&TIME_MEMBERS.list()[index].name))?;
@@ -327,14 +297,11 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
     /// Writes the default of a skipped field and records its place.
     fn default_field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
         let begin = self.out.len();
-        self.check_room(member.min_size)
-            .map_err(|fault| fault.in_field(&member.name))?;
-        let stamped =
-            in_header || matches!(&member.kind, Kind::Struct(message) if message.plan.header);
+        self.check_room(member.min_size).map_err(|fault| fault.in_field(&member.name))?;
+        let stamped = in_header || matches!(&member.kind, Kind::Struct(message) if message.plan.header);
         let now = self.options.now.filter(|_| stamped);
         self.layout.put_default(self.out, member, now);
-        self.check_room(0)
-            .map_err(|fault| fault.in_field(&member.name))?;
+        self.check_room(0).map_err(|fault| fault.in_field(&member.name))?;
         self.places.push((begin, self.out.len()));
         Ok(())
     }
@@ -350,8 +317,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
         let moved = |at: usize| phase + at - start;
         for (member, &(begin, end)) in members.iter().zip(&self.places[base..]) {
             let piece = moved(begin)..moved(end);
-            self.layout
-                .put_piece(self.out, member, &self.scratch, piece);
+            self.layout.put_piece(self.out, member, &self.scratch, piece);
         }
     }
 
@@ -368,14 +334,11 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
     fn end_count(&mut self, count: Count, begin: usize, found: usize) -> Result<(), Fault> {
         self.check_room(0)?;
         match count {
-            Count::Fixed(expected) if found != expected => {
-                Err(CodecErrorKind::WrongLength { expected, found }.into())
-            }
+            Count::Fixed(expected) if found != expected => Err(CodecErrorKind::WrongLength { expected, found }.into()),
             Count::Fixed(_) => Ok(()),
             Count::Bounded(most) if found > most => Err(too_many(count, found)),
             Count::Variable | Count::Bounded(_) => {
-                let length = u32::try_from(found)
-                    .map_err(|_| CodecErrorKind::TooLarge(u32::MAX as usize))?;
+                let length = u32::try_from(found).map_err(|_| CodecErrorKind::TooLarge(u32::MAX as usize))?;
                 self.out[begin - 4..begin].copy_from_slice(&length.to_le_bytes());
                 Ok(())
             }
@@ -396,11 +359,7 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
 fn too_many(count: Count, found: usize) -> Fault {
     match count {
         Count::Fixed(expected) => CodecErrorKind::WrongLength { expected, found },
-        _ => CodecErrorKind::TooMany {
-            most: count.max_count(),
-            of: "elements",
-            found,
-        },
+        _ => CodecErrorKind::TooMany { most: count.max_count(), of: "elements", found },
     }
     .into()
 }
@@ -411,12 +370,7 @@ fn check_text(text: Text, written: &str) -> Result<(), Fault> {
     }
     let most = text.most as usize;
     match written.chars().count() {
-        found if found > most => Err(CodecErrorKind::TooMany {
-            most,
-            of: "characters",
-            found,
-        }
-        .into()),
+        found if found > most => Err(CodecErrorKind::TooMany { most, of: "characters", found }.into()),
         _ => Ok(()),
     }
 }

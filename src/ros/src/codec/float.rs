@@ -7,8 +7,8 @@ use std::str::FromStr;
 use crate::codec::number::Decimal;
 
 const POWERS: [f64; 23] = [
-    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
-    1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
+    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20,
+    1e21, 1e22,
 ];
 
 /// Returns the nearest double; infinite when out of range.
@@ -55,9 +55,5 @@ fn exact(decimal: &Decimal<'_>) -> Option<f64> {
         exponent @ -22..=-1 => decimal.mantissa as f64 / POWERS[-exponent as usize],
         _ => return None,
     };
-    Some(if decimal.negative {
-        -magnitude
-    } else {
-        magnitude
-    })
+    Some(if decimal.negative { -magnitude } else { magnitude })
 }

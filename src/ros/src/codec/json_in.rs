@@ -13,17 +13,8 @@ use crate::schema::MessageType;
 use crate::schema::plan::Members;
 
 /// Appends the message that the JSON object describes.
-pub(crate) fn read(
-    message: &MessageType,
-    json: &[u8],
-    out: &mut Vec<u8>,
-    options: &FillOptions,
-) -> Result<(), Fault> {
-    let mut input = Json {
-        input: json,
-        at: 0,
-        scratch: Vec::new(),
-    };
+pub(crate) fn read(message: &MessageType, json: &[u8], out: &mut Vec<u8>, options: &FillOptions) -> Result<(), Fault> {
+    let mut input = Json { input: json, at: 0, scratch: Vec::new() };
     fill(&mut input, message, out, options)?;
     input.skip_space();
     match input.peek() {
@@ -92,9 +83,7 @@ impl ValueInput for Json<'_> {
     fn number<T: Wire>(&mut self) -> Result<T, Fault> {
         self.skip_space();
         match self.peek() {
-            Some(b'0'..=b'9' | b'-') if !self.rest().starts_with(b"-I") => {
-                T::from_decimal(&self.decimal()?)
-            }
+            Some(b'0'..=b'9' | b'-') if !self.rest().starts_with(b"-I") => T::from_decimal(&self.decimal()?),
             _ => self.non_finite(),
         }
     }
@@ -123,8 +112,7 @@ impl ValueInput for Json<'_> {
             _ => return Err(self.mismatch("base64 or a list of uint8")),
         }
         let rest = self.rest();
-        let end =
-            memchr2(b'"', b'\\', rest).ok_or_else(|| self.invalid("a string without an end"))?;
+        let end = memchr2(b'"', b'\\', rest).ok_or_else(|| self.invalid("a string without an end"))?;
         if rest[end] == b'"' {
             self.at += end + 1;
             decode_base64(&rest[..end], out)?;
@@ -178,11 +166,7 @@ impl<'a> Json<'a> {
 
     #[cold]
     fn invalid(&self, reason: &'static str) -> Fault {
-        CodecErrorKind::Json {
-            at: self.at,
-            reason,
-        }
-        .into()
+        CodecErrorKind::Json { at: self.at, reason }.into()
     }
 
     /// Returns the error for a value that the field does not take, or for invalid JSON.
@@ -253,8 +237,7 @@ impl<'a> Json<'a> {
     fn rest_of_text(&mut self, out: &mut Vec<u8>) -> Result<(), Fault> {
         loop {
             let rest = self.rest();
-            let end = memchr2(b'"', b'\\', rest)
-                .ok_or_else(|| self.invalid("a string without an end"))?;
+            let end = memchr2(b'"', b'\\', rest).ok_or_else(|| self.invalid("a string without an end"))?;
             let literal = &rest[..end];
             if std::str::from_utf8(literal).is_err() {
                 return Err(CodecErrorKind::InvalidUtf8.into());
@@ -302,14 +285,7 @@ impl<'a> Json<'a> {
             exponent = exponent.saturating_add(self.exponent()?);
         }
         let text = &self.input[start..self.at];
-        Ok(Decimal {
-            negative,
-            mantissa,
-            exponent,
-            truncated,
-            integral,
-            text,
-        })
+        Ok(Decimal { negative, mantissa, exponent, truncated, integral, text })
     }
 
     /// Reads one or more digits, eight at a time where possible.
@@ -317,17 +293,12 @@ impl<'a> Json<'a> {
     fn digits(&mut self, mantissa: &mut u64) -> Result<usize, Fault> {
         let rest = self.rest();
         let mut count = 0;
-        while let Some(eight) = rest[count..]
-            .first_chunk()
-            .and_then(|chunk| eight_digits(*chunk))
-        {
+        while let Some(eight) = rest[count..].first_chunk().and_then(|chunk| eight_digits(*chunk)) {
             *mantissa = mantissa.wrapping_mul(100_000_000).wrapping_add(eight);
             count += 8;
         }
         while let Some(digit @ b'0'..=b'9') = rest.get(count) {
-            *mantissa = mantissa
-                .wrapping_mul(10)
-                .wrapping_add((digit - b'0').into());
+            *mantissa = mantissa.wrapping_mul(10).wrapping_add((digit - b'0').into());
             count += 1;
         }
         self.at += count;
@@ -346,9 +317,7 @@ impl<'a> Json<'a> {
         let start = self.at;
         let mut exponent: i64 = 0;
         while let Some(digit @ b'0'..=b'9') = self.peek() {
-            exponent = exponent
-                .saturating_mul(10)
-                .saturating_add(i64::from(digit - b'0'));
+            exponent = exponent.saturating_mul(10).saturating_add(i64::from(digit - b'0'));
             self.at += 1;
         }
         if start == self.at {

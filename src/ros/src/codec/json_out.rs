@@ -135,21 +135,18 @@ impl Json<'_> {
     }
 
     fn boolean(&mut self, byte: u8) {
-        self.out
-            .extend_from_slice(if byte == 0 { b"false" } else { b"true" });
+        self.out.extend_from_slice(if byte == 0 { b"false" } else { b"true" });
     }
 
     #[inline]
     fn integer(&mut self, value: impl itoa::Integer) {
-        self.out
-            .extend_from_slice(itoa::Buffer::new().format(value).as_bytes());
+        self.out.extend_from_slice(itoa::Buffer::new().format(value).as_bytes());
     }
 
     #[inline]
     fn single(&mut self, value: f32) {
         if value.is_finite() {
-            self.out
-                .extend_from_slice(zmij::Buffer::new().format_finite(value).as_bytes());
+            self.out.extend_from_slice(zmij::Buffer::new().format_finite(value).as_bytes());
         } else {
             self.non_finite(value.into());
         }
@@ -158,8 +155,7 @@ impl Json<'_> {
     #[inline]
     fn double(&mut self, value: f64) {
         if value.is_finite() {
-            self.out
-                .extend_from_slice(zmij::Buffer::new().format_finite(value).as_bytes());
+            self.out.extend_from_slice(zmij::Buffer::new().format_finite(value).as_bytes());
         } else {
             self.non_finite(value);
         }

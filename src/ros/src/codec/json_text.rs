@@ -37,12 +37,8 @@ fn scan<const ASCII: bool>(bytes: &[u8]) -> usize {
         }
         at += 8;
     }
-    let special =
-        |byte: &u8| *byte < 0x20 || *byte == b'"' || *byte == b'\\' || (ASCII && *byte >= 0x80);
-    at + bytes[at..]
-        .iter()
-        .position(special)
-        .unwrap_or(bytes.len() - at)
+    let special = |byte: &u8| *byte < 0x20 || *byte == b'"' || *byte == b'\\' || (ASCII && *byte >= 0x80);
+    at + bytes[at..].iter().position(special).unwrap_or(bytes.len() - at)
 }
 
 /// Appends text with JSON's escapes, without enclosing quotes.
@@ -104,9 +100,7 @@ fn unescape_utf16(rest: &[u8], out: &mut Vec<u8>) -> Result<usize, &'static str>
 }
 
 fn hex4(digits: Option<&[u8]>) -> Option<u16> {
-    digits?.iter().try_fold(0, |value: u16, digit| {
-        Some(value << 4 | char::from(*digit).to_digit(16)? as u16)
-    })
+    digits?.iter().try_fold(0, |value: u16, digit| Some(value << 4 | char::from(*digit).to_digit(16)? as u16))
 }
 
 /// Returns the length of the JSON value at the beginning of `input`, including white space before it, without building
@@ -114,17 +108,12 @@ fn hex4(digits: Option<&[u8]>) -> Option<u16> {
 /// between them is left to the parser of the value.
 pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
     let fail = |at, reason| CodecError::from_input(CodecErrorKind::Json { at, reason });
-    let mut at = input
-        .iter()
-        .position(|byte| !is_space(*byte))
-        .unwrap_or(input.len());
+    let mut at = input.iter().position(|byte| !is_space(*byte)).unwrap_or(input.len());
     let mut depth = 0;
     loop {
         match input.get(at) {
             None => return Err(fail(at, "the input ends inside a value")),
-            Some(b'"') => {
-                at = string_end(input, at).ok_or_else(|| fail(at, "a string without an end"))?
-            }
+            Some(b'"') => at = string_end(input, at).ok_or_else(|| fail(at, "a string without an end"))?,
             Some(b'{' | b'[') => {
                 depth += 1;
                 at += 1;
@@ -141,10 +130,8 @@ pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
             }
             Some(_) if depth > 0 => at += unstructured_prefix(&input[at..]),
             Some(_) => {
-                let ends = |byte: &u8| {
-                    matches!(byte, b'"' | b'{' | b'}' | b'[' | b']' | b',' | b':')
-                        || is_space(*byte)
-                };
+                let ends =
+                    |byte: &u8| matches!(byte, b'"' | b'{' | b'}' | b'[' | b']' | b',' | b':') || is_space(*byte);
                 let rest = &input[at..];
                 at += rest.iter().position(ends).unwrap_or(rest.len());
             }
@@ -173,10 +160,7 @@ fn unstructured_prefix(bytes: &[u8]) -> usize {
         at += 8;
     }
     let structural = |byte: &u8| matches!(byte, b'"' | b'{' | b'}' | b'[' | b']');
-    at + bytes[at..]
-        .iter()
-        .position(structural)
-        .unwrap_or(bytes.len() - at)
+    at + bytes[at..].iter().position(structural).unwrap_or(bytes.len() - at)
 }
 
 /// Returns the end of the string that begins at `start` (a quote): the offset after its closing quote.
@@ -184,10 +168,7 @@ fn unstructured_prefix(bytes: &[u8]) -> usize {
 fn string_end(input: &[u8], start: usize) -> Option<usize> {
     let mut at = start + 1;
     // Most strings are keys: too short to be worth the wide search.
-    let near = input[at..]
-        .iter()
-        .take(16)
-        .position(|byte| matches!(byte, b'"' | b'\\'));
+    let near = input[at..].iter().take(16).position(|byte| matches!(byte, b'"' | b'\\'));
     match near {
         Some(near) if input[at + near] == b'"' => return Some(at + near + 1),
         Some(near) => at += near,

@@ -172,11 +172,7 @@ fn out_of_range<T: Wire>(mut found: String) -> Fault {
         found.truncate(40);
         found.push('…');
     }
-    CodecErrorKind::OutOfRange {
-        expected: T::NAME,
-        found,
-    }
-    .into()
+    CodecErrorKind::OutOfRange { expected: T::NAME, found }.into()
 }
 
 #[cold]

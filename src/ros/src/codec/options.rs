@@ -24,10 +24,7 @@ impl Time {
 impl From<SystemTime> for Time {
     fn from(time: SystemTime) -> Time {
         let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
-        Time {
-            secs: u32::try_from(since.as_secs()).unwrap_or(u32::MAX),
-            nsecs: since.subsec_nanos(),
-        }
+        Time { secs: u32::try_from(since.as_secs()).unwrap_or(u32::MAX), nsecs: since.subsec_nanos() }
     }
 }
 
@@ -87,11 +84,7 @@ pub struct CborOptions {
 
 impl Default for CborOptions {
     fn default() -> CborOptions {
-        CborOptions {
-            typed_arrays: true,
-            invalid_utf8: InvalidUtf8::default(),
-            max_bytes: DEFAULT_MAX_BYTES,
-        }
+        CborOptions { typed_arrays: true, invalid_utf8: InvalidUtf8::default(), max_bytes: DEFAULT_MAX_BYTES }
     }
 }
 
@@ -107,9 +100,6 @@ pub struct FillOptions {
 
 impl Default for FillOptions {
     fn default() -> FillOptions {
-        FillOptions {
-            now: None,
-            max_bytes: DEFAULT_MAX_BYTES,
-        }
+        FillOptions { now: None, max_bytes: DEFAULT_MAX_BYTES }
     }
 }

@@ -12,9 +12,7 @@ pub(crate) struct CdrWriter {
 impl CdrWriter {
     /// Creates a message without values.
     pub(crate) fn new() -> Self {
-        Self {
-            out: HEADER.to_vec(),
-        }
+        Self { out: HEADER.to_vec() }
     }
 
     /// Writes a number or a bool, given as little-endian bytes.

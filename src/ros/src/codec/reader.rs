@@ -50,10 +50,7 @@ impl SerializedReader for Packed<'_> {
     #[inline]
     fn take(&mut self, size: usize) -> Result<&[u8], Fault> {
         let Some((taken, rest)) = self.rest.split_at_checked(size) else {
-            return Err(CodecErrorKind::Truncated {
-                missing: size - self.rest.len(),
-            }
-            .into());
+            return Err(CodecErrorKind::Truncated { missing: size - self.rest.len() }.into());
         };
         self.rest = rest;
         Ok(taken)
@@ -94,24 +91,13 @@ impl SerializedReader for Packed<'_> {
 
 /// Checks that an array of this length can fit into the `left` remaining bytes.
 #[inline]
-pub(crate) fn check_length(
-    count: Count,
-    length: usize,
-    min_size: usize,
-    left: usize,
-) -> Result<(), Fault> {
+pub(crate) fn check_length(count: Count, length: usize, min_size: usize, left: usize) -> Result<(), Fault> {
     let fits = match min_size {
         0 => matches!(count, Count::Fixed(_)) || length <= MAX_EMPTY_ELEMENTS,
-        _ => length
-            .checked_mul(min_size)
-            .is_some_and(|size| size <= left),
+        _ => length.checked_mul(min_size).is_some_and(|size| size <= left),
     };
     if fits {
         return Ok(());
     }
-    Err(CodecErrorKind::LengthBeyondEnd {
-        count: length as u64,
-        left,
-    }
-    .into())
+    Err(CodecErrorKind::LengthBeyondEnd { count: length as u64, left }.into())
 }

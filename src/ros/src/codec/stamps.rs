@@ -25,10 +25,7 @@ pub struct Stamps {
 /// No stamps.
 impl Default for Stamps {
     fn default() -> Self {
-        Self {
-            version: RosVersion::One,
-            steps: [].into(),
-        }
+        Self { version: RosVersion::One, steps: [].into() }
     }
 }
 
@@ -54,17 +51,11 @@ enum Items {
 impl Stamps {
     /// Compiles the steps for messages of this type.
     pub fn for_type(message: &MessageType) -> Self {
-        let mut compiler = Compiler {
-            packed: message.version() == RosVersion::One,
-            known: HashMap::new(),
-        };
+        let mut compiler = Compiler { packed: message.version() == RosVersion::One, known: HashMap::new() };
         let mut steps = compiler.steps(message).to_vec();
         let last = steps.iter().rposition(StampStep::holds_stamps);
         steps.truncate(last.map_or(0, |last| last + 1));
-        Self {
-            version: message.version(),
-            steps: steps.into(),
-        }
+        Self { version: message.version(), steps: steps.into() }
     }
 
     /// Returns true if the type has no stamps.
@@ -74,10 +65,7 @@ impl Stamps {
 
     /// Returns the offsets of the stamps; `None` if the message is too short for the type.
     pub fn find(&self, message: &[u8]) -> Option<Vec<usize>> {
-        let mut walk = Walk {
-            cursor: MessageCursor::new(self.version, message)?,
-            found: Vec::new(),
-        };
+        let mut walk = Walk { cursor: MessageCursor::new(self.version, message)?, found: Vec::new() };
         walk.steps(&self.steps)?;
         Some(walk.found)
     }
@@ -87,16 +75,9 @@ impl Stamps {
         let is_big_endian = MessageCursor::new(self.version, message)?.is_big_endian();
         let word = |at: usize| {
             let word: [u8; TIME_PART] = message.get(at..at + TIME_PART)?.try_into().ok()?;
-            Some(if is_big_endian {
-                u32::from_be_bytes(word)
-            } else {
-                u32::from_le_bytes(word)
-            })
+            Some(if is_big_endian { u32::from_be_bytes(word) } else { u32::from_le_bytes(word) })
         };
-        Some(Time {
-            secs: word(at)?,
-            nsecs: word(at + TIME_PART)?,
-        })
+        Some(Time { secs: word(at)?, nsecs: word(at + TIME_PART)? })
     }
 
     /// Overwrites the stamp at such an offset, in the byte order of the message. Does nothing if no stamp could be read
@@ -106,15 +87,8 @@ impl Stamps {
         let (Some(is_big_endian), Some(place)) = (order, message.get_mut(at..at + TIME)) else {
             return;
         };
-        for (word, part) in place
-            .chunks_exact_mut(TIME_PART)
-            .zip([stamp.secs, stamp.nsecs])
-        {
-            word.copy_from_slice(&if is_big_endian {
-                part.to_be_bytes()
-            } else {
-                part.to_le_bytes()
-            });
+        for (word, part) in place.chunks_exact_mut(TIME_PART).zip([stamp.secs, stamp.nsecs]) {
+            word.copy_from_slice(&if is_big_endian { part.to_be_bytes() } else { part.to_le_bytes() });
         }
     }
 
@@ -183,10 +157,7 @@ impl Compiler {
                     }
                     None => {}
                 }
-                if self.packed
-                    && message.is_fixed_size()
-                    && !steps.iter().any(StampStep::holds_stamps)
-                {
+                if self.packed && message.is_fixed_size() && !steps.iter().any(StampStep::holds_stamps) {
                     self.skip(items, message.min_size())
                 } else {
                     StampStep::Messages(items, steps)

@@ -25,24 +25,12 @@ fn message(name: &str) -> Arc<MessageType> {
         ("std_msgs/msg/Float64", "float64 data"),
         ("std_msgs/msg/Time", "time data"),
         ("std_msgs/msg/Duration", "duration data"),
-        (
-            "std_msgs/msg/ColorRGBA",
-            "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
-        ),
+        ("std_msgs/msg/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a"),
         ("geometry_msgs/msg/Point", "float64 x\nfloat64 y\nfloat64 z"),
-        (
-            "geometry_msgs/msg/Quaternion",
-            "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-        ),
-        (
-            "geometry_msgs/msg/Pose",
-            "Point position\nQuaternion orientation",
-        ),
+        ("geometry_msgs/msg/Quaternion", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w"),
+        ("geometry_msgs/msg/Pose", "Point position\nQuaternion orientation"),
         ("geometry_msgs/msg/PoseStamped", "Header header\nPose pose"),
-        (
-            "nav_msgs/msg/Path",
-            "Header header\ngeometry_msgs/PoseStamped[] poses",
-        ),
+        ("nav_msgs/msg/Path", "Header header\ngeometry_msgs/PoseStamped[] poses"),
         (
             "sensor_msgs/msg/Image",
             "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] \
@@ -104,15 +92,7 @@ fn ros_of(message: &MessageType, json: &str) -> Result<Vec<u8>, String> {
 
 fn ros_at(message: &MessageType, json: &str, now: Option<Time>) -> Result<Vec<u8>, String> {
     let mut out = b"kept".to_vec();
-    let result = from_json(
-        message,
-        json.as_bytes(),
-        &mut out,
-        &FillOptions {
-            now,
-            ..FillOptions::default()
-        },
-    );
+    let result = from_json(message, json.as_bytes(), &mut out, &FillOptions { now, ..FillOptions::default() });
     assert_eq!(&out[..4], b"kept");
     match result {
         Ok(()) => {

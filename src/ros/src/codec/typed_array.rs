@@ -43,32 +43,19 @@ impl ElementLayout {
         let (float, signed) = (tag & 16 != 0, tag & 8 != 0);
         let exponent = (tag & 3) as u32 + u32::from(float);
         // 68 is clamped uint8, which has no byte order.
-        Some(ElementLayout {
-            float,
-            signed,
-            little_endian: tag & 4 != 0,
-            width: 1 << exponent,
-        })
+        Some(ElementLayout { float, signed, little_endian: tag & 4 != 0, width: 1 << exponent })
     }
 
     /// Appends the elements, converted to `T`.
-    pub(crate) fn append<T: Wire>(
-        self,
-        tag: u64,
-        bytes: &[u8],
-        out: &mut Vec<u8>,
-    ) -> Result<(), Fault> {
-        let same =
-            little_endian_tag(T::SCALAR) == Some(tag) || (tag == 68 && T::SCALAR == Scalar::U8);
+    pub(crate) fn append<T: Wire>(self, tag: u64, bytes: &[u8], out: &mut Vec<u8>) -> Result<(), Fault> {
+        let same = little_endian_tag(T::SCALAR) == Some(tag) || (tag == 68 && T::SCALAR == Scalar::U8);
         if same {
             out.extend_from_slice(bytes);
             return Ok(());
         }
         out.reserve(bytes.len() / self.width * T::SCALAR.size());
         for (index, element) in bytes.chunks_exact(self.width).enumerate() {
-            T::from_number(self.number(element))
-                .map_err(|fault| fault.at_index(index))?
-                .put(out);
+            T::from_number(self.number(element)).map_err(|fault| fault.at_index(index))?.put(out);
         }
         Ok(())
     }
@@ -113,9 +100,5 @@ fn half(bits: u16) -> f64 {
         31 => f64::NAN,
         exponent => (mantissa + 1024.0) * 2f64.powi(i32::from(exponent) - 25),
     };
-    if bits >> 15 == 0 {
-        magnitude
-    } else {
-        -magnitude
-    }
+    if bits >> 15 == 0 { magnitude } else { -magnitude }
 }

@@ -40,10 +40,7 @@ impl<'a> Value<'a> {
     /// Returns a field of a message.
     pub fn field(&self, name: &str) -> Option<&Value<'a>> {
         match self {
-            Value::Message(fields) => fields
-                .iter()
-                .find(|(field, _)| *field == name)
-                .map(|(_, value)| value),
+            Value::Message(fields) => fields.iter().find(|(field, _)| *field == name).map(|(_, value)| value),
             _ => None,
         }
     }
@@ -143,11 +140,8 @@ impl<'a> ValueDecoder<'a> {
             }
             Primitive::Wstring => {
                 let units = cursor.string(true)?;
-                let text = if cursor.is_big_endian() {
-                    units_to_utf8::<true>(units)
-                } else {
-                    units_to_utf8::<false>(units)
-                };
+                let text =
+                    if cursor.is_big_endian() { units_to_utf8::<true>(units) } else { units_to_utf8::<false>(units) };
                 return Some(Value::Text(text.into()));
             }
             Primitive::Time | Primitive::Duration => return self.time(),
@@ -172,10 +166,7 @@ mod tests {
     fn values_are_found_by_name_and_torn_messages_are_none() {
         let registry = Registry::new();
         let definitions = [
-            (
-                "x/msg/Pair",
-                "Header header\nInner[] more\nint8[2] both\nbool ok\n",
-            ),
+            ("x/msg/Pair", "Header header\nInner[] more\nint8[2] both\nbool ok\n"),
             ("x/msg/Inner", "float64 wide\nstring name\n"),
         ];
         for (key, text) in definitions {
@@ -190,10 +181,7 @@ mod tests {
         let header = read.field("header").unwrap();
         let stamp = header.field("stamp").and_then(Value::time);
         assert_eq!(stamp, Some(Time { secs: 7, nsecs: 8 }));
-        assert_eq!(
-            header.field("frame_id").and_then(Value::text).unwrap(),
-            "map"
-        );
+        assert_eq!(header.field("frame_id").and_then(Value::text).unwrap(), "map");
         let more = read.field("more").unwrap().items();
         let wide: Vec<_> = more.iter().map(|it| it.field("wide")?.number()).collect();
         assert_eq!(wide, [Some(0.1), Some(-2.5)]);
@@ -211,11 +199,9 @@ mod tests {
     fn values_without_bytes_are_bounded_in_number() {
         let registry = Registry::new();
         let fields: String = (0..100).map(|n| format!("Nothing f{n}\n")).collect();
-        for (key, text) in [
-            ("x/msg/Nothing", ""),
-            ("x/msg/Fields", fields.as_str()),
-            ("x/msg/Many", "Fields[] items\nuint8[] rest\n"),
-        ] {
+        for (key, text) in
+            [("x/msg/Nothing", ""), ("x/msg/Fields", fields.as_str()), ("x/msg/Many", "Fields[] items\nuint8[] rest\n")]
+        {
             registry.insert(key, text).unwrap();
         }
         let many = registry.message("x/Many").unwrap();

@@ -32,11 +32,7 @@ pub(crate) trait OutputFormat {
 }
 
 /// Walks over `bytes`, which must be exactly one message.
-pub(crate) fn walk<F: OutputFormat>(
-    message: &MessageType,
-    bytes: &[u8],
-    format: &mut F,
-) -> Result<(), Fault> {
+pub(crate) fn walk<F: OutputFormat>(message: &MessageType, bytes: &[u8], format: &mut F) -> Result<(), Fault> {
     match message.version() {
         RosVersion::One => walk_all(message, Packed { rest: bytes }, format),
         RosVersion::Two => match split_header(bytes)? {
@@ -85,11 +81,7 @@ fn walk_message<R: SerializedReader, F: OutputFormat>(
 }
 
 #[inline]
-fn walk_value<R: SerializedReader, F: OutputFormat>(
-    kind: &Kind,
-    reader: &mut R,
-    format: &mut F,
-) -> Result<(), Fault> {
+fn walk_value<R: SerializedReader, F: OutputFormat>(kind: &Kind, reader: &mut R, format: &mut F) -> Result<(), Fault> {
     match kind {
         Kind::Scalar(scalar) => format.scalar(*scalar, reader.scalar(*scalar)?),
         Kind::Text(text) => {
@@ -111,9 +103,7 @@ fn walk_value<R: SerializedReader, F: OutputFormat>(
         }
         Kind::Texts(text, count) => {
             let length = reader.length(*count, 4)?;
-            walk_elements(length, format, |format| {
-                walk_value(&Kind::Text(*text), reader, format)
-            })?;
+            walk_elements(length, format, |format| walk_value(&Kind::Text(*text), reader, format))?;
         }
         Kind::Struct(message) => walk_message(message, reader, format)?,
         Kind::Structs(message, count) => {
@@ -121,9 +111,7 @@ fn walk_value<R: SerializedReader, F: OutputFormat>(
             if F::SKIPS && reader.skip(&message.plan, length)? {
                 return Ok(());
             }
-            walk_elements(length, format, |format| {
-                walk_message(message, reader, format)
-            })?;
+            walk_elements(length, format, |format| walk_message(message, reader, format))?;
         }
     }
     Ok(())
@@ -137,9 +125,7 @@ fn walk_elements<F: OutputFormat>(
     format.begin_array(length);
     for index in 0..length {
         format.element(index);
-        element(format)
-            .and_then(|()| format.check_room(0))
-            .map_err(|fault| fault.at_index(index))?;
+        element(format).and_then(|()| format.check_room(0)).map_err(|fault| fault.at_index(index))?;
     }
     format.end_array();
     Ok(())

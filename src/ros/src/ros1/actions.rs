@@ -63,16 +63,8 @@ mod tests {
                 ends.reverse();
             }
             let [publishers, subscribers] = ends;
-            let type_name = if name.ends_with("result") {
-                "x/DoActionResult"
-            } else {
-                "x/OtherActionGoal"
-            };
-            let nodes = TopicNodes {
-                type_name: type_name.to_owned(),
-                publishers,
-                subscribers,
-            };
+            let type_name = if name.ends_with("result") { "x/DoActionResult" } else { "x/OtherActionGoal" };
+            let nodes = TopicNodes { type_name: type_name.to_owned(), publishers, subscribers };
             (name.to_owned(), nodes)
         };
         let mut topics: BTreeMap<_, _> = PARTS.map(|part| topic(&format!("/do/{part}"))).into();

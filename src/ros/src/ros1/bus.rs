@@ -55,9 +55,8 @@ use self::state::{CallPool, FAREWELL, HANDSHAKE, Loans, PublisherClients};
 use super::names;
 use crate::JoinOptions;
 use crate::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    Lending, ParamValue, PeerId, Publisher, PublisherReports, QosProfile, RosVersion,
-    ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, Lending, ParamValue,
+    PeerId, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
 use crate::ros1::tcpros::FrameBounds;
@@ -81,10 +80,7 @@ impl Ros1Bus {
     }
 
     /// Joins a ROS system. Fails if the Master does not answer now.
-    pub async fn connect_with(
-        sockets: Arc<dyn Sockets>,
-        options: JoinOptions,
-    ) -> Result<Arc<Self>, BusError> {
+    pub async fn connect_with(sockets: Arc<dyn Sockets>, options: JoinOptions) -> Result<Arc<Self>, BusError> {
         if !names::is_global(&options.node) {
             return Err(BusError::BadName(options.node));
         }
@@ -94,26 +90,17 @@ impl Ros1Bus {
         let local = match connecting.await {
             Ok(connected) => connected.map_err(io(to_master))?.local_addr(),
             Err(_) => {
-                return Err(BusError::Timeout {
-                    what: to_master,
-                    after: HANDSHAKE,
-                });
+                return Err(BusError::Timeout { what: to_master, after: HANDSHAKE });
             }
         };
         let local = local.map_err(io("own address".to_owned()))?.ip();
         let listen = |what: &str| {
             let what = format!("listening for {what}");
-            let ip = if local.is_loopback() {
-                local
-            } else {
-                IpAddr::V4(Ipv4Addr::UNSPECIFIED)
-            };
+            let ip = if local.is_loopback() { local } else { IpAddr::V4(Ipv4Addr::UNSPECIFIED) };
             let sockets = sockets.clone();
             async move {
                 let listener = sockets.listen(SocketAddr::new(ip, 0)).await;
-                listener
-                    .and_then(|listener| Ok((listener.local_addr()?.port(), listener)))
-                    .map_err(io(what))
+                listener.and_then(|listener| Ok((listener.local_addr()?.port(), listener))).map_err(io(what))
             }
         };
         let (port, tcpros_listener) = listen("TCPROS").await?;
@@ -122,17 +109,9 @@ impl Ros1Bus {
             IpAddr::V4(ip) => ip.to_string(),
             IpAddr::V6(ip) => format!("[{ip}]"),
         });
-        let master = Arc::new(MasterClient::new(
-            sockets.clone(),
-            options.master,
-            &options.node,
-            &options.budget,
-        )?);
-        let registrar = Registrar::new(
-            master.clone(),
-            format!("http://{host}:{slave_port}/"),
-            format!("rosrpc://{host}:{port}"),
-        );
+        let master = Arc::new(MasterClient::new(sockets.clone(), options.master, &options.node, &options.budget)?);
+        let registrar =
+            Registrar::new(master.clone(), format!("http://{host}:{slave_port}/"), format!("rosrpc://{host}:{port}"));
         let inner = Arc::new(Ros1BusState {
             sockets,
             node: options.node,
@@ -163,14 +142,10 @@ impl Ros1Bus {
             next_id: AtomicI32::new(1),
         });
         // Owned from here on: an error below stops the tasks.
-        let bus = Arc::new(Self {
-            inner: inner.clone(),
-        });
+        let bus = Arc::new(Self { inner: inner.clone() });
         let slave = Arc::new(slave::Slave { bus: inner.clone() });
         let limits = ServerLimits {
-            budget: options
-                .budget
-                .child("the XML-RPC of our node", xmlrpc::MAX_HELD),
+            budget: options.budget.child("the XML-RPC of our node", xmlrpc::MAX_HELD),
             ..ServerLimits::default()
         };
         inner.spawn(xmlrpc::serve(slave_listener, slave, limits));
@@ -222,8 +197,7 @@ impl Ros1BusState {
 
     /// Creates a client of the node at `uri`.
     fn client(&self, uri: &str) -> Result<XmlRpcClient, BusError> {
-        let client =
-            XmlRpcClient::new(self.sockets.clone(), uri).map_err(master_client::to_bus_error)?;
+        let client = XmlRpcClient::new(self.sockets.clone(), uri).map_err(master_client::to_bus_error)?;
         Ok(client.with_budget(&self.frames.budget))
     }
 
@@ -287,22 +261,12 @@ impl Bus for Ros1Bus {
         self.inner.graph.subscribe()
     }
 
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError> {
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
         subscriptions::subscribe(&self.inner, topic, of, qos, EndpointOwner::User).await
     }
 
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError> {
+    async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
         publications::advertise(&self.inner, topic, of, qos, EndpointOwner::User).await
     }
@@ -338,17 +302,9 @@ impl Bus for Ros1Bus {
         services::serve(&self.inner, service, service_type, handler).await
     }
 
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError> {
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         self.inner.check_name(action)?;
-        Ok(Box::new(actions::Ros1ActionClient::open(
-            &self.inner,
-            action,
-            of,
-        )))
+        Ok(Box::new(actions::Ros1ActionClient::open(&self.inner, action, of)))
     }
 
     fn serve_action(

@@ -54,11 +54,7 @@ pub struct MasterOptions {
 
 impl Default for MasterOptions {
     fn default() -> Self {
-        Self {
-            uri: "http://localhost:11311/".to_owned(),
-            parameters: BTreeMap::new(),
-            limits: ServerLimits::default(),
-        }
+        Self { uri: "http://localhost:11311/".to_owned(), parameters: BTreeMap::new(), limits: ServerLimits::default() }
     }
 }
 
@@ -112,19 +108,12 @@ impl Master {
             _ => new_run_id(),
         };
         // The line ends are roscore's, which sets these from the output of commands.
-        for (key, value) in [
-            ("/run_id", run_id.as_str()),
-            ("/rosdistro", "noetic\n"),
-            ("/rosversion", "1.16.0\n"),
-        ] {
+        for (key, value) in [("/run_id", run_id.as_str()), ("/rosdistro", "noetic\n"), ("/rosversion", "1.16.0\n")] {
             if params.get(key).is_none() {
                 let _ = params.set(key, Value::from(value));
             }
         }
-        let state = State {
-            params,
-            ..State::default()
-        };
+        let state = State { params, ..State::default() };
         Self {
             inner: Arc::new(MasterCore {
                 uri: options.uri,
@@ -142,9 +131,7 @@ impl Master {
     /// Serves nodes until dropped. `sockets` is used to call nodes back; only the first call's is used.
     pub async fn serve(&self, listener: TcpListener, sockets: Arc<dyn Sockets>) {
         let _ = self.inner.sockets.set(sockets);
-        let handler = Arc::new(api::Api {
-            master: self.inner.clone(),
-        });
+        let handler = Arc::new(api::Api { master: self.inner.clone() });
         xmlrpc::serve(listener, handler, self.inner.limits.clone()).await;
     }
 
@@ -181,18 +168,14 @@ impl MasterCore {
         let owned = |(name, text): (&str, &str)| (name.to_owned(), text.to_owned());
         let uses = state.uses.iter();
         let topics = state.registry.topics();
-        let topics = topics
-            .map(|(name, topic)| (name.to_owned(), topic))
-            .collect();
+        let topics = topics.map(|(name, topic)| (name.to_owned(), topic)).collect();
         Graph {
             generation: *self.generation.borrow(),
             actions: actions::find_actions(&topics),
             topics,
             services: state.registry.services().map(owned).collect(),
             nodes: state.registry.nodes().map(owned).collect(),
-            parameters: uses
-                .map(|(key, used)| (key.clone(), used.clone()))
-                .collect(),
+            parameters: uses.map(|(key, used)| (key.clone(), used.clone())).collect(),
             sought: state.sought.clone(),
             ends: BTreeMap::new(),
             enclaves: BTreeMap::new(),
@@ -228,11 +211,7 @@ impl MasterCore {
             return;
         }
         let used = state.uses.entry(key.to_owned()).or_default();
-        let nodes = if written {
-            &mut used.written_by
-        } else {
-            &mut used.read_by
-        };
+        let nodes = if written { &mut used.written_by } else { &mut used.read_by };
         if nodes.len() < MAX_USERS && nodes.iter().all(|known| known != node) {
             nodes.push(node.to_owned());
             if !std::mem::replace(&mut state.uses_changed, true) {

@@ -10,9 +10,7 @@ pub fn is_global(name: &str) -> bool {
         && name.starts_with('/')
         && !name.ends_with('/')
         && !name.contains("//")
-        && name
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'/')
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'/')
 }
 
 /// Makes `name` absolute as the ROS Master does: `/x` stays, `~x` goes below the node, `x` beside it.
@@ -71,11 +69,7 @@ impl PeerUri {
         if host.is_empty() || host.len() > 255 || !clean(host) || path.len() > 255 || !clean(path) {
             return None;
         }
-        Some(Self {
-            host: host.to_owned(),
-            port: port.parse().ok().filter(|port| *port > 0)?,
-            path: path.to_owned(),
-        })
+        Some(Self { host: host.to_owned(), port: port.parse().ok().filter(|port| *port > 0)?, path: path.to_owned() })
     }
 }
 
@@ -108,22 +102,9 @@ mod tests {
     #[test]
     fn addresses_are_read() {
         let uri = PeerUri::parse("http://localhost:11311/RPC2", "http").unwrap();
-        assert_eq!(
-            (uri.host.as_str(), uri.port, uri.path.as_str()),
-            ("localhost", 11311, "/RPC2")
-        );
-        assert_eq!(
-            PeerUri::parse("rosrpc://[::1]:5", "rosrpc").unwrap().host,
-            "[::1]"
-        );
-        for bad in [
-            "http://host/",
-            "http://:1/",
-            "http://h:0/",
-            "http://h:99999/",
-            "h:1",
-            "http://a\r\nb:1/",
-        ] {
+        assert_eq!((uri.host.as_str(), uri.port, uri.path.as_str()), ("localhost", 11311, "/RPC2"));
+        assert_eq!(PeerUri::parse("rosrpc://[::1]:5", "rosrpc").unwrap().host, "[::1]");
+        for bad in ["http://host/", "http://:1/", "http://h:0/", "http://h:99999/", "h:1", "http://a\r\nb:1/"] {
             assert_eq!(PeerUri::parse(bad, "http"), None, "{bad}");
         }
     }

@@ -4,12 +4,7 @@
 const OF_MASTER: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
 
 /// Names that every roscpp or rospy node reads.
-const OF_NODES: [&str; 4] = [
-    "use_sim_time",
-    "tcp_keepalive",
-    "enable_statistics",
-    "rosout_disable_topics_generation",
-];
+const OF_NODES: [&str; 4] = ["use_sim_time", "tcp_keepalive", "enable_statistics", "rosout_disable_topics_generation"];
 
 /// Returns true if the Master or roslaunch sets this parameter, or one above it. `name` may be absolute or not.
 pub fn is_set_by_master(name: &str) -> bool {
@@ -41,11 +36,7 @@ mod tests {
             ("/detector/run_id", false, false),
             ("/detector/use_sim_time", false, false),
         ] {
-            assert_eq!(
-                (is_set_by_master(name), is_read_by_every_node(name)),
-                (master, node),
-                "{name}"
-            );
+            assert_eq!((is_set_by_master(name), is_read_by_every_node(name)), (master, node), "{name}");
         }
     }
 }

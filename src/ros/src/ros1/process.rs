@@ -18,10 +18,7 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
         ("HOME", home.to_owned()),
         (HOME, home.to_owned()),
         ("ROS_LOG_DIR", format!("{home}/log")),
-        (
-            "ROS_MASTER_URI",
-            format!("http://localhost:{}", MASTER.port()),
-        ),
+        ("ROS_MASTER_URI", format!("http://localhost:{}", MASTER.port())),
         ("ROS_HOSTNAME", "localhost".to_owned()),
         // A node's output is a pipe: without these its lines arrive only when a buffer is full, and the last lines of a
         // node that crashes are lost.
@@ -34,18 +31,12 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
 
 pub(crate) fn identity(node: &str) -> NodeIdentity {
     let (above, last) = node.rsplit_once('/').unwrap_or(("", node));
-    NodeIdentity {
-        arguments: vec![format!("__name:={last}")],
-        ..namespace(above)
-    }
+    NodeIdentity { arguments: vec![format!("__name:={last}")], ..namespace(above) }
 }
 
 pub(crate) fn namespace(namespace: &str) -> NodeIdentity {
     let namespace = if namespace.is_empty() { "/" } else { namespace };
-    NodeIdentity {
-        arguments: Vec::new(),
-        environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
-    }
+    NodeIdentity { arguments: Vec::new(), environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into() }
 }
 
 /// Returns the parameters that roslaunch sets. The line end is roslaunch's, which fills the parameter from the output
@@ -87,9 +78,6 @@ mod tests {
         let environment = environment("/root");
         assert_eq!(environment["ROS_LOG_DIR"], "/root/log");
         assert_eq!(environment["ROS_MASTER_URI"], "http://localhost:11311");
-        assert_eq!(
-            (&*environment["HOME"], &*environment[HOME]),
-            ("/root", "/root")
-        );
+        assert_eq!((&*environment["HOME"], &*environment[HOME]), ("/root", "/root"));
     }
 }

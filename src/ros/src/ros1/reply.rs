@@ -14,27 +14,15 @@ pub(crate) struct ApiReply {
 
 impl ApiReply {
     pub(crate) fn success(message: impl Into<String>, value: impl Into<Value>) -> Self {
-        Self {
-            code: 1,
-            message: message.into(),
-            value: value.into(),
-        }
+        Self { code: 1, message: message.into(), value: value.into() }
     }
 
     pub(crate) fn failure(message: impl Into<String>, value: impl Into<Value>) -> Self {
-        Self {
-            code: 0,
-            message: message.into(),
-            value: value.into(),
-        }
+        Self { code: 0, message: message.into(), value: value.into() }
     }
 
     pub(crate) fn error(message: impl Into<String>, value: impl Into<Value>) -> Self {
-        Self {
-            code: -1,
-            message: message.into(),
-            value: value.into(),
-        }
+        Self { code: -1, message: message.into(), value: value.into() }
     }
 
     pub(crate) fn into_value(self) -> Value {
@@ -65,32 +53,23 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn new(values: Vec<Value>) -> Self {
-        Self {
-            values: values.into_iter(),
-        }
+        Self { values: values.into_iter() }
     }
 
     /// Takes the next argument, of any type.
     pub(crate) fn value(&mut self, what: &str) -> Result<Value, ApiReply> {
-        self.values
-            .next()
-            .ok_or_else(|| argument_error(format!("argument {what} is missing")))
+        self.values.next().ok_or_else(|| argument_error(format!("argument {what} is missing")))
     }
 
     /// Takes the next argument, which must be a non-empty string.
     pub(crate) fn text(&mut self, what: &str) -> Result<String, ApiReply> {
         match self.value(what)? {
-            Value::String(text) if text.is_empty() => {
-                Err(argument_error(format!("{what} is empty")))
-            }
+            Value::String(text) if text.is_empty() => Err(argument_error(format!("{what} is empty"))),
             Value::String(text) if text.len() > 4096 => {
                 Err(argument_error(format!("{what} is longer than 4096 bytes")))
             }
             Value::String(text) => Ok(text),
-            other => Err(argument_error(format!(
-                "{what} must be a string, not {}",
-                other.type_name()
-            ))),
+            other => Err(argument_error(format!("{what} must be a string, not {}", other.type_name()))),
         }
     }
 
@@ -99,9 +78,7 @@ impl Args {
         let text = self.text(what)?;
         match PeerUri::parse(&text, scheme) {
             Some(_) => Ok(text),
-            None => Err(argument_error(format!(
-                "{what} is not a {scheme}:// address: {text}"
-            ))),
+            None => Err(argument_error(format!("{what} is not a {scheme}:// address: {text}"))),
         }
     }
 
@@ -109,9 +86,7 @@ impl Args {
     pub(crate) fn finish(&mut self) -> Result<(), ApiReply> {
         match self.values.next() {
             None => Ok(()),
-            Some(_) => Err(argument_error(
-                "bad call arity: too many arguments".to_owned(),
-            )),
+            Some(_) => Err(argument_error("bad call arity: too many arguments".to_owned())),
         }
     }
 }

@@ -34,13 +34,8 @@ impl TestMaster {
         let listener = TcpListener::bind(address).await.unwrap();
         let address = listener.local_addr().unwrap();
         let serving = master.clone();
-        let task =
-            tokio::spawn(async move { serving.serve(listener, Arc::new(HostSockets)).await });
-        Self {
-            master,
-            address,
-            task,
-        }
+        let task = tokio::spawn(async move { serving.serve(listener, Arc::new(HostSockets)).await });
+        Self { master, address, task }
     }
 
     /// Calls a method; returns its `[code, message, value]`.
@@ -109,10 +104,7 @@ impl TestNode {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let uri = format!("http://{}/", listener.local_addr().unwrap());
         let (sender, calls) = mpsc::unbounded_channel();
-        let reporter = Arc::new(Reporter {
-            calls: sender,
-            answer,
-        });
+        let reporter = Arc::new(Reporter { calls: sender, answer });
         let task = tokio::spawn(serve(listener, reporter, ServerLimits::default()));
         Self { uri, calls, task }
     }

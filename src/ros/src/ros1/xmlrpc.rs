@@ -33,10 +33,7 @@ pub struct Fault {
 impl Fault {
     /// Creates a fault with ROS's usual code.
     pub fn new(text: impl Into<String>) -> Self {
-        Self {
-            code: 1,
-            text: text.into(),
-        }
+        Self { code: 1, text: text.into() }
     }
 }
 

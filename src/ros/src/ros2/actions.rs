@@ -57,22 +57,10 @@ impl ActionInterfaces {
         };
         let status = interfaces::message("action_msgs/msg/GoalStatusArray")?;
         Ok(Self {
-            send_goal: (
-                name("send_goal"),
-                ServiceType::from_service(&services.send_goal),
-            ),
-            get_result: (
-                name("get_result"),
-                ServiceType::from_service(&services.get_result),
-            ),
-            cancel_goal: (
-                name("cancel_goal"),
-                interfaces::service("action_msgs/srv/CancelGoal")?,
-            ),
-            feedback: (
-                name("feedback"),
-                WireType::from_message(&of.action_feedback),
-            ),
+            send_goal: (name("send_goal"), ServiceType::from_service(&services.send_goal)),
+            get_result: (name("get_result"), ServiceType::from_service(&services.get_result)),
+            cancel_goal: (name("cancel_goal"), interfaces::service("action_msgs/srv/CancelGoal")?),
+            feedback: (name("feedback"), WireType::from_message(&of.action_feedback)),
             status: (name("status"), WireType::from_message(&status)),
         })
     }

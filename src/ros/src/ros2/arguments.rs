@@ -14,13 +14,7 @@ pub const BEGIN: &str = "--ros-args";
 pub const END: &str = "--";
 
 /// ROS arguments that take a value, besides those for rules and parameters.
-const SETTINGS: [&str; 5] = [
-    "--log-level",
-    "--log-config-file",
-    "--log-file-name",
-    "-e",
-    "--enclave",
-];
+const SETTINGS: [&str; 5] = ["--log-level", "--log-config-file", "--log-file-name", "-e", "--enclave"];
 /// Names that `--enable-…` and `--disable-…` may be followed by.
 const SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-logs"];
 
@@ -213,14 +207,13 @@ pub fn parse(argv: &[String]) -> Result<Vec<CommandLinePart>, ArgumentError> {
             },
             "-r" | "--remap" => {
                 let given = take_value(word, words.next(), "FROM:=TO")?;
-                let rule = parse_rule(given)
-                    .map_err(|reason| refused_error(word, given, reason, RULES))?;
+                let rule = parse_rule(given).map_err(|reason| refused_error(word, given, reason, RULES))?;
                 part(vec![word, given], Kind::Rule(rule));
             }
             "-p" | "--param" => {
                 let given = take_value(word, words.next(), "NAME:=VALUE")?;
-                let parameter = parse_parameter(given)
-                    .map_err(|reason| refused_error(word, given, reason, PARAMETERS))?;
+                let parameter =
+                    parse_parameter(given).map_err(|reason| refused_error(word, given, reason, PARAMETERS))?;
                 part(vec![word, given], Kind::Parameter(parameter));
             }
             "--params-file" => {
@@ -265,52 +258,27 @@ pub fn node_for_stub<T>(mut nodes: Vec<T>, argv: impl Fn(&T) -> &[String]) -> Op
 
 /// Returns the parts of the node name that a command line sets for all nodes, by rules that are not for a single node.
 pub fn global_naming(argv: &[String]) -> Naming {
-    let says =
-        |renamed: RemapTarget| has_rule(argv, |rule| rule.of == renamed && rule.node.is_none());
-    Naming {
-        name: says(RemapTarget::Node),
-        namespace: says(RemapTarget::Namespace),
-    }
+    let says = |renamed: RemapTarget| has_rule(argv, |rule| rule.of == renamed && rule.node.is_none());
+    Naming { name: says(RemapTarget::Node), namespace: says(RemapTarget::Namespace) }
 }
 
-fn take_value<'a>(
-    flag: &str,
-    next: Option<&'a String>,
-    form: &'static str,
-) -> Result<&'a String, ArgumentError> {
-    next.ok_or_else(|| ArgumentError::NoValue {
-        flag: flag.to_owned(),
-        form,
-    })
+fn take_value<'a>(flag: &str, next: Option<&'a String>, form: &'static str) -> Result<&'a String, ArgumentError> {
+    next.ok_or_else(|| ArgumentError::NoValue { flag: flag.to_owned(), form })
 }
 
-fn refused_error(
-    flag: &str,
-    given: &str,
-    reason: ValueProblem,
-    form: &'static str,
-) -> ArgumentError {
-    ArgumentError::Refused {
-        flag: flag.to_owned(),
-        given: given.to_owned(),
-        reason,
-        form,
-    }
+fn refused_error(flag: &str, given: &str, reason: ValueProblem, form: &'static str) -> ArgumentError {
+    ArgumentError::Refused { flag: flag.to_owned(), given: given.to_owned(), reason, form }
 }
 
 fn is_switch(text: &str) -> bool {
-    let of = text
-        .strip_prefix("--enable-")
-        .or_else(|| text.strip_prefix("--disable-"));
+    let of = text.strip_prefix("--enable-").or_else(|| text.strip_prefix("--disable-"));
     of.is_some_and(|of| SWITCHES.contains(&of))
 }
 
 /// Returns true for a ROS 2 name without slashes.
 pub fn is_token(text: &str) -> bool {
     text.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
-        && text
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+        && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
 }
 
 /// Returns true if a parameter of this name can be given on a command line; a file can contain others.
@@ -334,10 +302,7 @@ fn split_node(text: &str) -> Result<(Option<String>, &str), ValueProblem> {
 fn parse_rule(text: &str) -> Result<RemapRule, ValueProblem> {
     let (from, to) = split_rule(text)?;
     // Rules for topics or services only.
-    let kinds = [
-        ("rostopic://", RemapTarget::Topic),
-        ("rosservice://", RemapTarget::Service),
-    ];
+    let kinds = [("rostopic://", RemapTarget::Topic), ("rosservice://", RemapTarget::Service)];
     let below = |name| {
         let mut kinds = kinds.iter();
         kinds.find_map(|(scheme, of)| Some((str::strip_prefix(name, scheme)?, *of)))
@@ -371,12 +336,7 @@ fn parse_rule(text: &str) -> Result<RemapRule, ValueProblem> {
         }
         _ => {}
     }
-    Ok(RemapRule {
-        node,
-        of,
-        from: from.to_owned(),
-        to: to.to_owned(),
-    })
+    Ok(RemapRule { node, of, from: from.to_owned(), to: to.to_owned() })
 }
 
 /// Checks the characters that rcl allows in rules; whether the rule makes sense is left to the node in the cloud.
@@ -391,11 +351,7 @@ fn parse_parameter(text: &str) -> Result<Parameter, ValueProblem> {
     if !is_parameter_name(name) {
         return Err(ValueProblem::NotAParameter(name.to_owned()));
     }
-    Ok(Parameter {
-        node,
-        name: name.to_owned(),
-        value: text.to_owned(),
-    })
+    Ok(Parameter { node, name: name.to_owned(), value: text.to_owned() })
 }
 
 #[cfg(test)]

@@ -42,9 +42,8 @@ use super::watcher::Watcher;
 use super::{actions, calls, names, publications, services, subscriptions, topic_type};
 use crate::JoinOptions;
 use crate::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending, NodeNames,
-    NodeParameters, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
-    WireFormat, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending, NodeNames, NodeParameters,
+    Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireFormat, WireType,
 };
 use crate::net::Sockets;
 use crate::schema::ActionDef;
@@ -61,10 +60,7 @@ pub struct Ros2Bus {
 
 impl Ros2Bus {
     /// Joins the ROS 2 system of a domain.
-    pub async fn connect(
-        sockets: Arc<dyn Sockets>,
-        options: JoinOptions,
-    ) -> Result<Arc<Self>, BusError> {
+    pub async fn connect(sockets: Arc<dyn Sockets>, options: JoinOptions) -> Result<Arc<Self>, BusError> {
         if !names::is_global(&options.node) {
             return Err(BusError::BadName(options.node));
         }
@@ -92,8 +88,7 @@ impl Ros2Bus {
         let joined = Participant::join(Arc::new(BusSockets(sockets)), config).await;
         let participant = joined.map_err(join_error)?;
         let told = Arc::new(ParticipantTable::default());
-        let listening =
-            participant.reader(entities::topic(), entities::qos(), Arc::clone(&told) as _);
+        let listening = participant.reader(entities::topic(), entities::qos(), Arc::clone(&told) as _);
         let teller = participant.writer(entities::topic(), entities::qos());
         let inner = Arc::new(Ros2BusState {
             participant,
@@ -133,10 +128,7 @@ fn join_error(error: JoinError) -> BusError {
     let what = "joining ROS 2".to_owned();
     match error {
         JoinError::Socket(source) => BusError::Io { what, source },
-        other => BusError::Io {
-            what,
-            source: io::Error::other(other),
-        },
+        other => BusError::Io { what, source: io::Error::other(other) },
     }
 }
 
@@ -144,9 +136,7 @@ impl Drop for Ros2Bus {
     fn drop(&mut self) {
         self.inner.shut_down();
         let participant = self.inner.participant.clone();
-        self.inner
-            .runtime
-            .spawn(async move { participant.close().await });
+        self.inner.runtime.spawn(async move { participant.close().await });
     }
 }
 
@@ -164,11 +154,7 @@ impl fmt::Debug for Ros2Bus {
 fn to_ros2_type(of: WireType) -> WireType {
     WireType {
         name: names::full_type_name(&of.name, "msg"),
-        format: if of.digest.is_any() {
-            WireFormat::Cdr
-        } else {
-            of.format
-        },
+        format: if of.digest.is_any() { WireFormat::Cdr } else { of.format },
         ..of
     }
 }
@@ -202,22 +188,12 @@ impl Bus for Ros2Bus {
         self.inner.graph.subscribe()
     }
 
-    async fn subscribe(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Subscription, BusError> {
+    async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
         subscriptions::subscribe(&self.inner, topic, to_ros2_type(of), qos)
     }
 
-    async fn advertise(
-        &self,
-        topic: &str,
-        of: WireType,
-        qos: QosProfile,
-    ) -> Result<Box<dyn Publisher>, BusError> {
+    async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
         publications::advertise(&self.inner, topic, to_ros2_type(of), qos).await
     }
@@ -258,17 +234,9 @@ impl Bus for Ros2Bus {
         services::serve(&self.inner, service, of, handler)
     }
 
-    fn action_client(
-        &self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Box<dyn ActionClient>, BusError> {
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
         self.inner.check_name(action)?;
-        Ok(Box::new(actions::Ros2ActionClient::open(
-            &self.inner,
-            action,
-            of,
-        )?))
+        Ok(Box::new(actions::Ros2ActionClient::open(&self.inner, action, of)?))
     }
 
     fn serve_action(

@@ -98,26 +98,18 @@ pub(super) fn client_for(
 
 /// Drops clients of services that no node serves any more.
 pub(super) fn drop_unserved_clients(bus: &Ros2BusState, seen: &DiscoverySnapshot) {
-    let idle: Vec<Arc<ServiceClient>> = bus
-        .clients
-        .lock()
-        .extract_idle(|service, _| seen.readers(&names::request_name(service)).is_empty());
+    let idle: Vec<Arc<ServiceClient>> =
+        bus.clients.lock().extract_idle(|service, _| seen.readers(&names::request_name(service)).is_empty());
     drop(idle);
 }
 
 trait ExtractIdle {
-    fn extract_idle(
-        &mut self,
-        wanted: impl Fn(&str, &ServiceClient) -> bool,
-    ) -> Vec<Arc<ServiceClient>>;
+    fn extract_idle(&mut self, wanted: impl Fn(&str, &ServiceClient) -> bool) -> Vec<Arc<ServiceClient>>;
 }
 
 impl ExtractIdle for HashMap<(String, String), Arc<ServiceClient>> {
     /// Takes out those that are not in use.
-    fn extract_idle(
-        &mut self,
-        wanted: impl Fn(&str, &ServiceClient) -> bool,
-    ) -> Vec<Arc<ServiceClient>> {
+    fn extract_idle(&mut self, wanted: impl Fn(&str, &ServiceClient) -> bool) -> Vec<Arc<ServiceClient>> {
         let mut taken = Vec::new();
         self.retain(|(service, _), client| {
             let idle = Arc::strong_count(client) == 1 && wanted(service, client);

@@ -7,8 +7,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rtps::{
-    EndpointData, EndpointMatches, Guid, GuidPrefix, SampleIdentity, SequenceNumber,
-    TopicDescription, VendorId,
+    EndpointData, EndpointMatches, Guid, GuidPrefix, SampleIdentity, SequenceNumber, TopicDescription, VendorId,
 };
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -22,9 +21,9 @@ use super::state::Ros2BusState;
 use super::{names, node_ends, services, type_hash};
 use crate::bus::{BusError, CallFate, ServiceType};
 
-/// Maximum wait for a server whose endpoints are known but which does not acknowledge ours. One that is there does, within
-/// a few milliseconds, or on a busy machine within a second or two; called before, it would answer to nobody, as a server
-/// of Fast DDS drops the reply to a reader that it has not matched.
+/// Maximum wait for a server whose endpoints are known but which does not acknowledge ours. One that is there does,
+/// within a few milliseconds, or on a busy machine within a second or two; called before, it would answer to nobody, as
+/// a server of Fast DDS drops the reply to a reader that it has not matched.
 const UNSURE: Duration = Duration::from_secs(5);
 
 /// The servers that a call would reach.
@@ -77,11 +76,7 @@ impl Drop for ServiceClient {
 }
 
 impl ServiceClient {
-    pub(super) fn open(
-        bus: &Arc<Ros2BusState>,
-        service: &str,
-        of: &ServiceType,
-    ) -> Result<Self, BusError> {
+    pub(super) fn open(bus: &Arc<Ros2BusState>, service: &str, of: &ServiceType) -> Result<Self, BusError> {
         let (request, reply) = (names::request(service, of)?, names::reply(service, of)?);
         let replies = Arc::new(Replies::default());
         // A server that discovers the writer of requests must also discover the reader of replies.
@@ -90,11 +85,7 @@ impl ServiceClient {
         let mut hasher = DefaultHasher::new();
         writer.guid().bytes().hash(&mut hasher);
         let number = hasher.finish();
-        let own = ReplyAddress {
-            reader: reader.guid(),
-            writer: writer.guid(),
-            number,
-        };
+        let own = ReplyAddress { reader: reader.guid(), writer: writer.guid(), number };
         let _ = replies.own.set(own);
         let (shown, servers) = watch::channel(Servers::default());
         let following = ServerWatcher {
@@ -144,18 +135,11 @@ impl ServiceClient {
     }
 
     fn timeout_error(&self, after: Duration) -> BusError {
-        BusError::Timeout {
-            what: format!("service {}", self.service),
-            after,
-        }
+        BusError::Timeout { what: format!("service {}", self.service), after }
     }
 
     fn call_error(&self, reason: impl Into<String>, fate: CallFate) -> BusError {
-        BusError::CallFailed {
-            service: self.service.clone(),
-            reason: reason.into(),
-            fate,
-        }
+        BusError::CallFailed { service: self.service.clone(), reason: reason.into(), fate }
     }
 
     /// Waits for a server that has matched both endpoints of this client, or appears to have.
@@ -184,8 +168,7 @@ impl ServiceClient {
             let reason = format!("{MAX_IN_FLIGHT} calls of it are under way");
             return Err(self.call_error(reason, CallFate::NotTaken));
         };
-        let gone =
-            servers.wait_for(|now| !asked.iter().any(|server| now.answering.contains(server)));
+        let gone = servers.wait_for(|now| !asked.iter().any(|server| now.answering.contains(server)));
         tokio::select! {
             biased;
             answer = &mut waiting.answer => answer.map_err(|_| BusError::Closed),
@@ -204,19 +187,13 @@ impl ServiceClient {
             server.is_some_and(|server| server.vendor == VendorId::CYCLONE)
         };
         if servers.iter().any(of_cyclone) {
-            let header = RequestHeader {
-                client: self.number,
-                number: self.questions.fetch_add(1, Ordering::Relaxed),
-            };
+            let header = RequestHeader { client: self.number, number: self.questions.fetch_add(1, Ordering::Relaxed) };
             let payload = header.join(&request)?;
             let waiting = self.replies.wait(ReplyKey::Header(header.number))?;
             self.writer.write(payload);
             return Some(waiting);
         }
-        let related = SampleIdentity {
-            writer: self.reader.guid(),
-            number: SequenceNumber::UNKNOWN,
-        };
+        let related = SampleIdentity { writer: self.reader.guid(), number: SequenceNumber::UNKNOWN };
         let writing = self.replies.begin_write()?;
         let number = self.writer.write_related(request, related);
         Some(writing.with_number(number))
@@ -264,10 +241,8 @@ impl ServerWatcher {
         let requests = Arc::clone(&self.requests.borrow_and_update());
         let replies = Arc::clone(&self.replies.borrow_and_update());
         let here = services::local_service(&self.bus, &self.service);
-        let mut servers = Servers {
-            answering: replies.matched.iter().map(|it| it.guid.prefix).collect(),
-            ..Servers::default()
-        };
+        let mut servers =
+            Servers { answering: replies.matched.iter().map(|it| it.guid.prefix).collect(), ..Servers::default() };
         match here {
             Some(served) if served.of.matches(&self.of) => servers.here = true,
             Some(served) => servers.other = Some(served.of.clone()),
@@ -290,8 +265,7 @@ impl ServerWatcher {
                 continue;
             }
             let knows = |guid: &Guid| guid.prefix == prefix;
-            servers.sure |=
-                requests.confirmed.contains(&end.guid) && replies.confirmed.iter().any(knows);
+            servers.sure |= requests.confirmed.contains(&end.guid) && replies.confirmed.iter().any(knows);
             servers.remote.push(prefix);
         }
         servers

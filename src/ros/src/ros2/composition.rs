@@ -135,12 +135,7 @@ impl ComponentContainer {
     /// # Errors
     /// The image has no definitions of `composition_interfaces`.
     pub fn new(bus: Arc<dyn Bus>, registry: &Registry, node: &str) -> Result<Self, SchemaError> {
-        Ok(Self {
-            bus,
-            node: node.to_owned(),
-            load: registry.service(LOAD)?,
-            list: registry.service(LIST)?,
-        })
+        Ok(Self { bus, node: node.to_owned(), load: registry.service(LOAD)?, list: registry.service(LIST)? })
     }
 
     /// Loads these components in order, except those that are already loaded; returns their absolute names. The
@@ -149,11 +144,7 @@ impl ComponentContainer {
     ///
     /// # Errors
     /// The first component that is not loaded; later ones are not tried.
-    pub async fn load_all(
-        &self,
-        components: &[Component],
-        patience: Duration,
-    ) -> Result<Vec<String>, NotLoaded> {
+    pub async fn load_all(&self, components: &[Component], patience: Duration) -> Result<Vec<String>, NotLoaded> {
         let Some(first) = components.first() else {
             return Ok(Vec::new());
         };
@@ -186,10 +177,7 @@ impl ComponentContainer {
         match timeout(patience, graph.wait_for(there)).await {
             Ok(Ok(_)) => Ok(()),
             Ok(Err(_)) => Err(BusError::Closed.into()),
-            Err(_) => Err(LoadFailure::NotServed {
-                service,
-                waited: patience,
-            }),
+            Err(_) => Err(LoadFailure::NotServed { service, waited: patience }),
         }
     }
 
@@ -229,9 +217,7 @@ impl ComponentContainer {
         let mut bytes = Vec::new();
         from_json(&of.request, request, &mut bytes, &FillOptions::default())?;
         let (service, digest) = (self.service(part), ServiceType::from_service(of).digest);
-        let answer = self
-            .bus
-            .call_typed(&service, &digest, bytes.into(), patience);
+        let answer = self.bus.call_typed(&service, &digest, bytes.into(), patience);
         to_json_value(&of.response, &answer.await?)
     }
 
@@ -304,12 +290,7 @@ mod tests {
 
     #[test]
     fn what_is_loaded_is_not_loaded_again() {
-        let all = [
-            component("a", ""),
-            component("", ""),
-            component("b", "/x"),
-            component("", ""),
-        ];
+        let all = [component("a", ""), component("", ""), component("b", "/x"), component("", "")];
         let still = |there: &[&str]| {
             let there = there.iter().map(|&name| name.to_owned()).collect();
             let left = missing_components(&all, there).into_iter();

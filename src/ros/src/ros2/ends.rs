@@ -5,9 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{
-    EndpointMatches, EndpointQos, Guid, SampleIdentity, SequenceNumber, Sink, TopicDescription,
-};
+use rtps::{EndpointMatches, EndpointQos, Guid, SampleIdentity, SequenceNumber, Sink, TopicDescription};
 use tokio::sync::watch;
 
 use super::entities::DiscoveredNode;
@@ -35,11 +33,7 @@ impl LocalEndpoints {
     /// Returns the nodes to announce: the nodes that this one represents or, without any, the node `own`. An endpoint
     /// may belong to several of them; one that belongs to none is attributed to the node `own` or, if the program has
     /// no node of that name, to the first one.
-    pub(super) fn nodes(
-        &self,
-        own: &str,
-        others: &BTreeMap<String, NodeNames>,
-    ) -> Vec<DiscoveredNode> {
+    pub(super) fn nodes(&self, own: &str, others: &BTreeMap<String, NodeNames>) -> Vec<DiscoveredNode> {
         let mut nodes: BTreeMap<&str, DiscoveredNode> = BTreeMap::new();
         let mut names: Vec<&str> = others.keys().map(String::as_str).collect();
         let own = match names.first() {
@@ -51,34 +45,22 @@ impl LocalEndpoints {
             }
         };
         for name in names {
-            let node = DiscoveredNode {
-                name: name.into(),
-                readers: Vec::new(),
-                writers: Vec::new(),
-            };
+            let node = DiscoveredNode { name: name.into(), readers: Vec::new(), writers: Vec::new() };
             nodes.insert(name, node);
         }
         let sides = [(&self.readers, false), (&self.writers, true)];
-        for (guid, end, writes) in sides
-            .into_iter()
-            .flat_map(|(ends, writes)| ends.iter().map(move |(guid, end)| (guid, end, writes)))
+        for (guid, end, writes) in
+            sides.into_iter().flat_map(|(ends, writes)| ends.iter().map(move |(guid, end)| (guid, end, writes)))
         {
             let has = |names: &NodeNames| end.belongs_to(names, writes);
-            let mut owners: Vec<&str> = others
-                .iter()
-                .filter(|(_, names)| has(names))
-                .map(|(name, _)| name.as_str())
-                .collect();
+            let mut owners: Vec<&str> =
+                others.iter().filter(|(_, names)| has(names)).map(|(name, _)| name.as_str()).collect();
             if owners.is_empty() {
                 owners.push(own);
             }
             for node in owners {
                 if let Some(node) = nodes.get_mut(node) {
-                    let ends = if writes {
-                        &mut node.writers
-                    } else {
-                        &mut node.readers
-                    };
+                    let ends = if writes { &mut node.writers } else { &mut node.readers };
                     ends.push(*guid);
                 }
             }
@@ -94,8 +76,9 @@ impl LocalEndpoint {
             (Some(RosTopicRole::Topic(name)), true) => names.publishes.contains(&name),
             (Some(RosTopicRole::Topic(name)), false) => names.subscribes.contains(&name),
             // The endpoints of clients are the other way round.
-            (Some(RosTopicRole::Request(name)), false)
-            | (Some(RosTopicRole::Reply(name)), true) => names.serves.contains(&name),
+            (Some(RosTopicRole::Request(name)), false) | (Some(RosTopicRole::Reply(name)), true) => {
+                names.serves.contains(&name)
+            }
             _ => false,
         }
     }
@@ -140,10 +123,7 @@ impl LocalEndpointTable {
 }
 
 fn local_endpoint(topic: &TopicDescription) -> LocalEndpoint {
-    LocalEndpoint {
-        topic: topic.name.clone(),
-        type_name: topic.type_name.clone(),
-    }
+    LocalEndpoint { topic: topic.name.clone(), type_name: topic.type_name.clone() }
 }
 
 /// A reader of this node, announced until it is dropped.
@@ -161,8 +141,7 @@ impl ReaderEnd {
     ) -> Self {
         let reader = bus.participant.reader(topic.clone(), qos, sink);
         let end = local_endpoint(topic);
-        bus.own
-            .change(|ends| drop(ends.readers.insert(reader.guid(), end)));
+        bus.own.change(|ends| drop(ends.readers.insert(reader.guid(), end)));
         let bus = Arc::clone(bus);
         Self { bus, reader }
     }
@@ -190,15 +169,10 @@ pub(super) struct WriterEnd {
 }
 
 impl WriterEnd {
-    pub(super) fn open(
-        bus: &Arc<Ros2BusState>,
-        topic: &TopicDescription,
-        qos: EndpointQos,
-    ) -> Self {
+    pub(super) fn open(bus: &Arc<Ros2BusState>, topic: &TopicDescription, qos: EndpointQos) -> Self {
         let writer = bus.participant.writer(topic.clone(), qos);
         let end = local_endpoint(topic);
-        bus.own
-            .change(|ends| drop(ends.writers.insert(writer.guid(), end)));
+        bus.own.change(|ends| drop(ends.writers.insert(writer.guid(), end)));
         let bus = Arc::clone(bus);
         Self { bus, writer }
     }
@@ -239,19 +213,11 @@ mod tests {
     #[test]
     fn ends_are_told_to_be_of_the_nodes_that_have_them() {
         let end = |number: u8, topic: &str| {
-            let end = LocalEndpoint {
-                topic: topic.to_owned(),
-                type_name: "T".to_owned(),
-            };
+            let end = LocalEndpoint { topic: topic.to_owned(), type_name: "T".to_owned() };
             (Guid::from([number; 16]), end)
         };
         let ends = LocalEndpoints {
-            readers: [
-                end(1, "rt/scan"),
-                end(2, "rq/mouth/setRequest"),
-                end(3, "rr/lent/setReply"),
-            ]
-            .into(),
+            readers: [end(1, "rt/scan"), end(2, "rq/mouth/setRequest"), end(3, "rr/lent/setReply")].into(),
             writers: [
                 end(4, "rt/rosout"),
                 end(5, "rr/mouth/setReply"),
@@ -261,11 +227,7 @@ mod tests {
             .into(),
         };
         let set = |names: &[&str]| names.iter().map(ToString::to_string).collect();
-        let ears = NodeNames {
-            publishes: set(&["/rosout"]),
-            subscribes: set(&["/scan"]),
-            ..NodeNames::default()
-        };
+        let ears = NodeNames { publishes: set(&["/rosout"]), subscribes: set(&["/scan"]), ..NodeNames::default() };
         let mouth = NodeNames {
             publishes: set(&["/rosout"]),
             // A client of the service is not one of its servers.
@@ -273,16 +235,9 @@ mod tests {
             ..NodeNames::default()
         };
         let told = |others: &BTreeMap<String, NodeNames>| {
-            let numbers =
-                |ends: &[Guid]| ends.iter().map(|guid| guid.bytes()[0]).collect::<Vec<_>>();
+            let numbers = |ends: &[Guid]| ends.iter().map(|guid| guid.bytes()[0]).collect::<Vec<_>>();
             let nodes = ends.nodes("/ears", others).into_iter();
-            let node = |node: DiscoveredNode| {
-                (
-                    node.name.to_string(),
-                    numbers(&node.readers),
-                    numbers(&node.writers),
-                )
-            };
+            let node = |node: DiscoveredNode| (node.name.to_string(), numbers(&node.readers), numbers(&node.writers));
             nodes.map(node).collect::<Vec<_>>()
         };
         let ears_all = ("/ears".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
@@ -293,10 +248,7 @@ mod tests {
         let bass_all = ("/bass".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
         assert_eq!(told(&bass), [bass_all]);
         // Endpoints that no node is said to have are the stub's own.
-        let expected = [
-            ("/ears".to_owned(), vec![1, 3], vec![4, 6, 7]),
-            ("/mouth".to_owned(), vec![2], vec![4, 5]),
-        ];
+        let expected = [("/ears".to_owned(), vec![1, 3], vec![4, 6, 7]), ("/mouth".to_owned(), vec![2], vec![4, 5])];
         assert_eq!(told(&others.into()), expected);
     }
 }

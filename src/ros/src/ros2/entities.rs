@@ -9,10 +9,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{
-    DiscoveredGraph, EndpointQos, Guid, GuidPrefix, HistoryKind, ReceivedSample, Sink,
-    TopicDescription,
-};
+use rtps::{DiscoveredGraph, EndpointQos, Guid, GuidPrefix, HistoryKind, ReceivedSample, Sink, TopicDescription};
 use tokio::sync::watch;
 
 use super::names;
@@ -98,10 +95,7 @@ impl ParticipantTable {
     pub(super) fn snapshot(
         &self,
         discovered: &watch::Receiver<Arc<DiscoveredGraph>>,
-    ) -> (
-        Arc<DiscoveredGraph>,
-        HashMap<GuidPrefix, Arc<ParticipantEntities>>,
-    ) {
+    ) -> (Arc<DiscoveredGraph>, HashMap<GuidPrefix, Arc<ParticipantEntities>>) {
         let mut told = self.told.lock();
         // Read while the lock is held: a participant that has announced something by now was discovered before.
         let now = Arc::clone(&discovered.borrow());
@@ -141,22 +135,14 @@ fn decode(payload: &[u8]) -> Option<ParticipantEntities> {
     }
     // A gid of 16 bytes is followed by the number of nodes and, if that is zero, by nothing.
     let padded = body.get(16..24).is_some_and(|rest| rest == [0; 8]);
-    let gids = if padded && body.len() >= 28 {
-        GidSize::TwentyFour
-    } else {
-        GidSize::Sixteen
-    };
+    let gids = if padded && body.len() >= 28 { GidSize::TwentyFour } else { GidSize::Sixteen };
     let mut cursor = CdrCursor { body, at: 0, big };
     cursor.take(gids.bytes())?;
     let mut nodes = Vec::new();
     for _ in 0..cursor.word()? {
         let (namespace, name) = (cursor.text()?, cursor.text()?);
         let full = format!("{}/{name}", namespace.trim_end_matches('/'));
-        let node = DiscoveredNode {
-            name: full.into(),
-            readers: cursor.gids(gids)?,
-            writers: cursor.gids(gids)?,
-        };
+        let node = DiscoveredNode { name: full.into(), readers: cursor.gids(gids)?, writers: cursor.gids(gids)? };
         if names::is_global(&node.name) {
             nodes.push(node);
         }
@@ -182,11 +168,7 @@ impl<'a> CdrCursor<'a> {
     fn word(&mut self) -> Option<usize> {
         self.at = self.at.checked_next_multiple_of(4)?;
         let word: [u8; 4] = self.take(4)?.try_into().ok()?;
-        let value = if self.big {
-            u32::from_be_bytes(word)
-        } else {
-            u32::from_le_bytes(word)
-        };
+        let value = if self.big { u32::from_be_bytes(word) } else { u32::from_le_bytes(word) };
         usize::try_from(value).ok()
     }
 
@@ -203,8 +185,7 @@ impl<'a> CdrCursor<'a> {
         let count = self.word()?;
         let bytes = self.take(count.checked_mul(size.bytes())?)?;
         let gids = bytes.chunks_exact(size.bytes());
-        gids.map(|gid| Some(Guid::from(*gid.first_chunk::<16>()?)))
-            .collect()
+        gids.map(|gid| Some(Guid::from(*gid.first_chunk::<16>()?))).collect()
     }
 }
 
@@ -255,11 +236,7 @@ mod tests {
 
     fn node(name: &str, readers: &[u8], writers: &[u8]) -> DiscoveredNode {
         let guids = |numbers: &[u8]| numbers.iter().copied().map(guid).collect();
-        DiscoveredNode {
-            name: name.into(),
-            readers: guids(readers),
-            writers: guids(writers),
-        }
+        DiscoveredNode { name: name.into(), readers: guids(readers), writers: guids(writers) }
     }
 
     #[test]
@@ -269,13 +246,7 @@ mod tests {
             for gids in [GidSize::Sixteen, GidSize::TwentyFour] {
                 let payload = encode(guid(9), &nodes, gids);
                 let told = decode(&payload).expect("it can be read");
-                assert_eq!(
-                    told,
-                    ParticipantEntities {
-                        nodes: nodes.clone(),
-                        gids
-                    }
-                );
+                assert_eq!(told, ParticipantEntities { nodes: nodes.clone(), gids });
             }
         }
     }

@@ -20,11 +20,7 @@ struct GraphEndpoint<'a> {
 
 /// Builds the graph of all nodes; `own` are the endpoints of the node with this name and participant. Names with a part
 /// that begins with `_` are left out of what is shown, and so are endpoints whose node is not known yet.
-pub(super) fn build(
-    seen: &DiscoverySnapshot,
-    own: &LocalEndpoints,
-    (node, participant): (&str, Guid),
-) -> Graph {
+pub(super) fn build(seen: &DiscoverySnapshot, own: &LocalEndpoints, (node, participant): (&str, Guid)) -> Graph {
     let mut building = GraphBuilder::default();
     for end in all_endpoints(seen, own, node) {
         building.add(&end);
@@ -33,44 +29,23 @@ pub(super) fn build(
     graph.ends = node_ends::collect_endpoints(seen);
     let served = &graph.services;
     let sought = building.sought.into_iter();
-    graph.sought = sought
-        .filter(|(service, _)| !served.contains_key(service))
-        .collect();
-    let nodes = seen
-        .nodes
-        .iter()
-        .map(|(name, participant)| (&**name, *participant));
+    graph.sought = sought.filter(|(service, _)| !served.contains_key(service)).collect();
+    let nodes = seen.nodes.iter().map(|(name, participant)| (&**name, *participant));
     let nodes = nodes.chain([(node, participant)]);
     let shown = nodes.filter(|(name, _)| !names::is_hidden(name));
-    graph.nodes = shown
-        .map(|(name, participant)| (name.to_owned(), participant.to_string()))
-        .collect();
+    graph.nodes = shown.map(|(name, participant)| (name.to_owned(), participant.to_string())).collect();
     let enclaves = seen.enclaves.iter();
     graph.enclaves = enclaves
-        .map(|(enclave, nodes)| {
-            (
-                enclave.clone(),
-                nodes.iter().map(|name| name.to_string()).collect(),
-            )
-        })
+        .map(|(enclave, nodes)| (enclave.clone(), nodes.iter().map(|name| name.to_string()).collect()))
         .collect();
     graph
 }
 
 /// Returns all endpoints, writers first, because they determine a topic's type.
-fn all_endpoints<'a>(
-    seen: &'a DiscoverySnapshot,
-    own: &'a LocalEndpoints,
-    node: &'a str,
-) -> Vec<GraphEndpoint<'a>> {
-    let (writers, readers) = (
-        seen.discovered.writers.values(),
-        seen.discovered.readers.values(),
-    );
+fn all_endpoints<'a>(seen: &'a DiscoverySnapshot, own: &'a LocalEndpoints, node: &'a str) -> Vec<GraphEndpoint<'a>> {
+    let (writers, readers) = (seen.discovered.writers.values(), seen.discovered.readers.values());
     let sides = [(true, &own.writers), (false, &own.readers)];
-    let theirs = writers
-        .map(|end| (true, end))
-        .chain(readers.map(|end| (false, end)));
+    let theirs = writers.map(|end| (true, end)).chain(readers.map(|end| (false, end)));
     let named = theirs.filter(|(_, end)| seen.is_named(end.guid));
     let theirs = named.map(|(writes, end)| GraphEndpoint {
         topic: &end.topic,
@@ -113,15 +88,12 @@ impl GraphBuilder {
     }
 
     fn topic(&mut self, name: String, end: &GraphEndpoint<'_>) {
-        let topic = self.graph.topics.entry(name).or_insert_with(|| TopicNodes {
-            type_name: names::ros_type(end.type_name),
-            ..TopicNodes::default()
-        });
-        let nodes = if end.writes {
-            &mut topic.publishers
-        } else {
-            &mut topic.subscribers
-        };
+        let topic = self
+            .graph
+            .topics
+            .entry(name)
+            .or_insert_with(|| TopicNodes { type_name: names::ros_type(end.type_name), ..TopicNodes::default() });
+        let nodes = if end.writes { &mut topic.publishers } else { &mut topic.subscribers };
         add(nodes, &end.node);
     }
 
@@ -144,11 +116,7 @@ impl GraphBuilder {
         if is_first_server || action.type_name.is_empty() {
             action.type_name = type_name;
         }
-        let nodes = if end.writes {
-            &mut action.clients
-        } else {
-            &mut action.servers
-        };
+        let nodes = if end.writes { &mut action.clients } else { &mut action.servers };
         add(nodes, &end.node);
     }
 }
@@ -166,9 +134,7 @@ mod tests {
     use std::sync::Arc;
 
     use bytes::Bytes;
-    use rtps::{
-        DiscoveredGraph, EndpointData, EndpointQos, EntityId, GuidPrefix, ParticipantData, VendorId,
-    };
+    use rtps::{DiscoveredGraph, EndpointData, EndpointQos, EntityId, GuidPrefix, ParticipantData, VendorId};
 
     use super::super::ends::LocalEndpoint;
     use super::super::entities::{DiscoveredNode, GidSize, ParticipantEntities};
@@ -219,27 +185,13 @@ mod tests {
             discovered.participants.insert(told.prefix, told);
         }
         for end in ends {
-            let known = if end.guid.entity.is_writer() {
-                &mut discovered.writers
-            } else {
-                &mut discovered.readers
-            };
+            let known = if end.guid.entity.is_writer() { &mut discovered.writers } else { &mut discovered.readers };
             known.insert(end.guid, end);
         }
-        let (writers, readers) = owned
-            .iter()
-            .copied()
-            .partition(|end: &Guid| end.entity.is_writer());
-        let node = |name: &str, readers, writers| DiscoveredNode {
-            name: name.into(),
-            readers,
-            writers,
-        };
+        let (writers, readers) = owned.iter().copied().partition(|end: &Guid| end.entity.is_writer());
+        let node = |name: &str, readers, writers| DiscoveredNode { name: name.into(), readers, writers };
         let entities = ParticipantEntities {
-            nodes: vec![
-                node("/server", readers, writers),
-                node("/_ros2cli_1", Vec::new(), Vec::new()),
-            ],
+            nodes: vec![node("/server", readers, writers), node("/_ros2cli_1", Vec::new(), Vec::new())],
             gids: GidSize::Sixteen,
         };
         let told = HashMap::from([(GuidPrefix([1; 12]), Arc::new(entities))]);
@@ -248,13 +200,7 @@ mod tests {
 
     #[test]
     fn topics_services_and_actions_are_what_ends_are_named_after() {
-        let owned = [
-            guid(1, 1, true),
-            guid(1, 2, false),
-            guid(1, 3, false),
-            guid(1, 4, true),
-            guid(1, 5, true),
-        ];
+        let owned = [guid(1, 1, true), guid(1, 2, false), guid(1, 3, false), guid(1, 4, true), guid(1, 5, true)];
         let seen = snapshot(
             &owned,
             vec![
@@ -271,15 +217,10 @@ mod tests {
             ],
         );
         let mut own = LocalEndpoints::default();
-        let asked = LocalEndpoint {
-            topic: "rq/set_boolRequest".to_owned(),
-            type_name: SET_BOOL.to_owned(),
-        };
+        let asked = LocalEndpoint { topic: "rq/set_boolRequest".to_owned(), type_name: SET_BOOL.to_owned() };
         own.writers.insert(guid(3, 1, true), asked);
-        let sends = LocalEndpoint {
-            topic: "rq/fib/_action/send_goalRequest".to_owned(),
-            type_name: SEND_GOAL.to_owned(),
-        };
+        let sends =
+            LocalEndpoint { topic: "rq/fib/_action/send_goalRequest".to_owned(), type_name: SEND_GOAL.to_owned() };
         own.writers.insert(guid(3, 2, true), sends);
         let us = Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT);
         let graph = build(&seen, &own, ("/us", us));
@@ -292,10 +233,7 @@ mod tests {
             subscribers: vec![stranger],
         };
         assert_eq!(graph.topics, [("/chatter".to_owned(), chatter)].into());
-        assert_eq!(
-            graph.services,
-            [("/set_bool".to_owned(), "/server".to_owned())].into()
-        );
+        assert_eq!(graph.services, [("/set_bool".to_owned(), "/server".to_owned())].into());
         assert_eq!(graph.sought, [("/needed".to_owned(), server())].into());
         let fib = ActionNodes {
             type_name: "test_msgs/action/Fibonacci".to_owned(),
@@ -340,11 +278,7 @@ mod tests {
         let mut discovered = DiscoveredGraph::default();
         let mut told = HashMap::new();
         for told_of in participants {
-            let node = |name: String| DiscoveredNode {
-                name: name.into(),
-                readers: Vec::new(),
-                writers: Vec::new(),
-            };
+            let node = |name: String| DiscoveredNode { name: name.into(), readers: Vec::new(), writers: Vec::new() };
             let own = format!("/own_{}", told_of.prefix.0[0]);
             let entities = ParticipantEntities {
                 nodes: vec![node("/see".into()), node(own), node("/_hidden".into())],
@@ -358,10 +292,7 @@ mod tests {
         let nodes = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
         let expected = [
             ("/a/b".to_owned(), nodes(&["/_hidden", "/own_2", "/see"])),
-            (
-                "/c".to_owned(),
-                nodes(&["/_hidden", "/own_3", "/own_4", "/see"]),
-            ),
+            ("/c".to_owned(), nodes(&["/_hidden", "/own_3", "/own_4", "/see"])),
         ];
         assert_eq!(graph.enclaves, expected.into());
     }

@@ -45,10 +45,7 @@ impl Loans {
         };
         let told = format!("{LABEL}={};", escape(label));
         let user_data = [&request.user_data[..], told.as_bytes()].concat();
-        TopicDescription {
-            user_data: user_data.into(),
-            ..request
-        }
+        TopicDescription { user_data: user_data.into(), ..request }
     }
 }
 
@@ -56,11 +53,7 @@ impl Loans {
 impl Lending for Ros2Bus {
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
         self.inner.check_open()?;
-        let following = LoanManager {
-            bus: Arc::clone(&self.inner),
-            lender,
-            loans: HashMap::new(),
-        };
+        let following = LoanManager { bus: Arc::clone(&self.inner), lender, loans: HashMap::new() };
         let following = self.inner.spawn(following.run());
         if let Some(before) = self.inner.loans.following.lock().replace(following) {
             before.abort();
@@ -99,15 +92,13 @@ impl Lending for Ros2Bus {
 /// Returns the first server of a service whose node is known.
 fn provider(seen: &DiscoverySnapshot, service: &str) -> Option<ServiceProvider> {
     let ends = seen.readers(&names::request_name(service));
-    ends.iter()
-        .filter(|end| seen.is_named(end.guid))
-        .find_map(|end| {
-            Some(ServiceProvider {
-                node: seen.node(end.guid).to_string(),
-                service_type: node_ends::service_type(seen, end, service, false)?,
-                label: parse_label(&end.user_data),
-            })
+    ends.iter().filter(|end| seen.is_named(end.guid)).find_map(|end| {
+        Some(ServiceProvider {
+            node: seen.node(end.guid).to_string(),
+            service_type: node_ends::service_type(seen, end, service, false)?,
+            label: parse_label(&end.user_data),
         })
+    })
 }
 
 /// Tracks the services that nodes look for in vain.
@@ -160,8 +151,7 @@ impl LoanManager {
                 service: service.clone(),
                 client,
             };
-            self.loans
-                .insert(service, Loan(self.bus.spawn(lending.run())));
+            self.loans.insert(service, Loan(self.bus.spawn(lending.run())));
         }
     }
 }
@@ -173,10 +163,7 @@ struct SeekingClient {
 }
 
 /// Returns the services that nodes have clients for and that no node serves; lent services do not count as served.
-fn sought_services(
-    bus: &Ros2BusState,
-    seen: &DiscoverySnapshot,
-) -> BTreeMap<String, SeekingClient> {
+fn sought_services(bus: &Ros2BusState, seen: &DiscoverySnapshot) -> BTreeMap<String, SeekingClient> {
     let mut sought = BTreeMap::new();
     for end in seen.discovered.writers.values() {
         let Some(RosTopicRole::Request(service)) = names::topic_role(&end.topic) else {
@@ -220,10 +207,7 @@ impl Borrower {
     async fn run(self) {
         let mut refused = None;
         loop {
-            let found = self
-                .lender
-                .find_service(&self.service, &self.client.node)
-                .await;
+            let found = self.lender.find_service(&self.service, &self.client.node).await;
             // A service that has just gone counts as not found; otherwise it would be requested without a pause.
             if let Some(lent) = found.filter(|lent| !*lent.gone.borrow()) {
                 if self.serve_until_gone(lent, &mut refused).await {
@@ -236,11 +220,7 @@ impl Borrower {
 
     /// Serves the service until it is gone; returns false if it cannot be served.
     async fn serve_until_gone(&self, lent: LentService, refused: &mut Option<ServiceType>) -> bool {
-        let LentService {
-            service_type: of,
-            handler,
-            mut gone,
-        } = lent;
+        let LentService { service_type: of, handler, mut gone } = lent;
         let wanted = &self.client.of;
         if of.name != wanted.name || !of.is_compatible_with(wanted) {
             // The client would take it for a server that never answers.
@@ -308,9 +288,7 @@ fn unescape(text: &str) -> Option<String> {
 fn parse_label(user_data: &[u8]) -> Option<String> {
     let text = std::str::from_utf8(user_data).ok()?;
     let mut pairs = text.split(';').filter_map(|pair| pair.split_once('='));
-    pairs
-        .find(|(key, _)| *key == LABEL)
-        .and_then(|(_, label)| unescape(label))
+    pairs.find(|(key, _)| *key == LABEL).and_then(|(_, label)| unescape(label))
 }
 
 #[cfg(test)]

@@ -18,10 +18,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tokio::time::timeout;
 
-use crate::bus::{
-    Bus, BusError, CallFate, Graph, QosProfile, RosVersion, Subscription, WireType,
-    wait_for_connected,
-};
+use crate::bus::{Bus, BusError, CallFate, Graph, QosProfile, RosVersion, Subscription, WireType, wait_for_connected};
 use crate::codec::cursor::MessageCursor;
 use crate::codec::put::CdrWriter;
 use crate::ros2::interfaces;
@@ -137,11 +134,7 @@ impl LifecycleNode {
             Ok(state) => format!("{} did not {}, and is {state} now", self.node, by.label()),
             Err(error) => format!("{} did not {}: {error}", self.node, by.label()),
         };
-        Err(BusError::CallFailed {
-            service: format!("{}/change_state", self.node),
-            reason,
-            fate: CallFate::Answered,
-        })
+        Err(BusError::CallFailed { service: format!("{}/change_state", self.node), reason, fate: CallFate::Answered })
     }
 
     /// Returns the labels of the transitions possible in the current state, with the states they lead to. Between two
@@ -163,24 +156,12 @@ impl LifecycleNode {
         let (of, qos) = (WireType::from_message(&of), QosProfile::keep_last(CHANGES));
         let topic = format!("{}/transition_event", self.node);
         let subscription = self.bus.subscribe(&topic, of, qos).await?;
-        let heard = timeout(
-            PATIENCE,
-            wait_for_connected(subscription.matched.clone(), 1),
-        );
-        heard.await.map_err(|_| BusError::Timeout {
-            what: format!("topic {topic}"),
-            after: PATIENCE,
-        })?;
+        let heard = timeout(PATIENCE, wait_for_connected(subscription.matched.clone(), 1));
+        heard.await.map_err(|_| BusError::Timeout { what: format!("topic {topic}"), after: PATIENCE })?;
         Ok(StateChanges { subscription })
     }
 
-    async fn call(
-        &self,
-        part: &str,
-        type_name: &str,
-        request: Bytes,
-        patience: Duration,
-    ) -> Result<Bytes, BusError> {
+    async fn call(&self, part: &str, type_name: &str, request: Bytes, patience: Duration) -> Result<Bytes, BusError> {
         let of = interfaces::service(&format!("lifecycle_msgs/srv/{type_name}"))?;
         let service = format!("{}/{part}", self.node);
         let answer = self.bus.call_typed(&service, &of.digest, request, patience);
@@ -225,10 +206,7 @@ fn read_change(cursor: &mut MessageCursor<'_>) -> Option<(String, StateChange)> 
     let (_, label) = read_number_and_label(cursor)?;
     let (from, _) = read_number_and_label(cursor)?;
     let (to, _) = read_number_and_label(cursor)?;
-    let change = StateChange {
-        from: State::from_number(from),
-        to: State::from_number(to),
-    };
+    let change = StateChange { from: State::from_number(from), to: State::from_number(to) };
     Some((label, change))
 }
 

@@ -32,9 +32,7 @@ pub fn is_hidden(name: &str) -> bool {
 fn is_identifier(part: &str) -> bool {
     let first = part.bytes().next();
     first.is_some_and(|first| !first.is_ascii_digit())
-        && part
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+        && part.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
 }
 
 /// Role of a DDS topic in ROS.
@@ -94,8 +92,7 @@ fn rosidl_type(dds: &str) -> Option<String> {
     let [package, kind, namespace, short] = [(); 4].map(|()| parts.next().unwrap_or_default());
     let short = short.strip_suffix('_')?;
     let well_formed = [package, kind, short].into_iter().all(is_identifier);
-    (namespace == "dds_" && well_formed && parts.next().is_none())
-        .then(|| format!("{package}/{kind}/{short}"))
+    (namespace == "dds_" && well_formed && parts.next().is_none()).then(|| format!("{package}/{kind}/{short}"))
 }
 
 /// Returns the service type `std_srvs/srv/SetBool` of its DDS request type.
@@ -178,11 +175,7 @@ pub(super) fn reply(service: &str, of: &ServiceType) -> Result<TopicDescription,
 }
 
 fn new_topic(name: String, type_name: String, digest: &Digest) -> TopicDescription {
-    TopicDescription {
-        name,
-        type_name,
-        user_data: type_hash::user_data(digest),
-    }
+    TopicDescription { name, type_name, user_data: type_hash::user_data(digest) }
 }
 
 #[cfg(test)]
@@ -218,33 +211,13 @@ mod tests {
     #[test]
     fn topics_of_dds_are_told_by_what_they_are_to_ros() {
         let known = |name: &str| topic_role(name).unwrap_or_else(|| panic!("{name} is ROS's"));
-        assert_eq!(
-            known("rt/chatter"),
-            RosTopicRole::Topic("/chatter".to_owned())
-        );
-        assert_eq!(
-            known("rq/a/addRequest"),
-            RosTopicRole::Request("/a/add".to_owned())
-        );
-        assert_eq!(
-            known("rr/a/addReply"),
-            RosTopicRole::Reply("/a/add".to_owned())
-        );
-        for other in [
-            "ros_discovery_info",
-            "rt",
-            "rq/add",
-            "rt//x",
-            "x",
-            "rqé",
-            "rq/Request",
-        ] {
+        assert_eq!(known("rt/chatter"), RosTopicRole::Topic("/chatter".to_owned()));
+        assert_eq!(known("rq/a/addRequest"), RosTopicRole::Request("/a/add".to_owned()));
+        assert_eq!(known("rr/a/addReply"), RosTopicRole::Reply("/a/add".to_owned()));
+        for other in ["ros_discovery_info", "rt", "rq/add", "rt//x", "x", "rqé", "rq/Request"] {
             assert_eq!(topic_role(other), None, "{other}");
         }
-        assert_eq!(
-            action_part("/a/fib/_action/send_goal"),
-            Some(("/a/fib", "send_goal"))
-        );
+        assert_eq!(action_part("/a/fib/_action/send_goal"), Some(("/a/fib", "send_goal")));
         for other in ["/send_goal", "/_action/send_goal", "/_a/_action/send_goal"] {
             assert_eq!(action_part(other), None, "{other}");
         }
@@ -254,35 +227,20 @@ mod tests {
     fn types_come_back_from_dds() {
         let of = WireType::with_name("std_msgs/msg/String");
         let topic = topic("/chatter", &of).expect("a topic");
-        assert_eq!(
-            (&*topic.name, &*topic.type_name),
-            ("rt/chatter", "std_msgs::msg::dds_::String_")
-        );
+        assert_eq!((&*topic.name, &*topic.type_name), ("rt/chatter", "std_msgs::msg::dds_::String_"));
         assert_eq!(ros_type(&topic.type_name), of.name);
-        assert_eq!(
-            message_type("std_msgs/String").expect("a type"),
-            topic.type_name
-        );
+        assert_eq!(message_type("std_msgs/String").expect("a type"), topic.type_name);
         let service = ServiceType::new("test_msgs/action/Fibonacci_SendGoal", "*");
         let asked = request("/fib/_action/send_goal", &service).expect("a topic");
         assert_eq!(
             (&*asked.name, &*asked.type_name),
-            (
-                "rq/fib/_action/send_goalRequest",
-                "test_msgs::action::dds_::Fibonacci_SendGoal_Request_"
-            )
+            ("rq/fib/_action/send_goalRequest", "test_msgs::action::dds_::Fibonacci_SendGoal_Request_")
         );
         assert_eq!(service_type(&asked.type_name), Some(service.name));
-        assert_eq!(
-            action_type(&asked.type_name).as_deref(),
-            Some("test_msgs/action/Fibonacci")
-        );
+        assert_eq!(action_type(&asked.type_name).as_deref(), Some("test_msgs/action/Fibonacci"));
         // A type made by others.
         assert_eq!(ros_type("HelloWorldData::Msg"), "HelloWorldData::Msg");
-        assert_eq!(
-            message_type("HelloWorldData::Msg").expect("a type"),
-            "HelloWorldData::Msg"
-        );
+        assert_eq!(message_type("HelloWorldData::Msg").expect("a type"), "HelloWorldData::Msg");
         for bad in ["*", "", "a/b/c/d", "a/b c", "/", "a//b"] {
             assert!(message_type(bad).is_err(), "{bad}");
         }

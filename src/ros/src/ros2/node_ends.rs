@@ -15,13 +15,8 @@ use crate::bus::{Digest, NodeEntities, ServiceType, WireFormat};
 /// ROS.
 pub(super) fn collect_endpoints(seen: &DiscoverySnapshot) -> BTreeMap<String, NodeEntities> {
     let mut nodes: BTreeMap<String, NodeEntities> = BTreeMap::new();
-    let (writers, readers) = (
-        seen.discovered.writers.values(),
-        seen.discovered.readers.values(),
-    );
-    let sides = writers
-        .map(|end| (end, true))
-        .chain(readers.map(|end| (end, false)));
+    let (writers, readers) = (seen.discovered.writers.values(), seen.discovered.readers.values());
+    let sides = writers.map(|end| (end, true)).chain(readers.map(|end| (end, false)));
     for (end, writes) in sides {
         let Some(owner) = seen.owner(end.guid) else {
             continue;
@@ -35,11 +30,7 @@ pub(super) fn collect_endpoints(seen: &DiscoverySnapshot) -> BTreeMap<String, No
         };
         match named {
             RosTopicRole::Topic(name) => {
-                let topics = if writes {
-                    &mut node.publishers
-                } else {
-                    &mut node.subscribers
-                };
+                let topics = if writes { &mut node.publishers } else { &mut node.subscribers };
                 let qos = quality::from_endpoint(&end.qos);
                 match topics.entry(name) {
                     Entry::Vacant(free) => {
@@ -52,11 +43,7 @@ pub(super) fn collect_endpoints(seen: &DiscoverySnapshot) -> BTreeMap<String, No
                 }
             }
             RosTopicRole::Request(name) => {
-                let services = if writes {
-                    &mut node.clients
-                } else {
-                    &mut node.services
-                };
+                let services = if writes { &mut node.clients } else { &mut node.services };
                 if let Some(of) = service_type(seen, end, &name, writes) {
                     services.entry(name).or_insert(of);
                 }
@@ -76,11 +63,7 @@ pub(super) fn service_type(
     writes: bool,
 ) -> Option<ServiceType> {
     let reply = names::reply_name(service);
-    let replies = if writes {
-        seen.readers(&reply)
-    } else {
-        seen.writers(&reply)
-    };
+    let replies = if writes { seen.readers(&reply) } else { seen.writers(&reply) };
     let same = replies.iter().find(|it| it.guid.prefix == end.guid.prefix);
     let response = same.map(|reply| type_hash::message_hash(&reply.user_data));
     Some(ServiceType {
@@ -98,9 +81,7 @@ mod tests {
     use std::sync::Arc;
 
     use bytes::Bytes;
-    use rtps::{
-        DiscoveredGraph, DurabilityKind, EndpointQos, EntityId, Guid, GuidPrefix, ReliabilityKind,
-    };
+    use rtps::{DiscoveredGraph, DurabilityKind, EndpointQos, EntityId, Guid, GuidPrefix, ReliabilityKind};
 
     use super::super::entities::{DiscoveredNode, GidSize, ParticipantEntities};
     use super::*;
@@ -127,14 +108,8 @@ mod tests {
 
     #[test]
     fn a_node_has_what_its_ends_are_named_after_with_what_tools_hide() {
-        let weak = EndpointQos {
-            reliability: ReliabilityKind::BestEffort,
-            ..EndpointQos::default()
-        };
-        let latching = EndpointQos {
-            durability: DurabilityKind::TransientLocal,
-            ..EndpointQos::default()
-        };
+        let weak = EndpointQos { reliability: ReliabilityKind::BestEffort, ..EndpointQos::default() };
+        let latching = EndpointQos { durability: DurabilityKind::TransientLocal, ..EndpointQos::default() };
         let string = "std_msgs::msg::dds_::String_";
         let set_bool = "std_srvs::srv::dds_::SetBool_Request_";
         let reply = "std_srvs::srv::dds_::SetBool_Response_";
@@ -159,19 +134,11 @@ mod tests {
                 let owned = if writes { &mut writers } else { &mut readers };
                 owned.push(end.guid);
             }
-            let known = if writes {
-                &mut discovered.writers
-            } else {
-                &mut discovered.readers
-            };
+            let known = if writes { &mut discovered.writers } else { &mut discovered.readers };
             known.insert(end.guid, end);
         }
         let entities = ParticipantEntities {
-            nodes: vec![DiscoveredNode {
-                name: "/node".into(),
-                readers,
-                writers,
-            }],
+            nodes: vec![DiscoveredNode { name: "/node".into(), readers, writers }],
             gids: GidSize::Sixteen,
         };
         let told = HashMap::from([(PARTICIPANT, Arc::new(entities))]);
@@ -188,21 +155,10 @@ mod tests {
         assert!(map.is_latching());
         let scan = node.subscribers["/scan"].1;
         assert_eq!(scan.reliability, bus::QosReliability::BestEffort);
-        let serves: Vec<_> = node
-            .services
-            .iter()
-            .map(|(name, of)| (&**name, &*of.name))
-            .collect();
+        let serves: Vec<_> = node.services.iter().map(|(name, of)| (&**name, &*of.name)).collect();
         assert_eq!(serves, [("/set", "std_srvs/srv/SetBool")]);
-        let calls: Vec<_> = node
-            .clients
-            .iter()
-            .map(|(name, of)| (&**name, &*of.name))
-            .collect();
-        let send_goal = (
-            "/fib/_action/send_goal",
-            "test_msgs/action/Fibonacci_SendGoal",
-        );
+        let calls: Vec<_> = node.clients.iter().map(|(name, of)| (&**name, &*of.name)).collect();
+        let send_goal = ("/fib/_action/send_goal", "test_msgs/action/Fibonacci_SendGoal");
         assert_eq!(calls, [send_goal]);
     }
 }

@@ -80,19 +80,9 @@ impl TypeMismatchLog {
 }
 
 /// Describes a mismatch; an action is reported once, not for each of its parts.
-fn mismatched_client(
-    service: &str,
-    node: String,
-    theirs: String,
-    ours: String,
-) -> Option<MismatchedClient> {
+fn mismatched_client(service: &str, node: String, theirs: String, ours: String) -> Option<MismatchedClient> {
     let told = match names::action_part(service) {
-        None => MismatchedClient {
-            what: format!("service {service}"),
-            node,
-            theirs,
-            ours,
-        },
+        None => MismatchedClient { what: format!("service {service}"), node, theirs, ours },
         Some((action, "send_goal")) => MismatchedClient {
             what: format!("action {action}"),
             node,
@@ -146,10 +136,7 @@ mod tests {
             readers: Vec::new(),
             writers: discovered.writers.keys().copied().collect(),
         };
-        let entities = ParticipantEntities {
-            nodes: vec![app],
-            gids: GidSize::Sixteen,
-        };
+        let entities = ParticipantEntities { nodes: vec![app], gids: GidSize::Sixteen };
         let told = HashMap::from([(APP, Arc::new(entities))]);
         DiscoverySnapshot::new(Arc::new(discovered), &told)
     }
@@ -158,26 +145,13 @@ mod tests {
     fn each_client_of_another_type_is_told_of_once_and_an_action_as_a_whole() {
         let of = |name: &str| ServiceType::new(name, "*");
         let set = of("std_srvs/srv/SetBool");
-        let (send, result) = (
-            of("test_msgs/action/Fibonacci_SendGoal"),
-            of("test_msgs/action/Fibonacci_GetResult"),
-        );
-        let served = [
-            ("/set", &set),
-            ("/fib/_action/send_goal", &send),
-            ("/fib/_action/get_result", &result),
-        ];
+        let (send, result) = (of("test_msgs/action/Fibonacci_SendGoal"), of("test_msgs/action/Fibonacci_GetResult"));
+        let served = [("/set", &set), ("/fib/_action/send_goal", &send), ("/fib/_action/get_result", &result)];
         let clients = snapshot(&[
             ("rq/setRequest", "std_srvs::srv::dds_::SetBool_Request_"),
             ("rq/setRequest", "std_srvs::srv::dds_::Trigger_Request_"),
-            (
-                "rq/fib/_action/send_goalRequest",
-                "x::action::dds_::Count_SendGoal_Request_",
-            ),
-            (
-                "rq/fib/_action/get_resultRequest",
-                "x::action::dds_::Count_GetResult_Request_",
-            ),
+            ("rq/fib/_action/send_goalRequest", "x::action::dds_::Count_SendGoal_Request_"),
+            ("rq/fib/_action/get_resultRequest", "x::action::dds_::Count_GetResult_Request_"),
         ]);
         let mut all = TypeMismatchLog::default();
         let told = |what: &str, theirs: &str, ours: &str| MismatchedClient {
@@ -187,16 +161,8 @@ mod tests {
             ours: ours.to_owned(),
         };
         let expected = [
-            told(
-                "service /set",
-                "std_srvs/srv/Trigger",
-                "std_srvs/srv/SetBool",
-            ),
-            told(
-                "action /fib",
-                "x/action/Count",
-                "test_msgs/action/Fibonacci",
-            ),
+            told("service /set", "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"),
+            told("action /fib", "x/action/Count", "test_msgs/action/Fibonacci"),
         ];
         assert_eq!(all.new_mismatches(served.into_iter(), &clients), expected);
         assert_eq!(all.new_mismatches(served.into_iter(), &clients), []);

@@ -15,9 +15,9 @@ use tokio::time::timeout;
 use self::reading::ParameterReader;
 use self::values::{CoerceError, TypedValue};
 use crate::bus::{
-    Bus, BusError, CallFate, DoubleRange, FailureReason, IntegerRange, MatchedPeers,
-    NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvent, ParameterEvents,
-    ParameterKind, ParameterNames, QosProfile, Subscription, WireType,
+    Bus, BusError, CallFate, DoubleRange, FailureReason, IntegerRange, MatchedPeers, NodeParameters, ParamChange,
+    ParamValue, ParameterDescription, ParameterEvent, ParameterEvents, ParameterKind, ParameterNames, QosProfile,
+    Subscription, WireType,
 };
 use crate::codec::put::CdrWriter;
 use crate::ros2::{Ros2Bus, interfaces};
@@ -38,11 +38,7 @@ impl NodeParameters for Ros2Bus {
         Ok(values.into_iter().map(Option::flatten).collect())
     }
 
-    async fn set(
-        &self,
-        node: &str,
-        changes: Vec<ParamChange>,
-    ) -> Result<Vec<Result<(), FailureReason>>, BusError> {
+    async fn set(&self, node: &str, changes: Vec<ParamChange>) -> Result<Vec<Result<(), FailureReason>>, BusError> {
         let typed = self.coerce_changes(node, changes).await?;
         let sent = typed.iter().filter_map(|change| change.as_ref().ok());
         let sent: Vec<_> = sent.collect();
@@ -52,14 +48,9 @@ impl NodeParameters for Ros2Bus {
             put_changes(&sent, &mut put);
             let service = (node, "set_parameters");
             let read = |reading: &mut ParameterReader<'_>| reading.list(read_set);
-            answers = self
-                .call_service(service, "SetParameters", put, read)
-                .await?;
+            answers = self.call_service(service, "SetParameters", put, read).await?;
             if answers.len() != sent.len() {
-                return Err(protocol_error(
-                    service,
-                    "it does not answer for each parameter",
-                ));
+                return Err(protocol_error(service, "it does not answer for each parameter"));
             }
         }
         let mut answers = answers.into_iter();
@@ -92,41 +83,24 @@ impl NodeParameters for Ros2Bus {
         })
     }
 
-    async fn list(
-        &self,
-        node: &str,
-        prefixes: &[String],
-        depth: u64,
-    ) -> Result<ParameterNames, BusError> {
+    async fn list(&self, node: &str, prefixes: &[String], depth: u64) -> Result<ParameterNames, BusError> {
         let mut put = CdrWriter::new();
         put_texts(prefixes, &mut put);
         put.number(depth.to_le_bytes());
         let read = |reading: &mut ParameterReader<'_>| {
-            Some(ParameterNames {
-                names: reading.texts()?,
-                prefixes: reading.texts()?,
-            })
+            Some(ParameterNames { names: reading.texts()?, prefixes: reading.texts()? })
         };
         let service = (node, "list_parameters");
-        self.call_service(service, "ListParameters", put, read)
-            .await
+        self.call_service(service, "ListParameters", put, read).await
     }
 
-    async fn describe(
-        &self,
-        node: &str,
-        names: &[String],
-    ) -> Result<Vec<Option<ParameterDescription>>, BusError> {
-        self.query_each(&DESCRIBE, node, names, read_description)
-            .await
+    async fn describe(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParameterDescription>>, BusError> {
+        self.query_each(&DESCRIBE, node, names, read_description).await
     }
 
     async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {
         let of = interfaces::message("rcl_interfaces/msg/ParameterEvent")?;
-        let (of, qos) = (
-            WireType::from_message(&of),
-            QosProfile::keep_last(MOST_EVENTS),
-        );
+        let (of, qos) = (WireType::from_message(&of), QosProfile::keep_last(MOST_EVENTS));
         let subscription = self.subscribe(EVENTS, of, qos).await?;
         self.wait_for_publishers(&subscription, node).await?;
         let node = node.map(str::to_owned);
@@ -140,18 +114,9 @@ struct ParameterQuery {
     type_name: &'static str,
 }
 
-const GET: ParameterQuery = ParameterQuery {
-    service: "get_parameters",
-    type_name: "GetParameters",
-};
-const TYPES: ParameterQuery = ParameterQuery {
-    service: "get_parameter_types",
-    type_name: "GetParameterTypes",
-};
-const DESCRIBE: ParameterQuery = ParameterQuery {
-    service: "describe_parameters",
-    type_name: "DescribeParameters",
-};
+const GET: ParameterQuery = ParameterQuery { service: "get_parameters", type_name: "GetParameters" };
+const TYPES: ParameterQuery = ParameterQuery { service: "get_parameter_types", type_name: "GetParameterTypes" };
+const DESCRIBE: ParameterQuery = ParameterQuery { service: "describe_parameters", type_name: "DescribeParameters" };
 
 /// A change that is not sent.
 struct RefusedChange {
@@ -195,24 +160,17 @@ impl Ros2Bus {
         put_texts(names, &mut put);
         let service = (node, by_name.service);
         let read = |reading: &mut ParameterReader<'_>| reading.list(read);
-        self.call_service(service, by_name.type_name, put, read)
-            .await
+        self.call_service(service, by_name.type_name, put, read).await
     }
 
     /// Waits until the events of this node, or of all existing nodes, are received.
-    async fn wait_for_publishers(
-        &self,
-        events: &Subscription,
-        node: Option<&str>,
-    ) -> Result<(), BusError> {
+    async fn wait_for_publishers(&self, events: &Subscription, node: Option<&str>) -> Result<(), BusError> {
         let mut matched = events.matched.clone();
         if let Some(node) = node {
             let heard = matched.wait_for(|matched| matched.has_node(node));
             let heard = timeout(PATIENCE, heard).await.map(drop);
-            return heard.map_err(|_| BusError::Timeout {
-                what: format!("topic {EVENTS} of node {node}"),
-                after: PATIENCE,
-            });
+            return heard
+                .map_err(|_| BusError::Timeout { what: format!("topic {EVENTS} of node {node}"), after: PATIENCE });
         }
         let graph = self.graph().borrow().clone();
         let nodes = graph.topics.get(EVENTS).map(|ends| &ends.publishers);
@@ -231,14 +189,12 @@ impl Ros2Bus {
         node: &str,
         changes: Vec<ParamChange>,
     ) -> Result<Vec<Result<(String, TypedValue), RefusedChange>>, BusError> {
-        let depends =
-            |(_, value): &&ParamChange| value.as_ref().is_some_and(values::depends_on_kind);
+        let depends = |(_, value): &&ParamChange| value.as_ref().is_some_and(values::depends_on_kind);
         let names = changes.iter().filter(depends).map(|(key, _)| key.clone());
         let names: Vec<String> = names.collect();
         let mut kinds = Vec::new();
         if !names.is_empty() {
-            let read =
-                |reading: &mut ParameterReader<'_>| reading.byte().map(ParameterKind::from_number);
+            let read = |reading: &mut ParameterReader<'_>| reading.byte().map(ParameterKind::from_number);
             kinds = self.query_each(&TYPES, node, &names, read).await?;
         }
         let mut kinds = kinds.into_iter();
@@ -275,10 +231,7 @@ impl Ros2Bus {
 }
 
 fn protocol_error((node, part): (&str, &str), reason: &str) -> BusError {
-    BusError::Protocol {
-        what: format!("service {node}/{part}"),
-        reason: reason.to_owned(),
-    }
+    BusError::Protocol { what: format!("service {node}/{part}"), reason: reason.to_owned() }
 }
 
 fn put_texts(texts: &[String], put: &mut CdrWriter) {
@@ -320,19 +273,11 @@ fn read_description(reading: &mut ParameterReader<'_>) -> Option<ParameterDescri
 }
 
 fn read_double_range(reading: &mut ParameterReader<'_>) -> Option<DoubleRange> {
-    Some(DoubleRange {
-        from: reading.double()?,
-        to: reading.double()?,
-        step: reading.double()?,
-    })
+    Some(DoubleRange { from: reading.double()?, to: reading.double()?, step: reading.double()? })
 }
 
 fn read_integer_range(reading: &mut ParameterReader<'_>) -> Option<IntegerRange> {
-    Some(IntegerRange {
-        from: reading.integer()?,
-        to: reading.integer()?,
-        step: reading.unsigned_integer()?,
-    })
+    Some(IntegerRange { from: reading.integer()?, to: reading.integer()?, step: reading.unsigned_integer()? })
 }
 
 /// Parameter events received on the topic that all nodes share.
@@ -365,10 +310,7 @@ impl ParameterEvents for ParameterEventStream {
 }
 
 /// Reads an event; the inner `None` means that it is of another node.
-fn read_event(
-    reading: &mut ParameterReader<'_>,
-    of: Option<&str>,
-) -> Option<Option<ParameterEvent>> {
+fn read_event(reading: &mut ParameterReader<'_>, of: Option<&str>) -> Option<Option<ParameterEvent>> {
     reading.skip_time()?;
     let node = reading.text()?;
     if of.is_some_and(|of| of != node) {

@@ -49,18 +49,11 @@ pub(crate) fn identity(node: &str) -> NodeIdentity {
 /// command line does not set itself, and the mark by which its nodes are known.
 pub(crate) fn robot_identity(node: &str, says: Naming) -> NodeIdentity {
     let (above, last) = split_name(node);
-    let name = says
-        .name
-        .then(|| ["-r".to_owned(), format!("__node:={last}")]);
-    let namespace = says
-        .namespace
-        .then(|| ["-r".to_owned(), format!("__ns:={}", or_root(above))]);
+    let name = says.name.then(|| ["-r".to_owned(), format!("__node:={last}")]);
+    let namespace = says.namespace.then(|| ["-r".to_owned(), format!("__ns:={}", or_root(above))]);
     let mark = enclave_for(node).map(|mark| ["--enclave".to_owned(), mark]);
     let told = [name, namespace, mark].into_iter().flatten();
-    NodeIdentity {
-        arguments: ros_arguments(told),
-        environment: BTreeMap::new(),
-    }
+    NodeIdentity { arguments: ros_arguments(told), environment: BTreeMap::new() }
 }
 
 /// Returns the enclave of a process that runs as the robot's node of this name; it identifies all nodes of the process,
@@ -102,10 +95,7 @@ pub(crate) fn first_rule_position(argv: &[String]) -> usize {
 /// several, the last one applies.
 pub(crate) fn enclave_identity(enclave: &str) -> NodeIdentity {
     let argument = ["--enclave".to_owned(), enclave.to_owned()];
-    NodeIdentity {
-        arguments: ros_arguments(std::iter::once(argument)),
-        environment: BTreeMap::new(),
-    }
+    NodeIdentity { arguments: ros_arguments(std::iter::once(argument)), environment: BTreeMap::new() }
 }
 
 /// Returns the arguments that set the parameters of the node of this absolute name: those below its name, and those
@@ -126,8 +116,7 @@ pub(crate) fn parameter_arguments(node: &str, all: &BTreeMap<String, ParamValue>
         }
     }
     let rules = given.iter();
-    let mut arguments =
-        ros_arguments(rules.map(|(name, value)| ["-p".to_owned(), format!("{name}:={value}")]));
+    let mut arguments = ros_arguments(rules.map(|(name, value)| ["-p".to_owned(), format!("{name}:={value}")]));
     if !arguments.is_empty() {
         arguments.push(END.to_owned());
     }
@@ -160,18 +149,14 @@ pub fn yaml(value: &ParamValue) -> String {
         ParamValue::Binary(bytes) => yaml_list(bytes.iter().map(|byte| byte.to_string())),
         ParamValue::List(items) => {
             // A list has one type; `[1, 2.5]` means doubles.
-            let doubles = items
-                .iter()
-                .any(|item| matches!(item, ParamValue::Double(_)));
+            let doubles = items.iter().any(|item| matches!(item, ParamValue::Double(_)));
             yaml_list(items.iter().map(|item| match item {
                 ParamValue::Int(value) if doubles => yaml_double(*value as f64),
                 item => yaml(item),
             }))
         }
         ParamValue::Map(entries) => {
-            let entries = entries
-                .iter()
-                .map(|(name, value)| format!("{}: {}", quote(name), yaml(value)));
+            let entries = entries.iter().map(|(name, value)| format!("{}: {}", quote(name), yaml(value)));
             format!("{{{}}}", entries.collect::<Vec<_>>().join(", "))
         }
     }
@@ -204,9 +189,7 @@ fn or_root(namespace: &str) -> &str {
 fn remap_identity(rules: &[(&str, &str)]) -> NodeIdentity {
     let rules = rules.iter();
     NodeIdentity {
-        arguments: ros_arguments(
-            rules.map(|(from, to)| ["-r".to_owned(), format!("{from}:={to}")]),
-        ),
+        arguments: ros_arguments(rules.map(|(from, to)| ["-r".to_owned(), format!("{from}:={to}")])),
         environment: BTreeMap::new(),
     }
 }
@@ -217,9 +200,7 @@ fn ros_arguments(rules: impl Iterator<Item = [String; 2]>) -> Vec<String> {
     if rules.is_empty() {
         return rules;
     }
-    std::iter::once(ROS_ARGUMENTS.to_owned())
-        .chain(rules)
-        .collect()
+    std::iter::once(ROS_ARGUMENTS.to_owned()).chain(rules).collect()
 }
 
 #[cfg(test)]
@@ -256,10 +237,7 @@ mod tests {
         let all = ["--ros-args", "-r", "__node:=see", "-r", "__ns:=/front"];
         assert_eq!(told(&[("", "/front/see")]), all);
         let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
-        assert_eq!(
-            first_rule_position(&argv("/x -v --ros-args -r __ns:=/front")),
-            2
-        );
+        assert_eq!(first_rule_position(&argv("/x -v --ros-args -r __ns:=/front")), 2);
         assert_eq!(first_rule_position(&argv("/x -v")), 2);
     }
 
@@ -271,42 +249,26 @@ mod tests {
         };
         let mark = "--enclave /cloudroid_link/camera/see";
         assert_eq!(told(false, false), format!("--ros-args {mark}"));
-        assert_eq!(
-            told(false, true),
-            format!("--ros-args -r __ns:=/camera {mark}")
-        );
+        assert_eq!(told(false, true), format!("--ros-args -r __ns:=/camera {mark}"));
         let all = format!("--ros-args -r __node:=see -r __ns:=/camera {mark}");
         assert_eq!(told(true, true), all);
         let long = format!("/{}", "x".repeat(240));
         let all = Naming::default();
-        assert_eq!(
-            robot_identity(&long, all).arguments,
-            identity(&long).arguments
-        );
+        assert_eq!(robot_identity(&long, all).arguments, identity(&long).arguments);
     }
 
     #[test]
     fn a_node_is_told_its_name_and_its_namespace() {
-        for (node, name, namespace) in [
-            ("/camera/see", "see", "/camera"),
-            ("/see", "see", "/"),
-            ("see", "see", "/"),
-            ("/a/b/c", "c", "/a/b"),
-        ] {
+        for (node, name, namespace) in
+            [("/camera/see", "see", "/camera"), ("/see", "see", "/"), ("see", "see", "/"), ("/a/b/c", "c", "/a/b")]
+        {
             let identity = identity(node);
             let rules = [format!("__node:={name}"), format!("__ns:={namespace}")];
             let [name, namespace] = &rules;
-            assert_eq!(
-                identity.arguments,
-                ["--ros-args", "-r", name, "-r", namespace],
-                "{node}"
-            );
+            assert_eq!(identity.arguments, ["--ros-args", "-r", name, "-r", namespace], "{node}");
             assert!(identity.environment.is_empty());
         }
-        assert_eq!(
-            enclave_identity("/x").arguments,
-            ["--ros-args", "--enclave", "/x"]
-        );
+        assert_eq!(enclave_identity("/x").arguments, ["--ros-args", "--enclave", "/x"]);
     }
 
     #[test]
@@ -314,10 +276,7 @@ mod tests {
         let environment = environment("/root");
         assert_eq!(environment["ROS_LOG_DIR"], "/root/log");
         assert_eq!(environment["ROS_DOMAIN_ID"], "0");
-        assert_eq!(
-            (&*environment["HOME"], &*environment[HOME]),
-            ("/root", "/root")
-        );
+        assert_eq!((&*environment["HOME"], &*environment[HOME]), ("/root", "/root"));
     }
 
     fn value(json: &str) -> ParamValue {

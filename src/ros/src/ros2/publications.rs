@@ -13,9 +13,7 @@ use super::quality;
 use super::seen::{self, DiscoverySnapshot};
 use super::state::Ros2BusState;
 use super::{names, show, topic_type};
-use crate::bus::{
-    BusError, IncompatiblePeer, MatchedPeers, PeerId, Publisher, QosProfile, TopicPeer, WireType,
-};
+use crate::bus::{BusError, IncompatiblePeer, MatchedPeers, PeerId, Publisher, QosProfile, TopicPeer, WireType};
 
 /// Advertises a topic with a writer of its own.
 pub(super) async fn advertise(
@@ -57,9 +55,7 @@ pub(super) async fn advertise(
 /// Checks that all advertisements of a topic have one type, and counts this one.
 fn claim(bus: &Ros2BusState, name: &str, of: WireType) -> Result<Arc<WireType>, BusError> {
     let mut adverts = bus.adverts.lock();
-    let (before, count) = adverts
-        .entry(name.to_owned())
-        .or_insert_with(|| (Arc::new(of.clone()), 0));
+    let (before, count) = adverts.entry(name.to_owned()).or_insert_with(|| (Arc::new(of.clone()), 0));
     if before.name != of.name || !before.is_compatible_with(&of) {
         return Err(BusError::TypeMismatch {
             what: format!("advertisement of {name}"),
@@ -112,22 +108,17 @@ impl SubscriberWatcher {
             let peer = seen.peer(reader.guid);
             let theirs = seen::wire_type(reader);
             if theirs.is_compatible_with(&self.of) {
-                now.peers.push(TopicPeer {
-                    id: peer,
-                    connected: ends.confirmed.contains(&reader.guid),
-                    offer: None,
-                });
+                now.peers.push(TopicPeer { id: peer, connected: ends.confirmed.contains(&reader.guid), offer: None });
             } else {
                 let why = show::type_mismatch_text(&theirs, &self.of);
                 now.refused.push(IncompatiblePeer { peer, why });
             }
         }
         let refused = ends.refused.iter().filter(|(reader, _)| named(reader));
-        now.refused
-            .extend(refused.map(|(reader, why)| IncompatiblePeer {
-                peer: seen.peer(reader.guid),
-                why: quality::mismatch_text(why, &self.qos, &reader.qos),
-            }));
+        now.refused.extend(refused.map(|(reader, why)| IncompatiblePeer {
+            peer: seen.peer(reader.guid),
+            why: quality::mismatch_text(why, &self.qos, &reader.qos),
+        }));
         // Endpoints with another type name do not match at all.
         for reader in seen.readers(&self.topic).iter().filter(|it| named(it)) {
             let theirs = seen::wire_type(reader);

@@ -1,9 +1,6 @@
 //! Quality of service: conversion between the bus and DDS.
 
-use rtps::{
-    DurabilityKind, EndpointData, EndpointQos, HistoryKind, LivelinessKind, Mismatch,
-    ReliabilityKind,
-};
+use rtps::{DurabilityKind, EndpointData, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind};
 
 use crate::bus::{self, QosProfile};
 
@@ -95,18 +92,10 @@ pub(crate) fn merge_qos(one: QosProfile, two: QosProfile, publishes: bool) -> Qo
     let reliable = [one, two].map(|it| it.reliability == bus::QosReliability::Reliable);
     let latching = [one, two].map(|it| it.is_latching());
     let both = |of: [bool; 2]| {
-        if publishes {
-            of[0] || of[1]
-        } else {
-            of[0] && of[1]
-        }
+        if publishes { of[0] || of[1] } else { of[0] && of[1] }
     };
     let joined = QosProfile {
-        reliability: if both(reliable) {
-            bus::QosReliability::Reliable
-        } else {
-            bus::QosReliability::BestEffort
-        },
+        reliability: if both(reliable) { bus::QosReliability::Reliable } else { bus::QosReliability::BestEffort },
         depth: one.depth.max(two.depth),
         ..one
     };
@@ -114,38 +103,18 @@ pub(crate) fn merge_qos(one: QosProfile, two: QosProfile, publishes: bool) -> Qo
 }
 
 /// Describes why a writer and a reader do not match, with both profiles.
-pub(super) fn mismatch_text(
-    why: &[Mismatch],
-    offered: &EndpointQos,
-    requested: &EndpointQos,
-) -> String {
+pub(super) fn mismatch_text(why: &[Mismatch], offered: &EndpointQos, requested: &EndpointQos) -> String {
     let reasons: Vec<String> = why.iter().map(Mismatch::to_string).collect();
-    format!(
-        "{} (publisher: {}; subscriber: {})",
-        reasons.join("; "),
-        profile(offered),
-        profile(requested)
-    )
+    format!("{} (publisher: {}; subscriber: {})", reasons.join("; "), profile(offered), profile(requested))
 }
 
 /// Describes a profile in the terms of ROS 2's tools; infinite durations are left out.
 fn profile(qos: &EndpointQos) -> String {
     let mut words = vec![qos.reliability.to_string(), qos.durability.to_string()];
-    let lease = qos
-        .lease
-        .is_some()
-        .then(|| format!("liveliness {}", qos.liveliness));
+    let lease = qos.lease.is_some().then(|| format!("liveliness {}", qos.liveliness));
     words.extend(lease);
-    let times = [
-        ("deadline", qos.deadline),
-        ("lifespan", qos.lifespan),
-        ("liveliness lease", qos.lease),
-    ];
-    words.extend(
-        times
-            .iter()
-            .filter_map(|(what, time)| time.map(|time| format!("{what} {} s", time.as_secs_f64()))),
-    );
+    let times = [("deadline", qos.deadline), ("lifespan", qos.lifespan), ("liveliness lease", qos.lease)];
+    words.extend(times.iter().filter_map(|(what, time)| time.map(|time| format!("{what} {} s", time.as_secs_f64()))));
     words.join(", ")
 }
 
@@ -179,14 +148,8 @@ mod tests {
 
     #[test]
     fn a_refusal_says_both_profiles() {
-        let offered = EndpointQos {
-            reliability: ReliabilityKind::BestEffort,
-            ..EndpointQos::default()
-        };
-        let requested = EndpointQos {
-            deadline: Some(Duration::from_millis(100)),
-            ..EndpointQos::default()
-        };
+        let offered = EndpointQos { reliability: ReliabilityKind::BestEffort, ..EndpointQos::default() };
+        let requested = EndpointQos { deadline: Some(Duration::from_millis(100)), ..EndpointQos::default() };
         let why = mismatch_text(&offered.mismatches(&requested), &offered, &requested);
         assert_eq!(
             why,

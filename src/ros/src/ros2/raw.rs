@@ -6,9 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{
-    DurabilityKind, EndpointMatches, EndpointQos, Guid, ReceivedSample, Sink, TopicDescription,
-};
+use rtps::{DurabilityKind, EndpointMatches, EndpointQos, Guid, ReceivedSample, Sink, TopicDescription};
 use tokio::sync::watch;
 
 use super::ends::{ReaderEnd, WriterEnd};
@@ -74,19 +72,14 @@ pub(super) fn reader(
     let kept: Vec<(Guid, Bytes)> = bus.hub.with_topic(topic, |local| {
         local.ears.push((guid, Arc::clone(&ear)));
         let kept = local.writers.iter();
-        kept.filter_map(|(writer, last)| Some((*writer, last.clone()?)))
-            .collect()
+        kept.filter_map(|(writer, last)| Some((*writer, last.clone()?))).collect()
     });
     if qos.durability >= DurabilityKind::TransientLocal {
         for (writer, last) in kept {
             ear.on_message(last, writer);
         }
     }
-    RawReader {
-        bus: Arc::clone(bus),
-        topic: topic.clone(),
-        end,
-    }
+    RawReader { bus: Arc::clone(bus), topic: topic.clone(), end }
 }
 
 impl RawReader {
@@ -125,15 +118,10 @@ pub(super) struct RawWriter {
 }
 
 /// Creates a writer of a topic.
-pub(super) fn writer(
-    bus: &Arc<Ros2BusState>,
-    topic: &TopicDescription,
-    qos: EndpointQos,
-) -> RawWriter {
+pub(super) fn writer(bus: &Arc<Ros2BusState>, topic: &TopicDescription, qos: EndpointQos) -> RawWriter {
     let end = WriterEnd::open(bus, topic, qos);
     let guid = end.guid();
-    bus.hub
-        .with_topic(topic, |local| drop(local.writers.insert(guid, None)));
+    bus.hub.with_topic(topic, |local| drop(local.writers.insert(guid, None)));
     RawWriter {
         bus: Arc::clone(bus),
         topic: topic.clone(),
@@ -168,8 +156,6 @@ impl RawWriter {
 impl Drop for RawWriter {
     fn drop(&mut self) {
         let guid = self.guid();
-        self.bus
-            .hub
-            .with_topic(&self.topic, |local| drop(local.writers.remove(&guid)));
+        self.bus.hub.with_topic(&self.topic, |local| drop(local.writers.remove(&guid)));
     }
 }

@@ -63,14 +63,10 @@ impl Replies {
     fn dispatch(&self, related: Option<SampleIdentity>, payload: Bytes) {
         let Some(own) = self.own.get() else { return };
         let (key, response) = match related {
-            Some(to) if to.writer == own.reader || to.writer == own.writer => {
-                (ReplyKey::Number(to.number.0), payload)
-            }
+            Some(to) if to.writer == own.reader || to.writer == own.writer => (ReplyKey::Number(to.number.0), payload),
             Some(_) => return,
             None => match RequestHeader::split(&payload) {
-                Some((header, response)) if header.client == own.number => {
-                    (ReplyKey::Header(header.number), response)
-                }
+                Some((header, response)) if header.client == own.number => (ReplyKey::Header(header.number), response),
                 _ => return,
             },
         };
@@ -92,11 +88,7 @@ impl Replies {
         state.waiting.insert(key, sender);
         drop(state);
         let replies = Arc::clone(self);
-        Some(PendingReply {
-            replies,
-            key,
-            answer,
-        })
+        Some(PendingReply { replies, key, answer })
     }
 
     /// Prepares to write a request; `None` if too many calls are pending.
@@ -128,11 +120,7 @@ impl Writing {
         }
         drop(state);
         let replies = Arc::clone(&self.0);
-        PendingReply {
-            replies,
-            key,
-            answer,
-        }
+        PendingReply { replies, key, answer }
     }
 }
 
@@ -172,30 +160,20 @@ mod tests {
 
     fn replies() -> Arc<Replies> {
         let replies = Arc::new(Replies::default());
-        let own = ReplyAddress {
-            reader: guid(READER),
-            writer: guid(WRITER),
-            number: 77,
-        };
+        let own = ReplyAddress { reader: guid(READER), writer: guid(WRITER), number: 77 };
         assert!(replies.own.set(own).is_ok());
         replies
     }
 
     fn related_to(kind: u8, number: i64) -> Option<SampleIdentity> {
-        Some(SampleIdentity {
-            writer: guid(kind),
-            number: SequenceNumber(number),
-        })
+        Some(SampleIdentity { writer: guid(kind), number: SequenceNumber(number) })
     }
 
     #[test]
     fn a_reply_names_our_reader_or_our_writer() {
         let replies = replies();
         for kind in [READER, WRITER] {
-            let mut waiting = replies
-                .begin_write()
-                .expect("room")
-                .with_number(SequenceNumber(5));
+            let mut waiting = replies.begin_write().expect("room").with_number(SequenceNumber(5));
             replies.dispatch(related_to(kind, 6), Bytes::from_static(b"another"));
             replies.dispatch(related_to(9, 5), Bytes::from_static(b"of another client"));
             assert!(waiting.answer.try_recv().is_err());
@@ -208,10 +186,7 @@ mod tests {
     #[test]
     fn a_reply_may_come_before_the_number_of_its_request_is_known() {
         let replies = replies();
-        let (one, two) = (
-            replies.begin_write().expect("room"),
-            replies.begin_write().expect("room"),
-        );
+        let (one, two) = (replies.begin_write().expect("room"), replies.begin_write().expect("room"));
         replies.dispatch(related_to(READER, 1), Bytes::from_static(b"first"));
         replies.dispatch(related_to(READER, 2), Bytes::from_static(b"second"));
         let mut second = two.with_number(SequenceNumber(2));
@@ -233,23 +208,16 @@ mod tests {
         }
         replies.dispatch(None, Bytes::from_static(b"short"));
         assert!(waiting.answer.try_recv().is_err());
-        let header = RequestHeader {
-            client: 77,
-            number: 5,
-        };
+        let header = RequestHeader { client: 77, number: 5 };
         replies.dispatch(None, header.join(&[0, 1, 0, 0, 9]).expect("CDR"));
-        assert_eq!(
-            waiting.answer.try_recv().expect("a reply"),
-            [0, 1, 0, 0, 9][..]
-        );
+        assert_eq!(waiting.answer.try_recv().expect("a reply"), [0, 1, 0, 0, 9][..]);
     }
 
     #[test]
     fn calls_under_way_are_bounded_and_given_up_ones_do_not_count() {
         let replies = replies();
-        let mut all: Vec<PendingReply> = (0..MAX_IN_FLIGHT as i64)
-            .filter_map(|number| replies.wait(ReplyKey::Header(number)))
-            .collect();
+        let mut all: Vec<PendingReply> =
+            (0..MAX_IN_FLIGHT as i64).filter_map(|number| replies.wait(ReplyKey::Header(number))).collect();
         assert_eq!(all.len(), MAX_IN_FLIGHT);
         assert!(replies.begin_write().is_none() && replies.wait(ReplyKey::Header(-1)).is_none());
         all.pop();

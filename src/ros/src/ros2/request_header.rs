@@ -25,16 +25,9 @@ impl RequestHeader {
         let big = representation[1] & 1 == 0;
         let number = |at: usize| -> Option<u64> {
             let bytes: [u8; 8] = header.get(at..at + 8)?.try_into().ok()?;
-            Some(if big {
-                u64::from_be_bytes(bytes)
-            } else {
-                u64::from_le_bytes(bytes)
-            })
+            Some(if big { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) })
         };
-        let header = Self {
-            client: number(0)?,
-            number: number(8)? as i64,
-        };
+        let header = Self { client: number(0)?, number: number(8)? as i64 };
         Some((header, [&representation[..], message].concat().into()))
     }
 
@@ -43,18 +36,10 @@ impl RequestHeader {
         let (representation, message) = payload.split_first_chunk::<REPRESENTATION>()?;
         let big = representation[1] & 1 == 0;
         let number = |number: u64| {
-            if big {
-                number.to_be_bytes()
-            } else {
-                number.to_le_bytes()
-            }
+            if big { number.to_be_bytes() } else { number.to_le_bytes() }
         };
         let (client, number) = (number(self.client), number(self.number as u64));
-        Some(
-            [&representation[..], &client, &number, message]
-                .concat()
-                .into(),
-        )
+        Some([&representation[..], &client, &number, message].concat().into())
     }
 }
 
@@ -64,10 +49,7 @@ mod tests {
 
     #[test]
     fn a_header_is_read_as_it_was_written() {
-        let header = RequestHeader {
-            client: 0x0102_0304_0506_0708,
-            number: -2,
-        };
+        let header = RequestHeader { client: 0x0102_0304_0506_0708, number: -2 };
         let little = header.join(&[0, 1, 0, 0, 9, 9]).expect("CDR");
         assert_eq!(little[4..12], [8, 7, 6, 5, 4, 3, 2, 1]);
         let big = header.join(&[0, 0, 0, 0, 9, 9]).expect("CDR");
@@ -83,13 +65,6 @@ mod tests {
         for length in 0..20 {
             assert!(RequestHeader::split(&Bytes::from(vec![0; length])).is_none());
         }
-        assert!(
-            RequestHeader {
-                client: 0,
-                number: 0
-            }
-            .join(&[0, 1, 0])
-            .is_none()
-        );
+        assert!(RequestHeader { client: 0, number: 0 }.join(&[0, 1, 0]).is_none());
     }
 }

@@ -32,10 +32,7 @@ pub(super) struct DiscoverySnapshot {
 }
 
 impl DiscoverySnapshot {
-    pub(super) fn new(
-        discovered: Arc<DiscoveredGraph>,
-        told: &HashMap<GuidPrefix, Arc<ParticipantEntities>>,
-    ) -> Self {
+    pub(super) fn new(discovered: Arc<DiscoveredGraph>, told: &HashMap<GuidPrefix, Arc<ParticipantEntities>>) -> Self {
         let (mut nodes, mut owners) = (BTreeMap::new(), HashMap::new());
         let mut enclaves: BTreeMap<String, BTreeSet<Arc<str>>> = BTreeMap::new();
         let mut gids = GidSize::Sixteen;
@@ -47,10 +44,7 @@ impl DiscoverySnapshot {
             let enclave = data.and_then(|data| enclave(&data.user_data));
             if let Some(enclave) = enclave.filter(|name| *name != "/") {
                 let names = entities.nodes.iter().map(|node| Arc::clone(&node.name));
-                enclaves
-                    .entry(enclave.to_owned())
-                    .or_default()
-                    .extend(names);
+                enclaves.entry(enclave.to_owned()).or_default().extend(names);
             }
             for node in &entities.nodes {
                 nodes.insert(Arc::clone(&node.name), participant(*prefix));
@@ -75,18 +69,12 @@ impl DiscoverySnapshot {
 
     /// Returns the writers of a DDS topic, whatever their types.
     pub(super) fn writers(&self, topic: &str) -> &[Arc<EndpointData>] {
-        self.writers
-            .get(topic)
-            .map(Vec::as_slice)
-            .unwrap_or_default()
+        self.writers.get(topic).map(Vec::as_slice).unwrap_or_default()
     }
 
     /// Returns the readers of a DDS topic, whatever their types.
     pub(super) fn readers(&self, topic: &str) -> &[Arc<EndpointData>] {
-        self.readers
-            .get(topic)
-            .map(Vec::as_slice)
-            .unwrap_or_default()
+        self.readers.get(topic).map(Vec::as_slice).unwrap_or_default()
     }
 
     /// Returns the node that an endpoint belongs to; `None` if it was not announced.
@@ -112,9 +100,7 @@ impl DiscoverySnapshot {
     pub(super) fn is_named(&self, end: Guid) -> bool {
         let participant = self.discovered.participants.get(&end.prefix);
         let of_ros = |it: &ParticipantData| behind_enclave(&it.user_data).is_some();
-        self.owners.contains_key(&end)
-            || self.late.contains(&end)
-            || participant.is_some_and(|it| !of_ros(it))
+        self.owners.contains_key(&end) || self.late.contains(&end) || participant.is_some_and(|it| !of_ros(it))
     }
 
     /// Returns the endpoints of topics and services whose node is not known yet.
@@ -122,9 +108,7 @@ impl DiscoverySnapshot {
         let ends = self.discovered.writers.values();
         let ends = ends.chain(self.discovered.readers.values());
         let of_ros = ends.filter(|end| names::topic_role(&end.topic).is_some());
-        of_ros
-            .map(|end| end.guid)
-            .filter(|end| !self.is_named(*end))
+        of_ros.map(|end| end.guid).filter(|end| !self.is_named(*end))
     }
 }
 
@@ -137,9 +121,7 @@ fn behind_enclave(user_data: &[u8]) -> Option<&[u8]> {
 
 /// Returns the enclave of a participant.
 fn enclave(user_data: &[u8]) -> Option<&str> {
-    let name = behind_enclave(user_data)?
-        .split(|byte| *byte == b';')
-        .next()?;
+    let name = behind_enclave(user_data)?.split(|byte| *byte == b';').next()?;
     let name = std::str::from_utf8(name).ok();
     name.filter(|name| name.len() <= MAX_ENCLAVE)
 }
@@ -164,10 +146,6 @@ fn by_topic(ends: &BTreeMap<Guid, Arc<EndpointData>>) -> HashMap<String, Vec<Arc
 pub(super) fn wire_type(end: &EndpointData) -> WireType {
     WireType {
         format: WireFormat::Cdr,
-        ..WireType::new(
-            names::ros_type(&end.type_name),
-            type_hash::message_hash(&end.user_data),
-            "",
-        )
+        ..WireType::new(names::ros_type(&end.type_name), type_hash::message_hash(&end.user_data), "")
     }
 }

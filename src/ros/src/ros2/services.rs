@@ -28,10 +28,7 @@ const MATCH: Duration = Duration::from_secs(1);
 /// Returns the QoS of service endpoints. Those of rmw keep 10 samples, which is meant for readers that are polled; here
 /// no request or reply may be lost because many clients call at once.
 pub(super) fn qos() -> EndpointQos {
-    EndpointQos {
-        history: HistoryKind::KeepLast(QUEUED as u32),
-        ..EndpointQos::default()
-    }
+    EndpointQos { history: HistoryKind::KeepLast(QUEUED as u32), ..EndpointQos::default() }
 }
 
 /// One service.
@@ -69,11 +66,7 @@ pub(super) fn lend(
     start(bus, service, ServedService { of, handler, lent })
 }
 
-fn start(
-    bus: &Arc<Ros2BusState>,
-    service: &str,
-    served: ServedService,
-) -> Result<Box<dyn Send + Sync>, BusError> {
+fn start(bus: &Arc<Ros2BusState>, service: &str, served: ServedService) -> Result<Box<dyn Send + Sync>, BusError> {
     let of = &served.of;
     let request = bus.loans.add_label(names::request(service, of)?);
     let reply = names::reply(service, of)?;
@@ -88,28 +81,16 @@ fn start(
     }
     let (queue, requests) = mpsc::channel(QUEUED);
     let service: Arc<str> = service.into();
-    let sink = RequestSink {
-        service: Arc::clone(&service),
-        queue,
-    };
+    let sink = RequestSink { service: Arc::clone(&service), queue };
     // A client that discovers the reader of requests must also discover the writer of replies.
     let writer = WriterEnd::open(bus, &reply, qos());
     let reader = ReaderEnd::open(bus, &request, qos(), Arc::new(sink));
-    let answering = ServiceResponder {
-        bus: Arc::clone(bus),
-        service: Arc::clone(&service),
-        served: Arc::clone(&served),
-        writer,
-    };
+    let answering =
+        ServiceResponder { bus: Arc::clone(bus), service: Arc::clone(&service), served: Arc::clone(&served), writer };
     let (end, ended) = oneshot::channel();
     bus.spawn(answer_all(Arc::new(answering), requests, ended));
     bus.served.send_modify(|number| *number += 1);
-    Ok(Box::new(ServerGuard {
-        bus: Arc::clone(bus),
-        service,
-        served,
-        end: Some((end, reader)),
-    }))
+    Ok(Box::new(ServerGuard { bus: Arc::clone(bus), service, served, end: Some((end, reader)) }))
 }
 
 struct ServerGuard {
@@ -223,10 +204,7 @@ impl ServiceResponder {
         let from = discovered.participants.get(&client.prefix);
         let of_cyclone = from.is_some_and(|from| from.vendor == VendorId::CYCLONE);
         let (payload, related) = (sample.payload, sample.related);
-        let written = SampleIdentity {
-            writer: client,
-            number: sample.number,
-        };
+        let written = SampleIdentity { writer: client, number: sample.number };
         let Some((asker, request)) = requester(payload, related, written, of_cyclone) else {
             tracing::debug!(service, "a request without the header of rmw_cyclonedds");
             return;
@@ -265,9 +243,7 @@ impl ServiceResponder {
     /// Waits until the client's reader of replies and this writer have matched. If they never do, the client is gone.
     async fn wait_until_matched(&self, client: Guid, asker: Requester) {
         let known = match asker {
-            Requester::Identity(identity) if !identity.writer.entity.is_writer() => {
-                Some(identity.writer)
-            }
+            Requester::Identity(identity) if !identity.writer.entity.is_writer() => Some(identity.writer),
             _ => None,
         };
         let is_it = |guid: &Guid| match known {
@@ -275,11 +251,7 @@ impl ServiceResponder {
             None => guid.prefix == client.prefix,
         };
         let mut ends = self.writer.ends();
-        let _ = timeout(
-            MATCH,
-            ends.wait_for(|ends| ends.confirmed.iter().any(is_it)),
-        )
-        .await;
+        let _ = timeout(MATCH, ends.wait_for(|ends| ends.confirmed.iter().any(is_it))).await;
     }
 }
 
@@ -298,10 +270,7 @@ fn requester(
     // rmw_fastrtps puts the client's reader of replies there; the server waits for it before replying.
     let related = related.map(|related| related.writer);
     let reader = related.filter(|guid| *guid != Guid::default());
-    let identity = SampleIdentity {
-        writer: reader.unwrap_or(written.writer),
-        ..written
-    };
+    let identity = SampleIdentity { writer: reader.unwrap_or(written.writer), ..written };
     Some((Requester::Identity(identity), payload))
 }
 
@@ -312,21 +281,16 @@ mod tests {
     use super::*;
 
     fn identity(end: u8, number: i64) -> SampleIdentity {
-        SampleIdentity {
-            writer: Guid::from([end; 16]),
-            number: SequenceNumber(number),
-        }
+        SampleIdentity { writer: Guid::from([end; 16]), number: SequenceNumber(number) }
     }
 
     #[test]
     fn a_reply_is_to_the_reader_that_a_request_names() {
         let payload = || Bytes::from_static(&[0, 1, 0, 0, 9]);
         let named = Some(identity(4, SequenceNumber::UNKNOWN.0));
-        for (related, expected) in [
-            (named, identity(4, 8)),
-            (None, identity(3, 8)),
-            (Some(identity(0, -1)), identity(3, 8)),
-        ] {
+        for (related, expected) in
+            [(named, identity(4, 8)), (None, identity(3, 8)), (Some(identity(0, -1)), identity(3, 8))]
+        {
             let found = requester(payload(), related, identity(3, 8), false);
             let Some((Requester::Identity(to), request)) = found else {
                 panic!("{related:?} should be answered by inline QoS");
@@ -337,10 +301,7 @@ mod tests {
 
     #[test]
     fn a_request_of_cyclone_has_a_header() {
-        let header = RequestHeader {
-            client: 7,
-            number: 8,
-        };
+        let header = RequestHeader { client: 7, number: 8 };
         let payload = header.join(&[0, 1, 0, 0, 9]).expect("CDR");
         let found = requester(payload, None, identity(3, 1), true);
         let Some((Requester::Header(read), request)) = found else {

@@ -29,11 +29,7 @@ pub(super) fn type_mismatch_text(theirs: &WireType, ours: &WireType) -> String {
 }
 
 /// Logs incompatible peers, once for each reason.
-pub(super) fn log_incompatible(
-    told: &mut HashMap<PeerId, String>,
-    topic: &str,
-    now: &MatchedPeers,
-) {
+pub(super) fn log_incompatible(told: &mut HashMap<PeerId, String>, topic: &str, now: &MatchedPeers) {
     let stands = |peer: &PeerId, why: &String| {
         let mut refused = now.refused.iter();
         refused.any(|refusal| refusal.peer == *peer && refusal.why == *why)
@@ -41,12 +37,7 @@ pub(super) fn log_incompatible(
     told.retain(|peer, why| stands(peer, why));
     for IncompatiblePeer { peer, why } in &now.refused {
         if !told.contains_key(peer) {
-            tracing::warn!(
-                topic,
-                node = peer.node(),
-                why,
-                "no messages pass between it and this process"
-            );
+            tracing::warn!(topic, node = peer.node(), why, "no messages pass between it and this process");
             told.insert(peer.clone(), why.clone());
         }
     }

@@ -24,12 +24,9 @@ use self::readers::Readers;
 use super::quality::{self, Quality};
 use super::seen::{self, DiscoverySnapshot};
 use super::state::Ros2BusState;
-use super::topic_in::{
-    HeldMessage, KnownWriter, ReaderSetKey, TopicIn, TopicSubscriber, TopicSubscribers,
-};
+use super::topic_in::{HeldMessage, KnownWriter, ReaderSetKey, TopicIn, TopicSubscriber, TopicSubscribers};
 use crate::bus::{
-    BusError, MessageSender, Offer, QosProfile, SerializedMessage, Subscription, WireType,
-    message_queue,
+    BusError, MessageSender, Offer, QosProfile, SerializedMessage, Subscription, WireType, message_queue,
 };
 
 /// Size below which a message to be kept is copied out of the receive buffer that it shares with others.
@@ -52,10 +49,7 @@ impl KnownWriter {
     fn new(writer: &EndpointData, wish: Quality, seen: &DiscoverySnapshot) -> Self {
         Self {
             peer: seen.peer(writer.guid),
-            offer: Offer {
-                wire_type: Arc::new(seen::wire_type(writer)),
-                latching: quality::is_latching(writer),
-            },
+            offer: Offer { wire_type: Arc::new(seen::wire_type(writer)), latching: quality::is_latching(writer) },
             quality: wish.at_most(&writer.qos),
             type_name: writer.type_name.clone(),
             named: seen.is_named(writer.guid),
@@ -70,17 +64,11 @@ pub(super) fn subscribe(
     wanted: WireType,
     qos: QosProfile,
 ) -> Result<Subscription, BusError> {
-    let key = ReaderSetKey {
-        topic: name.to_owned(),
-        type_name: wanted.name.clone(),
-        wish: Quality::from_qos(&qos),
-    };
+    let key = ReaderSetKey { topic: name.to_owned(), type_name: wanted.name.clone(), wish: Quality::from_qos(&qos) };
     let (sender, messages) = message_queue(qos.depth);
     let mut topics = bus.subscriptions.lock();
     let known = topics.get(&key).cloned();
-    let topic = known
-        .clone()
-        .unwrap_or_else(|| Arc::new(TopicIn::new(bus, &key, qos.depth)));
+    let topic = known.clone().unwrap_or_else(|| Arc::new(TopicIn::new(bus, &key, qos.depth)));
     // Before there is a reader, so that no message is missed.
     let id = topic.add(sender, wanted);
     if known.is_none() {
@@ -93,11 +81,7 @@ pub(super) fn subscribe(
         dropped: messages.drop_counter(),
         messages,
         matched: topic.matched.subscribe(),
-        guard: Box::new(ReaderGuard {
-            bus: Arc::clone(bus),
-            topic,
-            id,
-        }),
+        guard: Box::new(ReaderGuard { bus: Arc::clone(bus), topic, id }),
     })
 }
 
@@ -135,10 +119,7 @@ impl TopicIn {
         let mut wanted = locals.list.iter().map(|local| &local.wanted);
         let first = wanted.next();
         match first {
-            Some(ours)
-                if !ours.is_compatible_with(theirs)
-                    && !wanted.any(|ours| ours.is_compatible_with(theirs)) =>
-            {
+            Some(ours) if !ours.is_compatible_with(theirs) && !wanted.any(|ours| ours.is_compatible_with(theirs)) => {
                 Err(ours.clone())
             }
             _ => Ok(()),
@@ -177,12 +158,7 @@ impl TopicIn {
         if !waits {
             return self.deliver(&mut locals, writer, &source, (quality, bytes));
         }
-        locals.held.push(HeldMessage {
-            writer,
-            source,
-            quality,
-            bytes,
-        });
+        locals.held.push(HeldMessage { writer, source, quality, bytes });
         let held = locals.held.iter().map(|held| held.bytes.len());
         if locals.held.len() > MOST_HELD || held.sum::<usize>() > MOST_BYTES_HELD {
             self.release(&mut locals, |_| true);
@@ -261,8 +237,7 @@ struct ReaderSink {
 
 impl Sink for ReaderSink {
     fn on_sample(&self, sample: ReceivedSample) {
-        self.topic
-            .receive(sample.writer, self.quality, sample.payload);
+        self.topic.receive(sample.writer, self.quality, sample.payload);
     }
 }
 
@@ -281,17 +256,11 @@ impl Drop for ReaderGuard {
         let empty = locals.list.is_empty();
         drop(locals);
         let key = &self.topic.key;
-        let current = topics
-            .get(key)
-            .is_some_and(|it| Arc::ptr_eq(it, &self.topic));
+        let current = topics.get(key).is_some_and(|it| Arc::ptr_eq(it, &self.topic));
         if empty && current {
             topics.remove(key);
         }
         drop(topics);
-        if empty {
-            self.topic.close()
-        } else {
-            self.topic.changed.notify_one()
-        }
+        if empty { self.topic.close() } else { self.topic.changed.notify_one() }
     }
 }

@@ -13,9 +13,7 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::testing::{domain, join};
-use crate::bus::{
-    Bus, MatchedPeers, RosVersion, SerializedMessage, Subscription, WireType, wait_for_connected,
-};
+use crate::bus::{Bus, MatchedPeers, RosVersion, SerializedMessage, Subscription, WireType, wait_for_connected};
 use crate::schema::MessageType;
 
 /// Longer than anything here takes.
@@ -38,9 +36,7 @@ fn numbered_message(number: u8) -> Bytes {
 
 async fn next(subscription: &mut Subscription) -> SerializedMessage {
     let message = timeout(LONG, subscription.messages.recv()).await;
-    message
-        .expect("a message should come")
-        .expect("the bus is open")
+    message.expect("a message should come").expect("the bus is open")
 }
 
 /// Returns the numbers of the next messages.

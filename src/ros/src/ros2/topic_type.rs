@@ -37,11 +37,7 @@ fn find_known(seen: &DiscoverySnapshot, topic: &str) -> Option<WireType> {
     for ends in [seen.writers(topic), seen.readers(topic)] {
         let mut types = ends.iter().map(|end| seen::wire_type(end));
         let first = types.next();
-        let hashed = first
-            .clone()
-            .into_iter()
-            .chain(types)
-            .find(|it| !it.digest.is_any());
+        let hashed = first.clone().into_iter().chain(types).find(|it| !it.digest.is_any());
         if let Some(found) = hashed.or(first) {
             return Some(found);
         }

@@ -11,11 +11,7 @@ const DIGITS: usize = 64;
 
 /// Returns the user data of an endpoint with this digest; empty if the digest is not known.
 pub(super) fn user_data(digest: &Digest) -> Bytes {
-    if is_hash(digest.as_str()) {
-        format!("typehash={digest};").into()
-    } else {
-        Bytes::new()
-    }
+    if is_hash(digest.as_str()) { format!("typehash={digest};").into() } else { Bytes::new() }
 }
 
 /// Returns the digest of an endpoint's messages; `*` if it is missing or of an unknown version.
@@ -33,17 +29,13 @@ fn hash_value(user_data: &[u8], key: &str) -> Digest {
     let text = std::str::from_utf8(user_data).unwrap_or_default();
     let pairs = text.split(';').filter_map(|pair| pair.split_once('='));
     let mut values = pairs.filter(|(name, _)| *name == key);
-    let hash = values
-        .next()
-        .map(|(_, hash)| hash)
-        .filter(|hash| is_hash(hash));
+    let hash = values.next().map(|(_, hash)| hash).filter(|hash| is_hash(hash));
     hash.map_or_else(Digest::any, Digest::from)
 }
 
 fn is_hash(text: &str) -> bool {
-    text.strip_prefix(VERSION).is_some_and(|digits| {
-        digits.len() == DIGITS && digits.bytes().all(|digit| digit.is_ascii_hexdigit())
-    })
+    text.strip_prefix(VERSION)
+        .is_some_and(|digits| digits.len() == DIGITS && digits.bytes().all(|digit| digit.is_ascii_hexdigit()))
 }
 
 #[cfg(test)]

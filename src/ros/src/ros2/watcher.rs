@@ -102,9 +102,7 @@ impl Watcher {
         bus.seen.send_replace(Arc::clone(&seen));
         calls::drop_unserved_clients(bus, &seen);
         let services = bus.services.lock();
-        let served = services
-            .iter()
-            .map(|(name, served)| (name.as_str(), &served.of));
+        let served = services.iter().map(|(name, served)| (name.as_str(), &served.of));
         self.other_types.log_new(served, &seen);
         drop(services);
         bus.graph.send_if_modified(|_| news);
@@ -128,8 +126,7 @@ impl Watcher {
         let now = (nodes, size);
         if self.told.as_ref() != Some(&now) {
             let participant = self.bus.participant.guid();
-            self.teller
-                .write(entities::encode(participant, &now.0, size));
+            self.teller.write(entities::encode(participant, &now.0, size));
             self.told = Some(now);
         }
     }

@@ -7,11 +7,7 @@ use crate::schema::text::sections;
 
 /// Returns the text of a type generated from service `package/srv/Name`, by the suffix of its name; an empty suffix is
 /// the service itself.
-pub(crate) fn service_text(
-    service: &str,
-    text: &str,
-    ending: &str,
-) -> Result<Option<String>, SchemaError> {
+pub(crate) fn service_text(service: &str, text: &str, ending: &str) -> Result<Option<String>, SchemaError> {
     if !matches!(ending, "_Request" | "_Response") {
         return Ok(service_part(service, ending));
     }
@@ -37,11 +33,7 @@ fn service_part(service: &str, ending: &str) -> Option<String> {
 
 /// Returns the text of a type generated from action `package/action/Name`, by the suffix of its name; an empty suffix
 /// is the action itself.
-pub(crate) fn action_text(
-    action: &str,
-    text: &str,
-    ending: &str,
-) -> Result<Option<String>, SchemaError> {
+pub(crate) fn action_text(action: &str, text: &str, ending: &str) -> Result<Option<String>, SchemaError> {
     const GOAL_ID: &str = "unique_identifier_msgs/UUID goal_id\n";
     if matches!(ending, "_Goal" | "_Result" | "_Feedback") {
         let [goal, result, feedback] = sections::<3>(action, text)?;
@@ -76,18 +68,14 @@ pub(crate) fn action_text(
 /// Returns definitions that every ROS 2 system has and that actions, services and stamps need.
 pub(crate) fn well_known(name: &str) -> Option<&'static str> {
     Some(match name {
-        "builtin_interfaces/msg/Time" | "builtin_interfaces/msg/Duration" => {
-            "int32 sec\nuint32 nanosec\n"
-        }
+        "builtin_interfaces/msg/Time" | "builtin_interfaces/msg/Duration" => "int32 sec\nuint32 nanosec\n",
         "std_msgs/msg/Header" => "builtin_interfaces/Time stamp\nstring frame_id\n",
         "unique_identifier_msgs/msg/UUID" => "uint8[16] uuid\n",
         "service_msgs/msg/ServiceEventInfo" => {
             "uint8 REQUEST_SENT = 0\nuint8 REQUEST_RECEIVED = 1\nuint8 RESPONSE_SENT = 2\nuint8 RESPONSE_RECEIVED = 3\n\
              uint8 event_type\nbuiltin_interfaces/Time stamp\nchar[16] client_gid\nint64 sequence_number\n"
         }
-        "action_msgs/msg/GoalInfo" => {
-            "unique_identifier_msgs/UUID goal_id\nbuiltin_interfaces/Time stamp\n"
-        }
+        "action_msgs/msg/GoalInfo" => "unique_identifier_msgs/UUID goal_id\nbuiltin_interfaces/Time stamp\n",
         "action_msgs/msg/GoalStatus" => {
             "int8 STATUS_UNKNOWN = 0\nint8 STATUS_ACCEPTED = 1\nint8 STATUS_EXECUTING = 2\nint8 STATUS_CANCELING = 3\n\
              int8 STATUS_SUCCEEDED = 4\nint8 STATUS_CANCELED = 5\nint8 STATUS_ABORTED = 6\nGoalInfo goal_info\nint8 \

@@ -49,10 +49,7 @@ fn gather<'a>(message: &'a MessageType, found: &mut BTreeMap<&'a str, &'a Messag
 
 /// Appends a type as JSON. Names are plain ASCII, so there is nothing to escape.
 fn write_type(message: &MessageType, json: &mut String) {
-    json.push_str(&format!(
-        "{{\"type_name\": \"{}\", \"fields\": [",
-        message.name()
-    ));
+    json.push_str(&format!("{{\"type_name\": \"{}\", \"fields\": [", message.name()));
     for (index, field) in message.fields().iter().enumerate() {
         if index > 0 {
             json.push_str(", ");
@@ -65,14 +62,7 @@ fn write_type(message: &MessageType, json: &mut String) {
             Arity::Fixed(count) => count,
             _ => field.bounds.elements.unwrap_or(0),
         };
-        write_field(
-            &field.name,
-            type_id(field),
-            capacity,
-            field.bounds.text.unwrap_or(0),
-            nested,
-            json,
-        );
+        write_field(&field.name, type_id(field), capacity, field.bounds.text.unwrap_or(0), nested, json);
     }
     if message.fields().is_empty() {
         write_field(PLACEHOLDER, UINT8, 0, 0, "", json);
@@ -80,14 +70,7 @@ fn write_type(message: &MessageType, json: &mut String) {
     json.push_str("]}");
 }
 
-fn write_field(
-    name: &str,
-    type_id: u8,
-    capacity: u32,
-    string_capacity: u32,
-    nested: &str,
-    json: &mut String,
-) {
+fn write_field(name: &str, type_id: u8, capacity: u32, string_capacity: u32, nested: &str, json: &mut String) {
     // Writing to a string cannot fail.
     let _ = write!(
         json,

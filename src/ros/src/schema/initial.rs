@@ -17,11 +17,7 @@ pub(crate) enum InitialItem {
 
 impl Initial {
     /// Parses the value of a single field or of an array (`[1, 2]`).
-    pub(crate) fn parse(
-        primitive: Primitive,
-        is_array: bool,
-        written: &str,
-    ) -> Result<Initial, SyntaxError> {
+    pub(crate) fn parse(primitive: Primitive, is_array: bool, written: &str) -> Result<Initial, SyntaxError> {
         if !is_array {
             return Ok(Initial([parse_item(primitive, written)?].into()));
         }
@@ -29,9 +25,7 @@ impl Initial {
             .strip_prefix('[')
             .and_then(|rest| rest.strip_suffix(']'))
             .ok_or_else(|| SyntaxError::NotAList(written.to_owned()))?;
-        let items = elements(inside)?
-            .into_iter()
-            .map(|element| parse_item(primitive, element));
+        let items = elements(inside)?.into_iter().map(|element| parse_item(primitive, element));
         Ok(Initial(items.collect::<Result<_, _>>()?))
     }
 }
@@ -107,10 +101,8 @@ pub(crate) fn parse_item(primitive: Primitive, written: &str) -> Result<InitialI
         Primitive::Float64 => float::<f64>(written).map(f64::to_bits),
         Primitive::Time | Primitive::Duration => None,
     };
-    let bits = bits.ok_or_else(|| SyntaxError::BadValue {
-        value: written.to_owned(),
-        type_name: primitive.name().to_owned(),
-    })?;
+    let bits = bits
+        .ok_or_else(|| SyntaxError::BadValue { value: written.to_owned(), type_name: primitive.name().to_owned() })?;
     Ok(InitialItem::Scalar(bits.to_le_bytes()))
 }
 
@@ -182,10 +174,7 @@ mod tests {
             (Primitive::Int32, "1.0"),
             (Primitive::Int32, "--1"),
             (Primitive::Int32, "0x-1"),
-            (
-                Primitive::Uint64,
-                "99999999999999999999999999999999999999999999",
-            ),
+            (Primitive::Uint64, "99999999999999999999999999999999999999999999"),
             (Primitive::Float64, "one"),
         ] {
             assert!(parse_item(primitive, written).is_err(), "{written}");
@@ -203,10 +192,7 @@ mod tests {
             Ok::<Vec<_>, SyntaxError>(items.iter().map(text).collect())
         };
         assert_eq!(texts("[]").unwrap(), [""; 0]);
-        assert_eq!(
-            texts(r#"["a, b" , 'it\'s', plain word,"" ]"#).unwrap(),
-            ["a, b", "it's", "plain word", ""]
-        );
+        assert_eq!(texts(r#"["a, b" , 'it\'s', plain word,"" ]"#).unwrap(), ["a, b", "it's", "plain word", ""]);
         for (written, reason) in [
             ("[\"a]", "\"a has no closing quote"),
             ("[\"a\" b]", "\"b\" follows a value, write a comma"),

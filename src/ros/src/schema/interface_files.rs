@@ -92,10 +92,7 @@ fn assemble(key: &str, texts: &BTreeMap<String, String>) -> Result<String, Schem
     let texts = parts.iter().map(|part| {
         let name = format!("{key}{part}");
         let text = texts.get(&name).map(String::as_str);
-        text.ok_or(SchemaError::Missing {
-            name,
-            needed_by: key.to_owned(),
-        })
+        text.ok_or(SchemaError::Missing { name, needed_by: key.to_owned() })
     });
     Ok(texts.collect::<Result<Vec<_>, _>>()?.join("---\n"))
 }

@@ -112,10 +112,7 @@ impl Text {
     pub(crate) const UNBOUNDED: u32 = u32::MAX;
 
     fn from_field(field: &Field, primitive: Primitive) -> Text {
-        Text {
-            wide: primitive == Primitive::Wstring,
-            most: field.bounds.text.unwrap_or(Self::UNBOUNDED),
-        }
+        Text { wide: primitive == Primitive::Wstring, most: field.bounds.text.unwrap_or(Self::UNBOUNDED) }
     }
 }
 
@@ -139,15 +136,13 @@ impl Kind {
         match (&field.base, count) {
             (Base::Message(message), None) => Kind::Struct(message.clone()),
             (Base::Message(message), Some(count)) => Kind::Structs(message.clone(), count),
-            (Base::Primitive(primitive), count) => {
-                match (Scalar::from_primitive(*primitive), count) {
-                    (None, None) => Kind::Text(Text::from_field(field, *primitive)),
-                    (None, Some(count)) => Kind::Texts(Text::from_field(field, *primitive), count),
-                    (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
-                    (Some(scalar), None) => Kind::Scalar(scalar),
-                    (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
-                }
-            }
+            (Base::Primitive(primitive), count) => match (Scalar::from_primitive(*primitive), count) {
+                (None, None) => Kind::Text(Text::from_field(field, *primitive)),
+                (None, Some(count)) => Kind::Texts(Text::from_field(field, *primitive), count),
+                (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
+                (Some(scalar), None) => Kind::Scalar(scalar),
+                (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
+            },
         }
     }
 }

@@ -53,10 +53,7 @@ pub(crate) fn parse(version: RosVersion, name: &str, text: &str) -> Result<Parse
             reason: Box::new(reason),
         })?;
         if parsed.fields.len() + parsed.constants.len() > MAX_FIELDS {
-            return Err(SchemaError::TooLarge {
-                name: name.to_owned(),
-                reason: ExceededLimit::Fields,
-            });
+            return Err(SchemaError::TooLarge { name: name.to_owned(), reason: ExceededLimit::Fields });
         }
     }
     Ok(parsed)
@@ -77,33 +74,19 @@ fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), Synt
 /// Parses `TYPE NAME=VALUE`; the value of a string extends to the end of the line and may include `#`.
 fn parse_constant(line: &str, code: &str) -> Result<Constant, SyntaxError> {
     let (type_name, _) = code.split_once([' ', '\t', '=']).unwrap_or((code, ""));
-    let source = if type_name == "string" {
-        line.trim()
-    } else {
-        code
-    };
+    let source = if type_name == "string" { line.trim() } else { code };
     let rest = source.strip_prefix(type_name).unwrap_or_default();
     let (name, value) = rest.split_once('=').unwrap_or((rest, ""));
     let (name, value) = (name.trim(), value.trim());
     check_identifier(name)?;
     check_constant(type_name, value)?;
-    Ok(Constant {
-        name: name.to_owned(),
-        type_name: type_name.to_owned(),
-        value: value.to_owned(),
-    })
+    Ok(Constant { name: name.to_owned(), type_name: type_name.to_owned(), value: value.to_owned() })
 }
 
 fn check_constant(type_name: &str, value: &str) -> Result<(), SyntaxError> {
-    let fits = |low: i128, high: i128| {
-        value
-            .parse::<i128>()
-            .is_ok_and(|number| (low..=high).contains(&number))
-    };
+    let fits = |low: i128, high: i128| value.parse::<i128>().is_ok_and(|number| (low..=high).contains(&number));
     let valid = match Primitive::from_name(type_name) {
-        Some(Primitive::Bool) => {
-            matches!(value, "true" | "false" | "True" | "False") || value.parse::<i64>().is_ok()
-        }
+        Some(Primitive::Bool) => matches!(value, "true" | "false" | "True" | "False") || value.parse::<i64>().is_ok(),
         Some(Primitive::Int8) => fits(i8::MIN.into(), i8::MAX.into()),
         Some(Primitive::Uint8) => fits(0, u8::MAX.into()),
         Some(Primitive::Int16) => fits(i16::MIN.into(), i16::MAX.into()),
@@ -118,14 +101,7 @@ fn check_constant(type_name: &str, value: &str) -> Result<(), SyntaxError> {
             return Err(SyntaxError::BadConstantType(type_name.to_owned()));
         }
     };
-    if valid {
-        Ok(())
-    } else {
-        Err(SyntaxError::BadValue {
-            value: value.to_owned(),
-            type_name: type_name.to_owned(),
-        })
-    }
+    if valid { Ok(()) } else { Err(SyntaxError::BadValue { value: value.to_owned(), type_name: type_name.to_owned() }) }
 }
 
 fn parse_field(package: &str, code: &str) -> Result<ParsedField, SyntaxError> {
@@ -148,9 +124,7 @@ fn parse_brackets(brackets: &str) -> Result<Arity, SyntaxError> {
     let Some(inside) = brackets.strip_prefix('[') else {
         return Ok(Arity::One);
     };
-    let inside = inside
-        .strip_suffix(']')
-        .ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
+    let inside = inside.strip_suffix(']').ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
     if inside.is_empty() {
         return Ok(Arity::Variable);
     }
@@ -185,9 +159,7 @@ fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, Syn
 /// Checks that `name` is a letter followed by letters, digits and underscores.
 pub(crate) fn check_identifier(name: &str) -> Result<(), SyntaxError> {
     let mut bytes = name.bytes();
-    let legal = bytes
-        .next()
-        .is_some_and(|first| first.is_ascii_alphabetic())
+    let legal = bytes.next().is_some_and(|first| first.is_ascii_alphabetic())
         && bytes.all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
     if !legal {
         return Err(SyntaxError::BadIdentifier(name.to_owned()));

@@ -149,9 +149,7 @@ impl CodecPlan {
         fields.iter().fold(0, |sum: usize, field| {
             let values = match (&field.base, field.arity) {
                 (Base::Message(inner), Arity::One) => inner.plan.values + 1,
-                (Base::Message(inner), Arity::Fixed(count)) => {
-                    (inner.plan.values + 1).saturating_mul(count as usize)
-                }
+                (Base::Message(inner), Arity::Fixed(count)) => (inner.plan.values + 1).saturating_mul(count as usize),
                 _ => 1,
             };
             sum.saturating_add(values)
@@ -192,10 +190,7 @@ impl CodecPlan {
             }
             pending.json.extend_from_slice(&json_key(&field.name));
             pending.cbor.extend_from_slice(&cbor_key(&field.name));
-            self.names.push(Name {
-                outer,
-                name: field.name.as_str().into(),
-            });
+            self.names.push(Name { outer, name: field.name.as_str().into() });
             let name = self.names.len() - 1;
             match Kind::from_field(field) {
                 Kind::Struct(inner) if self.can_flatten(&inner.plan) => {
@@ -219,10 +214,7 @@ impl CodecPlan {
         let (json, cbor) = (self.json.0.len(), self.cbor.0.len());
         self.json.0.append(&mut pending.json);
         self.cbor.0.append(&mut pending.cbor);
-        Literal {
-            json: json..self.json.0.len(),
-            cbor: cbor..self.cbor.0.len(),
-        }
+        Literal { json: json..self.json.0.len(), cbor: cbor..self.cbor.0.len() }
     }
 }
 
@@ -248,9 +240,7 @@ impl Members {
 
     /// Returns the index of the field of this name.
     pub(crate) fn find(&self, name: &[u8]) -> Option<usize> {
-        let found = self
-            .sorted
-            .binary_search_by_key(&name, |index| self.list[*index].name.as_bytes());
+        let found = self.sorted.binary_search_by_key(&name, |index| self.list[*index].name.as_bytes());
         found.ok().map(|at| self.sorted[at])
     }
 }
@@ -281,10 +271,7 @@ fn cbor_key(name: &str) -> Vec<u8> {
 }
 
 fn member(field: &Field) -> Member {
-    Member {
-        initial: field.initial.clone(),
-        ..Member::new(&field.name, Kind::from_field(field), field.min_size())
-    }
+    Member { initial: field.initial.clone(), ..Member::new(&field.name, Kind::from_field(field), field.min_size()) }
 }
 
 /// Returns true if the fields have exactly these names and types and none is an array.

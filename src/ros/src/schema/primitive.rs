@@ -97,16 +97,8 @@ impl Primitive {
         match self {
             Primitive::Bool | Primitive::Int8 | Primitive::Uint8 => 1,
             Primitive::Int16 | Primitive::Uint16 => 2,
-            Primitive::Int32
-            | Primitive::Uint32
-            | Primitive::Float32
-            | Primitive::String
-            | Primitive::Wstring => 4,
-            Primitive::Int64
-            | Primitive::Uint64
-            | Primitive::Float64
-            | Primitive::Time
-            | Primitive::Duration => 8,
+            Primitive::Int32 | Primitive::Uint32 | Primitive::Float32 | Primitive::String | Primitive::Wstring => 4,
+            Primitive::Int64 | Primitive::Uint64 | Primitive::Float64 | Primitive::Time | Primitive::Duration => 8,
         }
     }
 }

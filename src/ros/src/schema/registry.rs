@@ -62,9 +62,7 @@ impl Registry {
     }
 
     /// Creates a registry of ROS 1 with these definitions, keyed as for [`insert`](Self::insert).
-    pub fn from_definitions(
-        definitions: &BTreeMap<String, String>,
-    ) -> Result<Registry, SchemaError> {
+    pub fn from_definitions(definitions: &BTreeMap<String, String>) -> Result<Registry, SchemaError> {
         Self::with_definitions(RosVersion::One, definitions)
     }
 
@@ -163,21 +161,15 @@ impl Registry {
     pub fn keys(&self) -> Vec<String> {
         let state = self.state.read();
         let full = state.version == RosVersion::Two;
-        let kinds = [
-            ("msg", &state.messages),
-            ("srv", &state.services),
-            ("action", &state.actions),
-        ];
+        let kinds = [("msg", &state.messages), ("srv", &state.services), ("action", &state.actions)];
         let mut keys: Vec<String> = kinds
             .into_iter()
             .flat_map(|(kind, texts)| {
-                texts.keys().map(move |name| {
-                    if full {
-                        name.clone()
-                    } else {
-                        name.replacen('/', &format!("/{kind}/"), 1)
-                    }
-                })
+                texts.keys().map(
+                    move |name| {
+                        if full { name.clone() } else { name.replacen('/', &format!("/{kind}/"), 1) }
+                    },
+                )
             })
             .collect();
         keys.sort();
@@ -193,11 +185,7 @@ impl MessageType {
     }
 
     /// Creates a message type from its full text alone.
-    pub fn parse_full_text(
-        version: RosVersion,
-        name: &str,
-        text: &str,
-    ) -> Result<Arc<MessageType>, SchemaError> {
+    pub fn parse_full_text(version: RosVersion, name: &str, text: &str) -> Result<Arc<MessageType>, SchemaError> {
         let registry = Registry::for_version(version);
         registry.insert_full_text(name, text)?;
         registry.message(name)
@@ -310,11 +298,7 @@ impl State {
     }
 }
 
-fn owner<'a>(
-    texts: &'a HashMap<String, Arc<str>>,
-    name: &str,
-    ending: &str,
-) -> Option<(&'a str, &'a str)> {
+fn owner<'a>(texts: &'a HashMap<String, Arc<str>>, name: &str, ending: &str) -> Option<(&'a str, &'a str)> {
     let (name, text) = texts.get_key_value(name.strip_suffix(ending)?)?;
     Some((name, text))
 }
@@ -355,19 +339,11 @@ fn full_name(name: &str, kind: &str) -> Result<String, SchemaError> {
 fn plain_name(name: &str, kind: &str) -> Result<String, SchemaError> {
     let bad = || SchemaError::BadName(name.chars().take(100).collect());
     let (package, rest) = name.split_once('/').ok_or_else(bad)?;
-    let short = rest
-        .strip_prefix(kind)
-        .and_then(|rest| rest.strip_prefix('/'))
-        .unwrap_or(rest);
-    check_identifier(package)
-        .and_then(|()| check_identifier(short))
-        .map_err(|_| bad())?;
+    let short = rest.strip_prefix(kind).and_then(|rest| rest.strip_prefix('/')).unwrap_or(rest);
+    check_identifier(package).and_then(|()| check_identifier(short)).map_err(|_| bad())?;
     Ok(format!("{package}/{short}"))
 }
 
 fn too_long(name: &str) -> SchemaError {
-    SchemaError::TooLarge {
-        name: name.to_owned(),
-        reason: ExceededLimit::TextBytes,
-    }
+    SchemaError::TooLarge { name: name.to_owned(), reason: ExceededLimit::TextBytes }
 }

@@ -14,15 +14,8 @@ use crate::schema::types::{ActionDef, ActionServices, Base, Field, MessageType, 
 use crate::schema::{Arity, ExceededLimit, SchemaError};
 
 /// Resolves message `name` (`package/Type`) and its dependencies.
-pub(crate) fn build_message(
-    state: &mut State,
-    name: &str,
-) -> Result<Arc<MessageType>, SchemaError> {
-    Resolver {
-        state,
-        stack: Vec::new(),
-    }
-    .message(name)
+pub(crate) fn build_message(state: &mut State, name: &str) -> Result<Arc<MessageType>, SchemaError> {
+    Resolver { state, stack: Vec::new() }.message(name)
 }
 
 /// Resolves a service's request and response.
@@ -48,15 +41,8 @@ pub(crate) fn build_service(state: &mut State, name: &str) -> Result<Arc<Service
         }
         RosVersion::Two => build_message(state, name)?.digest().to_owned(),
     };
-    let service = Arc::new(ServiceDef {
-        name: name.to_owned(),
-        md5: digest,
-        request,
-        response,
-    });
-    state
-        .resolved_services
-        .insert(name.to_owned(), service.clone());
+    let service = Arc::new(ServiceDef { name: name.to_owned(), md5: digest, request, response });
+    state.resolved_services.insert(name.to_owned(), service.clone());
     Ok(service)
 }
 
@@ -69,9 +55,7 @@ pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDe
         RosVersion::One => resolve_ros1_action(state, name)?,
         RosVersion::Two => resolve_ros2_action(state, name)?,
     });
-    state
-        .resolved_actions
-        .insert(name.to_owned(), action.clone());
+    state.resolved_actions.insert(name.to_owned(), action.clone());
     Ok(action)
 }
 
@@ -127,11 +111,7 @@ impl Resolver<'_> {
             return Ok(known.clone());
         }
         if let Some(start) = self.stack.iter().position(|outer| outer == name) {
-            let way: Vec<&str> = self.stack[start..]
-                .iter()
-                .map(String::as_str)
-                .chain([name])
-                .collect();
+            let way: Vec<&str> = self.stack[start..].iter().map(String::as_str).chain([name]).collect();
             return Err(SchemaError::Cycle(way.join(" > ")));
         }
         if self.stack.len() >= MAX_DEPTH {
@@ -140,31 +120,20 @@ impl Resolver<'_> {
         let Some(text) = self.state.message_text(name)? else {
             return Err(match self.stack.last() {
                 None => SchemaError::Unknown(name.to_owned()),
-                Some(outer) => SchemaError::Missing {
-                    name: name.to_owned(),
-                    needed_by: outer.clone(),
-                },
+                Some(outer) => SchemaError::Missing { name: name.to_owned(), needed_by: outer.clone() },
             });
         };
         self.stack.push(name.to_owned());
         let message = self.resolve(name, text)?;
         self.stack.pop();
-        self.state
-            .resolved_messages
-            .insert(name.to_owned(), message.clone());
+        self.state.resolved_messages.insert(name.to_owned(), message.clone());
         Ok(message)
     }
 
     fn resolve(&mut self, name: &str, text: Arc<str>) -> Result<Arc<MessageType>, SchemaError> {
         let version = self.state.version;
-        let Parsed {
-            constants,
-            fields: parsed,
-        } = parse(version, name, &text)?;
-        let fields = parsed
-            .into_iter()
-            .map(|field| self.field(field))
-            .collect::<Result<Vec<_>, _>>()?;
+        let Parsed { constants, fields: parsed } = parse(version, name, &text)?;
+        let fields = parsed.into_iter().map(|field| self.field(field)).collect::<Result<Vec<_>, _>>()?;
         check_size(name, &fields)?;
         let message = MessageType {
             version,
@@ -207,21 +176,14 @@ impl Resolver<'_> {
 fn md5_text(message: &MessageType) -> String {
     let mut out = String::new();
     for constant in &message.constants {
-        out.push_str(&format!(
-            "{} {}={}\n",
-            constant.type_name, constant.name, constant.value
-        ));
+        out.push_str(&format!("{} {}={}\n", constant.type_name, constant.name, constant.value));
     }
     for field in &message.fields {
         match (&field.base, field.arity) {
             (Base::Message(inner), _) => out.push_str(inner.md5()),
             (Base::Primitive(_), Arity::One) => out.push_str(&field.type_name),
-            (Base::Primitive(_), Arity::Variable) => {
-                out.push_str(&format!("{}[]", field.type_name))
-            }
-            (Base::Primitive(_), Arity::Fixed(count)) => {
-                out.push_str(&format!("{}[{count}]", field.type_name))
-            }
+            (Base::Primitive(_), Arity::Variable) => out.push_str(&format!("{}[]", field.type_name)),
+            (Base::Primitive(_), Arity::Fixed(count)) => out.push_str(&format!("{}[{count}]", field.type_name)),
         }
         out.push_str(&format!(" {}\n", field.name));
     }
@@ -230,9 +192,7 @@ fn md5_text(message: &MessageType) -> String {
 
 /// Rejects messages that are huge even when empty.
 fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
-    let size = fields
-        .iter()
-        .fold(0usize, |sum, field| sum.saturating_add(field.min_size()));
+    let size = fields.iter().fold(0usize, |sum, field| sum.saturating_add(field.min_size()));
     if size > MAX_MESSAGE_BYTES {
         return Err(too_large(name, ExceededLimit::FixedArrays));
     }
@@ -244,8 +204,5 @@ fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
 }
 
 fn too_large(name: &str, reason: ExceededLimit) -> SchemaError {
-    SchemaError::TooLarge {
-        name: name.to_owned(),
-        reason,
-    }
+    SchemaError::TooLarge { name: name.to_owned(), reason }
 }

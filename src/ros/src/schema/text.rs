@@ -21,11 +21,7 @@ pub(crate) fn sections<const N: usize>(name: &str, text: &str) -> Result<[String
         }
     }
     let found = parts.len() - 1;
-    parts.try_into().map_err(|_| SchemaError::Sections {
-        name: name.to_owned(),
-        expected: N - 1,
-        found,
-    })
+    parts.try_into().map_err(|_| SchemaError::Sections { name: name.to_owned(), expected: N - 1, found })
 }
 
 /// Returns the message's text followed by that of each dependency, in order of first mention, depth first.
@@ -36,11 +32,7 @@ pub(crate) fn full_text(message: &MessageType) -> String {
     out
 }
 
-fn append_dependencies<'a>(
-    message: &'a MessageType,
-    seen: &mut HashSet<&'a str>,
-    out: &mut String,
-) {
+fn append_dependencies<'a>(message: &'a MessageType, seen: &mut HashSet<&'a str>, out: &mut String) {
     for field in message.fields() {
         let Base::Message(dependency) = &field.base else {
             continue;
@@ -81,10 +73,7 @@ pub(crate) fn split_full_text(text: &str) -> (String, Vec<(String, String)>) {
     }
     // Every text but the last is followed by one newline that the concatenation added.
     let count = others.len();
-    for part in std::iter::once(&mut own)
-        .chain(others.iter_mut().map(|(_, part)| part))
-        .take(count)
-    {
+    for part in std::iter::once(&mut own).chain(others.iter_mut().map(|(_, part)| part)).take(count) {
         if part.ends_with('\n') {
             part.pop();
         }

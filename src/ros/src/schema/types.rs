@@ -75,9 +75,7 @@ impl Field {
     /// Returns true if the field always takes [`min_size`](Self::min_size) bytes plus padding.
     pub fn is_fixed_size(&self) -> bool {
         let one = match &self.base {
-            Base::Primitive(primitive) => {
-                !matches!(primitive, Primitive::String | Primitive::Wstring)
-            }
+            Base::Primitive(primitive) => !matches!(primitive, Primitive::String | Primitive::Wstring),
             Base::Message(message) => message.is_fixed_size(),
         };
         match self.arity {
@@ -169,8 +167,7 @@ impl MessageType {
     /// Returns true if the first field is a `std_msgs/Header`.
     pub fn has_header(&self) -> bool {
         self.fields.first().is_some_and(|first| {
-            first.arity == Arity::One
-                && matches!(&first.base, Base::Message(message) if message.is_header())
+            first.arity == Arity::One && matches!(&first.base, Base::Message(message) if message.is_header())
         })
     }
 

@@ -40,10 +40,7 @@ impl Extent {
     /// Compiles the steps for messages of this type; `None` if it has no width and height.
     pub fn for_type(message: &MessageType) -> Option<Extent> {
         let mut steps = Vec::new();
-        let file = matches!(
-            message.name(),
-            "sensor_msgs/CompressedImage" | "sensor_msgs/msg/CompressedImage"
-        );
+        let file = matches!(message.name(), "sensor_msgs/CompressedImage" | "sensor_msgs/msg/CompressedImage");
         let found = if file {
             push_file_steps(message, &mut steps)
         } else if has_sides(message) {
@@ -51,18 +48,12 @@ impl Extent {
         } else {
             push_nested_steps(message, &mut steps)
         };
-        found.map(|()| Extent {
-            version: message.version(),
-            steps,
-        })
+        found.map(|()| Extent { version: message.version(), steps })
     }
 
     /// Returns width and height of a message; `None` if it has none.
     pub fn find(&self, message: &[u8]) -> Option<(u64, u64)> {
-        let mut walk = Walk {
-            cursor: MessageCursor::new(self.version, message)?,
-            parts: 0,
-        };
+        let mut walk = Walk { cursor: MessageCursor::new(self.version, message)?, parts: 0 };
         let (mut width, mut height) = (None, None);
         for step in &self.steps {
             match *step {
@@ -183,9 +174,7 @@ fn push_skip_steps(field: &Field, steps: &mut Vec<ExtentStep>) -> Option<()> {
         }
     };
     match (one_size, times) {
-        (Some((size, alignment)), Some(times)) => {
-            steps.push(ExtentStep::Items(times, size, alignment))
-        }
+        (Some((size, alignment)), Some(times)) => steps.push(ExtentStep::Items(times, size, alignment)),
         (Some((size, alignment)), None) => steps.push(ExtentStep::CountedItems(size, alignment)),
         (None, Some(1)) => {
             for field in message.fields() {
@@ -288,27 +277,12 @@ mod tests {
     fn messages_of_ros_2_say_it_too() {
         let registry = Registry::for_version(RosVersion::Two);
         for (key, text) in [
-            (
-                "a/Picture",
-                "std_msgs/Header header\nwstring more\nuint16 height\nint64 width\nuint8[] data",
-            ),
-            (
-                "a/Info",
-                "builtin_interfaces/Time load\nfloat32 resolution\nuint32 width\nuint32 height",
-            ),
-            (
-                "a/Grid",
-                "std_msgs/Header header\nEmpty[2] none\nuint8 odd\nInfo info\nint8[] data",
-            ),
-            (
-                "a/Plain",
-                "std_msgs/Header header\nEmpty none\nfloat64[] skipped\nInfo info",
-            ),
+            ("a/Picture", "std_msgs/Header header\nwstring more\nuint16 height\nint64 width\nuint8[] data"),
+            ("a/Info", "builtin_interfaces/Time load\nfloat32 resolution\nuint32 width\nuint32 height"),
+            ("a/Grid", "std_msgs/Header header\nEmpty[2] none\nuint8 odd\nInfo info\nint8[] data"),
+            ("a/Plain", "std_msgs/Header header\nEmpty none\nfloat64[] skipped\nInfo info"),
             ("a/Empty", ""),
-            (
-                "sensor_msgs/CompressedImage",
-                "std_msgs/Header header\nstring format\nuint8[] data",
-            ),
+            ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data"),
         ] {
             registry.insert(key, text).unwrap();
         }
@@ -327,17 +301,11 @@ mod tests {
         assert_eq!(find("a/Grid", &format!("{{{info}}}")), None);
         let png = "iVBORw0KGgoAAAANSUhEUgAAAAUAAAAG";
         let compressed = format!(r#"{{"format": "png", "data": "{png}"}}"#);
-        assert_eq!(
-            find("sensor_msgs/CompressedImage", &compressed),
-            Some((5, 6))
-        );
+        assert_eq!(find("sensor_msgs/CompressedImage", &compressed), Some((5, 6)));
         // Big endian.
         let info = registry.message("a/Info").unwrap();
         let bytes = [0u32, 1, 2, 3, 640, 480].map(u32::to_be_bytes).concat();
-        assert_eq!(
-            Extent::for_type(&info).unwrap().find(&bytes),
-            Some((640, 480))
-        );
+        assert_eq!(Extent::for_type(&info).unwrap().find(&bytes), Some((640, 480)));
     }
 
     const HEADER: &str = "uint32 seq\ntime stamp\nstring frame_id";
@@ -348,28 +316,13 @@ mod tests {
             "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] \
              data",
         ),
-        (
-            "sensor_msgs/CompressedImage",
-            "Header header\nstring format\nuint8[] data",
-        ),
-        (
-            "nav_msgs/MapMetaData",
-            "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height",
-        ),
-        (
-            "nav_msgs/OccupancyGrid",
-            "Header header\nMapMetaData info\nint8[] data",
-        ),
+        ("sensor_msgs/CompressedImage", "Header header\nstring format\nuint8[] data"),
+        ("nav_msgs/MapMetaData", "time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height"),
+        ("nav_msgs/OccupancyGrid", "Header header\nMapMetaData info\nint8[] data"),
         ("a/Float", "float32 width\nfloat32 height"),
         ("a/One", "uint32 width"),
-        (
-            "a/Late",
-            "string[2] names\nstring[] more\nint64[] numbers\nint8 width\nint64 height",
-        ),
-        (
-            "a/Listed",
-            "Float[] all\nOne[3] some\nText[] texts\nuint8 width\nuint8 height",
-        ),
+        ("a/Late", "string[2] names\nstring[] more\nint64[] numbers\nint8 width\nint64 height"),
+        ("a/Listed", "Float[] all\nOne[3] some\nText[] texts\nuint8 width\nuint8 height"),
     ];
 
     fn extent(name: &str) -> Option<Extent> {
@@ -427,16 +380,8 @@ mod tests {
             ("sensor_msgs/Image", image, (640, 480)),
             ("nav_msgs/OccupancyGrid", grid, (30, 20)),
             ("a/Late", late, (7, 8)),
-            (
-                "sensor_msgs/CompressedImage",
-                compressed_image(png),
-                (640, 480),
-            ),
-            (
-                "sensor_msgs/CompressedImage",
-                compressed_image(&jpeg),
-                (640, 480),
-            ),
+            ("sensor_msgs/CompressedImage", compressed_image(png), (640, 480)),
+            ("sensor_msgs/CompressedImage", compressed_image(&jpeg), (640, 480)),
         ] {
             let extent = extent(name).expect(name);
             assert_eq!(extent.find(&message), Some(found), "{name}");

@@ -36,10 +36,7 @@ impl EndpointData {
         let mut bytes = list_header();
         let mut list = ParameterWriter::new(&mut bytes);
         list.guid(pid::ENDPOINT_GUID, self.guid);
-        list.guid(
-            pid::PARTICIPANT_GUID,
-            Guid::new(self.guid.prefix, EntityId::PARTICIPANT),
-        );
+        list.guid(pid::PARTICIPANT_GUID, Guid::new(self.guid.prefix, EntityId::PARTICIPANT));
         // Some implementations look up their existing data by this hash.
         list.guid(pid::KEY_HASH, self.guid);
         list.string(pid::TOPIC_NAME, &self.topic);
@@ -75,15 +72,10 @@ impl EndpointData {
         let mut input = parameter_list(payload)?;
         while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
             match number {
-                pid::TOPIC_NAME => {
-                    topic = Some(check_length(number, value.text(number)?)?.to_owned())
-                }
-                pid::TYPE_NAME => {
-                    type_name = Some(check_length(number, value.text(number)?)?.to_owned())
-                }
+                pid::TOPIC_NAME => topic = Some(check_length(number, value.text(number)?)?.to_owned()),
+                pid::TYPE_NAME => type_name = Some(check_length(number, value.text(number)?)?.to_owned()),
                 pid::USER_DATA => {
-                    data.user_data =
-                        Bytes::copy_from_slice(check_length(number, value.byte_sequence()?)?)
+                    data.user_data = Bytes::copy_from_slice(check_length(number, value.byte_sequence()?)?)
                 }
                 pid::UNICAST_LOCATOR => push_locator(&mut data.unicast, value.locator()?),
                 pid::EXPECTS_INLINE_QOS => data.expects_inline_qos = value.byte()? != 0,
@@ -97,11 +89,7 @@ impl EndpointData {
 }
 
 fn check_length<T: AsRef<[u8]> + ?Sized>(number: u16, value: &T) -> Result<&T, WireError> {
-    if value.as_ref().len() <= LONGEST {
-        Ok(value)
-    } else {
-        Err(WireError::Value(number))
-    }
+    if value.as_ref().len() <= LONGEST { Ok(value) } else { Err(WireError::Value(number)) }
 }
 
 /// Decodes only the GUID, which must be known before the rest is read.

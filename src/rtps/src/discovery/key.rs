@@ -9,10 +9,7 @@ use crate::{EntityId, Guid};
 /// Returns the GUID that a sample is about, from its key hash, which is the GUID itself, or from its payload, which may
 /// be complete or only a key.
 pub fn guid_of_key(data: &Data) -> Option<Guid> {
-    data.inline
-        .key_hash
-        .map(Guid::from)
-        .or_else(|| data.payload.as_ref().and_then(guid_of_payload))
+    data.inline.key_hash.map(Guid::from).or_else(|| data.payload.as_ref().and_then(guid_of_payload))
 }
 
 fn guid_of_payload(payload: &Bytes) -> Option<Guid> {
@@ -33,14 +30,7 @@ pub fn key_payload(guid: Guid) -> Bytes {
     let mut bytes = list_header();
     let mut list = ParameterWriter::new(&mut bytes);
     let is_participant = guid.entity == EntityId::PARTICIPANT;
-    list.guid(
-        if is_participant {
-            pid::PARTICIPANT_GUID
-        } else {
-            pid::ENDPOINT_GUID
-        },
-        guid,
-    );
+    list.guid(if is_participant { pid::PARTICIPANT_GUID } else { pid::ENDPOINT_GUID }, guid);
     list.end();
     bytes.into()
 }

@@ -6,9 +6,7 @@ use bytes::Bytes;
 
 use super::ParticipantData;
 use crate::locator::Locator;
-use crate::wire::{
-    ParameterWriter, WireError, WireReader, list_header, next_parameter, parameter_list, pid,
-};
+use crate::wire::{ParameterWriter, WireError, WireReader, list_header, next_parameter, parameter_list, pid};
 use crate::{EntityId, Guid, VendorId};
 
 /// Default lease duration (8.5.3.2).
@@ -46,10 +44,7 @@ impl ParticipantData {
         let mut list = ParameterWriter::new(&mut bytes);
         list.raw(pid::PROTOCOL_VERSION, &self.version);
         list.raw(pid::VENDOR_ID, &self.vendor.0);
-        list.guid(
-            pid::PARTICIPANT_GUID,
-            Guid::new(self.prefix, EntityId::PARTICIPANT),
-        );
+        list.guid(pid::PARTICIPANT_GUID, Guid::new(self.prefix, EntityId::PARTICIPANT));
         for locator in &self.discovery {
             list.locator(pid::METATRAFFIC_UNICAST_LOCATOR, locator);
         }
@@ -97,9 +92,7 @@ impl ParticipantData {
                 _ => data.set_parameter(number, value)?,
             }
         }
-        data.prefix = guid
-            .ok_or(WireError::Missing(pid::PARTICIPANT_GUID))?
-            .prefix;
+        data.prefix = guid.ok_or(WireError::Missing(pid::PARTICIPANT_GUID))?.prefix;
         Ok(data)
     }
 
@@ -109,9 +102,7 @@ impl ParticipantData {
             pid::VENDOR_ID => self.vendor = VendorId(value.array()?),
             pid::DOMAIN_ID => self.domain = Some(value.u32()?),
             pid::DOMAIN_TAG if !value.text(number)?.is_empty() => {
-                return Err(WireError::NotUnderstood(
-                    pid::DOMAIN_TAG | pid::MUST_BE_UNDERSTOOD,
-                ));
+                return Err(WireError::NotUnderstood(pid::DOMAIN_TAG | pid::MUST_BE_UNDERSTOOD));
             }
             pid::ENTITY_NAME => self.name = String::from_utf8_lossy(value.string()?).into_owned(),
             pid::USER_DATA => self.user_data = Bytes::copy_from_slice(value.byte_sequence()?),

@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use crate::qos::{
-    DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, ReliabilityKind, Representations,
-};
+use crate::qos::{DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, ReliabilityKind, Representations};
 use crate::wire::{ParameterWriter, WireError, WireReader, pid};
 
 /// Maximum blocking time of a writer, which only the writer itself uses. Default of DDS.
@@ -27,11 +25,7 @@ pub(super) const KNOWN: [u16; 7] = [
 /// Returns the default QoS of a writer or reader.
 pub(super) fn default_qos(is_writer: bool) -> EndpointQos {
     EndpointQos {
-        reliability: if is_writer {
-            ReliabilityKind::Reliable
-        } else {
-            ReliabilityKind::BestEffort
-        },
+        reliability: if is_writer { ReliabilityKind::Reliable } else { ReliabilityKind::BestEffort },
         durability: DurabilityKind::Volatile,
         history: HistoryKind::KeepLast(1),
         deadline: None,
@@ -79,11 +73,7 @@ pub(super) fn write_qos(qos: &EndpointQos, list: &mut ParameterWriter) {
 }
 
 /// Sets one policy from its parameter.
-pub(super) fn set_parameter(
-    qos: &mut EndpointQos,
-    number: u16,
-    mut value: WireReader,
-) -> Result<(), WireError> {
+pub(super) fn set_parameter(qos: &mut EndpointQos, number: u16, mut value: WireReader) -> Result<(), WireError> {
     match number {
         pid::RELIABILITY => {
             qos.reliability = match value.u32()? {

@@ -14,22 +14,17 @@ use crate::wire::{Data, InlineQos, ParticipantMessage, WireError};
 use crate::{EntityId, SequenceNumber};
 
 fn locators() -> impl Strategy<Value = Vec<Locator>> {
-    let other =
-        (any::<i32>(), any::<u32>(), any::<[u8; 16]>()).prop_map(|(kind, port, address)| Locator {
-            kind,
-            port,
-            address,
-        });
-    let udp = (any::<[u8; 4]>(), any::<u16>())
-        .prop_map(|(ip, port)| Locator::from((Ipv4Addr::from(ip), port)));
+    let other = (any::<i32>(), any::<u32>(), any::<[u8; 16]>()).prop_map(|(kind, port, address)| Locator {
+        kind,
+        port,
+        address,
+    });
+    let udp = (any::<[u8; 4]>(), any::<u16>()).prop_map(|(ip, port)| Locator::from((Ipv4Addr::from(ip), port)));
     vec(prop_oneof![other, udp], 0..4)
 }
 
 fn duration() -> impl Strategy<Value = Option<Duration>> {
-    option::of(
-        (0..i32::MAX as u64, 0..1_000_000_000u32)
-            .prop_map(|(seconds, nanos)| Duration::new(seconds, nanos)),
-    )
+    option::of((0..i32::MAX as u64, 0..1_000_000_000u32).prop_map(|(seconds, nanos)| Duration::new(seconds, nanos)))
 }
 
 fn user_data() -> impl Strategy<Value = Bytes> {
@@ -37,110 +32,55 @@ fn user_data() -> impl Strategy<Value = Bytes> {
 }
 
 fn participant() -> impl Strategy<Value = ParticipantData> {
-    let who = (
-        prefix(),
-        any::<[u8; 2]>(),
-        any::<[u8; 2]>(),
-        option::of(any::<u32>()),
-    );
-    let what = (
-        "[^\0]{0,20}",
-        user_data(),
-        locators(),
-        locators(),
-        any::<u32>(),
-        duration(),
-    );
-    (who, what).prop_map(
-        |(
-            (prefix, vendor, version, domain),
-            (name, user_data, discovery, user, builtin, lease),
-        )| {
-            let vendor = VendorId(vendor);
-            ParticipantData {
-                prefix,
-                vendor,
-                version,
-                domain,
-                name,
-                user_data,
-                discovery,
-                user,
-                builtin,
-                lease,
-            }
-        },
-    )
+    let who = (prefix(), any::<[u8; 2]>(), any::<[u8; 2]>(), option::of(any::<u32>()));
+    let what = ("[^\0]{0,20}", user_data(), locators(), locators(), any::<u32>(), duration());
+    (who, what).prop_map(|((prefix, vendor, version, domain), (name, user_data, discovery, user, builtin, lease))| {
+        let vendor = VendorId(vendor);
+        ParticipantData { prefix, vendor, version, domain, name, user_data, discovery, user, builtin, lease }
+    })
 }
 
 fn qos() -> impl Strategy<Value = EndpointQos> {
-    let reliability = prop_oneof![
-        Just(ReliabilityKind::BestEffort),
-        Just(ReliabilityKind::Reliable)
-    ];
+    let reliability = prop_oneof![Just(ReliabilityKind::BestEffort), Just(ReliabilityKind::Reliable)];
     let durability = prop_oneof![
         Just(DurabilityKind::Volatile),
         Just(DurabilityKind::TransientLocal),
         Just(DurabilityKind::Transient),
         Just(DurabilityKind::Persistent),
     ];
-    let history = prop_oneof![
-        (1..=i32::MAX as u32).prop_map(HistoryKind::KeepLast),
-        Just(HistoryKind::KeepAll)
-    ];
+    let history = prop_oneof![(1..=i32::MAX as u32).prop_map(HistoryKind::KeepLast), Just(HistoryKind::KeepAll)];
     let liveliness = prop_oneof![
         Just(LivelinessKind::Automatic),
         Just(LivelinessKind::ManualByParticipant),
         Just(LivelinessKind::ManualByTopic),
     ];
-    (
-        reliability,
-        durability,
-        history,
-        duration(),
-        duration(),
-        liveliness,
-        duration(),
-        vec(0u16..3, 0..3),
+    (reliability, durability, history, duration(), duration(), liveliness, duration(), vec(0u16..3, 0..3)).prop_map(
+        |(reliability, durability, history, deadline, lifespan, liveliness, lease, numbers)| EndpointQos {
+            representations: Representations::from_numbers(&numbers),
+            reliability,
+            durability,
+            history,
+            deadline,
+            lifespan,
+            liveliness,
+            lease,
+        },
     )
-        .prop_map(
-            |(reliability, durability, history, deadline, lifespan, liveliness, lease, numbers)| {
-                EndpointQos {
-                    representations: Representations::from_numbers(&numbers),
-                    reliability,
-                    durability,
-                    history,
-                    deadline,
-                    lifespan,
-                    liveliness,
-                    lease,
-                }
-            },
-        )
 }
 
 fn endpoint() -> impl Strategy<Value = EndpointData> {
     let name = "[^\0]{0,20}";
-    (
-        guid(),
-        name,
-        name,
-        qos(),
-        user_data(),
-        locators(),
-        any::<bool>(),
+    (guid(), name, name, qos(), user_data(), locators(), any::<bool>()).prop_map(
+        |(guid, topic, type_name, qos, user_data, unicast, expects_inline_qos)| EndpointData {
+            guid,
+            topic,
+            type_name,
+            qos,
+            user_data,
+            unicast,
+            expects_inline_qos,
+        },
     )
-        .prop_map(
-            |(guid, topic, type_name, qos, user_data, unicast, expects_inline_qos)| EndpointData {
-                guid,
-                topic,
-                type_name,
-                qos,
-                user_data,
-                unicast,
-                expects_inline_qos,
-            },
-        )
 }
 
 /// Asserts that what is decoded from these bytes is no larger than they are.
@@ -246,31 +186,16 @@ fn omitted_policies_have_the_defaults_of_dds() {
         representations: Representations::XCDR1,
     };
     assert_eq!((reader.qos, reader.expects_inline_qos), (unsaid, false));
-    let writer = EndpointData::from_payload(&list(&ENDPOINT.replace("00001207", "00001203")))
-        .expect("a writer");
-    assert_eq!(
-        writer.qos,
-        EndpointQos {
-            reliability: ReliabilityKind::Reliable,
-            ..unsaid
-        }
-    );
+    let writer = EndpointData::from_payload(&list(&ENDPOINT.replace("00001207", "00001203"))).expect("a writer");
+    assert_eq!(writer.qos, EndpointQos { reliability: ReliabilityKind::Reliable, ..unsaid });
 }
 
 #[test]
 fn omitted_participant_parameters_have_defaults() {
-    let told =
-        ParticipantData::from_payload(&list("5000 1000 01100001 02030405 06070809 000001c1"))
-            .expect("one");
+    let told = ParticipantData::from_payload(&list("5000 1000 01100001 02030405 06070809 000001c1")).expect("one");
     assert_eq!(told.prefix.0, [1, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9]);
-    assert_eq!(
-        (told.builtin, told.lease),
-        (0x3f, Some(Duration::from_secs(100)))
-    );
-    assert_eq!(
-        (told.domain, &*told.name, told.discovery.len()),
-        (None, "", 0)
-    );
+    assert_eq!((told.builtin, told.lease), (0x3f, Some(Duration::from_secs(100))));
+    assert_eq!((told.domain, &*told.name, told.discovery.len()), (None, "", 0));
 }
 
 #[test]
@@ -281,33 +206,19 @@ fn the_other_byte_order_is_read() {
          0058 0004 00000c3f 002c 0010 0000000b 656e636c 6176653d 2f3b3b00 0001 0000",
     );
     let told = ParticipantData::from_payload(&told).expect("a participant");
-    assert_eq!(
-        (told.version, told.vendor, told.builtin),
-        ([2, 2], VendorId::CYCLONE, 0xc3f)
-    );
-    assert_eq!(
-        told.discovery[0].udp_address(),
-        Some(SocketAddr::from(([127, 0, 0, 1], 7410)))
-    );
+    assert_eq!((told.version, told.vendor, told.builtin), ([2, 2], VendorId::CYCLONE, 0xc3f));
+    assert_eq!(told.discovery[0].udp_address(), Some(SocketAddr::from(([127, 0, 0, 1], 7410))));
     assert_eq!(told.lease, Some(Duration::from_millis(10_500)));
     assert_eq!(&told.user_data[..], b"enclave=/;;");
 }
 
 #[test]
 fn unknown_parameters_that_must_be_understood_are_an_error() {
-    let unknown = |parameter: &str| {
-        EndpointData::from_payload(&list(&format!("{ENDPOINT} {parameter}"))).err()
-    };
+    let unknown = |parameter: &str| EndpointData::from_payload(&list(&format!("{ENDPOINT} {parameter}"))).err();
     assert_eq!(unknown("0080 0400 00000000"), None);
-    assert_eq!(
-        unknown("0042 0400 00000000"),
-        Some(WireError::NotUnderstood(0x4200))
-    );
+    assert_eq!(unknown("0042 0400 00000000"), Some(WireError::NotUnderstood(0x4200)));
     // Reliability of kind 7; missing sentinel; missing topic; another serialization.
-    assert_eq!(
-        unknown("1a00 0c00 07000000 00000000 00000000"),
-        Some(WireError::Value(0x1a))
-    );
+    assert_eq!(unknown("1a00 0c00 07000000 00000000 00000000"), Some(WireError::Value(0x1a)));
     let cut = EndpointData::from_payload(&parse_hex(&format!("00030000 {ENDPOINT}")));
     assert_eq!(cut, Err(WireError::Short));
     let nameless = EndpointData::from_payload(&list(&ENDPOINT[..45]));
@@ -319,14 +230,9 @@ fn unknown_parameters_that_must_be_understood_are_an_error() {
 #[test]
 fn a_participant_with_a_domain_tag_is_rejected() {
     let participant = "5000 1000 01100001 02030405 06070809 000001c1";
-    let tagged = |tag: &str| {
-        ParticipantData::from_payload(&list(&format!("{participant} 1440 0800 {tag}"))).err()
-    };
+    let tagged = |tag: &str| ParticipantData::from_payload(&list(&format!("{participant} 1440 0800 {tag}"))).err();
     assert_eq!(tagged("01000000 00000000"), None);
-    assert_eq!(
-        tagged("03000000 61620000"),
-        Some(WireError::NotUnderstood(0x4014))
-    );
+    assert_eq!(tagged("03000000 61620000"), Some(WireError::NotUnderstood(0x4014)));
 }
 
 #[test]
@@ -362,9 +268,7 @@ fn values_too_long_for_a_parameter_are_omitted() {
         builtin: 0,
         lease: None,
     };
-    let read = |told: &ParticipantData| {
-        ParticipantData::from_payload(&told.to_bytes()).expect("a participant")
-    };
+    let read = |told: &ParticipantData| ParticipantData::from_payload(&told.to_bytes()).expect("a participant");
     assert_eq!(read(&told(65_527)), told(65_527));
     assert_eq!(read(&told(65_529)), told(0));
 }

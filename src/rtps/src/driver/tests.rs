@@ -61,13 +61,8 @@ async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
 
 async fn join() -> Participant {
     // At a well-known port, where others detect it.
-    let config = Config {
-        well_known: true,
-        ..Config::new(domain(), "test")
-    };
-    Participant::join_with_port_interval(Arc::new(HostNamespace), config, HOUR)
-        .await
-        .expect("a participant")
+    let config = Config { well_known: true, ..Config::new(domain(), "test") };
+    Participant::join_with_port_interval(Arc::new(HostNamespace), config, HOUR).await.expect("a participant")
 }
 
 #[tokio::test]
@@ -79,9 +74,7 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
     let at = {
         let known = timeout(LONG, known).await.expect("in time");
         let known = known.expect("it runs");
-        known.participants[&prefix].discovery[0]
-            .udp_address()
-            .expect("an address")
+        known.participants[&prefix].discovery[0].udp_address().expect("an address")
     };
     // Its sockets are closed without a farewell.
     drop(killed);
@@ -92,12 +85,7 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
         }
     };
     timeout(LONG, closed).await.expect("its port is free");
-    let there = || {
-        here.watch_discovered()
-            .borrow()
-            .participants
-            .contains_key(&prefix)
-    };
+    let there = || here.watch_discovered().borrow().participants.contains_key(&prefix);
     assert!(there(), "nobody has looked");
     here.check_ports();
     assert!(!there());

@@ -32,16 +32,12 @@ const MOST_WITHDRAWN: usize = 64;
 pub(super) const DISPOSED: u32 = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
 
 /// Writer and reader with which a discovery server and its clients announce participants.
-pub(super) const PARTICIPANTS: (EntityId, EntityId) =
-    (EntityId::SPDP_WRITER, EntityId::SPDP_READER);
+pub(super) const PARTICIPANTS: (EntityId, EntityId) = (EntityId::SPDP_WRITER, EntityId::SPDP_READER);
 
 /// Writers and readers with which endpoints are announced.
 pub(super) const ANNOUNCERS: [(EntityId, EntityId); 2] = [
     (EntityId::PUBLICATIONS_WRITER, EntityId::PUBLICATIONS_READER),
-    (
-        EntityId::SUBSCRIPTIONS_WRITER,
-        EntityId::SUBSCRIPTIONS_READER,
-    ),
+    (EntityId::SUBSCRIPTIONS_WRITER, EntityId::SUBSCRIPTIONS_READER),
 ];
 
 /// Bits of `PID_BUILTIN_ENDPOINT_SET` for the writers and the readers of endpoint announcements (9.3.2.12).
@@ -62,24 +58,10 @@ impl Engine {
         let own = builtin_endpoint(self.own.prefix, writer);
         self.writers.insert(
             writer,
-            LocalWriter {
-                state: WriterState::new(own),
-                ends: watch::Sender::new(Arc::default()),
-                leaves: None,
-            },
+            LocalWriter { state: WriterState::new(own), ends: watch::Sender::new(Arc::default()), leaves: None },
         );
-        let state = ReaderState::new(
-            builtin_endpoint(self.own.prefix, reader),
-            self.bounds.clone(),
-        );
-        self.readers.insert(
-            reader,
-            LocalReader {
-                state,
-                ends: watch::Sender::new(Arc::default()),
-                sink: None,
-            },
-        );
+        let state = ReaderState::new(builtin_endpoint(self.own.prefix, reader), self.bounds.clone());
+        self.readers.insert(reader, LocalReader { state, ends: watch::Sender::new(Arc::default()), sink: None });
     }
 
     // ---- local participant
@@ -97,20 +79,12 @@ impl Engine {
         let gone = |remote: &RemoteParticipant| {
             let silent = |since: Instant| now.saturating_duration_since(since);
             remote.data.lease.is_some_and(|lease| match remote.via {
-                DiscoverySource::Itself(_) | DiscoverySource::Named(_) => {
-                    silent(remote.heard) > lease
-                }
-                DiscoverySource::Servers => {
-                    remote.asked.is_some_and(|at| silent(at) > lease + SPARE)
-                }
+                DiscoverySource::Itself(_) | DiscoverySource::Named(_) => silent(remote.heard) > lease,
+                DiscoverySource::Servers => remote.asked.is_some_and(|at| silent(at) > lease + SPARE),
             })
         };
-        let silent: Vec<GuidPrefix> = self
-            .remotes
-            .iter()
-            .filter(|(_, remote)| gone(remote))
-            .map(|(prefix, _)| *prefix)
-            .collect();
+        let silent: Vec<GuidPrefix> =
+            self.remotes.iter().filter(|(_, remote)| gone(remote)).map(|(prefix, _)| *prefix).collect();
         for prefix in silent {
             self.remove_participant(prefix);
         }
@@ -129,21 +103,11 @@ impl Engine {
             self.announce_to_servers();
             return;
         }
-        let known = self
-            .remotes
-            .values()
-            .map(|remote| (remote.discovery, remote.data.prefix));
+        let known = self.remotes.values().map(|remote| (remote.discovery, remote.data.prefix));
         let unknown = self.announce_to.iter().map(|to| (*to, GuidPrefix::UNKNOWN));
-        let ports = self
-            .bound
-            .iter()
-            .map(|at| (SocketAddr::V4(*at), GuidPrefix::UNKNOWN));
+        let ports = self.bound.iter().map(|at| (SocketAddr::V4(*at), GuidPrefix::UNKNOWN));
         let mut told = BTreeSet::new();
-        let all: Vec<_> = known
-            .chain(unknown)
-            .chain(ports)
-            .filter(|(to, _)| told.insert(*to))
-            .collect();
+        let all: Vec<_> = known.chain(unknown).chain(ports).filter(|(to, _)| told.insert(*to)).collect();
         for (to, prefix) in all {
             self.send_announcement(to, prefix);
         }
@@ -178,24 +142,14 @@ impl Engine {
             reader: EntityId::SPDP_READER,
             writer: EntityId::SPDP_WRITER,
             number,
-            inline: InlineQos {
-                related: None,
-                status: DISPOSED,
-                key_hash: Some(guid.bytes()),
-            },
+            inline: InlineQos { related: None, status: DISPOSED, key_hash: Some(guid.bytes()) },
             payload: Some(discovery::key_payload(guid)),
             key_only: true,
         };
         self.send_participant_data(gone, to, prefix, &data);
     }
 
-    fn send_participant_data(
-        &mut self,
-        whose: GuidPrefix,
-        to: SocketAddr,
-        prefix: GuidPrefix,
-        data: &wire::Data,
-    ) {
+    fn send_participant_data(&mut self, whose: GuidPrefix, to: SocketAddr, prefix: GuidPrefix, data: &wire::Data) {
         let mut writer = wire::DatagramWriter::new(whose);
         if prefix != GuidPrefix::UNKNOWN {
             writer.destination(prefix);
@@ -210,11 +164,7 @@ impl Engine {
             self.leave_servers(now);
             return;
         }
-        let known: Vec<_> = self
-            .remotes
-            .values()
-            .map(|remote| (remote.discovery, remote.data.prefix))
-            .collect();
+        let known: Vec<_> = self.remotes.values().map(|remote| (remote.discovery, remote.data.prefix)).collect();
         for (to, prefix) in known {
             self.announcements += 1;
             let number = SequenceNumber(self.announcements);
@@ -225,13 +175,7 @@ impl Engine {
     // ---- remote participants
 
     /// Handles an announcement received from this address.
-    pub(super) fn on_participant_data(
-        &mut self,
-        now: Instant,
-        from: GuidPrefix,
-        source: IpAddr,
-        data: &wire::Data,
-    ) {
+    pub(super) fn on_participant_data(&mut self, now: Instant, from: GuidPrefix, source: IpAddr, data: &wire::Data) {
         if data.inline.status != 0 {
             if let Some(guid) = discovery::guid_of_key(data) {
                 self.remove_participant(guid.prefix);
@@ -262,12 +206,7 @@ impl Engine {
     }
 
     /// Handles a sample of a built-in writer.
-    pub(super) fn on_announcement(
-        &mut self,
-        now: Instant,
-        reader: EntityId,
-        sample: &ReceivedSample,
-    ) {
+    pub(super) fn on_announcement(&mut self, now: Instant, reader: EntityId, sample: &ReceivedSample) {
         if reader == EntityId::SPDP_READER {
             self.on_server_data(now, sample);
         } else {
@@ -289,17 +228,14 @@ impl Engine {
             }
         };
         let whose = told.guid.prefix;
-        let told_by_server =
-            self.is_server(sample.writer.prefix) && self.remotes.contains_key(&whose);
+        let told_by_server = self.is_server(sample.writer.prefix) && self.remotes.contains_key(&whose);
         let fits = (whose == sample.writer.prefix || told_by_server)
             && told.guid.entity.is_writer() == (reader == EntityId::PUBLICATIONS_READER)
             && !told.guid.entity.is_builtin();
         if !fits {
             return;
         }
-        let DiscoveredGraph {
-            writers, readers, ..
-        } = &self.discovered;
+        let DiscoveredGraph { writers, readers, .. } = &self.discovered;
         let known = writers.contains_key(&told.guid) || readers.contains_key(&told.guid);
         if !known && writers.len() + readers.len() >= MOST_ENDS {
             if !std::mem::replace(&mut self.crowded, true) {
@@ -345,9 +281,7 @@ impl Engine {
         };
         let withdrawal = self.publish(now, announcer, change);
         self.withdrawn.push_back((announcer, withdrawal));
-        let old = (self.withdrawn.len() > MOST_WITHDRAWN)
-            .then(|| self.withdrawn.pop_front())
-            .flatten();
+        let old = (self.withdrawn.len() > MOST_WITHDRAWN).then(|| self.withdrawn.pop_front()).flatten();
         for (announcer, number) in [Some((announcer, number)), old].into_iter().flatten() {
             if let Some(writer) = self.writers.get_mut(&announcer) {
                 writer.state.forget(number);

@@ -31,14 +31,7 @@ impl Engine {
         let ends = watch::Sender::new(Arc::default());
         let receiver = ends.subscribe();
         let guid = own.guid;
-        self.writers.insert(
-            entity,
-            LocalWriter {
-                state: WriterState::new(own.clone()),
-                ends,
-                leaves: None,
-            },
-        );
+        self.writers.insert(entity, LocalWriter { state: WriterState::new(own.clone()), ends, leaves: None });
         self.match_own_writer(now, entity);
         self.announce_endpoint(now, &own);
         self.publish_changes();
@@ -58,14 +51,7 @@ impl Engine {
         let receiver = ends.subscribe();
         let guid = own.guid;
         let state = ReaderState::new(own.clone(), self.bounds.clone());
-        self.readers.insert(
-            entity,
-            LocalReader {
-                state,
-                ends,
-                sink: Some(sink),
-            },
-        );
+        self.readers.insert(entity, LocalReader { state, ends, sink: Some(sink) });
         self.match_own_reader(now, entity);
         self.announce_endpoint(now, &own);
         self.publish_changes();
@@ -91,8 +77,7 @@ impl Engine {
         let Engine { writers, paths, .. } = self;
         let done = |(entity, writer): (&EntityId, &LocalWriter)| {
             let leaves = writer.leaves?;
-            let sent =
-                writer.state.is_settled() && !paths.values().any(|path| path.has_pending(*entity));
+            let sent = writer.state.is_settled() && !paths.values().any(|path| path.has_pending(*entity));
             (sent || leaves <= now).then_some(*entity)
         };
         let done: Vec<EntityId> = writers.iter().filter_map(done).collect();
@@ -113,12 +98,7 @@ impl Engine {
         number
     }
 
-    fn endpoint_data(
-        &self,
-        entity: EntityId,
-        topic: &TopicDescription,
-        qos: EndpointQos,
-    ) -> EndpointData {
+    fn endpoint_data(&self, entity: EntityId, topic: &TopicDescription, qos: EndpointQos) -> EndpointData {
         EndpointData {
             guid: Guid::new(self.own.prefix, entity),
             topic: topic.name.clone(),
@@ -138,22 +118,11 @@ impl Engine {
         payload: Bytes,
         related: Option<SampleIdentity>,
     ) -> SequenceNumber {
-        let change = CacheChange {
-            payload,
-            related,
-            written: SystemTime::now().into(),
-            status: 0,
-            key: None,
-        };
+        let change = CacheChange { payload, related, written: SystemTime::now().into(), status: 0, key: None };
         self.publish(now, entity, change)
     }
 
-    pub(super) fn publish(
-        &mut self,
-        now: Instant,
-        entity: EntityId,
-        mut change: CacheChange,
-    ) -> SequenceNumber {
+    pub(super) fn publish(&mut self, now: Instant, entity: EntityId, mut change: CacheChange) -> SequenceNumber {
         let mut wanted = SendRequests::default();
         let Some(next) = self.writers.get(&entity).map(|it| it.state.last().next()) else {
             return SequenceNumber::UNKNOWN;
@@ -171,8 +140,6 @@ impl Engine {
 
     /// Returns the number of samples of a writer that were dropped before all reliable readers had acknowledged them.
     pub fn dropped_samples(&self, entity: EntityId) -> u64 {
-        self.writers
-            .get(&entity)
-            .map_or(0, |writer| writer.state.dropped)
+        self.writers.get(&entity).map_or(0, |writer| writer.state.dropped)
     }
 }

@@ -29,9 +29,7 @@ impl Engine {
                 remote.heard = now;
                 remote.asked = None;
             }
-            let other = received
-                .to
-                .is_some_and(|to| to != self.own.prefix && to != GuidPrefix::UNKNOWN);
+            let other = received.to.is_some_and(|to| to != self.own.prefix && to != GuidPrefix::UNKNOWN);
             if !other && received.from != self.own.prefix {
                 self.receive_submessage(now, source, received);
             }
@@ -40,13 +38,7 @@ impl Engine {
     }
 
     fn receive_submessage(&mut self, now: Instant, source: IpAddr, received: ReceivedSubmessage) {
-        let ReceivedSubmessage {
-            from,
-            vendor: _,
-            written,
-            submessage,
-            ..
-        } = received;
+        let ReceivedSubmessage { from, vendor: _, written, submessage, .. } = received;
         match submessage {
             Submessage::Data(data) if data.writer == EntityId::SPDP_WRITER && !self.is_client() => {
                 self.on_participant_data(now, from, source, &data)
@@ -56,9 +48,7 @@ impl Engine {
                     self.on_server_announcement(now, from, source, &data);
                 }
                 let writer = Guid::new(from, data.writer);
-                let withdrawn = (data.inline.status != 0)
-                    .then(|| discovery::guid_of_key(&data))
-                    .flatten();
+                let withdrawn = (data.inline.status != 0).then(|| discovery::guid_of_key(&data)).flatten();
                 let is_sample = data.payload.is_some() && !data.key_only && data.inline.status == 0;
                 self.deliver_to_readers(now, data.reader, writer, |reader, out| {
                     if is_sample || (reader.sink.is_none() && withdrawn.is_some()) {
@@ -110,14 +100,7 @@ impl Engine {
                 let reader = Guid::new(from, ack.reader);
                 self.on_server_acknack(now, reader, ack.writer, &ack.set);
                 if let Some(writer) = self.writers.get_mut(&ack.writer) {
-                    if writer.state.on_acknack(
-                        now,
-                        reader,
-                        &ack.set,
-                        ack.count,
-                        ack.is_final,
-                        &mut wanted,
-                    ) {
+                    if writer.state.on_acknack(now, reader, &ack.set, ack.count, ack.is_final, &mut wanted) {
                         self.changed_ends.insert(ack.writer);
                     }
                     let ask_at = writer.state.next_heartbeat_at();
@@ -129,14 +112,7 @@ impl Engine {
                 let mut wanted = SendRequests::default();
                 let reader = Guid::new(from, nack.reader);
                 if let Some(writer) = self.writers.get_mut(&nack.writer) {
-                    writer.state.on_nack_frag(
-                        now,
-                        reader,
-                        nack.number,
-                        &nack.set,
-                        nack.count,
-                        &mut wanted,
-                    );
+                    writer.state.on_nack_frag(now, reader, nack.number, &nack.set, nack.count, &mut wanted);
                     self.enqueue(nack.writer, wanted);
                 }
             }
@@ -161,9 +137,7 @@ impl Engine {
             }
             due = due.min(reader.state.answer_at(writer).unwrap_or(due));
             match &reader.sink {
-                Some(sink) => self
-                    .deliveries
-                    .extend(out.into_iter().map(|sample| (Arc::clone(sink), sample))),
+                Some(sink) => self.deliveries.extend(out.into_iter().map(|sample| (Arc::clone(sink), sample))),
                 None => announcements.extend(out.into_iter().map(|sample| (entity, sample))),
             }
         };

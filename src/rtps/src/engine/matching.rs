@@ -15,11 +15,7 @@ impl Engine {
     /// Handles a new or changed remote endpoint.
     pub(super) fn on_endpoint_discovered(&mut self, now: Instant, told: Arc<EndpointData>) {
         let guid = told.guid;
-        let known = if guid.entity.is_writer() {
-            &mut self.discovered.writers
-        } else {
-            &mut self.discovered.readers
-        };
+        let known = if guid.entity.is_writer() { &mut self.discovered.writers } else { &mut self.discovered.readers };
         if known.get(&guid).is_some_and(|before| *before == told) {
             return;
         }
@@ -52,11 +48,7 @@ impl Engine {
     }
 
     pub(super) fn on_endpoint_lost(&mut self, guid: Guid) {
-        let known = if guid.entity.is_writer() {
-            &mut self.discovered.writers
-        } else {
-            &mut self.discovered.readers
-        };
+        let known = if guid.entity.is_writer() { &mut self.discovered.writers } else { &mut self.discovered.readers };
         if known.remove(&guid).is_some() {
             self.discovered_changed = true;
             self.unmatch(guid);
@@ -64,30 +56,15 @@ impl Engine {
     }
 
     fn unmatch(&mut self, guid: Guid) {
-        let Engine {
-            readers,
-            writers,
-            changed_ends,
-            ..
-        } = self;
+        let Engine { readers, writers, changed_ends, .. } = self;
         for (entity, reader) in readers {
-            let refused = reader
-                .ends
-                .borrow()
-                .refused
-                .iter()
-                .any(|(end, _)| end.guid == guid);
+            let refused = reader.ends.borrow().refused.iter().any(|(end, _)| end.guid == guid);
             if reader.state.remove_writer(guid) || refused {
                 changed_ends.insert(*entity);
             }
         }
         for (entity, writer) in writers {
-            let refused = writer
-                .ends
-                .borrow()
-                .refused
-                .iter()
-                .any(|(end, _)| end.guid == guid);
+            let refused = writer.ends.borrow().refused.iter().any(|(end, _)| end.guid == guid);
             if writer.state.remove_reader(guid) || refused {
                 changed_ends.insert(*entity);
             }
@@ -95,40 +72,20 @@ impl Engine {
     }
 
     pub(super) fn match_own_writer(&mut self, now: Instant, entity: EntityId) {
-        let Some(own) = self
-            .writers
-            .get(&entity)
-            .map(|writer| writer.state.own.clone())
-        else {
+        let Some(own) = self.writers.get(&entity).map(|writer| writer.state.own.clone()) else {
             return;
         };
-        let theirs: Vec<_> = self
-            .discovered
-            .readers
-            .values()
-            .filter(|end| is_same_topic(&own, end))
-            .cloned()
-            .collect();
+        let theirs: Vec<_> = self.discovered.readers.values().filter(|end| is_same_topic(&own, end)).cloned().collect();
         for end in theirs {
             self.match_writer(now, entity, &end);
         }
     }
 
     pub(super) fn match_own_reader(&mut self, now: Instant, entity: EntityId) {
-        let Some(own) = self
-            .readers
-            .get(&entity)
-            .map(|reader| reader.state.own.clone())
-        else {
+        let Some(own) = self.readers.get(&entity).map(|reader| reader.state.own.clone()) else {
             return;
         };
-        let theirs: Vec<_> = self
-            .discovered
-            .writers
-            .values()
-            .filter(|end| is_same_topic(&own, end))
-            .cloned()
-            .collect();
+        let theirs: Vec<_> = self.discovered.writers.values().filter(|end| is_same_topic(&own, end)).cloned().collect();
         for end in theirs {
             self.match_reader(now, entity, &end);
         }
@@ -143,8 +100,7 @@ impl Engine {
         let mut wanted = SendRequests::default();
         if let Some(ours) = self.writers.get_mut(&entity) {
             if ours.state.own.qos.mismatches(&reader.qos).is_empty() {
-                ours.state
-                    .add_reader(now, Arc::clone(reader), address, &mut wanted);
+                ours.state.add_reader(now, Arc::clone(reader), address, &mut wanted);
             }
         }
         self.enqueue(entity, wanted);
@@ -160,8 +116,7 @@ impl Engine {
         self.changed_ends.insert(entity);
         if let Some(ours) = self.readers.get_mut(&entity) {
             if writer.qos.mismatches(&ours.state.own.qos).is_empty() {
-                ours.state
-                    .add_writer(now, Arc::clone(writer), address, vendor);
+                ours.state.add_writer(now, Arc::clone(writer), address, vendor);
             }
         }
         self.wake(now);
@@ -170,9 +125,7 @@ impl Engine {
     /// Returns the address at which a remote endpoint receives.
     fn endpoint_address(&self, end: &EndpointData) -> Option<SocketAddr> {
         let remote = self.remotes.get(&end.guid.prefix)?;
-        let own = self
-            .network
-            .choose_address(&end.unicast, Some(remote.user.ip()));
+        let own = self.network.choose_address(&end.unicast, Some(remote.user.ip()));
         Some(own.unwrap_or(remote.user))
     }
 
@@ -181,28 +134,12 @@ impl Engine {
         for entity in std::mem::take(&mut self.changed_ends) {
             if let Some(writer) = self.writers.get(&entity) {
                 let refused = |end: &Arc<EndpointData>| writer.state.own.qos.mismatches(&end.qos);
-                let theirs = self
-                    .discovered
-                    .readers
-                    .values()
-                    .filter(|end| is_same_topic(&writer.state.own, end));
-                writer.ends.send_replace(Arc::new(collect_matches(
-                    writer.state.readers(),
-                    theirs,
-                    refused,
-                )));
+                let theirs = self.discovered.readers.values().filter(|end| is_same_topic(&writer.state.own, end));
+                writer.ends.send_replace(Arc::new(collect_matches(writer.state.readers(), theirs, refused)));
             } else if let Some(reader) = self.readers.get(&entity) {
                 let refused = |end: &Arc<EndpointData>| end.qos.mismatches(&reader.state.own.qos);
-                let theirs = self
-                    .discovered
-                    .writers
-                    .values()
-                    .filter(|end| is_same_topic(&reader.state.own, end));
-                reader.ends.send_replace(Arc::new(collect_matches(
-                    reader.state.writers(),
-                    theirs,
-                    refused,
-                )));
+                let theirs = self.discovered.writers.values().filter(|end| is_same_topic(&reader.state.own, end));
+                reader.ends.send_replace(Arc::new(collect_matches(reader.state.writers(), theirs, refused)));
             }
         }
         if std::mem::take(&mut self.discovered_changed) {
@@ -222,9 +159,7 @@ fn collect_matches<'a>(
         ends.matched.push(Arc::clone(end));
         ends.confirmed.extend(confirmed.then_some(end.guid));
     }
-    let refused = theirs
-        .map(|end| (Arc::clone(end), mismatches(end)))
-        .filter(|(_, why)| !why.is_empty());
+    let refused = theirs.map(|end| (Arc::clone(end), mismatches(end))).filter(|(_, why)| !why.is_empty());
     ends.refused = refused.collect();
     ends
 }

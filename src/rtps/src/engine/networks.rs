@@ -26,10 +26,7 @@ impl Engine {
         }
         let (discovery, user) = self.own_ports();
         self.network = network;
-        let (discovery, user) = (
-            self.network.locators(discovery),
-            self.network.locators(user),
-        );
+        let (discovery, user) = (self.network.locators(discovery), self.network.locators(user));
         if (&discovery, &user) != (&self.own.discovery, &self.own.user) {
             self.own.discovery = discovery;
             self.own.user = user;
@@ -45,9 +42,7 @@ impl Engine {
                 let leads = self.network.is_reachable(remote.discovery.ip());
                 let told = &remote.data.discovery;
                 let chosen = || match remote.via {
-                    DiscoverySource::Itself(source) => {
-                        self.network.choose_address(told, Some(source))
-                    }
+                    DiscoverySource::Itself(source) => self.network.choose_address(told, Some(source)),
                     DiscoverySource::Servers => self.network.choose_address(told, None),
                     DiscoverySource::Named(address) => Some(address),
                 };

@@ -17,8 +17,7 @@ impl Engine {
         for nack in &answer.nack_frags {
             writer.nack_frag(nack);
         }
-        self.control
-            .push_back(Datagram::from_writer(answer.to, writer));
+        self.control.push_back(Datagram::from_writer(answer.to, writer));
     }
 
     pub(super) fn new_datagram(&self, to: GuidPrefix) -> DatagramWriter {
@@ -39,10 +38,7 @@ impl Engine {
         let mut out = Vec::new();
         for (to, reader, first, asks) in wanted.heartbeats {
             // A sample in flight still exists, even if a newer one has replaced it in the history.
-            let under_way = self
-                .paths
-                .get(&to)
-                .and_then(|path| path.in_flight_number(entity));
+            let under_way = self.paths.get(&to).and_then(|path| path.in_flight_number(entity));
             let first = under_way.map_or(first, |number| first.min(number));
             let beat = wire::Heartbeat {
                 reader: reader.entity,
@@ -58,19 +54,11 @@ impl Engine {
         for (to, reader, start, end) in wanted.gaps {
             // The sample was dropped from the history but is still being sent completely. Fast DDS 2.14 does not cope
             // with a GAP for a sample of which it has fragments: takes from that reader then never return.
-            let under_way = self
-                .paths
-                .get(&to)
-                .and_then(|path| path.in_flight_number(entity));
+            let under_way = self.paths.get(&to).and_then(|path| path.in_flight_number(entity));
             if under_way.is_some_and(|number| (start..end).contains(&number)) {
                 continue;
             }
-            let gap = wire::Gap {
-                reader: reader.entity,
-                writer: entity,
-                start,
-                set: SequenceSet::empty(end),
-            };
+            let gap = wire::Gap { reader: reader.entity, writer: entity, start, set: SequenceSet::empty(end) };
             out.push((to, reader.prefix, Submessage::Gap(gap)));
         }
         for (to, prefix, submessage) in out {
@@ -86,10 +74,7 @@ impl Engine {
 
     /// Returns the next datagram to send; `None` if there is none, or if all wait for room at their receivers. `room`
     /// returns whether a receiver has room for a datagram of this length, which it has requested again or not.
-    pub fn transmit(
-        &mut self,
-        room: &mut dyn FnMut(SocketAddr, usize, bool) -> bool,
-    ) -> Option<Datagram> {
+    pub fn transmit(&mut self, room: &mut dyn FnMut(SocketAddr, usize, bool) -> bool) -> Option<Datagram> {
         if let Some(datagram) = self.control.pop_front() {
             return Some(datagram);
         }
@@ -97,11 +82,7 @@ impl Engine {
         let after = self.next_path;
         let order: Vec<SocketAddr> = match after {
             Some(after) => {
-                let later = self
-                    .paths
-                    .range(after..)
-                    .map(|(to, _)| *to)
-                    .filter(|to| *to != after);
+                let later = self.paths.range(after..).map(|(to, _)| *to).filter(|to| *to != after);
                 let earlier = self.paths.range(..=after).map(|(to, _)| *to);
                 later.chain(earlier).collect()
             }
@@ -123,9 +104,7 @@ impl Engine {
                 continue;
             }
             self.next_path = Some(to);
-            if let Some(datagram) =
-                path.next_datagram(to, self.own.prefix, &mut self.writers, &mut self.control)
-            {
+            if let Some(datagram) = path.next_datagram(to, self.own.prefix, &mut self.writers, &mut self.control) {
                 return Some(datagram);
             }
         }

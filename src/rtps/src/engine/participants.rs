@@ -9,9 +9,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::discovering::{
-    ANNOUNCERS, ANNOUNCES, HEARS, MOST_PARTICIPANTS, PARTICIPANTS, builtin_endpoint,
-};
+use super::discovering::{ANNOUNCERS, ANNOUNCES, HEARS, MOST_PARTICIPANTS, PARTICIPANTS, builtin_endpoint};
 use super::servers::DiscoverySource;
 use super::{Engine, RemoteParticipant};
 use crate::discovery::{EndpointData, ParticipantData};
@@ -22,12 +20,7 @@ use crate::{EntityId, Guid, GuidPrefix};
 
 impl Engine {
     /// Handles the announcement of a new or known participant.
-    pub(super) fn update_participant(
-        &mut self,
-        now: Instant,
-        via: DiscoverySource,
-        told: ParticipantData,
-    ) {
+    pub(super) fn update_participant(&mut self, now: Instant, via: DiscoverySource, told: ParticipantData) {
         let prefix = told.prefix;
         let Some(remote) = self.remotes.get_mut(&prefix) else {
             self.add_participant(now, via, told);
@@ -37,14 +30,8 @@ impl Engine {
             return;
         }
         // If its endpoints or address may have changed, it is discovered anew, unless it is still at the same address.
-        let left = |told: &[Locator], at: SocketAddr| {
-            !told
-                .iter()
-                .filter_map(Locator::udp_address)
-                .any(|it| it == at)
-        };
-        let moved = left(&told.discovery, remote.discovery)
-            && !matches!(via, DiscoverySource::Named(_))
+        let left = |told: &[Locator], at: SocketAddr| !told.iter().filter_map(Locator::udp_address).any(|it| it == at);
+        let moved = left(&told.discovery, remote.discovery) && !matches!(via, DiscoverySource::Named(_))
             || remote.data.user != told.user && left(&told.user, remote.user)
             || remote.data.builtin != told.builtin;
         if moved {
@@ -52,19 +39,12 @@ impl Engine {
             return;
         }
         remote.data = Arc::new(told);
-        self.discovered
-            .participants
-            .insert(prefix, Arc::clone(&remote.data));
+        self.discovered.participants.insert(prefix, Arc::clone(&remote.data));
         self.discovered_changed = true;
     }
 
     /// Rediscovers a known participant at another address.
-    pub(super) fn rematch_participant(
-        &mut self,
-        now: Instant,
-        via: DiscoverySource,
-        told: ParticipantData,
-    ) {
+    pub(super) fn rematch_participant(&mut self, now: Instant, via: DiscoverySource, told: ParticipantData) {
         // A participant announces its endpoints when it is discovered again, but a server does not repeat them.
         let ends = match via {
             DiscoverySource::Servers => self.endpoints_of(told.prefix),
@@ -78,33 +58,19 @@ impl Engine {
     }
 
     fn endpoints_of(&self, prefix: GuidPrefix) -> Vec<Arc<EndpointData>> {
-        let DiscoveredGraph {
-            writers, readers, ..
-        } = &self.discovered;
+        let DiscoveredGraph { writers, readers, .. } = &self.discovered;
         let all = writers.values().chain(readers.values());
-        all.filter(|end| end.guid.prefix == prefix)
-            .cloned()
-            .collect()
+        all.filter(|end| end.guid.prefix == prefix).cloned().collect()
     }
 
-    pub(super) fn add_participant(
-        &mut self,
-        now: Instant,
-        via: DiscoverySource,
-        told: ParticipantData,
-    ) {
+    pub(super) fn add_participant(&mut self, now: Instant, via: DiscoverySource, told: ParticipantData) {
         let chosen = match via {
             DiscoverySource::Named(address) => Some(address),
-            DiscoverySource::Itself(source) => {
-                self.network.choose_address(&told.discovery, Some(source))
-            }
+            DiscoverySource::Itself(source) => self.network.choose_address(&told.discovery, Some(source)),
             DiscoverySource::Servers => self.network.choose_address(&told.discovery, None),
         };
         let Some(discovery) = chosen else {
-            tracing::debug!(
-                ?via,
-                "a DDS participant announces no address for UDP over IPv4 that reaches it"
-            );
+            tracing::debug!(?via, "a DDS participant announces no address for UDP over IPv4 that reaches it");
             return;
         };
         // An address belongs to one process at a time, so its previous owner is gone. Servers also announce
@@ -114,12 +80,8 @@ impl Engine {
             DiscoverySource::Named(_) => remote.via == via,
             DiscoverySource::Servers => false,
         };
-        let before: Vec<GuidPrefix> = self
-            .remotes
-            .iter()
-            .filter(|(_, remote)| other(remote))
-            .map(|(prefix, _)| *prefix)
-            .collect();
+        let before: Vec<GuidPrefix> =
+            self.remotes.iter().filter(|(_, remote)| other(remote)).map(|(prefix, _)| *prefix).collect();
         for prefix in before {
             self.remove_participant(prefix);
         }
@@ -132,27 +94,12 @@ impl Engine {
             }
             return;
         }
-        let user = self
-            .network
-            .choose_address(&told.user, Some(discovery.ip()))
-            .unwrap_or(discovery);
+        let user = self.network.choose_address(&told.user, Some(discovery.ip())).unwrap_or(discovery);
         let (prefix, has) = (told.prefix, told.builtin);
         let data = Arc::new(told);
-        self.discovered
-            .participants
-            .insert(prefix, Arc::clone(&data));
+        self.discovered.participants.insert(prefix, Arc::clone(&data));
         self.discovered_changed = true;
-        self.remotes.insert(
-            prefix,
-            RemoteParticipant {
-                data,
-                discovery,
-                user,
-                via,
-                heard: now,
-                asked: None,
-            },
-        );
+        self.remotes.insert(prefix, RemoteParticipant { data, discovery, user, via, heard: now, asked: None });
         match via {
             // It exchanges endpoint data only with its servers.
             DiscoverySource::Servers => {}
@@ -209,24 +156,16 @@ impl Engine {
                 ours.state.remove_writer(Guid::new(prefix, writer));
             }
         }
-        let ends = self
-            .discovered
-            .writers
-            .keys()
-            .chain(self.discovered.readers.keys());
+        let ends = self.discovered.writers.keys().chain(self.discovered.readers.keys());
         let ends: Vec<Guid> = ends.filter(|guid| guid.prefix == prefix).copied().collect();
         for guid in ends {
             self.on_endpoint_lost(guid);
         }
         let still = |address: SocketAddr| {
-            self.remotes
-                .values()
-                .any(|other| other.discovery == address || other.user == address)
+            self.remotes.values().any(|other| other.discovery == address || other.user == address)
         };
-        let unused: Vec<SocketAddr> = [remote.discovery, remote.user]
-            .into_iter()
-            .filter(|address| !still(*address))
-            .collect();
+        let unused: Vec<SocketAddr> =
+            [remote.discovery, remote.user].into_iter().filter(|address| !still(*address)).collect();
         for address in unused {
             self.paths.remove(&address);
         }

@@ -28,15 +28,11 @@ impl WriterQueue {
             return;
         }
         // Dropped samples are skipped; readers that miss them are told when they ask.
-        self.waiting
-            .retain(|item| state.change(item.number).is_some());
+        self.waiting.retain(|item| state.change(item.number).is_some());
         // Samples that were started are repaired before another one is started.
         let full = state.is_window_full(to);
         let small = |item: &SendItem| item.last == 0 && item.reader != EntityId::UNKNOWN;
-        let next = self
-            .waiting
-            .iter()
-            .position(|item| !full || small(item) || state.is_started(item.number));
+        let next = self.waiting.iter().position(|item| !full || small(item) || state.is_started(item.number));
         let Some(item) = next.and_then(|at| self.waiting.remove(at)) else {
             return;
         };
@@ -70,18 +66,14 @@ impl DestinationQueue {
             WriterQueue::default()
         });
         let same = |other: &SendItem| {
-            other.number == item.number
-                && (other.reader == item.reader || other.reader == EntityId::UNKNOWN)
+            other.number == item.number && (other.reader == item.reader || other.reader == EntityId::UNKNOWN)
         };
         // A repeated request for a queued sample is not queued twice. Neither is one for the sample being sent: what
         // the receiver misses has not been sent or not been read there, and it is asked again with the last fragment.
-        let covers = |waiting: &SendItem| {
-            same(waiting) && waiting.next <= item.next && waiting.last >= item.last
-        };
+        let covers = |waiting: &SendItem| same(waiting) && waiting.next <= item.next && waiting.last >= item.last;
         let again = item.reader != EntityId::UNKNOWN;
         let under_way = |(current, _): &(SendItem, CacheChange)| same(current);
-        let waits = again
-            && (queue.waiting.iter().any(covers) || queue.current.as_ref().is_some_and(under_way));
+        let waits = again && (queue.waiting.iter().any(covers) || queue.current.as_ref().is_some_and(under_way));
         if !waits {
             queue.waiting.push_back(item);
         }
@@ -89,9 +81,7 @@ impl DestinationQueue {
 
     /// Returns whether anything of this writer is queued.
     pub fn has_pending(&self, writer: EntityId) -> bool {
-        self.queues
-            .get(&writer)
-            .is_some_and(|queue| queue.current.is_some() || !queue.waiting.is_empty())
+        self.queues.get(&writer).is_some_and(|queue| queue.current.is_some() || !queue.waiting.is_empty())
     }
 
     /// Returns the sample of this writer of which some but not all fragments were sent.
@@ -106,11 +96,7 @@ impl DestinationQueue {
     }
 
     /// Prepares the next datagram for this address.
-    pub fn prepare(
-        &mut self,
-        to: SocketAddr,
-        writers: &HashMap<EntityId, LocalWriter>,
-    ) -> SendReadiness {
+    pub fn prepare(&mut self, to: SocketAddr, writers: &HashMap<EntityId, LocalWriter>) -> SendReadiness {
         let mut held = 0;
         while let Some(writer) = self.turns.front().copied() {
             if held == self.turns.len() {
@@ -157,9 +143,8 @@ impl DestinationQueue {
             state.mark_started(item.number, to);
         }
         // Reliable readers are asked for an acknowledgement with the last fragment of each sample.
-        let heartbeat = state
-            .filter(|state| item.next == item.last && state.needs_ack(to))
-            .map(|state| wire::Heartbeat {
+        let heartbeat =
+            state.filter(|state| item.next == item.last && state.needs_ack(to)).map(|state| wire::Heartbeat {
                 reader: item.reader,
                 writer,
                 first: state.relevant_from(to),
@@ -169,11 +154,7 @@ impl DestinationQueue {
                 liveliness: false,
             });
         let heartbeat = heartbeat.filter(|beat| beat.first <= beat.last);
-        let inline = InlineQos {
-            related: change.related,
-            status: change.status,
-            key_hash: change.key,
-        };
+        let inline = InlineQos { related: change.related, status: change.status, key_hash: change.key };
         let mut datagram = DatagramWriter::new(from);
         datagram.destination(item.prefix);
         datagram.timestamp(change.written);
@@ -192,9 +173,7 @@ impl DestinationQueue {
             return Some(Datagram::from_writer(to, datagram));
         }
         let start = (item.next as usize - 1) * FRAGMENT;
-        let body = change
-            .payload
-            .slice(start..change.payload.len().min(start + FRAGMENT));
+        let body = change.payload.slice(start..change.payload.len().min(start + FRAGMENT));
         let fragment = DataFragHead {
             reader: item.reader,
             writer,
@@ -218,11 +197,6 @@ impl DestinationQueue {
             item.next += 1;
             queue.current = Some((item, change));
         }
-        Some(Datagram {
-            to,
-            head,
-            body,
-            tail,
-        })
+        Some(Datagram { to, head, body, tail })
     }
 }

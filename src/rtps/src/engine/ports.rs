@@ -35,8 +35,7 @@ impl Engine {
             .map(|port| SocketAddrV4::new(Ipv4Addr::LOCALHOST, port));
         let own = self.own_ports().0;
         let servers = self.local_servers();
-        let mut ports: BTreeSet<SocketAddrV4> =
-            free.chain(known.iter().copied()).chain(servers).collect();
+        let mut ports: BTreeSet<SocketAddrV4> = free.chain(known.iter().copied()).chain(servers).collect();
         ports.retain(|at| at.port() != own);
         ports
     }
@@ -48,11 +47,7 @@ impl Engine {
         let domain = self.ports.discovery_multicast()..=last;
         let servers: BTreeSet<SocketAddrV4> = self.local_servers().collect();
         let concerns = |at: &&SocketAddrV4| {
-            if self.is_client() {
-                servers.contains(at)
-            } else {
-                domain.contains(&at.port())
-            }
+            if self.is_client() { servers.contains(at) } else { domain.contains(&at.port()) }
         };
         let found: BTreeSet<SocketAddrV4> = bound.iter().filter(concerns).copied().collect();
         let new: Vec<SocketAddrV4> = found.difference(&self.bound).copied().collect();
@@ -68,10 +63,7 @@ impl Engine {
         let dead: Vec<GuidPrefix> = self
             .remotes
             .iter()
-            .filter(|(_, remote)| {
-                self.local_address(remote)
-                    .is_some_and(|at| !bound.contains(&at))
-            })
+            .filter(|(_, remote)| self.local_address(remote).is_some_and(|at| !bound.contains(&at)))
             .map(|(prefix, _)| *prefix)
             .collect();
         for prefix in dead {

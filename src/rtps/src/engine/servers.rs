@@ -103,11 +103,7 @@ impl Engine {
             let mut met = self.remotes.values();
             met.any(|remote| remote.via == DiscoverySource::Named(server.at))
         };
-        if self.servers.iter().all(is_met) {
-            LAST_PAUSE
-        } else {
-            MISSING
-        }
+        if self.servers.iter().all(is_met) { LAST_PAUSE } else { MISSING }
     }
 
     /// Publishes changed data of this participant to the servers.
@@ -138,8 +134,7 @@ impl Engine {
             let mut writer = wire::DatagramWriter::new(self.own.prefix);
             writer.timestamp(SystemTime::now().into());
             writer.data(&data);
-            self.control
-                .push_back(Datagram::from_writer(server.at, writer));
+            self.control.push_back(Datagram::from_writer(server.at, writer));
         }
     }
 
@@ -154,11 +149,7 @@ impl Engine {
     }
 
     /// Returns the identity of an announcement; servers do not forward announcements without one.
-    pub(super) fn announcement_identity(
-        &self,
-        announcer: EntityId,
-        number: SequenceNumber,
-    ) -> Option<SampleIdentity> {
+    pub(super) fn announcement_identity(&self, announcer: EntityId, number: SequenceNumber) -> Option<SampleIdentity> {
         let writer = Guid::new(self.own.prefix, announcer);
         (self.is_client() && announcer.is_builtin()).then_some(SampleIdentity { writer, number })
     }
@@ -167,8 +158,7 @@ impl Engine {
     /// without a server: they may have ended together with it.
     pub(super) fn ping_silent(&mut self, now: Instant) {
         let silent = self.remotes.iter().filter(|(_, remote)| {
-            remote.via == DiscoverySource::Servers
-                && now.saturating_duration_since(remote.heard) >= LAST_PAUSE
+            remote.via == DiscoverySource::Servers && now.saturating_duration_since(remote.heard) >= LAST_PAUSE
         });
         let silent: Vec<GuidPrefix> = silent.map(|(prefix, _)| *prefix).collect();
         for prefix in silent {
@@ -189,13 +179,7 @@ impl Engine {
 
     /// Handles an announcement of a participant. A configured server is matched; everything else from a known server
     /// arrives in order through [`Self::on_server_data`], and other participants are ignored.
-    pub(super) fn on_server_announcement(
-        &mut self,
-        now: Instant,
-        from: GuidPrefix,
-        source: IpAddr,
-        data: &wire::Data,
-    ) {
+    pub(super) fn on_server_announcement(&mut self, now: Instant, from: GuidPrefix, source: IpAddr, data: &wire::Data) {
         if data.inline.status != 0 {
             // The last message of a server is sent only once.
             let gone = discovery::guid_of_key(data);
@@ -248,9 +232,7 @@ impl Engine {
         let via = match self.remotes.get(&server).map(|server| server.via) {
             Some(via @ DiscoverySource::Named(_)) if told.prefix == server => via,
             // Other servers announce themselves.
-            Some(DiscoverySource::Named(_)) if self.find_server_address(&told).is_none() => {
-                DiscoverySource::Servers
-            }
+            Some(DiscoverySource::Named(_)) if self.find_server_address(&told).is_none() => DiscoverySource::Servers,
             _ => return,
         };
         if told.prefix != self.own.prefix {
@@ -260,20 +242,11 @@ impl Engine {
 
     /// Handles an acknowledgement of one of our built-in writers by a server. A server that has lost what it had
     /// acknowledged has restarted.
-    pub(super) fn on_server_acknack(
-        &mut self,
-        now: Instant,
-        reader: Guid,
-        writer: EntityId,
-        set: &SequenceSet,
-    ) {
+    pub(super) fn on_server_acknack(&mut self, now: Instant, reader: Guid, writer: EntityId, set: &SequenceSet) {
         let Some(ours) = self.writers.get(&writer).filter(|_| writer.is_builtin()) else {
             return;
         };
-        let lost = ours
-            .state
-            .last_acknowledged(reader)
-            .is_some_and(|had| set.base <= had);
+        let lost = ours.state.last_acknowledged(reader).is_some_and(|had| set.base <= had);
         if lost && self.is_server(reader.prefix) {
             tracing::debug!(server = ?reader.prefix, "a discovery server was restarted");
             self.match_server(now, reader.prefix);

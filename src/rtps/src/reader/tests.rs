@@ -22,11 +22,7 @@ fn endpoint(guid: Guid, durability: DurabilityKind) -> EndpointData {
         guid,
         topic: "rt/chatter".into(),
         type_name: "std_msgs::msg::dds_::String_".into(),
-        qos: EndpointQos {
-            history: HistoryKind::KeepAll,
-            durability,
-            ..EndpointQos::default()
-        },
+        qos: EndpointQos { history: HistoryKind::KeepAll, durability, ..EndpointQos::default() },
         user_data: Bytes::new(),
         unicast: Vec::new(),
         expects_inline_qos: false,
@@ -42,11 +38,7 @@ impl ReaderHarness {
     fn with_limit(limit: usize, writers: u8) -> Self {
         let budget = Budget::new("samples", limit);
         let own = Guid::new(GuidPrefix([99; 12]), EntityId::user_reader(1));
-        let bounds = ReaderLimits {
-            max_sample: 16 << 20,
-            budget: budget.clone(),
-            unfinished: UNFINISHED,
-        };
+        let bounds = ReaderLimits { max_sample: 16 << 20, budget: budget.clone(), unfinished: UNFINISHED };
         let now = Instant::now();
         let mut state = ReaderState::new(endpoint(own, DurabilityKind::TransientLocal), bounds);
         for number in 1..=writers {
@@ -54,13 +46,7 @@ impl ReaderHarness {
             let address = SocketAddr::from(([127, 0, 0, 1], 7411));
             state.add_writer(now, data, address, VendorId::OURS);
         }
-        Self {
-            now,
-            state,
-            budget,
-            out: Vec::new(),
-            answers: Vec::new(),
-        }
+        Self { now, state, budget, out: Vec::new(), answers: Vec::new() }
     }
 
     fn data(&mut self, of: u8, number: i64, payload: Bytes) {
@@ -72,8 +58,7 @@ impl ReaderHarness {
             written: None,
             withdrawn: None,
         };
-        self.state
-            .on_data(self.now, writer(of), sample, &mut self.out);
+        self.state.on_data(self.now, writer(of), sample, &mut self.out);
     }
 
     fn fragment(&mut self, of: u8, number: i64, size: u32, first: FragmentNumber) {
@@ -89,8 +74,7 @@ impl ReaderHarness {
             payload: vec![0; 1000].into(),
             key_only: false,
         };
-        self.state
-            .on_data_frag(self.now, writer(of), &frag, None, &mut self.out);
+        self.state.on_data_frag(self.now, writer(of), &frag, None, &mut self.out);
     }
 
     fn heartbeat(&mut self, of: u8, first: i64, last: i64, count: u32) {
@@ -103,8 +87,7 @@ impl ReaderHarness {
             is_final: false,
             liveliness: false,
         };
-        self.state
-            .on_heartbeat(self.now, writer(of), &beat, &mut self.out);
+        self.state.on_heartbeat(self.now, writer(of), &beat, &mut self.out);
     }
 
     /// Returns the numbers requested after this time.
@@ -113,9 +96,7 @@ impl ReaderHarness {
         self.answers.clear();
         self.state.tick(self.now, &mut self.answers, &mut self.out);
         let sets = self.answers.iter().map(|answer| &answer.acknack.set);
-        sets.flat_map(SequenceSet::iter)
-            .map(|number| number.0)
-            .collect()
+        sets.flat_map(SequenceSet::iter).map(|number| number.0).collect()
     }
 
     fn numbers(&self) -> Vec<i64> {

@@ -24,12 +24,7 @@ pub(crate) struct WireReader<'a> {
 impl<'a> WireReader<'a> {
     /// Creates a cursor over all bytes.
     pub fn new(whole: &'a Bytes, little: bool) -> Self {
-        Self {
-            whole,
-            at: 0,
-            end: whole.len(),
-            little,
-        }
+        Self { whole, at: 0, end: whole.len(), little }
     }
 
     /// Returns the number of remaining bytes.
@@ -44,9 +39,7 @@ impl<'a> WireReader<'a> {
 
     /// Reads the next bytes.
     pub fn array<const N: usize>(&mut self) -> Result<[u8; N], WireError> {
-        let bytes = self.whole[self.at..self.end]
-            .first_chunk()
-            .ok_or(WireError::Short)?;
+        let bytes = self.whole[self.at..self.end].first_chunk().ok_or(WireError::Short)?;
         self.at += N;
         Ok(*bytes)
     }
@@ -63,12 +56,7 @@ impl<'a> WireReader<'a> {
         }
         let begin = self.at;
         self.at += length;
-        Ok(Self {
-            whole: self.whole,
-            at: begin,
-            end: self.at,
-            little: self.little,
-        })
+        Ok(Self { whole: self.whole, at: begin, end: self.at, little: self.little })
     }
 
     /// Returns the remaining bytes.
@@ -87,20 +75,12 @@ impl<'a> WireReader<'a> {
 
     pub fn u16(&mut self) -> Result<u16, WireError> {
         let bytes = self.array()?;
-        Ok(if self.little {
-            u16::from_le_bytes(bytes)
-        } else {
-            u16::from_be_bytes(bytes)
-        })
+        Ok(if self.little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) })
     }
 
     pub fn u32(&mut self) -> Result<u32, WireError> {
         let bytes = self.array()?;
-        Ok(if self.little {
-            u32::from_le_bytes(bytes)
-        } else {
-            u32::from_be_bytes(bytes)
-        })
+        Ok(if self.little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
     }
 
     pub fn i32(&mut self) -> Result<i32, WireError> {
@@ -128,11 +108,7 @@ impl<'a> WireReader<'a> {
     /// Reads a sequence number of at least `least` that is low enough for additions not to overflow.
     pub fn number_at_least(&mut self, least: i64) -> Result<SequenceNumber, WireError> {
         let number = self.number()?;
-        if (least..MOST).contains(&number.0) {
-            Ok(number)
-        } else {
-            Err(WireError::Number(number.0))
-        }
+        if (least..MOST).contains(&number.0) { Ok(number) } else { Err(WireError::Number(number.0)) }
     }
 
     /// Reads the sequence number of a sample.
@@ -141,24 +117,15 @@ impl<'a> WireReader<'a> {
     }
 
     pub fn identity(&mut self) -> Result<SampleIdentity, WireError> {
-        Ok(SampleIdentity {
-            writer: self.guid()?,
-            number: self.number()?,
-        })
+        Ok(SampleIdentity { writer: self.guid()?, number: self.number()? })
     }
 
     pub fn duration(&mut self) -> Result<WireDuration, WireError> {
-        Ok(WireDuration {
-            seconds: self.i32()?,
-            fraction: self.u32()?,
-        })
+        Ok(WireDuration { seconds: self.i32()?, fraction: self.u32()? })
     }
 
     pub fn time(&mut self) -> Result<WireTime, WireError> {
-        Ok(WireTime {
-            seconds: self.u32()?,
-            fraction: self.u32()?,
-        })
+        Ok(WireTime { seconds: self.u32()?, fraction: self.u32()? })
     }
 
     /// Reads a CDR sequence or string of bytes, which is preceded by its length.

@@ -40,9 +40,6 @@ impl ParticipantMessage {
             return Err(WireError::Serialization(serialization));
         }
         input.skip(2)?;
-        Ok(Self {
-            prefix: input.prefix()?,
-            kind: input.array()?,
-        })
+        Ok(Self { prefix: input.prefix()?, kind: input.array()? })
     }
 }

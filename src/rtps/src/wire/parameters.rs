@@ -111,8 +111,7 @@ impl<'a> ParameterWriter<'a> {
             self.bytes.extend_from_slice(&number.to_le_bytes());
             self.bytes.extend_from_slice(&length.to_le_bytes());
             self.bytes.extend_from_slice(value);
-            self.bytes
-                .resize(self.bytes.len() + (padded - value.len()), 0);
+            self.bytes.resize(self.bytes.len() + (padded - value.len()), 0);
         }
         self
     }
@@ -138,12 +137,7 @@ impl<'a> ParameterWriter<'a> {
     }
 
     /// Writes a policy that consists of a kind and a duration.
-    pub fn kind_and_duration(
-        &mut self,
-        number: u16,
-        kind: u32,
-        duration: Option<Duration>,
-    ) -> &mut Self {
+    pub fn kind_and_duration(&mut self, number: u16, kind: u32, duration: Option<Duration>) -> &mut Self {
         let mut value = [0; 12];
         value[..4].copy_from_slice(&kind.to_le_bytes());
         value[4..].copy_from_slice(&duration_bytes(duration));
@@ -209,11 +203,7 @@ fn duration_bytes(duration: Option<Duration>) -> [u8; 8] {
 
 impl<'a> WireReader<'a> {
     pub fn locator(&mut self) -> Result<Locator, WireError> {
-        Ok(Locator {
-            kind: self.i32()?,
-            port: self.u32()?,
-            address: self.array()?,
-        })
+        Ok(Locator { kind: self.i32()?, port: self.u32()?, address: self.array()? })
     }
 
     /// Reads a CDR string without its terminating zero, which some implementations omit.

@@ -9,9 +9,7 @@ use crate::sequence::{NumberSet, SPAN};
 use crate::{Guid, SequenceNumber};
 
 pub(crate) fn prefix() -> impl Strategy<Value = GuidPrefix> {
-    any::<[u8; 12]>()
-        .prop_filter("it is somebody's", |bytes| *bytes != [0; 12])
-        .prop_map(GuidPrefix)
+    any::<[u8; 12]>().prop_filter("it is somebody's", |bytes| *bytes != [0; 12]).prop_map(GuidPrefix)
 }
 
 pub(crate) fn guid() -> impl Strategy<Value = Guid> {
@@ -26,9 +24,7 @@ fn number() -> impl Strategy<Value = SequenceNumber> {
     prop_oneof![1i64..1000, 1i64..1 << 62].prop_map(SequenceNumber)
 }
 
-fn set<N: Copy + std::fmt::Debug>(
-    base: impl Strategy<Value = N>,
-) -> impl Strategy<Value = NumberSet<N>> {
+fn set<N: Copy + std::fmt::Debug>(base: impl Strategy<Value = N>) -> impl Strategy<Value = NumberSet<N>> {
     (base, 0..=SPAN).prop_flat_map(|(base, bits)| {
         let words = vec(any::<u32>(), bits.div_ceil(32) as usize);
         words.prop_map(move |words| NumberSet::from_words(base, bits, &words).expect("they fit"))
@@ -36,17 +32,13 @@ fn set<N: Copy + std::fmt::Debug>(
 }
 
 fn inline() -> impl Strategy<Value = InlineQos> {
-    let related = (guid(), any::<i64>()).prop_map(|(writer, number)| SampleIdentity {
-        writer,
-        number: SequenceNumber(number),
-    });
-    (option::of(related), 0u32..4, option::of(any::<[u8; 16]>())).prop_map(
-        |(related, status, key_hash)| InlineQos {
-            related,
-            status,
-            key_hash,
-        },
-    )
+    let related =
+        (guid(), any::<i64>()).prop_map(|(writer, number)| SampleIdentity { writer, number: SequenceNumber(number) });
+    (option::of(related), 0u32..4, option::of(any::<[u8; 16]>())).prop_map(|(related, status, key_hash)| InlineQos {
+        related,
+        status,
+        key_hash,
+    })
 }
 
 fn payload() -> impl Strategy<Value = Bytes> {
@@ -54,178 +46,72 @@ fn payload() -> impl Strategy<Value = Bytes> {
 }
 
 fn data() -> impl Strategy<Value = Submessage> {
-    (
-        entity(),
-        entity(),
-        number(),
-        inline(),
-        option::of(payload()),
-        any::<bool>(),
-    )
-        .prop_map(|(reader, writer, number, inline, payload, key_only)| {
+    (entity(), entity(), number(), inline(), option::of(payload()), any::<bool>()).prop_map(
+        |(reader, writer, number, inline, payload, key_only)| {
             let key_only = key_only && payload.is_some();
-            Submessage::Data(Data {
-                reader,
-                writer,
-                number,
-                inline,
-                payload,
-                key_only,
-            })
-        })
+            Submessage::Data(Data { reader, writer, number, inline, payload, key_only })
+        },
+    )
 }
 
 fn data_frag() -> impl Strategy<Value = DataFrag> {
     let lengths = (1u32..40, 1u16..5, 1u16..40, any::<prop::sample::Index>());
-    (
-        entity(),
-        entity(),
-        number(),
-        inline(),
-        lengths,
-        any::<bool>(),
+    (entity(), entity(), number(), inline(), lengths, any::<bool>()).prop_map(
+        |(reader, writer, number, inline, (first, count, fragment_size, tail), key_only)| {
+            let size = u32::from(fragment_size);
+            let begin = (first - 1) * size;
+            // The sample ends within or after the last fragment.
+            let sample_size = begin + (u32::from(count) - 1) * size + 1 + tail.index(2 * fragment_size as usize) as u32;
+            let end = sample_size.min(begin + u32::from(count) * size);
+            let payload = (begin..end).map(|at| at as u8).collect();
+            DataFrag { reader, writer, number, inline, first, count, fragment_size, sample_size, payload, key_only }
+        },
     )
-        .prop_map(
-            |(reader, writer, number, inline, (first, count, fragment_size, tail), key_only)| {
-                let size = u32::from(fragment_size);
-                let begin = (first - 1) * size;
-                // The sample ends within or after the last fragment.
-                let sample_size = begin
-                    + (u32::from(count) - 1) * size
-                    + 1
-                    + tail.index(2 * fragment_size as usize) as u32;
-                let end = sample_size.min(begin + u32::from(count) * size);
-                let payload = (begin..end).map(|at| at as u8).collect();
-                DataFrag {
-                    reader,
-                    writer,
-                    number,
-                    inline,
-                    first,
-                    count,
-                    fragment_size,
-                    sample_size,
-                    payload,
-                    key_only,
-                }
-            },
-        )
 }
 
 fn submessage() -> impl Strategy<Value = Submessage> {
-    let beat = (
-        entity(),
-        entity(),
-        number(),
-        0i64..1000,
-        any::<u32>(),
-        any::<bool>(),
-        any::<bool>(),
-    )
-        .prop_map(
-            |(reader, writer, first, more, count, is_final, liveliness)| {
-                let last = SequenceNumber((first.0 - 1 + more).min((1 << 62) - 1));
-                Submessage::Heartbeat(Heartbeat {
-                    reader,
-                    writer,
-                    first,
-                    last,
-                    count,
-                    is_final,
-                    liveliness,
-                })
-            },
-        );
-    let beat_frag = (entity(), entity(), number(), 1u32.., any::<u32>()).prop_map(
-        |(reader, writer, number, last, count)| {
-            Submessage::HeartbeatFrag(HeartbeatFrag {
-                reader,
-                writer,
-                number,
-                last,
-                count,
-            })
+    let beat = (entity(), entity(), number(), 0i64..1000, any::<u32>(), any::<bool>(), any::<bool>()).prop_map(
+        |(reader, writer, first, more, count, is_final, liveliness)| {
+            let last = SequenceNumber((first.0 - 1 + more).min((1 << 62) - 1));
+            Submessage::Heartbeat(Heartbeat { reader, writer, first, last, count, is_final, liveliness })
         },
     );
+    let beat_frag =
+        (entity(), entity(), number(), 1u32.., any::<u32>()).prop_map(|(reader, writer, number, last, count)| {
+            Submessage::HeartbeatFrag(HeartbeatFrag { reader, writer, number, last, count })
+        });
     let base = prop_oneof![Just(SequenceNumber(0)), number()];
     let acknack = (entity(), entity(), set(base), any::<u32>(), any::<bool>()).prop_map(
-        |(reader, writer, set, count, is_final)| {
-            Submessage::AckNack(AckNack {
-                reader,
-                writer,
-                set,
-                count,
-                is_final,
-            })
-        },
+        |(reader, writer, set, count, is_final)| Submessage::AckNack(AckNack { reader, writer, set, count, is_final }),
     );
     let fragments = set(1u32..u32::MAX - SPAN);
-    let nack_frag = (entity(), entity(), number(), fragments, any::<u32>()).prop_map(
-        |(reader, writer, number, set, count)| {
-            Submessage::NackFrag(NackFrag {
-                reader,
-                writer,
-                number,
-                set,
-                count,
-            })
-        },
-    );
-    let gap =
-        (entity(), entity(), number(), set(number())).prop_map(|(reader, writer, start, set)| {
-            Submessage::Gap(Gap {
-                reader,
-                writer,
-                start,
-                set,
-            })
+    let nack_frag =
+        (entity(), entity(), number(), fragments, any::<u32>()).prop_map(|(reader, writer, number, set, count)| {
+            Submessage::NackFrag(NackFrag { reader, writer, number, set, count })
         });
-    prop_oneof![
-        data(),
-        data_frag().prop_map(Submessage::DataFrag),
-        beat,
-        beat_frag,
-        acknack,
-        nack_frag,
-        gap
-    ]
+    let gap = (entity(), entity(), number(), set(number()))
+        .prop_map(|(reader, writer, start, set)| Submessage::Gap(Gap { reader, writer, start, set }));
+    prop_oneof![data(), data_frag().prop_map(Submessage::DataFrag), beat, beat_frag, acknack, nack_frag, gap]
 }
 
 /// Generates the submessages of one datagram, each with its context.
 fn received_submessages() -> impl Strategy<Value = Vec<ReceivedSubmessage>> {
-    let time =
-        (any::<u32>(), 0..u32::MAX).prop_map(|(seconds, fraction)| WireTime { seconds, fraction });
+    let time = (any::<u32>(), 0..u32::MAX).prop_map(|(seconds, fraction)| WireTime { seconds, fraction });
     let one = (option::of(prefix()), option::of(time), submessage());
     (prefix(), vec(one, 0..8)).prop_map(|(from, said)| {
         let (mut to, mut written) = (None, None);
         let said = said.into_iter().map(|(destination, time, submessage)| {
             to = destination.or(to);
             written = time.or(written);
-            ReceivedSubmessage {
-                from,
-                vendor: VendorId::OURS,
-                to,
-                written,
-                submessage,
-            }
+            ReceivedSubmessage { from, vendor: VendorId::OURS, to, written, submessage }
         });
         said.collect()
     })
 }
 
 fn write(received: &[ReceivedSubmessage]) -> Bytes {
-    let mut writer = DatagramWriter::new(
-        received
-            .first()
-            .map_or(GuidPrefix([1; 12]), |first| first.from),
-    );
-    for ReceivedSubmessage {
-        to,
-        written,
-        submessage,
-        ..
-    } in received
-    {
+    let mut writer = DatagramWriter::new(received.first().map_or(GuidPrefix([1; 12]), |first| first.from));
+    for ReceivedSubmessage { to, written, submessage, .. } in received {
         if let Some(to) = to {
             writer.destination(*to);
         }
@@ -247,11 +133,7 @@ fn write(received: &[ReceivedSubmessage]) -> Bytes {
 
 /// Pads a payload to a multiple of four bytes, as the writer does.
 fn pad_payload(mut received: ReceivedSubmessage) -> ReceivedSubmessage {
-    if let Submessage::Data(Data {
-        payload: Some(payload),
-        ..
-    }) = &mut received.submessage
-    {
+    if let Submessage::Data(Data { payload: Some(payload), .. }) = &mut received.submessage {
         let mut bytes = payload.to_vec();
         bytes.resize(bytes.len().next_multiple_of(4), 0);
         *payload = bytes.into();

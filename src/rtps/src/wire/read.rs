@@ -3,9 +3,8 @@
 use bytes::Bytes;
 
 use super::{
-    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, MOST_SUBMESSAGES,
-    NackFrag, Parsed, ReceivedSubmessage, Submessage, WireError, WireReader, kind, next_parameter,
-    pid,
+    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, MOST_SUBMESSAGES, NackFrag, Parsed,
+    ReceivedSubmessage, Submessage, WireError, WireReader, kind, next_parameter, pid,
 };
 use crate::sequence::{NumberSet, SPAN};
 use crate::time::WireTime;
@@ -19,10 +18,7 @@ pub fn parse(datagram: &Bytes) -> Parsed {
     parsed
 }
 
-fn read_submessages(
-    datagram: &Bytes,
-    received: &mut Vec<ReceivedSubmessage>,
-) -> Result<(), WireError> {
+fn read_submessages(datagram: &Bytes, received: &mut Vec<ReceivedSubmessage>) -> Result<(), WireError> {
     let mut input = WireReader::new(datagram, false);
     let mut said = SubmessageContext::from_header(&mut input).ok_or(WireError::NotRtps)?;
     for _ in 0..MOST_SUBMESSAGES {
@@ -31,26 +27,11 @@ fn read_submessages(
         }
         let (kind, flags, body) = next_submessage(&mut input)?;
         if let Some(submessage) = said.read_submessage(kind, flags, body)? {
-            let SubmessageContext {
-                from,
-                vendor,
-                to,
-                written,
-            } = said;
-            received.push(ReceivedSubmessage {
-                from,
-                vendor,
-                to,
-                written,
-                submessage,
-            });
+            let SubmessageContext { from, vendor, to, written } = said;
+            received.push(ReceivedSubmessage { from, vendor, to, written, submessage });
         }
     }
-    if input.remaining() == 0 {
-        Ok(())
-    } else {
-        Err(WireError::TooMany)
-    }
+    if input.remaining() == 0 { Ok(()) } else { Err(WireError::TooMany) }
 }
 
 /// Reads the next submessage: its id, its flags and its body.
@@ -59,11 +40,7 @@ fn next_submessage<'a>(input: &mut WireReader<'a>) -> Result<(u8, u8, WireReader
     input.little = flags & 1 != 0;
     let length = usize::from(input.u16()?);
     let to_the_end = length == 0 && !matches!(kind, kind::PAD | kind::INFO_TS);
-    let body = input.split_to(if to_the_end {
-        input.remaining()
-    } else {
-        length
-    })?;
+    let body = input.split_to(if to_the_end { input.remaining() } else { length })?;
     // Submessages start at multiples of four bytes, also after one without a length.
     let filler = input.position().next_multiple_of(4) - input.position();
     input.skip(filler.min(input.remaining()))?;
@@ -86,29 +63,15 @@ impl SubmessageContext {
         let vendor = VendorId(input.array().ok()?);
         let from = input.prefix().ok()?;
         debug_assert_eq!(input.position(), HEADER);
-        (protocol == *b"RTPS" && major == 2).then_some(Self {
-            from,
-            vendor,
-            to: None,
-            written: None,
-        })
+        (protocol == *b"RTPS" && major == 2).then_some(Self { from, vendor, to: None, written: None })
     }
 
     /// Reads a submessage. Returns `None` if it only changes the context or is unknown.
-    fn read_submessage(
-        &mut self,
-        kind: u8,
-        flags: u8,
-        mut body: WireReader,
-    ) -> Result<Option<Submessage>, WireError> {
+    fn read_submessage(&mut self, kind: u8, flags: u8, mut body: WireReader) -> Result<Option<Submessage>, WireError> {
         let input = &mut body;
         match kind {
             kind::INFO_TS => {
-                self.written = if flags & 2 != 0 {
-                    None
-                } else {
-                    Some(input.time()?).filter(|time| *time != NEVER)
-                };
+                self.written = if flags & 2 != 0 { None } else { Some(input.time()?).filter(|time| *time != NEVER) };
             }
             kind::INFO_SRC => {
                 input.skip(4)?;
@@ -138,10 +101,7 @@ impl SubmessageContext {
 }
 
 /// The time value that means unknown (9.3.2.1).
-const NEVER: WireTime = WireTime {
-    seconds: u32::MAX,
-    fraction: u32::MAX,
-};
+const NEVER: WireTime = WireTime { seconds: u32::MAX, fraction: u32::MAX };
 
 /// Common header of DATA and DATA_FRAG.
 struct DataHeader {
@@ -152,18 +112,12 @@ struct DataHeader {
 
 /// Reads the common header. `input` is then positioned at the inline QoS, the returned reader at the other fields
 /// before it.
-fn read_data_header<'a>(
-    input: &mut WireReader<'a>,
-) -> Result<(DataHeader, WireReader<'a>), WireError> {
+fn read_data_header<'a>(input: &mut WireReader<'a>) -> Result<(DataHeader, WireReader<'a>), WireError> {
     input.skip(2)?;
     // A later version may add fields there, which are skipped.
     let to_inline = usize::from(input.u16()?);
     let mut fixed = input.split_to(to_inline)?;
-    let head = DataHeader {
-        reader: fixed.entity()?,
-        writer: fixed.entity()?,
-        number: fixed.sample_number()?,
-    };
+    let head = DataHeader { reader: fixed.entity()?, writer: fixed.entity()?, number: fixed.sample_number()? };
     Ok((head, fixed))
 }
 
@@ -172,14 +126,7 @@ fn data(flags: u8, input: &mut WireReader) -> Result<Option<Submessage>, WireErr
     if flags & 0x10 != 0 {
         return Ok(None);
     }
-    let (
-        DataHeader {
-            reader,
-            writer,
-            number,
-        },
-        _,
-    ) = read_data_header(input)?;
+    let (DataHeader { reader, writer, number }, _) = read_data_header(input)?;
     let Some(inline) = inline_qos(flags, input)? else {
         return Ok(None);
     };
@@ -189,34 +136,19 @@ fn data(flags: u8, input: &mut WireReader) -> Result<Option<Submessage>, WireErr
         return Err(WireError::Flags(flags));
     }
     let payload = (sample || key_only).then(|| input.to_bytes());
-    Ok(Some(Submessage::Data(Data {
-        reader,
-        writer,
-        number,
-        inline,
-        payload,
-        key_only,
-    })))
+    Ok(Some(Submessage::Data(Data { reader, writer, number, inline, payload, key_only })))
 }
 
 fn data_frag(flags: u8, input: &mut WireReader) -> Result<Option<Submessage>, WireError> {
-    let (
-        DataHeader {
-            reader,
-            writer,
-            number,
-        },
-        mut fixed,
-    ) = read_data_header(input)?;
+    let (DataHeader { reader, writer, number }, mut fixed) = read_data_header(input)?;
     let (first, count) = (fixed.u32()?, fixed.u16()?);
     let (fragment_size, sample_size) = (fixed.u16()?, fixed.u32()?);
-    let length =
-        covered_length(first, count, fragment_size, sample_size).ok_or(WireError::Fragments {
-            first,
-            count,
-            size: fragment_size,
-            sample: sample_size,
-        })?;
+    let length = covered_length(first, count, fragment_size, sample_size).ok_or(WireError::Fragments {
+        first,
+        count,
+        size: fragment_size,
+        sample: sample_size,
+    })?;
     let Some(inline) = inline_qos(flags, input)? else {
         return Ok(None);
     };
@@ -257,47 +189,22 @@ fn heartbeat(flags: u8, input: &mut WireReader) -> Result<Submessage, WireError>
         return Err(WireError::Number(last.0));
     }
     let (is_final, liveliness) = (flags & 2 != 0, flags & 4 != 0);
-    Ok(Submessage::Heartbeat(Heartbeat {
-        reader,
-        writer,
-        first,
-        last,
-        count: input.u32()?,
-        is_final,
-        liveliness,
-    }))
+    Ok(Submessage::Heartbeat(Heartbeat { reader, writer, first, last, count: input.u32()?, is_final, liveliness }))
 }
 
 fn heartbeat_frag(input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
     let (number, last, count) = (input.sample_number()?, input.u32()?, input.u32()?);
     if last == 0 {
-        return Err(WireError::Fragments {
-            first: 1,
-            count: 0,
-            size: 0,
-            sample: 0,
-        });
+        return Err(WireError::Fragments { first: 1, count: 0, size: 0, sample: 0 });
     }
-    Ok(Submessage::HeartbeatFrag(HeartbeatFrag {
-        reader,
-        writer,
-        number,
-        last,
-        count,
-    }))
+    Ok(Submessage::HeartbeatFrag(HeartbeatFrag { reader, writer, number, last, count }))
 }
 
 fn acknack(flags: u8, input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
     let set = sequence_set(input, 0)?;
-    Ok(Submessage::AckNack(AckNack {
-        reader,
-        writer,
-        set,
-        count: input.u32()?,
-        is_final: flags & 2 != 0,
-    }))
+    Ok(Submessage::AckNack(AckNack { reader, writer, set, count: input.u32()?, is_final: flags & 2 != 0 }))
 }
 
 fn nack_frag(input: &mut WireReader) -> Result<Submessage, WireError> {
@@ -308,24 +215,13 @@ fn nack_frag(input: &mut WireReader) -> Result<Submessage, WireError> {
     if base == 0 || set.bits > 0 && base.checked_add(set.bits - 1).is_none() {
         return Err(WireError::Set(set.bits));
     }
-    Ok(Submessage::NackFrag(NackFrag {
-        reader,
-        writer,
-        number,
-        set,
-        count: input.u32()?,
-    }))
+    Ok(Submessage::NackFrag(NackFrag { reader, writer, number, set, count: input.u32()? }))
 }
 
 fn gap(input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
     let start = input.sample_number()?;
-    Ok(Submessage::Gap(Gap {
-        reader,
-        writer,
-        start,
-        set: sequence_set(input, 1)?,
-    }))
+    Ok(Submessage::Gap(Gap { reader, writer, start, set: sequence_set(input, 1)? }))
 }
 
 /// Reads a set of sequence numbers whose base is at least `least`.
@@ -364,26 +260,16 @@ fn inline_qos(flags: u8, input: &mut WireReader) -> Result<Option<InlineQos>, Wi
     }
 }
 
-const INLINE: [u16; 4] = [
-    pid::RELATED_SAMPLE_IDENTITY,
-    pid::FAST_DDS_RELATED_SAMPLE_IDENTITY,
-    pid::STATUS_INFO,
-    pid::KEY_HASH,
-];
+const INLINE: [u16; 4] =
+    [pid::RELATED_SAMPLE_IDENTITY, pid::FAST_DDS_RELATED_SAMPLE_IDENTITY, pid::STATUS_INFO, pid::KEY_HASH];
 
 impl InlineQos {
     /// Sets one of these parameters.
-    pub(super) fn set_parameter(
-        &mut self,
-        number: u16,
-        mut value: WireReader,
-    ) -> Result<(), WireError> {
+    pub(super) fn set_parameter(&mut self, number: u16, mut value: WireReader) -> Result<(), WireError> {
         match number {
             pid::RELATED_SAMPLE_IDENTITY => self.related = Some(value.identity()?),
             // Redundant if the standard parameter is present.
-            pid::FAST_DDS_RELATED_SAMPLE_IDENTITY => {
-                self.related = self.related.or(Some(value.identity()?))
-            }
+            pid::FAST_DDS_RELATED_SAMPLE_IDENTITY => self.related = self.related.or(Some(value.identity()?)),
             // The flags are in the last byte, in either byte order (9.6.4.9).
             pid::STATUS_INFO => self.status = u32::from_be_bytes(value.array()?),
             pid::KEY_HASH => self.key_hash = Some(value.array()?),

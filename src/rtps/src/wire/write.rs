@@ -1,8 +1,7 @@
 //! Writing of datagrams: little-endian, with the length of every submessage a multiple of four bytes.
 
 use super::{
-    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, NackFrag,
-    ParameterWriter, kind, pid,
+    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, NackFrag, ParameterWriter, kind, pid,
 };
 use crate::sequence::NumberSet;
 use crate::time::WireTime;
@@ -70,9 +69,7 @@ impl DatagramWriter {
 
     /// Sets the destination of the following submessages; UNKNOWN: everybody.
     pub fn destination(&mut self, prefix: GuidPrefix) -> &mut Self {
-        self.submessage(kind::INFO_DST, LITTLE, |bytes| {
-            bytes.extend_from_slice(&prefix.0)
-        })
+        self.submessage(kind::INFO_DST, LITTLE, |bytes| bytes.extend_from_slice(&prefix.0))
     }
 
     /// Sets the source timestamp of the following samples.
@@ -106,16 +103,12 @@ impl DatagramWriter {
 
     /// Writes the samples that a reader has received and misses.
     pub fn acknack(&mut self, acknack: &AckNack) -> &mut Self {
-        self.submessage(
-            kind::ACKNACK,
-            LITTLE | flag_if(2, acknack.is_final),
-            |bytes| {
-                write_entities(bytes, acknack.reader, acknack.writer);
-                bytes.extend_from_slice(&number_bytes(acknack.set.base));
-                write_set(bytes, &acknack.set);
-                bytes.extend_from_slice(&acknack.count.to_le_bytes());
-            },
-        )
+        self.submessage(kind::ACKNACK, LITTLE | flag_if(2, acknack.is_final), |bytes| {
+            write_entities(bytes, acknack.reader, acknack.writer);
+            bytes.extend_from_slice(&number_bytes(acknack.set.base));
+            write_set(bytes, &acknack.set);
+            bytes.extend_from_slice(&acknack.count.to_le_bytes());
+        })
     }
 
     /// Writes the fragments of a sample that a reader misses.
@@ -156,13 +149,7 @@ impl DatagramWriter {
         let flags = inline_flag(&frag.inline) | flag_if(4, frag.key_only);
         self.submessage(kind::DATA_FRAG, flags, |bytes| {
             write_frag_header(bytes, frag.reader, frag.writer, frag.number);
-            write_fragment_info(
-                bytes,
-                frag.first,
-                frag.count,
-                frag.fragment_size,
-                frag.sample_size,
-            );
+            write_fragment_info(bytes, frag.first, frag.count, frag.fragment_size, frag.sample_size);
             write_inline_qos(bytes, &frag.inline);
             bytes.extend_from_slice(&frag.payload);
         })
@@ -173,22 +160,11 @@ impl DatagramWriter {
     /// submessage's length. Fast DDS does the same, and Cyclone DDS rejects a last fragment of less than four bytes.
     #[must_use = "the zeros are part of the datagram"]
     pub fn data_frag_head(&mut self, head: &DataFragHead, payload_length: usize) -> &'static [u8] {
-        self.submessage_header(
-            kind::DATA_FRAG,
-            inline_flag(&head.inline),
-            payload_length,
-            |bytes| {
-                write_frag_header(bytes, head.reader, head.writer, head.number);
-                write_fragment_info(
-                    bytes,
-                    head.first,
-                    head.count,
-                    head.fragment_size,
-                    head.sample_size,
-                );
-                write_inline_qos(bytes, &head.inline);
-            },
-        )
+        self.submessage_header(kind::DATA_FRAG, inline_flag(&head.inline), payload_length, |bytes| {
+            write_frag_header(bytes, head.reader, head.writer, head.number);
+            write_fragment_info(bytes, head.first, head.count, head.fragment_size, head.sample_size);
+            write_inline_qos(bytes, &head.inline);
+        })
     }
 
     /// Writes a complete submessage.
@@ -248,36 +224,20 @@ fn write_set<N: Copy>(bytes: &mut Vec<u8>, set: &NumberSet<N>) {
 }
 
 /// Writes the header of DATA: no extra flags, 16 bytes to the inline QoS.
-fn write_data_header(
-    bytes: &mut Vec<u8>,
-    reader: EntityId,
-    writer: EntityId,
-    number: SequenceNumber,
-) {
+fn write_data_header(bytes: &mut Vec<u8>, reader: EntityId, writer: EntityId, number: SequenceNumber) {
     bytes.extend_from_slice(&[0, 0, 16, 0]);
     write_entities(bytes, reader, writer);
     bytes.extend_from_slice(&number_bytes(number));
 }
 
 /// Writes the header of DATA_FRAG: no extra flags, 28 bytes to the inline QoS.
-fn write_frag_header(
-    bytes: &mut Vec<u8>,
-    reader: EntityId,
-    writer: EntityId,
-    number: SequenceNumber,
-) {
+fn write_frag_header(bytes: &mut Vec<u8>, reader: EntityId, writer: EntityId, number: SequenceNumber) {
     bytes.extend_from_slice(&[0, 0, 28, 0]);
     write_entities(bytes, reader, writer);
     bytes.extend_from_slice(&number_bytes(number));
 }
 
-fn write_fragment_info(
-    bytes: &mut Vec<u8>,
-    first: FragmentNumber,
-    count: u16,
-    fragment_size: u16,
-    sample_size: u32,
-) {
+fn write_fragment_info(bytes: &mut Vec<u8>, first: FragmentNumber, count: u16, fragment_size: u16, sample_size: u32) {
     bytes.extend_from_slice(&first.to_le_bytes());
     bytes.extend_from_slice(&count.to_le_bytes());
     bytes.extend_from_slice(&fragment_size.to_le_bytes());

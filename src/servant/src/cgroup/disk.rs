@@ -10,10 +10,7 @@ use std::path::Path;
 pub(super) fn whole_disk(path: &Path) -> Option<String> {
     let device = fs::metadata(path).ok()?.dev();
     let number = format!("{}:{}", libc::major(device), libc::minor(device));
-    let entry = Path::new("/sys/dev/block")
-        .join(&number)
-        .canonicalize()
-        .ok()?;
+    let entry = Path::new("/sys/dev/block").join(&number).canonicalize().ok()?;
     // A limit is set on the disk, not on one of its partitions.
     if entry.join("partition").exists() {
         let whole = fs::read_to_string(entry.parent()?.join("dev")).ok()?;

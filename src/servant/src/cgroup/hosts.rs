@@ -54,29 +54,18 @@ impl CgroupParent {
     /// Finds the parent directories, and creates them if needed.
     pub fn find() -> Result<Self, Error> {
         let read = |path: &str| fs::read_to_string(path).map_err(Error::file("read", path));
-        let mounted =
-            parse_hierarchies(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
-        let uses_v1 = mounted
-            .iter()
-            .any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has_controller(name)));
+        let mounted = parse_hierarchies(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
+        let uses_v1 = mounted.iter().any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has_controller(name)));
         match mounted.iter().find(|hierarchy| hierarchy.unified) {
             _ if uses_v1 => Ok(Self::v1(&mounted)),
             Some(unified) => Self::v2(unified),
-            None => Ok(Self {
-                version: 0,
-                hierarchies: vec![],
-                reason: "no cgroup hierarchy is mounted".into(),
-            }),
+            None => Ok(Self { version: 0, hierarchies: vec![], reason: "no cgroup hierarchy is mounted".into() }),
         }
     }
 
     /// Returns the available controllers, sorted.
     pub fn controllers(&self) -> Vec<String> {
-        let mut names: Vec<_> = self
-            .hierarchies
-            .iter()
-            .flat_map(|below| below.controllers.clone())
-            .collect();
+        let mut names: Vec<_> = self.hierarchies.iter().flat_map(|below| below.controllers.clone()).collect();
         names.sort();
         names
     }
@@ -95,34 +84,18 @@ impl CgroupParent {
         let lacks_v2 = !has_cgroup_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
         let wanted = |hierarchy: &&MountedHierarchy| {
             let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has_controller(name));
-            hierarchy.unified
-                || has_any(&WANTED_V1)
-                || has_any(&IF_ASKED_V1)
-                || lacks_v2 && has_any(&WITHOUT_V2)
+            hierarchy.unified || has_any(&WANTED_V1) || has_any(&IF_ASKED_V1) || lacks_v2 && has_any(&WITHOUT_V2)
         };
-        let below = mounted
-            .iter()
-            .filter(wanted)
-            .map(|hierarchy| ParentDirectory {
-                controllers: hierarchy.controllers.clone(),
-                directory: hierarchy.own.join(NAME),
-                unified: hierarchy.unified,
-            });
-        let parent = Self {
-            version: 1,
-            hierarchies: below.collect(),
-            reason: String::new(),
-        };
+        let below = mounted.iter().filter(wanted).map(|hierarchy| ParentDirectory {
+            controllers: hierarchy.controllers.clone(),
+            directory: hierarchy.own.join(NAME),
+            unified: hierarchy.unified,
+        });
+        let parent = Self { version: 1, hierarchies: below.collect(), reason: String::new() };
         let known = parent.controllers();
-        let absent: Vec<_> = ["cpu", "memory", "pids"]
-            .into_iter()
-            .filter(|name| !known.iter().any(|k| k == name))
-            .collect();
-        let reason = if absent.is_empty() {
-            String::new()
-        } else {
-            format!("cgroup v1 without {}", absent.join(", "))
-        };
+        let absent: Vec<_> =
+            ["cpu", "memory", "pids"].into_iter().filter(|name| !known.iter().any(|k| k == name)).collect();
+        let reason = if absent.is_empty() { String::new() } else { format!("cgroup v1 without {}", absent.join(", ")) };
         Self { reason, ..parent }
     }
 
@@ -131,30 +104,16 @@ impl CgroupParent {
         fs::create_dir_all(&directory).map_err(Error::file("make the cgroup", &directory))?;
         // From the directory just above downwards: each directory enables for its children what it was given itself.
         let mut reason = String::new();
-        let above = directory
-            .parent()
-            .filter(|above| above.starts_with(&unified.mount));
+        let above = directory.parent().filter(|above| above.starts_with(&unified.mount));
         for place in above.into_iter().chain([directory.as_path()]) {
             if let Err(error) = enable_controllers(place, place == directory) {
-                reason = format!(
-                    "the controllers of {} cannot be handed down: {error}",
-                    place.display()
-                );
+                reason = format!("the controllers of {} cannot be handed down: {error}", place.display());
             }
         }
-        let enabled =
-            fs::read_to_string(directory.join("cgroup.subtree_control")).unwrap_or_default();
+        let enabled = fs::read_to_string(directory.join("cgroup.subtree_control")).unwrap_or_default();
         let controllers = enabled.split_whitespace().map(str::to_owned).collect();
-        let below = ParentDirectory {
-            controllers,
-            directory,
-            unified: true,
-        };
-        Ok(Self {
-            version: 2,
-            hierarchies: vec![below],
-            reason,
-        })
+        let below = ParentDirectory { controllers, directory, unified: true };
+        Ok(Self { version: 2, hierarchies: vec![below], reason })
     }
 }
 
@@ -170,16 +129,11 @@ impl MountedHierarchy {
 fn choose_v2(unified: &MountedHierarchy) -> PathBuf {
     let unit = unified.mount.join("system.slice").join(UNIT);
     let own_is_root = unified.own == unified.mount;
-    let by_systemd =
-        || Path::new("/run/systemd/system").exists() && (is_unit_active() || start_unit());
+    let by_systemd = || Path::new("/run/systemd/system").exists() && (is_unit_active() || start_unit());
     if unit.exists() || !own_is_root && by_systemd() {
         return unit;
     }
-    if own_is_root {
-        unified.own.join(NAME)
-    } else {
-        unified.own.with_file_name(NAME)
-    }
+    if own_is_root { unified.own.join(NAME) } else { unified.own.with_file_name(NAME) }
 }
 
 /// Returns whether the delegated unit is active in systemd.
@@ -194,19 +148,8 @@ fn start_unit() -> bool {
     let mut command = Command::new("systemd-run");
     // Otherwise it would notify our own supervisor that it is ready.
     command.env_remove("NOTIFY_SOCKET");
-    command.args([
-        "--quiet",
-        "--unit",
-        UNIT,
-        "--description",
-        "Cgroups of Cloudroid's servants",
-    ]);
-    for property in [
-        "Type=oneshot",
-        "RemainAfterExit=yes",
-        "Delegate=yes",
-        "KillMode=none",
-    ] {
+    command.args(["--quiet", "--unit", UNIT, "--description", "Cgroups of Cloudroid's servants"]);
+    for property in ["Type=oneshot", "RemainAfterExit=yes", "Delegate=yes", "KillMode=none"] {
         command.args(["--property", property]);
     }
     command.arg("/bin/true");
@@ -220,10 +163,7 @@ fn enable_controllers(place: &Path, ours: bool) -> io::Result<()> {
     let control = place.join("cgroup.subtree_control");
     let handed = fs::read_to_string(&control)?;
     let mut refused = None;
-    for name in WANTED_V2
-        .iter()
-        .filter(|name| available.split_whitespace().any(|known| known == **name))
-    {
+    for name in WANTED_V2.iter().filter(|name| available.split_whitespace().any(|known| known == **name)) {
         if !handed.split_whitespace().any(|known| known == *name) {
             refused = fs::write(&control, format!("+{name}")).err().or(refused);
         }
@@ -237,9 +177,7 @@ fn enable_controllers(place: &Path, ours: bool) -> io::Result<()> {
 /// Returns whether this kernel has `cgroup.kill`, which came with 5.14 and which no root directory shows.
 fn has_cgroup_kill() -> bool {
     let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    let mut numbers = release
-        .split(['.', '-'])
-        .map_while(|part| part.trim().parse::<u32>().ok());
+    let mut numbers = release.split(['.', '-']).map_while(|part| part.trim().parse::<u32>().ok());
     (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0)) >= (5, 14)
 }
 
@@ -272,41 +210,24 @@ fn parse_hierarchies(mountinfo: &str, cgroup: &str) -> Vec<MountedHierarchy> {
         let Some((names, path)) = own_path(cgroup, &options, unified) else {
             continue;
         };
-        let inside = Path::new(path)
-            .strip_prefix(root)
-            .or_else(|_| Path::new(path).strip_prefix("/"));
+        let inside = Path::new(path).strip_prefix(root).or_else(|_| Path::new(path).strip_prefix("/"));
         let own = Path::new(mount).join(inside.unwrap_or(Path::new("")));
         // join() with an empty path adds a slash; only the components matter.
         let own: PathBuf = own.components().collect();
-        let known = found
-            .iter()
-            .any(|other| other.unified == unified && other.controllers == names);
+        let known = found.iter().any(|other| other.unified == unified && other.controllers == names);
         if !known {
-            found.push(MountedHierarchy {
-                controllers: names,
-                mount: mount.into(),
-                own,
-                unified,
-            });
+            found.push(MountedHierarchy { controllers: names, mount: mount.into(), own, unified });
         }
     }
     found
 }
 
 /// Finds our line of /proc/self/cgroup for a hierarchy: its controllers and our path.
-fn own_path<'a>(
-    cgroup: &'a str,
-    options: &[&str],
-    unified: bool,
-) -> Option<(Vec<String>, &'a str)> {
+fn own_path<'a>(cgroup: &'a str, options: &[&str], unified: bool) -> Option<(Vec<String>, &'a str)> {
     cgroup.lines().find_map(|line| {
         let mut fields = line.splitn(3, ':');
         let (_, names, path) = (fields.next()?, fields.next()?, fields.next()?);
-        let names: Vec<String> = names
-            .split(',')
-            .filter(|name| !name.is_empty())
-            .map(str::to_owned)
-            .collect();
+        let names: Vec<String> = names.split(',').filter(|name| !name.is_empty()).map(str::to_owned).collect();
         let same = if unified {
             names.is_empty()
         } else {
@@ -329,10 +250,7 @@ mod tests {
 33 24 0:29 / /proc rw - proc proc rw";
         let cgroup = "4:memory:/private/x\n1:cpu,cpuacct:/\n0::/\n";
         let found = parse_hierarchies(mountinfo, cgroup);
-        let owns: Vec<_> = found
-            .iter()
-            .map(|one| (one.own.to_str().unwrap(), one.unified))
-            .collect();
+        let owns: Vec<_> = found.iter().map(|one| (one.own.to_str().unwrap(), one.unified)).collect();
         assert_eq!(
             owns,
             [
@@ -342,10 +260,7 @@ mod tests {
             ]
         );
         let parent = CgroupParent::v1(&found);
-        assert_eq!(
-            parent.hierarchies[1].directory,
-            Path::new("/sys/fs/cgroup/memory/private/x/cloudroid")
-        );
+        assert_eq!(parent.hierarchies[1].directory, Path::new("/sys/fs/cgroup/memory/private/x/cloudroid"));
         assert_eq!(parent.reason, "cgroup v1 without pids");
     }
 

@@ -38,18 +38,11 @@ pub fn counts_sockets(hierarchy: &Path) -> bool {
 
 pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     // The caller reads back whether a write took effect.
-    let write = |controller, name, value: String| {
-        cgroup
-            .control_file(controller, name)
-            .map(|file| fs::write(file, value))
-    };
+    let write =
+        |controller, name, value: String| cgroup.control_file(controller, name).map(|file| fs::write(file, value));
     if let Some(cpus) = limits.cpus {
         write("cpu", "cpu.cfs_period_us", PERIOD.to_string());
-        write(
-            "cpu",
-            "cpu.cfs_quota_us",
-            (cpus * PERIOD).round().max(1000.0).to_string(),
-        );
+        write("cpu", "cpu.cfs_quota_us", (cpus * PERIOD).round().max(1000.0).to_string());
     }
     if let Some(weight) = limits.cpu_weight {
         write("cpu", "cpu.shares", weight_to_shares(weight).to_string());
@@ -72,11 +65,7 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     if let Some(disk) = &cgroup.disk {
         for (name, limit) in [(READ, limits.io_read), (WRITE, limits.io_write)] {
             if let Some(limit) = limit {
-                write(
-                    "blkio",
-                    name,
-                    format!("{disk} {}", format_limit(limit.0, "0")),
-                );
+                write("blkio", name, format!("{disk} {}", format_limit(limit.0, "0")));
             }
         }
     }
@@ -98,24 +87,13 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     let period = number("cpu", "cpu.cfs_period_us");
     // -1 means no limit; it does not parse as u64, so it becomes `None`.
     let quota = number("cpu", "cpu.cfs_quota_us");
-    let io = |name| {
-        read_field(
-            &cgroup.control_file("blkio", name)?,
-            cgroup.disk.as_deref()?,
-        )
-        .map(Size)
-    };
-    let cpuset = cgroup
-        .control_file("cpuset", "cpuset.cpus")
-        .and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
+    let io = |name| read_field(&cgroup.control_file("blkio", name)?, cgroup.disk.as_deref()?).map(Size);
+    let cpuset =
+        cgroup.control_file("cpuset", "cpuset.cpus").and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
     Limits {
-        cpus: quota
-            .zip(period)
-            .map(|(quota, period)| quota as f64 / period as f64),
+        cpus: quota.zip(period).map(|(quota, period)| quota as f64 / period as f64),
         cpu_weight: number("cpu", "cpu.shares").map(shares_to_weight),
-        memory: number("memory", "memory.limit_in_bytes")
-            .filter(|bytes| *bytes < NO_LIMIT)
-            .map(Size),
+        memory: number("memory", "memory.limit_in_bytes").filter(|bytes| *bytes < NO_LIMIT).map(Size),
         // The nearest equivalent, soft_limit_in_bytes, throttles nobody.
         memory_high: None,
         pids: number("pids", "pids.max"),
@@ -145,9 +123,9 @@ pub(super) fn inherit_cpuset(directory: &Path) -> io::Result<()> {
 
 /// Returns whether a cpuset has no cores yet; false for directories that are not cpusets.
 fn has_empty_cpuset(directory: &Path) -> bool {
-    ["cpuset.cpus", "cpuset.mems"].iter().any(|name| {
-        fs::read_to_string(directory.join(name)).is_ok_and(|text| text.trim().is_empty())
-    })
+    ["cpuset.cpus", "cpuset.mems"]
+        .iter()
+        .any(|name| fs::read_to_string(directory.join(name)).is_ok_and(|text| text.trim().is_empty()))
 }
 
 /// Reads processor time, memory and, if a v2 hierarchy is mounted as well, pressure.
@@ -157,9 +135,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
     let beside = || read_field(&unified?.directory.join("cpu.stat"), "usage_usec");
     let cpu = number("cpuacct", "cpuacct.usage").map(|nanoseconds| nanoseconds / 1000);
     let memory = number("memory", "memory.usage_in_bytes");
-    let throttled = cgroup
-        .control_file("cpu", "cpu.stat")
-        .and_then(|file| read_field(&file, "throttled_time"));
+    let throttled = cgroup.control_file("cpu", "cpu.stat").and_then(|file| read_field(&file, "throttled_time"));
     Usage {
         cpu_usec: cpu.or_else(beside).unwrap_or(0),
         throttled_usec: throttled.unwrap_or(0) / 1000,
@@ -187,10 +163,7 @@ mod tests {
     #[test]
     fn weights_survive_the_way_to_v1_and_back() {
         for weight in [1, 50, 100, 333, 1000, 10_000] {
-            assert!(
-                super::shares_to_weight(super::weight_to_shares(weight)).abs_diff(weight) <= 1,
-                "{weight}"
-            );
+            assert!(super::shares_to_weight(super::weight_to_shares(weight)).abs_diff(weight) <= 1, "{weight}");
         }
         assert_eq!(super::weight_to_shares(100), 1024);
     }

@@ -13,17 +13,10 @@ const PERIOD: f64 = 100_000.0;
 
 pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
     // The caller reads back whether a write took effect.
-    let write = |controller, name, value: String| {
-        cgroup
-            .control_file(controller, name)
-            .map(|file| fs::write(file, value))
-    };
+    let write =
+        |controller, name, value: String| cgroup.control_file(controller, name).map(|file| fs::write(file, value));
     if let Some(cpus) = limits.cpus {
-        write(
-            "cpu",
-            "cpu.max",
-            format!("{} {PERIOD}", (cpus * PERIOD).round().max(1000.0)),
-        );
+        write("cpu", "cpu.max", format!("{} {PERIOD}", (cpus * PERIOD).round().max(1000.0)));
     }
     if let Some(weight) = limits.cpu_weight {
         write("cpu", "cpu.weight", weight.to_string());
@@ -72,9 +65,8 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
         let disk = cgroup.disk.as_deref()?;
         read_device_field(&cgroup.control_file("io", "io.max")?, disk, key).map(Size)
     };
-    let cpuset = cgroup
-        .control_file("cpuset", "cpuset.cpus")
-        .and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
+    let cpuset =
+        cgroup.control_file("cpuset", "cpuset.cpus").and_then(|file| fs::read_to_string(file).ok()?.parse().ok());
     Limits {
         cpus,
         cpu_weight: number("cpu", "cpu.weight"),
@@ -92,9 +84,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
     // These files exist even if the controller is not enabled.
     let plain = |name: &str| Some(cgroup.leaves.first()?.directory.join(name));
     let stat = |field| read_field(&plain("cpu.stat")?, field);
-    let memory = cgroup
-        .control_file("memory", "memory.current")
-        .and_then(|file| read_number(&file));
+    let memory = cgroup.control_file("memory", "memory.current").and_then(|file| read_number(&file));
     Usage {
         cpu_usec: stat("usage_usec").unwrap_or(0),
         throttled_usec: stat("throttled_usec").unwrap_or(0),
@@ -103,10 +93,7 @@ pub(super) fn usage(cgroup: &Cgroup) -> Usage {
             .control_file("memory", "memory.stat")
             .and_then(|file| read_field(&file, "inactive_file"))
             .unwrap_or(0),
-        pressure: cgroup
-            .leaves
-            .first()
-            .and_then(|leaf| cgroup_pressure(&leaf.directory)),
+        pressure: cgroup.leaves.first().and_then(|leaf| cgroup_pressure(&leaf.directory)),
         ..Usage::default()
     }
 }

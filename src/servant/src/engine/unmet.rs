@@ -38,9 +38,7 @@ impl EnforcedLimits {
     pub fn unmet_limits(&self, asked: &Limits) -> Vec<String> {
         let why = |name: &str| match (self.cgroup_version, name) {
             (0, _) => "no cgroup controller can be used here",
-            (1, "memory_high") => {
-                "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes does not throttle"
-            }
+            (1, "memory_high") => "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes does not throttle",
             (1, "cpuset") => {
                 "the cpuset controller must be mounted, and cgroup v1 accepts cores only for a servant that was \
                     started with some"
@@ -48,15 +46,10 @@ impl EnforcedLimits {
             (1, name) if name.starts_with("io_") => {
                 "cgroup v1 accepts it only for a servant that was started with one and whose layers are on a disk"
             }
-            (_, name) if name.starts_with("io_") => {
-                "its layers are not on a disk that can be limited"
-            }
+            (_, name) if name.starts_with("io_") => "its layers are not on a disk that can be limited",
             _ => "the kernel rejected it",
         };
-        missing_limits(asked, &self.limits)
-            .into_iter()
-            .map(|name| format!("{name} ({})", why(name)))
-            .collect()
+        missing_limits(asked, &self.limits).into_iter().map(|name| format!("{name} ({})", why(name))).collect()
     }
 }
 
@@ -67,49 +60,21 @@ mod tests {
 
     #[test]
     fn a_limit_that_is_not_in_force_is_named() {
-        let asked = Limits {
-            cpus: Some(1.5),
-            memory: Some(Size(100_000_000)),
-            pids: Some(10),
-            ..Limits::default()
-        };
-        let got = Limits {
-            memory: Some(Size(99_999_744)),
-            pids: None,
-            ..asked
-        };
+        let asked = Limits { cpus: Some(1.5), memory: Some(Size(100_000_000)), pids: Some(10), ..Limits::default() };
+        let got = Limits { memory: Some(Size(99_999_744)), pids: None, ..asked };
         assert_eq!(missing_limits(&asked, &got), ["pids"]);
         assert_eq!(missing_limits(&Limits::default(), &got), [""; 0]);
-        let lifted = Limits {
-            pids: Some(UNLIMITED),
-            io_read: Some(Size(UNLIMITED)),
-            ..Limits::default()
-        };
-        let still = Limits {
-            io_read: Some(Size(1 << 20)),
-            ..Limits::default()
-        };
+        let lifted = Limits { pids: Some(UNLIMITED), io_read: Some(Size(UNLIMITED)), ..Limits::default() };
+        let still = Limits { io_read: Some(Size(1 << 20)), ..Limits::default() };
         assert_eq!(missing_limits(&lifted, &still), ["io_read"]);
     }
 
     #[test]
     fn what_cgroup_v1_does_not_have_is_said() {
-        let asked = Limits {
-            memory_high: Some(Size(1 << 26)),
-            ..Limits::default()
-        };
-        let enforced = |cgroup_version| EnforcedLimits {
-            cgroup_version,
-            ..EnforcedLimits::default()
-        };
+        let asked = Limits { memory_high: Some(Size(1 << 26)), ..Limits::default() };
+        let enforced = |cgroup_version| EnforcedLimits { cgroup_version, ..EnforcedLimits::default() };
         let on_v1 = enforced(1).unmet_limits(&asked);
-        assert!(
-            on_v1[0].starts_with("memory_high (cgroup v1 has no memory.high"),
-            "{on_v1:?}"
-        );
-        assert_eq!(
-            enforced(2).unmet_limits(&asked),
-            ["memory_high (the kernel rejected it)"]
-        );
+        assert!(on_v1[0].starts_with("memory_high (cgroup v1 has no memory.high"), "{on_v1:?}");
+        assert_eq!(enforced(2).unmet_limits(&asked), ["memory_high (the kernel rejected it)"]);
     }
 }

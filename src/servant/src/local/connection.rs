@@ -73,12 +73,7 @@ impl ServantView {
 
     fn apply_message(&self, message: ShimMessage) {
         match message {
-            ShimMessage::Hello {
-                state,
-                nodes,
-                enforced,
-                ..
-            } => {
+            ShimMessage::Hello { state, nodes, enforced, .. } => {
                 self.enforced.send_replace(enforced);
                 self.nodes.send_replace(nodes);
                 self.set_state(state);
@@ -95,12 +90,7 @@ impl ServantView {
                 self.enforced.send_replace(enforced);
             }
             ShimMessage::Reply { id, error } => {
-                let answer = self
-                    .waiting
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .answers
-                    .remove(&id);
+                let answer = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).answers.remove(&id);
                 if let Some(answer) = answer {
                     let _ = answer.send(error);
                 }
@@ -121,9 +111,7 @@ impl ServantView {
     }
 
     /// Allocates the id of a request and the channel for its reply.
-    fn register_request(
-        &self,
-    ) -> Result<(u64, oneshot::Receiver<Option<String>>), ShimRequestError> {
+    fn register_request(&self) -> Result<(u64, oneshot::Receiver<Option<String>>), ShimRequestError> {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         if waiting.closed {
             return Err(ShimRequestError::Gone);
@@ -159,27 +147,13 @@ pub(super) enum ShimRequestError {
 impl RequestSender {
     pub(super) fn split(stream: UnixStream) -> (OwnedReadHalf, Self) {
         let (read, write) = stream.into_split();
-        (
-            read,
-            Self {
-                write: AsyncMutex::new(write),
-            },
-        )
+        (read, Self { write: AsyncMutex::new(write) })
     }
 
-    pub(super) async fn request(
-        &self,
-        known: &ServantView,
-        command: Command,
-    ) -> Result<(), ShimRequestError> {
+    pub(super) async fn request(&self, known: &ServantView, command: Command) -> Result<(), ShimRequestError> {
         let (id, answer) = known.register_request()?;
         let line = protocol::to_line(&ShimRequest { id, command });
-        self.write
-            .lock()
-            .await
-            .write_all(&line)
-            .await
-            .map_err(|_| ShimRequestError::Gone)?;
+        self.write.lock().await.write_all(&line).await.map_err(|_| ShimRequestError::Gone)?;
         match answer.await {
             Ok(None) => Ok(()),
             Ok(Some(reason)) => Err(ShimRequestError::Refused(reason)),
@@ -208,11 +182,7 @@ mod tests {
     use super::*;
 
     fn signal() -> Command {
-        Command::SignalNode {
-            node: "/a".to_owned(),
-            signal: 9,
-            last: false,
-        }
+        Command::SignalNode { node: "/a".to_owned(), signal: 9, last: false }
     }
 
     #[tokio::test]
@@ -244,9 +214,7 @@ mod tests {
         for asked in asks.join_all().await {
             asked.expect("it answers after all");
         }
-        let asked = requests
-            .request_with_timeout(&known, signal(), Duration::ZERO)
-            .await;
+        let asked = requests.request_with_timeout(&known, signal(), Duration::ZERO).await;
         assert!(matches!(asked, Err(ShimRequestError::Silent)), "{asked:?}");
         listener.abort();
     }

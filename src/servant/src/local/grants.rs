@@ -45,10 +45,7 @@ pub(super) struct ResolvedGrants {
 
 impl ResolvedGrants {
     /// Returns the spec's environment extended by the variables of the devices.
-    pub(super) fn merge_environment(
-        &self,
-        plan: &BTreeMap<String, String>,
-    ) -> BTreeMap<String, String> {
+    pub(super) fn merge_environment(&self, plan: &BTreeMap<String, String>) -> BTreeMap<String, String> {
         let mut all = plan.clone();
         all.extend(self.environment.clone());
         all
@@ -56,25 +53,14 @@ impl ResolvedGrants {
 }
 
 /// Resolves all grants, if they are allowed and exist.
-pub(super) fn resolve(
-    grants: &Grants,
-    allow: &Allow,
-    resources: &dyn Resources,
-) -> Result<ResolvedGrants, GrantError> {
+pub(super) fn resolve(grants: &Grants, allow: &Allow, resources: &dyn Resources) -> Result<ResolvedGrants, GrantError> {
     let hosts = resources.hosts(&grants.egress);
-    let mut granted = ResolvedGrants {
-        hosts: hosts.map_err(GrantError::Egress)?,
-        ..ResolvedGrants::default()
-    };
+    let mut granted = ResolvedGrants { hosts: hosts.map_err(GrantError::Egress)?, ..ResolvedGrants::default() };
     for volume in &grants.volumes {
         granted.mounts.push(volume::open(volume, &allow.volumes)?);
     }
     for name in &grants.devices {
-        if !allow
-            .devices
-            .iter()
-            .any(|known| device_matches(known, name))
-        {
+        if !allow.devices.iter().any(|known| device_matches(known, name)) {
             return Err(not_allowed("device", name));
         }
         cdi::add_device(name, &cdi::directories(), &mut granted)?;
@@ -83,18 +69,12 @@ pub(super) fn resolve(
 }
 
 fn not_allowed(kind: &'static str, name: &str) -> GrantError {
-    GrantError::NotAllowed {
-        kind,
-        name: name.to_owned(),
-    }
+    GrantError::NotAllowed { kind, name: name.to_owned() }
 }
 
 /// Returns whether `known` is the device or its class: `vendor.com/class=*` matches a whole class.
 fn device_matches(known: &str, name: &str) -> bool {
-    known == name
-        || known
-            .strip_suffix('*')
-            .is_some_and(|class| class.ends_with('=') && name.starts_with(class))
+    known == name || known.strip_suffix('*').is_some_and(|class| class.ends_with('=') && name.starts_with(class))
 }
 
 #[cfg(test)]
@@ -102,20 +82,12 @@ mod tests {
     use super::*;
 
     fn allow() -> Allow {
-        Allow {
-            devices: vec!["vendor.com/net=*".into(), "vendor.com/gpu=0".into()],
-            ..Allow::default()
-        }
+        Allow { devices: vec!["vendor.com/net=*".into(), "vendor.com/gpu=0".into()], ..Allow::default() }
     }
 
     #[test]
     fn a_class_of_devices_may_be_allowed() {
-        let covered = |name: &str| {
-            allow()
-                .devices
-                .iter()
-                .any(|known| device_matches(known, name))
-        };
+        let covered = |name: &str| allow().devices.iter().any(|known| device_matches(known, name));
         assert!(covered("vendor.com/net=7") && covered("vendor.com/gpu=0"));
         assert!(!covered("vendor.com/gpu=1") && !covered("vendor.com/network=7"));
     }

@@ -20,9 +20,7 @@ use super::connection::{RequestSender, ServantView, ShimRequestError};
 use super::sweep;
 use crate::Error;
 use crate::cgroup::Cgroup;
-use crate::engine::{
-    ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage,
-};
+use crate::engine::{ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage};
 use crate::launch::{self, ExitRecord, LaunchRecord, RuntimeRecord};
 use crate::local::GracePeriods;
 use crate::logs::{self, DirectoryWatches};
@@ -80,14 +78,8 @@ pub(super) async fn wait_until_running(
     shim: ProcessIdentity,
 ) -> Result<Arc<LocalServant>, Error> {
     let ServantLocation { id, directory, .. } = place;
-    let ended = || Error::Start {
-        id: id.to_owned(),
-        reason: start_failure_reason(directory),
-    };
-    let pidfd = shim
-        .open_pidfd()
-        .map_err(Error::call("looking at the shim just started"))?
-        .ok_or_else(ended)?;
+    let ended = || Error::Start { id: id.to_owned(), reason: start_failure_reason(directory) };
+    let pidfd = shim.open_pidfd().map_err(Error::call("looking at the shim just started"))?.ok_or_else(ended)?;
     let runtime = RuntimeRecord {
         shim,
         cgroup: Cgroup::for_servant(&launch.parent, &launch.spec),
@@ -108,10 +100,7 @@ pub(super) async fn wait_until_running(
         ContainerState::Running => Ok(servant),
         ContainerState::Creating => Err(ended()),
         ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
-            Err(Error::Start {
-                id: id.to_owned(),
-                reason,
-            })
+            Err(Error::Start { id: id.to_owned(), reason })
         }
     }
 }
@@ -124,35 +113,26 @@ pub(super) async fn adopt(
 ) -> Result<Arc<LocalServant>, Error> {
     let ServantLocation { id, directory, .. } = place;
     let path = directory.join(launch::SPEC);
-    let missing = || Error::Malformed {
-        path: path.clone(),
-        reason: "there is no launch record".into(),
-    };
+    let missing = || Error::Malformed { path: path.clone(), reason: "there is no launch record".into() };
     let launch: LaunchRecord = launch::read_record(&path)?.ok_or_else(missing)?;
     let opened = File::open(directory).map_err(Error::file("open", directory))?;
     // Through a descriptor, since the path itself may be longer than a socket address allows.
     let address = format!("/proc/self/fd/{}/{}", opened.as_raw_fd(), launch::SOCKET);
-    let control = StdStream::connect(address)
-        .map_err(Error::file("connect to", directory.join(launch::SOCKET)))?;
+    let control = StdStream::connect(address).map_err(Error::file("connect to", directory.join(launch::SOCKET)))?;
     // The pid is certainly that of the process held by its pidfd.
     let network = NetNs::from_pid(runtime.shim.pid)?;
     let grace = launch.grace;
     let servant = connect(place, network, control, runtime, pidfd, grace)?;
     let mut state = servant.known.state.subscribe();
     let mut closed = servant.known.closed.subscribe();
-    let silent = || Error::Ended {
-        id: id.to_owned(),
-        reason: "its shim does not answer".into(),
-    };
+    let silent = || Error::Ended { id: id.to_owned(), reason: "its shim does not answer".into() };
     let answered = async {
         tokio::select! {
             _ = state.wait_for(|state| *state != ContainerState::Creating) => Ok(()),
             _ = closed.wait_for(|closed| *closed) => Err(silent()),
         }
     };
-    tokio::time::timeout(ANSWER, answered)
-        .await
-        .map_err(|_| silent())??;
+    tokio::time::timeout(ANSWER, answered).await.map_err(|_| silent())??;
     Ok(servant)
 }
 
@@ -164,9 +144,7 @@ fn connect(
     pidfd: OwnedFd,
     grace: GracePeriods,
 ) -> Result<Arc<LocalServant>, Error> {
-    control
-        .set_nonblocking(true)
-        .map_err(Error::call("talking to a shim"))?;
+    control.set_nonblocking(true).map_err(Error::call("talking to a shim"))?;
     let stream = UnixStream::from_std(control).map_err(Error::call("talking to a shim"))?;
     let (read, requests) = RequestSender::split(stream);
     let ServantLocation { id, directory, .. } = place;
@@ -201,13 +179,10 @@ async fn watch_shim(
     if let Err(error) = wait_for_end(&shim, FINISH).await {
         tracing::warn!(%error, "a shim closed its connection and did not end");
     }
-    let exit: Option<ExitRecord> =
-        launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
+    let exit: Option<ExitRecord> = launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
     let over = known.state.borrow().is_over();
     if !over {
-        let lost = || ContainerState::Failed {
-            reason: shim_loss_reason(&directory),
-        };
+        let lost = || ContainerState::Failed { reason: shim_loss_reason(&directory) };
         let state = exit.map_or_else(lost, |exit| {
             known.nodes.send_replace(exit.nodes);
             exit.state
@@ -218,8 +193,7 @@ async fn watch_shim(
 
 /// Returns the reason why a shim ended without a final state.
 fn shim_loss_reason(directory: &Path) -> String {
-    let runtime: Option<RuntimeRecord> =
-        launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
+    let runtime: Option<RuntimeRecord> = launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
     let cgroup = runtime.and_then(|runtime| runtime.shim_cgroup);
     match cgroup.filter(|cgroup| cgroup.oom_kills() > 0) {
         Some(cgroup) => {
@@ -248,44 +222,24 @@ async fn wait_for_end(pidfd: &OwnedFd, patience: Duration) -> std::io::Result<()
 
 /// Returns the last error messages of a shim that ended.
 fn start_failure_reason(directory: &Path) -> String {
-    let exit: Option<ExitRecord> =
-        launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
-    if let Some(ExitRecord {
-        state: ContainerState::Failed { reason } | ContainerState::Stopped { reason },
-        ..
-    }) = exit
+    let exit: Option<ExitRecord> = launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
+    if let Some(ExitRecord { state: ContainerState::Failed { reason } | ContainerState::Stopped { reason }, .. }) = exit
     {
         return reason;
     }
     let log = std::fs::read_to_string(directory.join(launch::SHIM_LOG)).unwrap_or_default();
     match log.trim() {
         "" => "its shim ended without a word".into(),
-        text => text
-            .lines()
-            .rev()
-            .take(5)
-            .collect::<Vec<_>>()
-            .into_iter()
-            .rev()
-            .collect::<Vec<_>>()
-            .join("; "),
+        text => text.lines().rev().take(5).collect::<Vec<_>>().into_iter().rev().collect::<Vec<_>>().join("; "),
     }
 }
 
 impl LocalServant {
     async fn send_signal(&self, node: &str, signal: i32, last: bool) -> Result<(), Error> {
         if !self.known.nodes.borrow().contains_key(node) {
-            return Err(Error::NoNode {
-                id: self.id.clone(),
-                node: node.to_owned(),
-            });
+            return Err(Error::NoNode { id: self.id.clone(), node: node.to_owned() });
         }
-        self.request_briefly(Command::SignalNode {
-            node: node.to_owned(),
-            signal,
-            last,
-        })
-        .await
+        self.request_briefly(Command::SignalNode { node: node.to_owned(), signal, last }).await
     }
 
     /// Sends a request to the shim.
@@ -296,12 +250,8 @@ impl LocalServant {
 
     /// Sends a request that the shim answers at once.
     async fn request_briefly(&self, command: Command) -> Result<(), Error> {
-        let asked = self
-            .requests
-            .request_with_timeout(&self.known, command, ANSWER);
-        asked
-            .await
-            .map_err(|unfulfilled| self.request_error(unfulfilled))
+        let asked = self.requests.request_with_timeout(&self.known, command, ANSWER);
+        asked.await.map_err(|unfulfilled| self.request_error(unfulfilled))
     }
 
     fn request_error(&self, unfulfilled: ShimRequestError) -> Error {
@@ -315,15 +265,10 @@ impl LocalServant {
 
     fn ended_error(&self) -> Error {
         let reason = match &*self.known.state.borrow() {
-            ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
-                reason.clone()
-            }
+            ContainerState::Stopped { reason } | ContainerState::Failed { reason } => reason.clone(),
             _ => "its shim does not answer".into(),
         };
-        Error::Ended {
-            id: self.id.clone(),
-            reason,
-        }
+        Error::Ended { id: self.id.clone(), reason }
     }
 
     fn ensure_running(&self) -> Result<(), Error> {
@@ -344,9 +289,7 @@ impl LocalServant {
     }
 
     /// Loads the state left by this daemon or an earlier one for the next; `None` if there is none.
-    pub async fn load_handover<T: DeserializeOwned + Send + 'static>(
-        &self,
-    ) -> Result<Option<T>, Error> {
+    pub async fn load_handover<T: DeserializeOwned + Send + 'static>(&self) -> Result<Option<T>, Error> {
         let path = self.directory.join(launch::DAEMON);
         privilege::run(async move { launch::read_record(&path) }).await
     }
@@ -382,14 +325,10 @@ impl LocalServant {
 /// (Documentation/scheduler/sched-stats.rst: nanoseconds on a CPU, nanoseconds waiting, timeslices).
 fn thread_wait_time(pid: i32) -> Duration {
     let threads = std::fs::read_dir(format!("/proc/{pid}/task"));
-    let waited = threads
-        .into_iter()
-        .flatten()
-        .flatten()
-        .filter_map(|thread| {
-            let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
-            text.split_whitespace().nth(1)?.parse::<u64>().ok()
-        });
+    let waited = threads.into_iter().flatten().flatten().filter_map(|thread| {
+        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+        text.split_whitespace().nth(1)?.parse::<u64>().ok()
+    });
     Duration::from_nanos(waited.sum())
 }
 
@@ -465,20 +404,12 @@ impl ServantHandle for LocalServant {
     async fn wait_node(&self, node: &str) -> Result<NodeExit, Error> {
         let mut nodes = self.known.nodes.subscribe();
         if !nodes.borrow().contains_key(node) {
-            return Err(Error::NoNode {
-                id: self.id.clone(),
-                node: node.to_owned(),
-            });
+            return Err(Error::NoNode { id: self.id.clone(), node: node.to_owned() });
         }
         let mut state = self.known.state.subscribe();
         let exit = |nodes: &watch::Receiver<_>| {
-            let nodes: watch::Ref<
-                '_,
-                std::collections::BTreeMap<String, crate::protocol::NodeStatus>,
-            > = nodes.borrow();
-            nodes
-                .get(node)
-                .and_then(|status| status.current_exit().cloned())
+            let nodes: watch::Ref<'_, std::collections::BTreeMap<String, crate::protocol::NodeStatus>> = nodes.borrow();
+            nodes.get(node).and_then(|status| status.current_exit().cloned())
         };
         loop {
             if let Some(exit) = exit(&nodes) {
@@ -499,13 +430,7 @@ impl ServantHandle for LocalServant {
     fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine> {
         let path = self.log_path();
         let guard = self.followers.subscribe();
-        logs::follow(
-            &self.watches,
-            path,
-            from,
-            wait_until_over(self.state()),
-            guard,
-        )
+        logs::follow(&self.watches, path, from, wait_until_over(self.state()), guard)
     }
 
     async fn stop(&self) -> Result<(), Error> {
@@ -515,8 +440,7 @@ impl ServantHandle for LocalServant {
         if let Err(error) = wait_for_end(&self.shim, patience).await {
             tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
             let shim = self.shim.clone();
-            let _ =
-                privilege::run_sync(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
+            let _ = privilege::run_sync(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
             let _ = wait_for_end(&self.shim, FINISH).await;
         }
         // Its final messages are read, and its log is opened by its followers, before both are removed.

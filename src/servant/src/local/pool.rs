@@ -24,12 +24,7 @@ struct NetworkPoolState {
 impl NetworkPool {
     /// Takes a namespace that nobody else has.
     pub(super) fn take(&self) -> Result<NetNs, Error> {
-        let ready = self
-            .inner
-            .ready
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .pop();
+        let ready = self.inner.ready.lock().unwrap_or_else(PoisonError::into_inner).pop();
         self.refill();
         ready.map_or_else(NetNs::create, Ok)
     }
@@ -41,29 +36,14 @@ impl NetworkPool {
         }
         let inner = self.inner.clone();
         let work = move || {
-            while inner
-                .ready
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .len()
-                < READY
-            {
+            while inner.ready.lock().unwrap_or_else(PoisonError::into_inner).len() < READY {
                 // The caller that needs one creates it itself and gets the error.
                 let Ok(network) = NetNs::create() else { break };
-                inner
-                    .ready
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .push(network);
+                inner.ready.lock().unwrap_or_else(PoisonError::into_inner).push(network);
             }
             inner.refilling.store(false, Ordering::Release);
         };
-        if std::thread::Builder::new()
-            .name("netns-pool".into())
-            .stack_size(256 * 1024)
-            .spawn(work)
-            .is_err()
-        {
+        if std::thread::Builder::new().name("netns-pool".into()).stack_size(256 * 1024).spawn(work).is_err() {
             self.inner.refilling.store(false, Ordering::Release);
         }
     }

@@ -13,10 +13,7 @@ pub trait Resources: Send + Sync + 'static {
     async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Box<dyn StdError + Send + Sync>>;
     /// Resolves the hosts of `HOST:PORT`s to their names, each with the loopback address in the container that stands
     /// for it; fails with the one that is not allowed.
-    fn hosts(
-        &self,
-        egress: &[String],
-    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>>;
+    fn hosts(&self, egress: &[String]) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>>;
 }
 
 /// Provides no image and no host: for engines that only start containers from layers.
@@ -28,10 +25,7 @@ impl Resources for NoResources {
         Err("this engine was given no images".into())
     }
 
-    fn hosts(
-        &self,
-        egress: &[String],
-    ) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>> {
+    fn hosts(&self, egress: &[String]) -> Result<Vec<(IpAddr, String)>, Box<dyn StdError + Send + Sync>> {
         match egress.first() {
             Some(name) => Err(format!("this engine allows no connections to {name}").into()),
             None => Ok(Vec::new()),

@@ -19,10 +19,7 @@ use crate::netns::NetNs;
 use crate::process::ProcessIdentity;
 use crate::{Error, uids};
 
-pub(super) async fn start(
-    shared: &EngineShared,
-    mut spec: ContainerSpec,
-) -> Result<Arc<LocalServant>, Error> {
+pub(super) async fn start(shared: &EngineShared, mut spec: ContainerSpec) -> Result<Arc<LocalServant>, Error> {
     spec.limits = spec.limits.or(shared.config.default_limits);
     validate::validate(&spec)?;
     let id = spec.id.clone();
@@ -42,11 +39,7 @@ pub(super) async fn start(
     started
 }
 
-async fn start_in(
-    shared: &EngineShared,
-    spec: ContainerSpec,
-    directory: &Path,
-) -> Result<Arc<LocalServant>, Error> {
+async fn start_in(shared: &EngineShared, spec: ContainerSpec, directory: &Path) -> Result<Arc<LocalServant>, Error> {
     let network = shared.networks.take()?;
     let config = &shared.config;
     let held = uids::claimed_ranges(&config.home_servants_dir)?;
@@ -66,11 +59,7 @@ async fn start_in(
     send_descriptors(&control, &network, &lock, &launch.spec.mounts)?;
     // The shim holds the lock from here on.
     drop(lock);
-    let place = handle::ServantLocation {
-        id: &launch.spec.id,
-        directory,
-        watches: &shared.watches,
-    };
+    let place = handle::ServantLocation { id: &launch.spec.id, directory, watches: &shared.watches };
     handle::wait_until_running(&launch, place, network, control, shim).await
 }
 
@@ -83,15 +72,10 @@ fn spawn(shared: &EngineShared, directory: &Path) -> Result<(UnixStream, Process
     options.write(true).create(true).truncate(true).mode(0o600);
     let log = options.open(&path).map_err(Error::file("make", &path))?;
     let log_again = log.try_clone().map_err(Error::file("open", &path))?;
-    let (program, arguments) =
-        shared
-            .config
-            .shim_command
-            .split_first()
-            .ok_or_else(|| Error::Call {
-                call: "starting a shim without a shim_command",
-                source: io::Error::from(io::ErrorKind::InvalidInput),
-            })?;
+    let (program, arguments) = shared.config.shim_command.split_first().ok_or_else(|| Error::Call {
+        call: "starting a shim without a shim_command",
+        source: io::Error::from(io::ErrorKind::InvalidInput),
+    })?;
     let mut command = tokio::process::Command::new(program);
     command.args(arguments).arg(directory).env_clear();
     // There is one process per servant, and each would have its own allocator arenas.
@@ -101,16 +85,10 @@ fn spawn(shared: &EngineShared, directory: &Path) -> Result<(UnixStream, Process
             command.env(name, value);
         }
     }
-    command
-        .stdin(Stdio::from(OwnedFd::from(theirs)))
-        .stdout(log)
-        .stderr(log_again);
-    let mut child = command
-        .spawn()
-        .map_err(Error::file("start the shim", program))?;
+    command.stdin(Stdio::from(OwnedFd::from(theirs))).stdout(log).stderr(log_again);
+    let mut child = command.spawn().map_err(Error::file("start the shim", program))?;
     let pid = child.id().unwrap_or_default() as i32;
-    let identity =
-        ProcessIdentity::from_pid(pid).map_err(Error::call("looking at the shim just started"))?;
+    let identity = ProcessIdentity::from_pid(pid).map_err(Error::call("looking at the shim just started"))?;
     // The shim outlives the daemon; while the daemon lives, it reaps the shim.
     tokio::spawn(async move {
         let _ = child.wait().await;
@@ -120,12 +98,7 @@ fn spawn(shared: &EngineShared, directory: &Path) -> Result<(UnixStream, Process
 
 /// Sends the network namespace and the lock with one byte that says how many messages follow; then each opened mount
 /// source with the index of its mount.
-fn send_descriptors(
-    control: &UnixStream,
-    network: &NetNs,
-    lock: &OwnedFd,
-    mounts: &[Mount],
-) -> Result<(), Error> {
+fn send_descriptors(control: &UnixStream, network: &NetNs, lock: &OwnedFd, mounts: &[Mount]) -> Result<(), Error> {
     let failed = Error::call("sending to the shim");
     let opened: Vec<(u8, RawFd)> = (0..=u8::MAX)
         .zip(mounts)
@@ -134,10 +107,6 @@ fn send_descriptors(
     let count = opened.len() as u8;
     let send = |byte: u8, fds: &[RawFd]| socket::send(control.as_raw_fd(), &[byte], fds).map(drop);
     send(count, &[network.as_fd().as_raw_fd(), lock.as_raw_fd()])
-        .and_then(|()| {
-            opened
-                .iter()
-                .try_for_each(|(index, fd)| send(*index, &[*fd]))
-        })
+        .and_then(|()| opened.iter().try_for_each(|(index, fd)| send(*index, &[*fd])))
         .map_err(failed)
 }

@@ -59,21 +59,12 @@ pub fn follow(
     });
     match discovering {
         Ok([file, younger]) => {
-            let reader = LogReader {
-                file,
-                younger,
-                opened,
-                changed,
-                sender,
-            };
+            let reader = LogReader { file, younger, opened, changed, sender };
             tokio::spawn(reader.run(start));
         }
         Err(error) => {
             // The channel is empty, so there is room for one line.
-            let _ = sender.try_send(log_note(format!(
-                "could not follow {}: {error}",
-                path.display()
-            )));
+            let _ = sender.try_send(log_note(format!("could not follow {}: {error}", path.display())));
         }
     }
     receiver
@@ -124,18 +115,8 @@ struct Discovery {
 }
 
 impl Discovery {
-    fn open(
-        path: &Path,
-        start: LogStart,
-        watch: DirectoryWatch,
-        files: Arc<UnreadFiles>,
-    ) -> io::Result<Self> {
-        let mut discovery = Self {
-            path: path.into(),
-            watch,
-            files,
-            last: None,
-        };
+    fn open(path: &Path, start: LogStart, watch: DirectoryWatch, files: Arc<UnreadFiles>) -> io::Result<Self> {
+        let mut discovery = Self { path: path.into(), watch, files, last: None };
         if start != LogStart::Now {
             discovery.scan()?;
         } else if let Some(mut file) = open_if_exists(path)? {
@@ -226,9 +207,7 @@ impl LogReader {
                 Some(Ok(lines)) => lines,
                 Some(Err(error)) => {
                     self.file = None;
-                    vec![log_note(format!(
-                        "the log could not be read any further: {error}"
-                    ))]
+                    vec![log_note(format!("the log could not be read any further: {error}"))]
                 }
             };
             if !lines.is_empty() {
@@ -314,9 +293,7 @@ impl LogLineDecoder {
                 let Some(number) = line.number else {
                     continue;
                 };
-                let missed = self
-                    .expected
-                    .map_or(0, |expected| number.saturating_sub(expected));
+                let missed = self.expected.map_or(0, |expected| number.saturating_sub(expected));
                 self.expected = Some(number + 1);
                 if missed > 0 {
                     lines.push(log_note(format!(
@@ -340,18 +317,11 @@ fn open_if_exists(path: &Path) -> io::Result<Option<File>> {
 }
 
 fn inode(file: &File) -> io::Result<(u64, u64)> {
-    file.metadata()
-        .map(|metadata| (metadata.dev(), metadata.ino()))
+    file.metadata().map(|metadata| (metadata.dev(), metadata.ino()))
 }
 
 fn log_note(line: String) -> LogLine {
-    LogLine {
-        number: None,
-        time: SystemTime::now(),
-        node: "cloudroid".into(),
-        stream: "stderr".into(),
-        line,
-    }
+    LogLine { number: None, time: SystemTime::now(), node: "cloudroid".into(), stream: "stderr".into(), line }
 }
 
 #[cfg(test)]

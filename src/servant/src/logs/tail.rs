@@ -145,10 +145,7 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("log.jsonl");
         let texts = |count, node| -> Vec<String> {
-            last_lines(open_newest_first(&path), count, node)
-                .into_iter()
-                .map(|line| line.line)
-                .collect()
+            last_lines(open_newest_first(&path), count, node).into_iter().map(|line| line.line).collect()
         };
         assert!(texts(5, None).is_empty(), "no log yet");
         std::fs::write(rotated_path(&path), line("/a", "1") + &line("/b", "2")).expect("written");
@@ -167,9 +164,7 @@ mod tests {
         let text: String = all.iter().map(|text| line("/a", text)).collect();
         std::fs::write(&path, &text).expect("written");
         for count in [1, 2, 7, 20, 30] {
-            let seen = last_lines(open_newest_first(&path), count, None)
-                .into_iter()
-                .map(|line| line.line);
+            let seen = last_lines(open_newest_first(&path), count, None).into_iter().map(|line| line.line);
             let expected = &all[20 - count.min(20)..];
             assert!(seen.eq(expected.iter().cloned()), "the last {count}");
         }

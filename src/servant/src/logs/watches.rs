@@ -14,9 +14,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 /// Events that are watched in a directory.
-const EVENTS: AddWatchFlags = AddWatchFlags::IN_MODIFY
-    .union(AddWatchFlags::IN_CREATE)
-    .union(AddWatchFlags::IN_ONLYDIR);
+const EVENTS: AddWatchFlags = AddWatchFlags::IN_MODIFY.union(AddWatchFlags::IN_CREATE).union(AddWatchFlags::IN_ONLYDIR);
 
 /// The watched directories. The inotify instance exists while there are any.
 #[derive(Debug, Default)]
@@ -65,11 +63,7 @@ impl DirectoryWatches {
         let watched = instance.inotify.get_ref().0.add_watch(directory, EVENTS)?;
         let changed = directories.entry(watched).or_default().subscribe();
         drop(directories);
-        Ok(DirectoryWatch {
-            instance,
-            directory: watched,
-            changed,
-        })
+        Ok(DirectoryWatch { instance, directory: watched, changed })
     }
 
     fn instance(&self) -> io::Result<Arc<InotifyInstance>> {
@@ -79,19 +73,11 @@ impl DirectoryWatches {
         }
         let inotify = Inotify::init(InitFlags::IN_CLOEXEC | InitFlags::IN_NONBLOCK)?;
         // SAFETY: the descriptor is owned by the registration, and nothing else closes it.
-        let registered =
-            unsafe { AsyncFd::register_with_interest(InotifyFd(inotify), Interest::READABLE) };
+        let registered = unsafe { AsyncFd::register_with_interest(InotifyFd(inotify), Interest::READABLE) };
         let inotify = Arc::new(registered?);
         let directories = Directories::default();
-        let telling = tokio::spawn(notify_changes(
-            Arc::clone(&inotify),
-            Arc::clone(&directories),
-        ));
-        let instance = Arc::new(InotifyInstance {
-            inotify,
-            directories,
-            telling: telling.abort_handle(),
-        });
+        let telling = tokio::spawn(notify_changes(Arc::clone(&inotify), Arc::clone(&directories)));
+        let instance = Arc::new(InotifyInstance { inotify, directories, telling: telling.abort_handle() });
         *kept = Arc::downgrade(&instance);
         Ok(instance)
     }
@@ -164,9 +150,7 @@ mod tests {
 
     /// Returns the number of inotify instances of this process.
     fn instances() -> usize {
-        let open = fs::read_dir("/proc/self/fd")
-            .expect("descriptors")
-            .flatten();
+        let open = fs::read_dir("/proc/self/fd").expect("descriptors").flatten();
         open.filter_map(|entry| fs::read_link(entry.path()).ok())
             .filter(|target| target.to_string_lossy().contains("inotify"))
             .count()
@@ -175,9 +159,7 @@ mod tests {
     #[tokio::test]
     async fn followers_of_many_directories_share_one_instance_and_are_told_of_their_own() {
         let home = tempfile::tempdir().expect("a directory");
-        let directories: Vec<_> = (0..200)
-            .map(|number| home.path().join(number.to_string()))
-            .collect();
+        let directories: Vec<_> = (0..200).map(|number| home.path().join(number.to_string())).collect();
         let watches = DirectoryWatches::default();
         let mut held = Vec::new();
         for directory in &directories {

@@ -31,20 +31,13 @@ pub fn make_skeleton(
     ] {
         let path = skeleton.join(name);
         make_directory(&path)?;
-        fs::set_permissions(&path, fs::Permissions::from_mode(mode))
-            .map_err(Error::file("change", &path))?;
+        fs::set_permissions(&path, fs::Permissions::from_mode(mode)).map_err(Error::file("change", &path))?;
     }
-    let mut hosts = format!(
-        "127.0.0.1\tlocalhost\n127.0.0.1\t{id}\n::1\tlocalhost ip6-localhost ip6-loopback\n"
-    );
+    let mut hosts = format!("127.0.0.1\tlocalhost\n127.0.0.1\t{id}\n::1\tlocalhost ip6-localhost ip6-loopback\n");
     for (address, name) in names {
         hosts += &format!("{address}\t{name}\n");
     }
-    let files = [
-        ("hosts", hosts),
-        ("hostname", format!("{id}\n")),
-        ("resolv.conf", String::new()),
-    ];
+    let files = [("hosts", hosts), ("hostname", format!("{id}\n")), ("resolv.conf", String::new())];
     for (name, text) in files {
         let path = skeleton.join("etc").join(name);
         fs::write(&path, text).map_err(Error::file("write", &path))?;
@@ -58,26 +51,13 @@ pub fn make_skeleton(
 /// Creates a mount point, which a read-only root must already contain. Its directories must not hide a link of the
 /// layers.
 fn make_mount_point(skeleton: &Path, layers: &[PathBuf], mount: &Mount) -> Result<(), Error> {
-    let inside: PathBuf = mount
-        .target
-        .components()
-        .filter_map(normal_component)
-        .collect();
-    for part in inside
-        .ancestors()
-        .filter(|part| !part.as_os_str().is_empty())
-    {
-        let found = layers
-            .iter()
-            .rev()
-            .find_map(|layer| fs::symlink_metadata(layer.join(part)).ok());
+    let inside: PathBuf = mount.target.components().filter_map(normal_component).collect();
+    for part in inside.ancestors().filter(|part| !part.as_os_str().is_empty()) {
+        let found = layers.iter().rev().find_map(|layer| fs::symlink_metadata(layer.join(part)).ok());
         if found.is_some_and(|metadata| metadata.is_symlink()) {
             return Err(Error::Malformed {
                 path: mount.target.clone(),
-                reason: format!(
-                    "/{} is a link in the image: mount at its target",
-                    part.display()
-                ),
+                reason: format!("/{} is a link in the image: mount at its target", part.display()),
             });
         }
     }
@@ -109,21 +89,12 @@ mod tests {
             opened: None,
         };
         let make = |name: &str, target: &str| {
-            make_skeleton(
-                &home.path().join(name),
-                "x",
-                std::slice::from_ref(&layer),
-                &[mount(target)],
-                &[],
-            )
+            make_skeleton(&home.path().join(name), "x", std::slice::from_ref(&layer), &[mount(target)], &[])
         };
         let error = make("one", "/lib/models").unwrap_err().to_string();
         assert!(error.contains("/lib is a link in the image"), "{error}");
         make("two", "/usr/lib/models").unwrap();
         assert!(home.path().join("two/usr/lib/models").is_dir());
-        assert!(
-            !layer.join("usr/lib/models").exists(),
-            "the layer is not written"
-        );
+        assert!(!layer.join("usr/lib/models").exists(), "the layer is not written");
     }
 }

@@ -23,11 +23,9 @@ const STAGE: &str = "/sys/fs/cgroup";
 pub(super) fn enter_mount_namespace() -> Result<PathBuf, Error> {
     unshare(CloneFlags::CLONE_NEWNS).map_err(Error::nix("unshare of a mount namespace"))?;
     let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
-    mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
-        .map_err(Error::nix("making mounts private"))?;
+    mount(None::<&str>, "/", None::<&str>, private, None::<&str>).map_err(Error::nix("making mounts private"))?;
     let points = || {
-        let table = fs::read_to_string("/proc/self/mountinfo")
-            .map_err(Error::file("read", "/proc/self/mountinfo"))?;
+        let table = fs::read_to_string("/proc/self/mountinfo").map_err(Error::file("read", "/proc/self/mountinfo"))?;
         Ok::<_, Error>(cgroup_mounts(&table))
     };
     // The deepest first: a mount with others inside is busy.
@@ -37,19 +35,10 @@ pub(super) fn enter_mount_namespace() -> Result<PathBuf, Error> {
     }
     if let Some(left) = points()?.first() {
         let reason = "a cgroup mount cannot be hidden from the creation of a container".into();
-        return Err(Error::Malformed {
-            path: left.clone(),
-            reason,
-        });
+        return Err(Error::Malformed { path: left.clone(), reason });
     }
-    mount(
-        Some("cloudroid"),
-        STAGE,
-        Some("tmpfs"),
-        MsFlags::MS_NODEV,
-        Some("mode=755,size=1m"),
-    )
-    .map_err(|error| Error::file("cover", STAGE)(error.into()))?;
+    mount(Some("cloudroid"), STAGE, Some("tmpfs"), MsFlags::MS_NODEV, Some("mode=755,size=1m"))
+        .map_err(|error| Error::file("cover", STAGE)(error.into()))?;
     Ok(STAGE.into())
 }
 
@@ -57,10 +46,7 @@ pub(super) fn enter_mount_namespace() -> Result<PathBuf, Error> {
 fn cgroup_mounts(mountinfo: &str) -> Vec<PathBuf> {
     let point = |line: &str| {
         let (left, right) = line.split_once(" - ")?;
-        right
-            .starts_with("cgroup")
-            .then(|| left.split(' ').nth(4).map(PathBuf::from))
-            .flatten()
+        right.starts_with("cgroup").then(|| left.split(' ').nth(4).map(PathBuf::from)).flatten()
     };
     mountinfo.lines().filter_map(point).collect()
 }
@@ -69,18 +55,11 @@ fn cgroup_mounts(mountinfo: &str) -> Vec<PathBuf> {
 pub(super) fn attach_shifted(layer: &Path, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
     let copy = sys::clone_mount(layer).map_err(Error::file("open the layer", layer))?;
     sys::idmap_mount(copy.as_fd(), shift.as_fd()).map_err(|source| {
-        let unsupported = matches!(
-            source.raw_os_error(),
-            Some(libc::EINVAL | libc::ENOSYS | libc::EOPNOTSUPP)
-        );
+        let unsupported = matches!(source.raw_os_error(), Some(libc::EINVAL | libc::ENOSYS | libc::EOPNOTSUPP));
         if !unsupported {
             return Error::file("shift the ids of", layer)(source);
         }
-        Error::IdmapUnsupported {
-            path: layer.into(),
-            filesystem: filesystem_of(layer),
-            source,
-        }
+        Error::IdmapUnsupported { path: layer.into(), filesystem: filesystem_of(layer), source }
     })?;
     sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a layer at", place))
 }
@@ -97,12 +76,7 @@ pub(super) fn copy_volume(volume: &Mount) -> Result<OwnedFd, Error> {
 /// Attaches the copy of a mount's source for the container. A read-only volume is idmapped if its file system supports
 /// it, so that root in the container may read root's files; a writable one never is, since root in the container would
 /// then write as root.
-pub(super) fn attach_volume(
-    volume: &Mount,
-    copy: &OwnedFd,
-    place: &Path,
-    shift: &OwnedFd,
-) -> Result<(), Error> {
+pub(super) fn attach_volume(volume: &Mount, copy: &OwnedFd, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
     let is_directory = volume.is_directory();
     if is_directory.map_err(Error::file("mount", &volume.source))? {
         make_directory(place)?;
@@ -123,18 +97,10 @@ fn filesystem_of(path: &Path) -> String {
     let holds = |line: &str| {
         let (left, right) = line.split_once(" - ")?;
         let point = left.split(' ').nth(4)?.to_owned();
-        path.starts_with(&point).then(|| {
-            (
-                point.len(),
-                right.split(' ').next().unwrap_or("").to_owned(),
-            )
-        })
+        path.starts_with(&point).then(|| (point.len(), right.split(' ').next().unwrap_or("").to_owned()))
     };
     // Among mounts at the same path the last one is visible.
-    let found = table
-        .lines()
-        .filter_map(holds)
-        .max_by_key(|(length, _)| *length);
+    let found = table.lines().filter_map(holds).max_by_key(|(length, _)| *length);
     found.map_or_else(|| "an unknown filesystem".into(), |(_, kind)| kind)
 }
 
@@ -146,10 +112,7 @@ mod tests {
     fn every_kind_of_cgroup_mount_is_found() {
         let table = "30 24 0:26 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n\
                      31 24 0:27 / /c2 rw x:1 - cgroup2 c rw\n32 1 0:1 / / rw - ext4 /dev/a rw\n";
-        assert_eq!(
-            cgroup_mounts(table),
-            [Path::new("/sys/fs/cgroup/cpu"), Path::new("/c2")]
-        );
+        assert_eq!(cgroup_mounts(table), [Path::new("/sys/fs/cgroup/cpu"), Path::new("/c2")]);
     }
 
     #[test]

@@ -51,24 +51,17 @@ pub(super) fn begin(directory: &Path) -> Result<PreparedShim, Error> {
     // Files written from here on, in particular the log, are for this user alone.
     umask(Mode::from_bits_truncate(0o077));
     let control = take_control()?;
-    let ReceivedDescriptors {
-        network,
-        uid_lock,
-        opened,
-    } = receive_descriptors(&control)?;
+    let ReceivedDescriptors { network, uid_lock, opened } = receive_descriptors(&control)?;
     let path = directory.join(launch::SPEC);
-    let mut launch: LaunchRecord = launch::read_record(&path)?.ok_or_else(|| Error::Malformed {
-        path: path.clone(),
-        reason: "there is no launch record".into(),
-    })?;
+    let mut launch: LaunchRecord = launch::read_record(&path)?
+        .ok_or_else(|| Error::Malformed { path: path.clone(), reason: "there is no launch record".into() })?;
     for (index, descriptor) in opened {
         if let Some(mount) = launch.spec.mounts.get_mut(usize::from(index)) {
             mount.opened = Some(descriptor);
         }
     }
     let own = std::process::id() as i32;
-    let identity =
-        ProcessIdentity::from_pid(own).map_err(Error::call("reading our own start time"))?;
+    let identity = ProcessIdentity::from_pid(own).map_err(Error::call("reading our own start time"))?;
     let cgroup = Cgroup::for_servant(&launch.parent, &launch.spec);
     let shim_cgroup = Cgroup::for_shim(&launch.parent, &launch.spec.id);
     let runtime = RuntimeRecord {
@@ -84,12 +77,7 @@ pub(super) fn begin(directory: &Path) -> Result<PreparedShim, Error> {
         mount.opened = None;
     }
     match begun {
-        Ok(PreparedContainer {
-            enforced,
-            init,
-            listener,
-            creator,
-        }) => Ok(PreparedShim {
+        Ok(PreparedContainer { enforced, init, listener, creator }) => Ok(PreparedShim {
             directory: directory.into(),
             launch,
             identity,
@@ -115,9 +103,7 @@ fn take_control() -> Result<UnixStream, Error> {
     // SAFETY: descriptor 0 is open, or the call fails; the result is a new descriptor that nobody else owns.
     let control = unsafe { libc::fcntl(0, libc::F_DUPFD_CLOEXEC, 3) };
     if control < 0 {
-        return Err(Error::call(
-            "taking the daemon's socket from standard input",
-        )(io::Error::last_os_error()));
+        return Err(Error::call("taking the daemon's socket from standard input")(io::Error::last_os_error()));
     }
     // SAFETY: see above.
     let control = unsafe { OwnedFd::from_raw_fd(control) };
@@ -165,11 +151,7 @@ fn receive(control: &UnixStream) -> Result<(u8, Vec<OwnedFd>), Error> {
     // SAFETY: just received, owned by nobody else.
     let own = |fd: &i32| unsafe { OwnedFd::from_raw_fd(*fd) };
     let fds = fds[..count].iter().map(own).collect();
-    if bytes == 1 {
-        Ok((byte[0], fds))
-    } else {
-        Err(daemon_gone_error())
-    }
+    if bytes == 1 { Ok((byte[0], fds)) } else { Err(daemon_gone_error()) }
 }
 
 fn daemon_gone_error() -> Error {
@@ -193,13 +175,8 @@ fn prepare(
     network: &NetNs,
 ) -> Result<PreparedContainer, Error> {
     network.enter()?;
-    let (ours, theirs) = socketpair(
-        AddressFamily::Unix,
-        SockType::SeqPacket,
-        None,
-        SockFlag::SOCK_CLOEXEC,
-    )
-    .map_err(Error::nix("socketpair for init"))?;
+    let (ours, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)
+        .map_err(Error::nix("socketpair for init"))?;
     let listener = listen(directory)?;
     let waiting = create::fork(directory, launch, theirs)?;
     let enforced = match confine(launch, cgroups, waiting.pid) {
@@ -209,29 +186,17 @@ fn prepare(
             return Err(error);
         }
     };
-    Ok(PreparedContainer {
-        enforced,
-        init: ours,
-        listener,
-        creator: waiting.resume(),
-    })
+    Ok(PreparedContainer { enforced, init: ours, listener, creator: waiting.resume() })
 }
 
 /// Creates the cgroups, sets their limits, and moves the creator and this process into theirs.
-fn confine(
-    launch: &LaunchRecord,
-    [cgroup, own]: [&Cgroup; 2],
-    creator: u32,
-) -> Result<EnforcedLimits, Error> {
+fn confine(launch: &LaunchRecord, [cgroup, own]: [&Cgroup; 2], creator: u32) -> Result<EnforcedLimits, Error> {
     own.create()?;
     let asked = launch.shim_limits_for(&launch.spec.limits);
     let of_shim = own.set_limits(&asked).limits;
     own.add_self()?;
     cgroup.create()?;
-    let enforced = EnforcedLimits {
-        shim: of_shim,
-        ..cgroup.set_limits(&launch.spec.limits)
-    };
+    let enforced = EnforcedLimits { shim: of_shim, ..cgroup.set_limits(&launch.spec.limits) };
     let mut missing = engine::missing_limits(&launch.spec.limits, &enforced.limits);
     // A controller that is missing altogether is reported once, for the host.
     let controllers = launch.parent.controllers();
@@ -247,10 +212,7 @@ fn confine(
             "" => format!("cgroup v{}", launch.parent.version),
             reason => reason.to_owned(),
         };
-        return Err(Error::Isolation {
-            missing: missing.join(", "),
-            reason,
-        });
+        return Err(Error::Isolation { missing: missing.join(", "), reason });
     }
     // The container stays in the cgroup in which it was created.
     cgroup.add_process(creator)?;
@@ -266,32 +228,17 @@ fn listen(directory: &Path) -> Result<UnixListener, Error> {
 }
 
 /// Records the failure and leaves nothing else.
-fn record_failure(
-    directory: &Path,
-    cgroup: &Cgroup,
-    shim: ProcessIdentity,
-    control: UnixStream,
-    error: &Error,
-) {
-    let state = ContainerState::Failed {
-        reason: error.to_string(),
-    };
+fn record_failure(directory: &Path, cgroup: &Cgroup, shim: ProcessIdentity, control: UnixStream, error: &Error) {
+    let state = ContainerState::Failed { reason: error.to_string() };
     if let Err(error) = cgroup.destroy(PATIENCE) {
         eprintln!("{error}");
     }
-    let exit = ExitRecord {
-        state: state.clone(),
-        nodes: Default::default(),
-    };
+    let exit = ExitRecord { state: state.clone(), nodes: Default::default() };
     if let Err(error) = launch::write_record(&directory.join(launch::EXIT), &exit) {
         eprintln!("{error}");
     }
-    let hello = ShimMessage::Hello {
-        shim,
-        state: state.into(),
-        nodes: exit.nodes,
-        enforced: EnforcedLimits::default(),
-    };
+    let hello =
+        ShimMessage::Hello { shim, state: state.into(), nodes: exit.nodes, enforced: EnforcedLimits::default() };
     // If the daemon is gone, exit.json tells the next one.
     let _ = io::Write::write_all(&mut &control, &protocol::to_line(&hello));
 }

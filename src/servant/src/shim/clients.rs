@@ -22,11 +22,7 @@ pub(super) struct DaemonConnections {
 
 impl DaemonConnections {
     pub(super) fn new(inputs: mpsc::UnboundedSender<ShimEvent>) -> Self {
-        Self {
-            inputs,
-            next: 0,
-            connected: BTreeMap::new(),
-        }
+        Self { inputs, next: 0, connected: BTreeMap::new() }
     }
 
     /// Accepts connections from now on.

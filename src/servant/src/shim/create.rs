@@ -25,9 +25,7 @@ use std::sync::Arc;
 use libcontainer::container::builder::ContainerBuilder;
 use libcontainer::error::LibcontainerError;
 use libcontainer::syscall::syscall::SyscallType;
-use libcontainer::workload::{
-    Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError,
-};
+use libcontainer::workload::{Executor, ExecutorError, ExecutorSetEnvsError, ExecutorValidationError};
 use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, send, socketpair};
 use nix::sys::stat::{Mode, umask};
 use nix::unistd::ForkResult;
@@ -81,45 +79,28 @@ impl PausedCreator {
     pub(super) fn resume(self) -> Creator {
         // If nobody listens, it has failed and exited, and says so in its report. That must not kill us (SIGPIPE).
         let _ = send(self.go.as_raw_fd(), b".", MsgFlags::MSG_NOSIGNAL);
-        Creator {
-            report: self.report,
-        }
+        Creator { report: self.report }
     }
 }
 
 /// Forks the creator. The calling process must have one thread.
-pub(super) fn fork(
-    directory: &Path,
-    launch: &LaunchRecord,
-    socket: OwnedFd,
-) -> Result<PausedCreator, Error> {
-    let (report, write) =
-        nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
-    let (wait, go) = socketpair(
-        AddressFamily::Unix,
-        SockType::Stream,
-        None,
-        SockFlag::SOCK_CLOEXEC,
-    )
-    .map_err(Error::nix("socketpair for the creator"))?;
+pub(super) fn fork(directory: &Path, launch: &LaunchRecord, socket: OwnedFd) -> Result<PausedCreator, Error> {
+    let (report, write) = nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
+    let (wait, go) = socketpair(AddressFamily::Unix, SockType::Stream, None, SockFlag::SOCK_CLOEXEC)
+        .map_err(Error::nix("socketpair for the creator"))?;
     // SAFETY: one thread, so that the child may do anything its parent might.
     match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork of the creator"))? {
-        ForkResult::Parent { child } => Ok(PausedCreator {
-            pid: child.as_raw() as u32,
-            report,
-            go,
-        }),
+        ForkResult::Parent { child } => Ok(PausedCreator { pid: child.as_raw() as u32, report, go }),
         ForkResult::Child => {
             drop((report, go));
             let write = Arc::new(File::from(write));
             // Errors that libcontainer meets in its own children are only logged.
             let _ = tracing::subscriber::set_global_default(ErrorReporter(write.clone()));
-            let outcome = match stage(directory, launch)
-                .and_then(|staged| create(directory, launch, staged, socket, wait))
-            {
-                Ok(init) => CreatorReport::Created { init },
-                Err(error) => CreatorReport::Failed(chain(&error)),
-            };
+            let outcome =
+                match stage(directory, launch).and_then(|staged| create(directory, launch, staged, socket, wait)) {
+                    Ok(init) => CreatorReport::Created { init },
+                    Err(error) => CreatorReport::Failed(chain(&error)),
+                };
             report_line(&write, &outcome);
             // SAFETY: ends the child without running the exit handlers registered by the parent.
             unsafe { libc::_exit(0) }
@@ -171,13 +152,7 @@ fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, Cre
     umask(Mode::from_bits_truncate(0o022));
     let init = File::open(&launch.init).map_err(Error::file("open", &launch.init))?;
     let skeleton = directory.join("skeleton");
-    make_skeleton(
-        &skeleton,
-        &launch.spec.id,
-        &launch.spec.layers,
-        &launch.spec.mounts,
-        &launch.spec.hosts,
-    )?;
+    make_skeleton(&skeleton, &launch.spec.id, &launch.spec.layers, &launch.spec.mounts, &launch.spec.hosts)?;
     let rootfs = Rootfs {
         layers: &launch.spec.layers,
         skeleton: &skeleton,
@@ -191,15 +166,8 @@ fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, Cre
     let json = serde_json::to_vec(&config)?;
     let mut options = File::options();
     options.write(true).create(true).truncate(true).mode(0o600);
-    options
-        .open(&file)
-        .and_then(|mut file| file.write_all(&json))
-        .map_err(Error::file("write", &file))?;
-    Ok(StagedContainer {
-        init,
-        records: staged.root.with_file_name("records"),
-        _user_namespace: staged.user_namespace,
-    })
+    options.open(&file).and_then(|mut file| file.write_all(&json)).map_err(Error::file("write", &file))?;
+    Ok(StagedContainer { init, records: staged.root.with_file_name("records"), _user_namespace: staged.user_namespace })
 }
 
 /// Creates and starts the container; returns the host pid of init.
@@ -213,18 +181,10 @@ fn create(
     if nix::unistd::read(&wait, &mut [0]) != Ok(1) {
         return Err(CreatorError::NotMoved);
     }
-    let null = || {
-        File::options()
-            .read(true)
-            .write(true)
-            .open("/dev/null")
-            .map_err(CreatorError::Null)
-    };
+    let null = || File::options().read(true).write(true).open("/dev/null").map_err(CreatorError::Null);
     let mut container = ContainerBuilder::new(launch.spec.id.clone(), SyscallType::default())
         .with_root_path(&staged.records)?
-        .with_executor(RunInit {
-            init: Arc::new(staged.init),
-        })
+        .with_executor(RunInit { init: Arc::new(staged.init) })
         .with_stdin(socket)
         .with_stdout(null()?)
         .with_stderr(null()?)
@@ -270,15 +230,10 @@ impl Executor for RunInit {
         let environment: [CString; 0] = [];
         let flags = nix::fcntl::AtFlags::AT_EMPTY_PATH;
         let Err(error) = nix::unistd::execveat(&*self.init, c"", &[name], &environment, flags);
-        Err(ExecutorError::Other(format!(
-            "init could not be executed: {error}"
-        )))
+        Err(ExecutorError::Other(format!("init could not be executed: {error}")))
     }
 
-    fn validate(
-        &self,
-        _spec: &libcontainer::oci_spec::runtime::Spec,
-    ) -> Result<(), ExecutorValidationError> {
+    fn validate(&self, _spec: &libcontainer::oci_spec::runtime::Spec) -> Result<(), ExecutorValidationError> {
         Ok(())
     }
 
@@ -302,17 +257,15 @@ impl tracing::Subscriber for ErrorReporter {
 
     fn event(&self, event: &tracing::Event<'_>) {
         let mut text = String::new();
-        event.record(
-            &mut |field: &tracing::field::Field, value: &dyn std::fmt::Debug| {
-                let separator = if text.is_empty() { "" } else { ", " };
-                let part = if field.name() == "message" {
-                    format!("{separator}{value:?}")
-                } else {
-                    format!("{separator}{}: {value:?}", field.name())
-                };
-                text += &part;
-            },
-        );
+        event.record(&mut |field: &tracing::field::Field, value: &dyn std::fmt::Debug| {
+            let separator = if text.is_empty() { "" } else { ", " };
+            let part = if field.name() == "message" {
+                format!("{separator}{value:?}")
+            } else {
+                format!("{separator}{}: {value:?}", field.name())
+            };
+            text += &part;
+        });
         report_line(&self.0, &CreatorReport::Failed(text));
     }
 
@@ -332,9 +285,7 @@ impl tracing::Subscriber for ErrorReporter {
 /// Reason why a container was not created, in the words of its creator.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum CreationError {
-    #[error(
-        "the creating process ended without a word: see the kernel's log for an out-of-memory kill"
-    )]
+    #[error("the creating process ended without a word: see the kernel's log for an out-of-memory kill")]
     Silent,
     #[error("{0}")]
     Reported(String),
@@ -345,15 +296,8 @@ pub(super) enum CreationError {
 impl Creator {
     /// Returns whether the report, as far as it was read, says that init runs.
     pub(super) fn has_succeeded(text: &[u8]) -> bool {
-        let last = text
-            .strip_suffix(b"\n")
-            .and_then(|whole| whole.rsplit(|byte| *byte == b'\n').next());
-        last.is_some_and(|line| {
-            matches!(
-                serde_json::from_slice(line),
-                Ok(CreatorReport::Created { .. })
-            )
-        })
+        let last = text.strip_suffix(b"\n").and_then(|whole| whole.rsplit(|byte| *byte == b'\n').next());
+        last.is_some_and(|line| matches!(serde_json::from_slice(line), Ok(CreatorReport::Created { .. })))
     }
 
     /// Evaluates the whole report: host pid of init, or the errors.
@@ -362,9 +306,7 @@ impl Creator {
         for line in text.lines() {
             match serde_json::from_str(line) {
                 Ok(CreatorReport::Created { init }) => return Ok(init),
-                Ok(CreatorReport::Failed(reason)) if !complaints.contains(&reason) => {
-                    complaints.push(reason)
-                }
+                Ok(CreatorReport::Failed(reason)) if !complaints.contains(&reason) => complaints.push(reason),
                 Ok(CreatorReport::Failed(_)) => {}
                 Err(_) => complaints.push(line.to_owned()),
             }
@@ -373,10 +315,7 @@ impl Creator {
         Err(match complaints.as_slice() {
             [] => CreationError::Silent,
             [only] => CreationError::Reported(only.clone()),
-            [first, .., last] => CreationError::ReportedWithCause {
-                outermost: last.clone(),
-                cause: first.clone(),
-            },
+            [first, .., last] => CreationError::ReportedWithCause { outermost: last.clone(), cause: first.clone() },
         })
     }
 }
@@ -387,8 +326,7 @@ mod tests {
 
     #[test]
     fn the_cause_is_told_with_the_outermost_error() {
-        let line =
-            |report: &CreatorReport| String::from_utf8(crate::protocol::to_line(report)).unwrap();
+        let line = |report: &CreatorReport| String::from_utf8(crate::protocol::to_line(report)).unwrap();
         let failed = |text: &str| line(&CreatorReport::Failed(text.into()));
         assert_eq!(
             Creator::outcome(&(failed("warning") + &line(&CreatorReport::Created { init: 7 })))
@@ -396,10 +334,7 @@ mod tests {
             7
         );
         let refusal = |text: &str| Creator::outcome(text).unwrap_err().to_string();
-        assert_eq!(
-            refusal(&(failed("no such mount") + &failed("create failed"))),
-            "create failed (no such mount)"
-        );
+        assert_eq!(refusal(&(failed("no such mount") + &failed("create failed"))), "create failed (no such mount)");
         assert!(refusal("").contains("without a word"));
     }
 }

@@ -80,12 +80,8 @@ impl Driver {
         let control = control.map_err(Error::call("talking to the daemon"))?;
         let log = begun.directory.join(logs::FILE);
         let rate = begun.launch.quotas().log_rate;
-        let log = logs::LogWriter::create(&log, logs::ROTATE_AT, rate)
-            .map_err(Error::file("make", &log))?;
-        let init = begun
-            .init
-            .try_clone()
-            .map_err(Error::call("dup of init's socket"))?;
+        let log = logs::LogWriter::create(&log, logs::ROTATE_AT, rate).map_err(Error::file("make", &log))?;
+        let init = begun.init.try_clone().map_err(Error::call("dup of init's socket"))?;
         watch_signals(&inputs).map_err(Error::call("watching signals"))?;
         let _ = inputs.send(ShimEvent::Connected(control));
         Ok(Self {
@@ -149,12 +145,7 @@ impl Driver {
     }
 
     /// Executes a command; returns `None` if the reply comes later.
-    async fn execute(
-        &mut self,
-        client: u64,
-        request: u64,
-        command: Command,
-    ) -> Option<Result<(), CommandError>> {
+    async fn execute(&mut self, client: u64, request: u64, command: Command) -> Option<Result<(), CommandError>> {
         match command {
             Command::Stop => {
                 self.stop("stopped").await;
@@ -184,15 +175,9 @@ impl Driver {
             Command::SetLimits(limits) => {
                 let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();
-                self.clients.report(&ShimMessage::Enforced {
-                    enforced: enforced.clone(),
-                });
+                self.clients.report(&ShimMessage::Enforced { enforced: enforced.clone() });
                 let unmet = enforced.unmet_limits(&limits);
-                Some(if unmet.is_empty() {
-                    Ok(())
-                } else {
-                    Err(CommandError::Limits(unmet))
-                })
+                Some(if unmet.is_empty() { Ok(()) } else { Err(CommandError::Limits(unmet)) })
             }
         }
     }
@@ -201,10 +186,7 @@ impl Driver {
     fn set_limits(&self, limits: &Limits) -> EnforcedLimits {
         let enforced = self.begun.cgroup.set_limits(limits);
         let of_shim = self.begun.launch.shim_limits_for(&enforced.limits);
-        EnforcedLimits {
-            shim: self.begun.shim_cgroup.set_limits(&of_shim).limits,
-            ..enforced
-        }
+        EnforcedLimits { shim: self.begun.shim_cgroup.set_limits(&of_shim).limits, ..enforced }
     }
 
     fn set_state(&mut self, state: ContainerState) {
@@ -216,10 +198,7 @@ impl Driver {
     fn snapshot(&self) -> Snapshot {
         let running = self.state == ContainerState::Running;
         let init = self.init.as_ref().filter(|_| running);
-        Snapshot {
-            state: self.state.clone(),
-            init_pid: init.map(|(pid, _)| *pid),
-        }
+        Snapshot { state: self.state.clone(), init_pid: init.map(|(pid, _)| *pid) }
     }
 
     fn report_node(&self, event: NodeEvent) {
@@ -232,9 +211,7 @@ impl Driver {
             shim: self.begun.identity,
             state: self.snapshot(),
             nodes: self.nodes.statuses(),
-            enforced: EnforcedLimits {
-                ..self.begun.enforced.clone()
-            },
+            enforced: EnforcedLimits { ..self.begun.enforced.clone() },
         }
     }
 }

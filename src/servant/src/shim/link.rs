@@ -33,9 +33,7 @@ impl InitLink {
         fcntl(&socket, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
         // SAFETY: the descriptor is owned by the registration, and nothing else closes it.
         let socket = unsafe { AsyncFd::register(socket) }?;
-        Ok(Self {
-            socket: Rc::new(socket),
-        })
+        Ok(Self { socket: Rc::new(socket) })
     }
 
     /// Receives the next reply and the pidfd attached to it; `None` when init has closed the socket.
@@ -45,9 +43,7 @@ impl InitLink {
                 let (mut bytes, mut fds) = ([0; REPLY], [-1; MAX_FDS]);
                 let (length, count) = socket::receive(fd.as_raw_fd(), &mut bytes, &mut fds)?;
                 // SAFETY: just received, owned by nobody else.
-                let mut owned = fds[..count]
-                    .iter()
-                    .map(|fd| unsafe { OwnedFd::from_raw_fd(*fd) });
+                let mut owned = fds[..count].iter().map(|fd| unsafe { OwnedFd::from_raw_fd(*fd) });
                 let first = owned.next();
                 owned.for_each(drop);
                 Ok((InitReply::decode(&bytes[..length]), length, first))
@@ -62,32 +58,18 @@ impl InitLink {
     }
 
     /// Requests the start of a program; `streams` are its standard output and error.
-    pub(super) async fn start(
-        &self,
-        request: &StartRequest<'_>,
-        streams: [RawFd; 2],
-    ) -> Result<(), LinkError> {
+    pub(super) async fn start(&self, request: &StartRequest<'_>, streams: [RawFd; 2]) -> Result<(), LinkError> {
         let bytes = request.encode()?;
         Ok(self.send(&bytes, &streams).await?)
     }
 
     /// Requests a signal.
-    pub(super) async fn signal(
-        &self,
-        pid: i32,
-        signal: i32,
-        scope: Scope,
-    ) -> Result<(), LinkError> {
-        Ok(self
-            .send(&InitRequest::encode_signal(pid, signal, scope), &[])
-            .await?)
+    pub(super) async fn signal(&self, pid: i32, signal: i32, scope: Scope) -> Result<(), LinkError> {
+        Ok(self.send(&InitRequest::encode_signal(pid, signal, scope), &[]).await?)
     }
 
     async fn send(&self, bytes: &[u8], fds: &[RawFd]) -> io::Result<()> {
         let send = |fd: &OwnedFd| socket::send(fd.as_raw_fd(), bytes, fds);
-        self.socket
-            .async_io(Interest::WRITABLE, send)
-            .await
-            .map(drop)
+        self.socket.async_io(Interest::WRITABLE, send).await.map(drop)
     }
 }

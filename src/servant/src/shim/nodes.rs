@@ -52,39 +52,17 @@ pub(super) enum Consequence {
 impl NodeTable {
     /// Adds a node, or replaces one of the same name that has ended.
     pub(super) fn add(&mut self, spec: NodeSpec) -> Result<(), NodeTableError> {
-        if spec.name.is_empty()
-            || spec
-                .argv
-                .first()
-                .is_none_or(|program| !program.starts_with('/'))
-        {
+        if spec.name.is_empty() || spec.argv.first().is_none_or(|program| !program.starts_with('/')) {
             return Err(NodeTableError::Incomplete(spec.name));
         }
         let starting = self.is_starting(&spec.name);
-        let running = self
-            .known
-            .get(&spec.name)
-            .is_some_and(|node| node.inside.is_some());
+        let running = self.known.get(&spec.name).is_some_and(|node| node.inside.is_some());
         if starting || running {
             return Err(NodeTableError::RunsAlready(spec.name));
         }
-        let starts = self
-            .known
-            .get(&spec.name)
-            .map_or(0, |node| node.status.starts);
-        let status = NodeStatus {
-            starts,
-            run: spec.environment.get(RUN).cloned(),
-            ..NodeStatus::default()
-        };
-        self.known.insert(
-            spec.name.clone(),
-            NodeRecord {
-                spec,
-                status,
-                inside: None,
-            },
-        );
+        let starts = self.known.get(&spec.name).map_or(0, |node| node.status.starts);
+        let status = NodeStatus { starts, run: spec.environment.get(RUN).cloned(), ..NodeStatus::default() };
+        self.known.insert(spec.name.clone(), NodeRecord { spec, status, inside: None });
         Ok(())
     }
 
@@ -121,38 +99,19 @@ impl NodeTable {
     }
 
     /// Called when the program could not be executed.
-    pub(super) fn on_exec_failed(
-        &mut self,
-        number: u32,
-        reason: String,
-    ) -> Option<(NodeEvent, Consequence)> {
+    pub(super) fn on_exec_failed(&mut self, number: u32, reason: String) -> Option<(NodeEvent, Consequence)> {
         let name = self.starting.remove(&number)?;
         let node = self.known.get_mut(&name)?;
-        node.status.exit = Some(NodeExit {
-            code: None,
-            signal: None,
-            out_of_memory: false,
-            exec_error: Some(reason.clone()),
-        });
+        node.status.exit =
+            Some(NodeExit { code: None, signal: None, out_of_memory: false, exec_error: Some(reason.clone()) });
         // A restart would fail again.
-        let consequence = if node.spec.required {
-            Consequence::EndServant
-        } else {
-            Consequence::None
-        };
+        let consequence = if node.spec.required { Consequence::EndServant } else { Consequence::None };
         Some((NodeEvent::ExecFailed { node: name, reason }, consequence))
     }
 
     /// Called when the process with this pid in the container has ended; returns `None` if it is not a node.
-    pub(super) fn on_exited(
-        &mut self,
-        inside: i32,
-        exit: NodeExit,
-    ) -> Option<(NodeEvent, Consequence)> {
-        let (name, node) = self
-            .known
-            .iter_mut()
-            .find(|(_, node)| node.inside == Some(inside))?;
+    pub(super) fn on_exited(&mut self, inside: i32, exit: NodeExit) -> Option<(NodeEvent, Consequence)> {
+        let (name, node) = self.known.iter_mut().find(|(_, node)| node.inside == Some(inside))?;
         node.inside = None;
         node.status.pid = None;
         node.status.exit = Some(exit.clone());
@@ -161,30 +120,13 @@ impl NodeTable {
             spec if spec.respawn => Consequence::Respawn(spec.respawn_delay.clamp(0.0, 3600.0)),
             _ => Consequence::None,
         };
-        let NodeExit {
-            code,
-            signal,
-            out_of_memory,
-            ..
-        } = exit;
-        Some((
-            NodeEvent::Exited {
-                node: name.clone(),
-                code,
-                signal,
-                out_of_memory,
-            },
-            consequence,
-        ))
+        let NodeExit { code, signal, out_of_memory, .. } = exit;
+        Some((NodeEvent::Exited { node: name.clone(), code, signal, out_of_memory }, consequence))
     }
 
     /// Returns the running nodes with their pids in the container, and the number of nodes being started.
     pub(super) fn running_and_starting(&self) -> (Vec<(String, i32)>, usize) {
-        let running = self
-            .known
-            .iter()
-            .filter_map(|(name, node)| Some((name.clone(), node.inside?)))
-            .collect();
+        let running = self.known.iter().filter_map(|(name, node)| Some((name.clone(), node.inside?))).collect();
         (running, self.starting.len())
     }
 
@@ -200,28 +142,18 @@ impl NodeTable {
 
     /// Returns the pid of a node in the container.
     pub(super) fn pid_inside(&self, name: &str) -> Result<i32, NodeTableError> {
-        let node = self
-            .known
-            .get(name)
-            .ok_or_else(|| NodeTableError::Unknown(name.to_owned()))?;
-        node.inside
-            .ok_or_else(|| NodeTableError::NotRunning(name.to_owned()))
+        let node = self.known.get(name).ok_or_else(|| NodeTableError::Unknown(name.to_owned()))?;
+        node.inside.ok_or_else(|| NodeTableError::NotRunning(name.to_owned()))
     }
 
     /// Returns the status of a node.
     pub(super) fn status(&self, name: &str) -> NodeStatus {
-        self.known
-            .get(name)
-            .map(|node| node.status.clone())
-            .unwrap_or_default()
+        self.known.get(name).map(|node| node.status.clone()).unwrap_or_default()
     }
 
     /// Returns the status of all nodes.
     pub(super) fn statuses(&self) -> BTreeMap<String, NodeStatus> {
-        self.known
-            .iter()
-            .map(|(name, node)| (name.clone(), node.status.clone()))
-            .collect()
+        self.known.iter().map(|(name, node)| (name.clone(), node.status.clone())).collect()
     }
 }
 
@@ -229,12 +161,7 @@ impl NodeTable {
 pub(super) fn parse_wait_status(status: i32, out_of_memory: bool) -> NodeExit {
     let code = libc::WIFEXITED(status).then(|| libc::WEXITSTATUS(status));
     let signal = libc::WIFSIGNALED(status).then(|| libc::WTERMSIG(status));
-    NodeExit {
-        code,
-        signal,
-        out_of_memory,
-        exec_error: None,
-    }
+    NodeExit { code, signal, out_of_memory, exec_error: None }
 }
 
 #[cfg(test)]
@@ -268,11 +195,7 @@ mod tests {
         run(&mut nodes, node("/plain", false, false), 2);
         run(&mut nodes, node("/again", false, true), 3);
         run(&mut nodes, node("/needed", true, true), 4);
-        let mut end = |pid| {
-            nodes
-                .on_exited(pid, parse_wait_status(0, false))
-                .map(|(_, consequence)| consequence)
-        };
+        let mut end = |pid| nodes.on_exited(pid, parse_wait_status(0, false)).map(|(_, consequence)| consequence);
         assert_eq!(end(2), Some(Consequence::None));
         assert_eq!(end(3), Some(Consequence::Respawn(0.5)));
         assert_eq!(end(4), Some(Consequence::EndServant));
@@ -305,28 +228,12 @@ mod tests {
     fn a_name_is_free_again_once_its_node_has_ended() {
         let mut nodes = NodeTable::default();
         run(&mut nodes, node("/a", false, false), 2);
-        assert!(
-            nodes
-                .add(node("/a", false, false))
-                .unwrap_err()
-                .to_string()
-                .contains("runs already")
-        );
+        assert!(nodes.add(node("/a", false, false)).unwrap_err().to_string().contains("runs already"));
         nodes.on_exited(2, parse_wait_status(256, false)).unwrap();
         assert_eq!(nodes.status("/a").current_exit().unwrap().code, Some(1));
         run(&mut nodes, node("/a", false, false), 3);
-        assert_eq!(
-            (nodes.status("/a").starts, nodes.status("/a").pid),
-            (2, Some(1003))
-        );
-        assert!(
-            nodes
-                .add(NodeSpec {
-                    argv: vec!["relative".into()],
-                    ..node("/b", false, false)
-                })
-                .is_err()
-        );
+        assert_eq!((nodes.status("/a").starts, nodes.status("/a").pid), (2, Some(1003)));
+        assert!(nodes.add(NodeSpec { argv: vec!["relative".into()], ..node("/b", false, false) }).is_err());
     }
 
     #[test]
@@ -334,15 +241,10 @@ mod tests {
         let mut nodes = NodeTable::default();
         for (life, inside) in [("first life", 2), ("second life", 3)] {
             let environment = BTreeMap::from([(RUN.to_owned(), life.to_owned())]);
-            let spec = NodeSpec {
-                environment,
-                ..node("/see", false, false)
-            };
+            let spec = NodeSpec { environment, ..node("/see", false, false) };
             run(&mut nodes, spec, inside);
             assert_eq!(nodes.status("/see").run.as_deref(), Some(life));
-            nodes
-                .on_exited(inside, parse_wait_status(0, false))
-                .unwrap();
+            nodes.on_exited(inside, parse_wait_status(0, false)).unwrap();
         }
         run(&mut nodes, node("/planned", false, false), 4);
         assert_eq!(nodes.status("/planned").run, None);
@@ -352,12 +254,6 @@ mod tests {
     fn statuses_are_read_as_wait_means_them() {
         assert_eq!(parse_wait_status(0x0300, false).code, Some(3));
         assert_eq!(parse_wait_status(9, true).signal, Some(9));
-        assert_eq!(
-            (
-                parse_wait_status(9, true).code,
-                parse_wait_status(9, true).out_of_memory
-            ),
-            (None, true)
-        );
+        assert_eq!((parse_wait_status(9, true).code, parse_wait_status(9, true).out_of_memory), (None, true));
     }
 }

@@ -16,8 +16,8 @@ use std::path::Path;
 use caps::errors::CapsError;
 use caps::{CapSet, Capability, CapsHashSet};
 use landlock::{
-    ABI, Access, AccessFs, BitFlags, CompatLevel, Compatible, Ruleset, RulesetAttr,
-    RulesetCreatedAttr, RulesetError, path_beneath_rules,
+    ABI, Access, AccessFs, BitFlags, CompatLevel, Compatible, Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetError,
+    path_beneath_rules,
 };
 use libseccomp::error::SeccompError;
 use libseccomp::{ScmpAction, ScmpArgCompare, ScmpCompareOp, ScmpFilterContext, ScmpSyscall};
@@ -31,15 +31,13 @@ pub(super) fn confine(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), Err
     drop_all_but_kill()?;
     restrict_files(directory, cgroups)
         .map_err(|error| Error::call("keeping the shim to its files")(io::Error::other(error)))?;
-    install_seccomp_filter()
-        .map_err(|error| Error::call("filtering the shim's calls")(io::Error::other(error)))
+    install_seccomp_filter().map_err(|error| Error::call("filtering the shim's calls")(io::Error::other(error)))
 }
 
 /// Returns whether the kernel supports restricting a process to some files (Landlock).
 pub(super) fn can_restrict_files() -> bool {
-    let asked = Ruleset::default()
-        .set_compatibility(CompatLevel::HardRequirement)
-        .handle_access(AccessFs::from_all(ABI::V1));
+    let asked =
+        Ruleset::default().set_compatibility(CompatLevel::HardRequirement).handle_access(AccessFs::from_all(ABI::V1));
     asked.is_ok()
 }
 
@@ -72,10 +70,7 @@ fn restrict_files(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), Ruleset
         .add_rules(path_beneath_rules([directory], all & !AccessFs::Execute))?
         .add_rules(path_beneath_rules(cgroups(), change))?
         // Removing a directory needs a right on its parent.
-        .add_rules(path_beneath_rules(
-            cgroups().filter_map(Path::parent),
-            AccessFs::RemoveDir,
-        ))?
+        .add_rules(path_beneath_rules(cgroups().filter_map(Path::parent), AccessFs::RemoveDir))?
         // Host pids of processes, which are read from their pidfds.
         .add_rules(path_beneath_rules(["/proc"], read))?
         .restrict_self()?;

@@ -20,20 +20,15 @@ pub(super) struct Streams {
 
 impl Streams {
     pub(super) fn new(log: LogWriter) -> Self {
-        Self {
-            log: Rc::new(RefCell::new(log)),
-            open: watch::Sender::new(0),
-        }
+        Self { log: Rc::new(RefCell::new(log)), open: watch::Sender::new(0) }
     }
 
     /// Creates a pipe whose lines are logged as `stream` of `node`; returns the write end.
     pub(super) fn open(&self, node: &str, stream: &'static str) -> Result<OwnedFd, Error> {
-        let (read, write) =
-            nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
+        let (read, write) = nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
         let set = nix::fcntl::FcntlArg::F_SETFL(nix::fcntl::OFlag::O_NONBLOCK);
         nix::fcntl::fcntl(&read, set).map_err(Error::nix("fcntl on a pipe"))?;
-        let receiver =
-            pipe::Receiver::from_owned_fd(read).map_err(Error::call("watching a pipe"))?;
+        let receiver = pipe::Receiver::from_owned_fd(read).map_err(Error::call("watching a pipe"))?;
         self.open.send_modify(|count| *count += 1);
         tokio::task::spawn_local(self.clone().copy(receiver, node.to_owned(), stream));
         Ok(write)

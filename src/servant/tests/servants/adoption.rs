@@ -25,35 +25,18 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     assert_eq!(second.id(), id);
     assert_eq!(*second.state().borrow(), ContainerState::Running);
     assert_eq!(second.nodes(), ["/goes", "/stays"]);
-    assert_eq!(
-        (second.uid_range(), second.enforced_limits()),
-        (uids, enforced)
-    );
+    assert_eq!((second.uid_range(), second.enforced_limits()), (uids, enforced));
     assert_eq!(*second.network(), network);
     let left: Option<String> = second.load_handover().await.unwrap();
     assert_eq!(left.as_deref(), Some("of the first"));
     assert_eq!(processes(&second, 2).await, of_first, "the same");
-    assert!(
-        read_from_port(&second, 11311)
-            .await
-            .unwrap()
-            .starts_with("\"same\"")
-    );
+    assert!(read_from_port(&second, 11311).await.unwrap().starts_with("\"same\""));
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
-    assert_eq!(
-        with_timeout(second.wait_node("/goes"))
-            .await
-            .unwrap()
-            .signal,
-        Some(libc::SIGTERM)
-    );
+    assert_eq!(with_timeout(second.wait_node("/goes")).await.unwrap().signal, Some(libc::SIGTERM));
     drop(second);
     // The third daemon knows what happened meanwhile.
     let third = world.adopt_single(&world.restart_engine()).await;
-    assert_eq!(
-        with_timeout(third.wait_node("/goes")).await.unwrap().signal,
-        Some(libc::SIGTERM)
-    );
+    assert_eq!(with_timeout(third.wait_node("/goes")).await.unwrap().signal, Some(libc::SIGTERM));
     world.stop(third).await;
 }
 
@@ -91,10 +74,7 @@ async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
     let engine = world.restart_engine();
     let mut adopted = with_timeout(engine.adopt()).await.unwrap();
     let told: Vec<_> = adopted.failures.iter().map(ToString::to_string).collect();
-    assert!(
-        told.len() == 1 && told[0].contains(&*stray.to_string_lossy()),
-        "{told:?}"
-    );
+    assert!(told.len() == 1 && told[0].contains(&*stray.to_string_lossy()), "{told:?}");
     assert_eq!(std::fs::read_to_string(&stray).unwrap(), "somebody's");
     let servant = adopted.running.pop().expect("the servant beside it");
     assert_eq!(servant.id(), id);
@@ -113,40 +93,19 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
     let runtime = world.runtime(&id);
     let shim = runtime.shim.open_pidfd().unwrap().expect("it runs");
     drop(servant);
-    kill(
-        &servant::process::ProcessIdentity::from_pid(pid)
-            .unwrap()
-            .open_pidfd()
-            .unwrap()
-            .expect("it runs"),
-    );
-    let mut watched = [nix::poll::PollFd::new(
-        std::os::fd::AsFd::as_fd(&shim),
-        nix::poll::PollFlags::POLLIN,
-    )];
-    assert_eq!(
-        nix::poll::poll(&mut watched, 20_000_u16).unwrap(),
-        1,
-        "the shim ends with its servant"
-    );
+    kill(&servant::process::ProcessIdentity::from_pid(pid).unwrap().open_pidfd().unwrap().expect("it runs"));
+    let mut watched = [nix::poll::PollFd::new(std::os::fd::AsFd::as_fd(&shim), nix::poll::PollFlags::POLLIN)];
+    assert_eq!(nix::poll::poll(&mut watched, 20_000_u16).unwrap(), 1, "the shim ends with its servant");
     let engine = world.restart_engine();
     let adoption = with_timeout(engine.adopt()).await.unwrap();
     assert!(adoption.running.is_empty());
-    assert!(
-        world.servant_directory(&id).exists(),
-        "robots wait for no removal"
-    );
+    assert!(world.servant_directory(&id).exists(), "robots wait for no removal");
     let failures = with_timeout(engine.sweep(&adoption.ended)).await;
     assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(adoption.ended[0].id, id);
-    let Some(ContainerState::Stopped { reason }) = &adoption.ended[0].state else {
-        panic!("{:?}", adoption.ended)
-    };
-    assert!(
-        reason.contains("/required was killed by signal 9"),
-        "{reason}"
-    );
+    let Some(ContainerState::Stopped { reason }) = &adoption.ended[0].state else { panic!("{:?}", adoption.ended) };
+    assert!(reason.contains("/required was killed by signal 9"), "{reason}");
     world.assert_gone(&id, &runtime, &[pid]);
 }
 
@@ -160,24 +119,17 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     lines_until(&mut lines, |line| line.line == "stubborn").await;
     let processes = processes(&servant, 2).await;
     let runtime = world.runtime(&id);
-    let nodes: Vec<_> = processes
-        .iter()
-        .map(|pid| servant::process::ProcessIdentity::from_pid(*pid).unwrap())
-        .collect();
+    let nodes: Vec<_> =
+        processes.iter().map(|pid| servant::process::ProcessIdentity::from_pid(*pid).unwrap()).collect();
     kill(&runtime.shim.open_pidfd().unwrap().expect("it runs"));
-    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
-        panic!("it did not fail")
-    };
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else { panic!("it did not fail") };
     assert!(reason.contains("shim was killed"), "{reason}");
     let error = servant.usage().await.unwrap_err().to_string();
     assert!(error.contains("shim was killed"), "{error}");
     drop(servant);
     // Init notices the end of the shim without a daemon.
     with_timeout(async {
-        while nodes
-            .iter()
-            .any(|node| node.open_pidfd().unwrap().is_some())
-        {
+        while nodes.iter().any(|node| node.open_pidfd().unwrap().is_some()) {
             tokio::task::yield_now().await;
         }
     })
@@ -188,11 +140,7 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(
-        adoption
-            .ended
-            .iter()
-            .map(|ended| (ended.id.as_str(), ended.state.is_some()))
-            .collect::<Vec<_>>(),
+        adoption.ended.iter().map(|ended| (ended.id.as_str(), ended.state.is_some())).collect::<Vec<_>>(),
         [(id.as_str(), false)]
     );
     world.assert_gone(&id, &runtime, &processes);
@@ -202,28 +150,17 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
 async fn what_a_daemon_left_half_made_is_removed() {
     let world = World::new();
     std::fs::create_dir(world.servant_directory("half")).unwrap();
-    std::fs::write(
-        world.servant_directory("half").join("spec.json"),
-        "{ \"half",
-    )
-    .unwrap();
+    std::fs::write(world.servant_directory("half").join("spec.json"), "{ \"half").unwrap();
     let adoption = with_timeout(world.engine.adopt()).await.unwrap();
     assert_eq!((adoption.ended.len(), adoption.failures.len()), (1, 0));
-    assert!(
-        with_timeout(world.engine.sweep(&adoption.ended))
-            .await
-            .is_empty()
-    );
+    assert!(with_timeout(world.engine.sweep(&adoption.ended)).await.is_empty());
     assert!(!world.servant_directory("half").exists());
 }
 
 #[tokio::test]
 async fn a_pid_that_now_belongs_to_another_is_left_alone() {
     let world = World::new();
-    let mut bystander = std::process::Command::new("cat")
-        .stdin(std::process::Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut bystander = std::process::Command::new("cat").stdin(std::process::Stdio::piped()).spawn().unwrap();
     let spec = spec(vec![]);
     let id = spec.id.clone();
     let servant = world.start(spec).await;
@@ -233,11 +170,7 @@ async fn a_pid_that_now_belongs_to_another_is_left_alone() {
     // The same pid, but of a process with another start time.
     runtime.shim.start -= 1;
     std::fs::create_dir(world.servant_directory(&id)).unwrap();
-    servant::launch::write_record(
-        &world.servant_directory(&id).join(servant::launch::RUNTIME),
-        &runtime,
-    )
-    .unwrap();
+    servant::launch::write_record(&world.servant_directory(&id).join(servant::launch::RUNTIME), &runtime).unwrap();
     let adoption = with_timeout(world.engine.adopt()).await.unwrap();
     assert_eq!(adoption.ended.len(), 1);
     with_timeout(world.engine.sweep(&adoption.ended)).await;

@@ -15,21 +15,11 @@ async fn installing_writes_the_root_and_changes_owners() {
     let mut spec = spec(vec![node("/chown", &["chown", "/usr/made", "33"])]);
     (spec.profile, spec.writable) = (Profile::Install, Some(upper.clone()));
     let servant = world.start(spec).await;
-    assert_eq!(
-        with_timeout(servant.wait_node("/chown"))
-            .await
-            .unwrap()
-            .code,
-        Some(0)
-    );
+    assert_eq!(with_timeout(servant.wait_node("/chown")).await.unwrap().code, Some(0));
     let (first, _) = servant.uid_range();
     world.stop(servant).await;
     let made = std::fs::metadata(upper.join("usr/made")).unwrap();
-    assert_eq!(
-        (made.uid(), made.gid()),
-        (first + 33, first + 33),
-        "what is written keeps the shifted ids"
-    );
+    assert_eq!((made.uid(), made.gid()), (first + 33, first + 33), "what is written keeps the shifted ids");
     assert_eq!(std::fs::metadata(&upper).unwrap().uid(), first);
     assert!(!work_directory(&upper).exists());
 }

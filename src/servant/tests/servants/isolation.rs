@@ -13,14 +13,9 @@ async fn a_shim_may_end_processes_and_nothing_else() {
     let shim = world.runtime(servant.id()).shim.pid;
     let kill = "0000000000000020";
     let none = "0000000000000000";
-    for (name, value) in [
-        ("CapInh", none),
-        ("CapPrm", kill),
-        ("CapEff", kill),
-        ("CapBnd", kill),
-        ("CapAmb", none),
-        ("NoNewPrivs", "1"),
-    ] {
+    for (name, value) in
+        [("CapInh", none), ("CapPrm", kill), ("CapEff", kill), ("CapBnd", kill), ("CapAmb", none), ("NoNewPrivs", "1")]
+    {
         assert_eq!(status_field(shim, name), value, "{name}");
     }
     world.stop(servant).await;
@@ -42,10 +37,7 @@ async fn a_shim_that_was_taken_over_reaches_nothing_of_roots() {
     let shim = world.runtime(servant.id()).shim.pid;
     assert_eq!(status_field(shim, "Seccomp"), "2");
     // It can still change limits and end its servant.
-    let change = servant::spec::Limits {
-        memory: Some(servant::spec::Size(64 << 20)),
-        ..Default::default()
-    };
+    let change = servant::spec::Limits { memory: Some(servant::spec::Size(64 << 20)), ..Default::default() };
     if world.has_controller("memory") {
         let enforced = servant.set_limits(change).await.unwrap();
         assert_eq!(enforced.limits.memory, change.memory);
@@ -56,12 +48,7 @@ async fn a_shim_that_was_taken_over_reaches_nothing_of_roots() {
 #[tokio::test]
 async fn every_process_is_confined_as_seen_from_the_host() {
     let world = World::new();
-    let servant = world
-        .start(spec(vec![
-            node("/one", &["family"]),
-            node("/two", &["sleep"]),
-        ]))
-        .await;
+    let servant = world.start(spec(vec![node("/one", &["family"]), node("/two", &["sleep"])])).await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "family").await;
     let processes = processes(&servant, 3).await;
@@ -74,18 +61,11 @@ async fn every_process_is_confined_as_seen_from_the_host() {
             assert_eq!(status_field(pid, set), "0000000000000000", "{set}");
         }
         let map = std::fs::read_to_string(format!("/proc/{pid}/uid_map")).unwrap();
-        let map: Vec<u32> = map
-            .split_whitespace()
-            .map(|number| number.parse().unwrap())
-            .collect();
+        let map: Vec<u32> = map.split_whitespace().map(|number| number.parse().unwrap()).collect();
         assert_eq!(map, [0, first, count]);
-        assert_eq!(
-            status_field(pid, "Uid").split_whitespace().next().unwrap(),
-            first.to_string()
-        );
+        assert_eq!(status_field(pid, "Uid").split_whitespace().next().unwrap(), first.to_string());
         for kind in ["user", "mnt", "pid", "net", "ipc", "uts", "cgroup"] {
-            let namespace =
-                |who: &str| std::fs::read_link(format!("/proc/{who}/ns/{kind}")).unwrap();
+            let namespace = |who: &str| std::fs::read_link(format!("/proc/{who}/ns/{kind}")).unwrap();
             assert_ne!(namespace(&pid.to_string()), namespace("self"), "{kind}");
         }
     }
@@ -99,21 +79,10 @@ async fn no_way_out_is_open() {
     let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
     assert!(told.len() > 40, "everything was tried: {told:?}");
-    let allowed: Vec<_> = told
-        .iter()
-        .filter(|line| line.line.ends_with("allowed"))
-        .collect();
+    let allowed: Vec<_> = told.iter().filter(|line| line.line.ends_with("allowed")).collect();
     assert!(allowed.is_empty(), "{allowed:#?}");
-    let answer = |name: &str| {
-        told.iter()
-            .find_map(|line| line.line.strip_prefix(name))
-            .unwrap()
-            .to_owned()
-    };
-    assert!(
-        answer("clone3: ").contains("not implemented"),
-        "so that the C library falls back"
-    );
+    let answer = |name: &str| told.iter().find_map(|line| line.line.strip_prefix(name)).unwrap().to_owned();
+    assert!(answer("clone3: ").contains("not implemented"), "so that the C library falls back");
     // Refused by the filter, not by the kernel, which has such families or loads them.
     for family in ["netlink", "tipc"] {
         let answer = answer(&format!("{family} socketpair: "));
@@ -136,18 +105,12 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
         let servant = world.start(spec(vec![node("/greedy", &["exhaust"])])).await;
         let mut lines = servant.follow(LogStart::First);
         let line = lines_until(&mut lines, |line| line.stream == "stdout").await;
-        let counts: Vec<u64> = line[line.len() - 1]
-            .line
-            .split(' ')
-            .map(|count| count.parse().unwrap())
-            .collect();
+        let counts: Vec<u64> = line[line.len() - 1].line.split(' ').map(|count| count.parse().unwrap()).collect();
         told.push(counts);
         servants.push(servant);
     }
     assert!(told[0].iter().all(|count| *count > 0), "{told:?}");
-    let [queues, signals, instances, terminals] = told[0][..] else {
-        panic!("{told:?}")
-    };
+    let [queues, signals, instances, terminals] = told[0][..] else { panic!("{told:?}") };
     // A signal pending for the servant's first process at that moment counts as well.
     let others = told[1][1];
     assert!(signals.abs_diff(others) < 8, "{told:?}");
@@ -160,14 +123,8 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
     watch.expect("an inotify instance for root");
     let mut timer = std::ptr::null_mut();
     // SAFETY: no event, which means a signal, and a location for the timer.
-    let made =
-        unsafe { libc::timer_create(libc::CLOCK_MONOTONIC, std::ptr::null_mut(), &raw mut timer) };
-    assert_eq!(
-        made,
-        0,
-        "a timer for root: {}",
-        std::io::Error::last_os_error()
-    );
+    let made = unsafe { libc::timer_create(libc::CLOCK_MONOTONIC, std::ptr::null_mut(), &raw mut timer) };
+    assert_eq!(made, 0, "a timer for root: {}", std::io::Error::last_os_error());
     // SAFETY: just created.
     unsafe { libc::timer_delete(timer) };
     for servant in servants {
@@ -185,14 +142,10 @@ async fn builds_open_no_way_out_either() {
         let servant = world.start(spec).await;
         let mut lines = servant.follow(LogStart::First);
         let told = lines_until(&mut lines, |line| line.line == "end of calls").await;
-        let mut allowed = told
-            .iter()
-            .map(|line| line.line.as_str())
-            .filter(|line| line.ends_with("allowed"));
+        let mut allowed = told.iter().map(|line| line.line.as_str()).filter(|line| line.ends_with("allowed"));
         // An install may write its root; that is its purpose.
-        let expected = |line: &str| {
-            profile == Profile::Install && line.starts_with("write /") && !line.contains("/proc")
-        };
+        let expected =
+            |line: &str| profile == Profile::Install && line.starts_with("write /") && !line.contains("/proc");
         assert_eq!(allowed.find(|line| !expected(line)), None);
         world.stop(servant).await;
     }
@@ -204,10 +157,8 @@ async fn a_volume_is_there_and_read_only() {
     let models = world.path("models");
     std::fs::create_dir(&models).unwrap();
     std::fs::write(models.join("weights"), "heavy\n").unwrap();
-    let mut spec = spec(vec![
-        node("/reads", &["read", "/opt/models/weights"]),
-        node("/writes", &["write", "/opt/models/x"]),
-    ]);
+    let mut spec =
+        spec(vec![node("/reads", &["read", "/opt/models/weights"]), node("/writes", &["write", "/opt/models/x"])]);
     spec.mounts = vec![Mount {
         source: models.clone(),
         target: "/opt/models".into(),
@@ -216,20 +167,8 @@ async fn a_volume_is_there_and_read_only() {
         opened: None,
     }];
     let servant = world.start(spec).await;
-    assert_eq!(
-        with_timeout(servant.wait_node("/reads"))
-            .await
-            .unwrap()
-            .code,
-        Some(0)
-    );
-    assert_eq!(
-        with_timeout(servant.wait_node("/writes"))
-            .await
-            .unwrap()
-            .code,
-        Some(libc::EROFS)
-    );
+    assert_eq!(with_timeout(servant.wait_node("/reads")).await.unwrap().code, Some(0));
+    assert_eq!(with_timeout(servant.wait_node("/writes")).await.unwrap().code, Some(libc::EROFS));
     world.stop(servant).await;
     assert!(models.join("weights").exists());
 }
@@ -243,18 +182,14 @@ async fn what_was_opened_is_mounted_whatever_took_its_place() {
     }
     std::fs::write(models.join("weights"), "heavy\n").unwrap();
     std::fs::write(secret.join("key"), "of the host\n").unwrap();
-    let mut spec = spec(vec![
-        node("/reads", &["read", "/opt/models/weights"]),
-        node("/pries", &["read", "/opt/models/key"]),
-    ]);
+    let mut spec =
+        spec(vec![node("/reads", &["read", "/opt/models/weights"]), node("/pries", &["read", "/opt/models/key"])]);
     spec.mounts = vec![Mount {
         source: models.clone(),
         target: "/opt/models".into(),
         writable: false,
         device: false,
-        opened: Some(OpenedSource::new(
-            std::fs::File::open(&models).unwrap().into(),
-        )),
+        opened: Some(OpenedSource::new(std::fs::File::open(&models).unwrap().into())),
     }];
     std::fs::rename(&models, world.path("moved")).unwrap();
     std::os::unix::fs::symlink(&secret, &models).unwrap();
@@ -273,18 +208,8 @@ async fn two_servants_share_nothing_and_their_networks_are_apart() {
     let mut second = spec(vec![]);
     second.resident = serde_json::json!({ "name": "second" });
     let (first, second) = (world.start(first).await, world.start(second).await);
-    assert!(
-        read_from_port(&first, 11311)
-            .await
-            .unwrap()
-            .contains("first")
-    );
-    assert!(
-        read_from_port(&second, 11311)
-            .await
-            .unwrap()
-            .contains("second")
-    );
+    assert!(read_from_port(&first, 11311).await.unwrap().contains("first"));
+    assert!(read_from_port(&second, 11311).await.unwrap().contains("second"));
     assert_ne!(first.uid_range().0, second.uid_range().0);
     assert_ne!(first.network(), second.network());
     world.stop(first).await;

@@ -11,23 +11,13 @@ use crate::support::*;
 #[tokio::test]
 async fn stop_leaves_nothing_of_nodes_that_do_not_want_to_end() {
     let world = World::new();
-    let servant = world
-        .start(spec(vec![
-            node("/stubborn", &["stubborn"]),
-            node("/polite", &["sleep"]),
-        ]))
-        .await;
+    let servant = world.start(spec(vec![node("/stubborn", &["stubborn"]), node("/polite", &["sleep"])])).await;
     let mut lines = servant.follow(LogStart::First);
     lines_until(&mut lines, |line| line.line == "stubborn").await;
     assert_eq!(processes(&servant, 3).await.len(), 3);
     let state = servant.state();
     world.stop(servant).await;
-    assert_eq!(
-        *state.borrow(),
-        ContainerState::Stopped {
-            reason: "stopped".into()
-        }
-    );
+    assert_eq!(*state.borrow(), ContainerState::Stopped { reason: "stopped".into() });
     assert!(lines.recv().await.is_none(), "the log has ended");
 }
 
@@ -72,27 +62,14 @@ async fn exit_codes_signals_and_programs_that_are_not_there_are_told_apart() {
     let exit = async |name: &str| with_timeout(servant.wait_node(name)).await.unwrap();
     assert_eq!(exit("/fine").await.code, Some(0));
     assert_eq!(exit("/seven").await.code, Some(7));
-    assert_eq!(
-        (exit("/dead").await.code, exit("/dead").await.signal),
-        (None, Some(11))
-    );
+    assert_eq!((exit("/dead").await.code, exit("/dead").await.signal), (None, Some(11)));
     let reason = exit("/missing").await.exec_error.unwrap();
-    assert!(
-        reason.contains("could not be executed: No such file"),
-        "{reason}"
-    );
+    assert!(reason.contains("could not be executed: No such file"), "{reason}");
     let reason = exit("/lost").await.exec_error.unwrap();
     assert!(reason.contains("working directory"), "{reason}");
-    let error = servant
-        .wait_node("/unheard-of")
-        .await
-        .unwrap_err()
-        .to_string();
+    let error = servant.wait_node("/unheard-of").await.unwrap_err().to_string();
     assert!(error.contains("/unheard-of"), "{error}");
-    assert!(
-        matches!(*servant.state().borrow(), ContainerState::Running),
-        "no node was required"
-    );
+    assert!(matches!(*servant.state().borrow(), ContainerState::Running), "no node was required");
     world.stop(servant).await;
 }
 
@@ -104,25 +81,10 @@ async fn the_end_of_a_required_node_ends_the_servant() {
     let servant = world.start(spec(vec![node("/other", &["sleep"])])).await;
     // A required node that ends during the start makes that fail; this one is started afterwards.
     servant.start_node(required).await.unwrap();
-    let ContainerState::Stopped { reason } = wait_until_ended(&*servant).await else {
-        panic!("it failed")
-    };
-    assert!(
-        reason.contains("/required") && reason.contains('3'),
-        "{reason}"
-    );
-    assert_eq!(
-        with_timeout(servant.wait_node("/required"))
-            .await
-            .unwrap()
-            .code,
-        Some(3)
-    );
-    let error = servant
-        .start_node(node("/late", &["sleep"]))
-        .await
-        .unwrap_err()
-        .to_string();
+    let ContainerState::Stopped { reason } = wait_until_ended(&*servant).await else { panic!("it failed") };
+    assert!(reason.contains("/required") && reason.contains('3'), "{reason}");
+    assert_eq!(with_timeout(servant.wait_node("/required")).await.unwrap().code, Some(3));
+    let error = servant.start_node(node("/late", &["sleep"])).await.unwrap_err().to_string();
     assert!(error.contains("ended"), "{error}");
     world.stop(servant).await;
 }
@@ -184,26 +146,14 @@ async fn nodes_have_their_environment_and_directory_and_a_name_once() {
     let mut speaker = node("/speaker", &["environment"]);
     speaker.environment = [("OWN".to_owned(), "1".to_owned())].into();
     speaker.directory = "/tmp".into();
-    let servant = world
-        .start(spec(vec![speaker, node("/stays", &["sleep"])]))
-        .await;
+    let servant = world.start(spec(vec![speaker, node("/stays", &["sleep"])])).await;
     let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.node == "/speaker").await;
-    assert_eq!(
-        told.last().unwrap().line,
-        r#"{"OWN": "1", "SHARED": "yes"} "/tmp""#
-    );
-    let error = servant
-        .start_node(node("/stays", &["sleep"]))
-        .await
-        .unwrap_err()
-        .to_string();
+    assert_eq!(told.last().unwrap().line, r#"{"OWN": "1", "SHARED": "yes"} "/tmp""#);
+    let error = servant.start_node(node("/stays", &["sleep"])).await.unwrap_err().to_string();
     assert!(error.contains("/stays runs already"), "{error}");
     with_timeout(servant.wait_node("/speaker")).await.unwrap();
-    servant
-        .start_node(node("/speaker", &["exit", "5"]))
-        .await
-        .unwrap();
+    servant.start_node(node("/speaker", &["exit", "5"])).await.unwrap();
     world.stop(servant).await;
 }
 
@@ -229,20 +179,12 @@ async fn a_killed_init_is_a_failure() {
     let world = World::new();
     let servant = world.start(spec(vec![])).await;
     servant.start_node(node("/a", &["sleep"])).await.unwrap();
-    let pidfd: OwnedFd = ProcessIdentity::from_pid(servant.init_pid().unwrap())
-        .unwrap()
-        .open_pidfd()
-        .unwrap()
-        .expect("it runs");
+    let pidfd: OwnedFd =
+        ProcessIdentity::from_pid(servant.init_pid().unwrap()).unwrap().open_pidfd().unwrap().expect("it runs");
     kill(&pidfd);
-    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
-        panic!("it did not fail")
-    };
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else { panic!("it did not fail") };
     assert!(reason.contains("init was killed by signal 9"), "{reason}");
-    assert_eq!(
-        with_timeout(servant.wait_node("/a")).await.unwrap().signal,
-        Some(libc::SIGKILL)
-    );
+    assert_eq!(with_timeout(servant.wait_node("/a")).await.unwrap().signal, Some(libc::SIGKILL));
     world.stop(servant).await;
 }
 
@@ -255,31 +197,17 @@ async fn what_cannot_start_says_why_and_leaves_nothing() {
     residentless.resident = serde_json::json!({ "fail": "no room" });
     let mut nodeless = spec(vec![node("/a", &[])]);
     nodeless.nodes[0].argv = vec!["relative".into()];
-    for (spec, words) in [
-        (unshiftable, "proc, which cannot be mounted"),
-        (residentless, "no room"),
-        (nodeless, "absolute path"),
-    ] {
+    for (spec, words) in
+        [(unshiftable, "proc, which cannot be mounted"), (residentless, "no room"), (nodeless, "absolute path")]
+    {
         let id = spec.id.clone();
-        let error = world
-            .engine
-            .start_container(spec)
-            .await
-            .map(|_| ())
-            .unwrap_err()
-            .to_string();
+        let error = world.engine.start_container(spec).await.map(|_| ()).unwrap_err().to_string();
         assert!(error.contains(words), "{error}");
         assert!(!world.servant_directory(&id).exists(), "{words}");
     }
     let spec = spec(vec![]);
     let servant = world.start(spec.clone()).await;
-    let error = world
-        .engine
-        .start_container(spec)
-        .await
-        .map(|_| ())
-        .unwrap_err()
-        .to_string();
+    let error = world.engine.start_container(spec).await.map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("exists already"), "{error}");
     world.stop(servant).await;
 }
@@ -287,10 +215,7 @@ async fn what_cannot_start_says_why_and_leaves_nothing() {
 #[tokio::test]
 async fn a_creation_that_libcontainer_fails_harms_nobody() {
     let world = World::new();
-    let mut bystander = std::process::Command::new("cat")
-        .stdin(std::process::Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut bystander = std::process::Command::new("cat").stdin(std::process::Stdio::piped()).spawn().unwrap();
     let mut spec = spec(vec![]);
     // No directory can be created there, which libcontainer notices half-way.
     spec.mounts = vec![Mount {
@@ -301,20 +226,11 @@ async fn a_creation_that_libcontainer_fails_harms_nobody() {
         opened: None,
     }];
     let id = spec.id.clone();
-    let error = world
-        .engine
-        .start_container(spec)
-        .await
-        .map(|_| ())
-        .unwrap_err()
-        .to_string();
+    let error = world.engine.start_container(spec).await.map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("failed to create container"), "{error}");
     assert!(!world.servant_directory(&id).exists());
     // Its cleanup kills what it takes for the container's processes.
-    assert!(
-        bystander.try_wait().unwrap().is_none(),
-        "a process of the host was killed"
-    );
+    assert!(bystander.try_wait().unwrap().is_none(), "a process of the host was killed");
     drop(bystander.stdin.take());
     bystander.wait().unwrap();
 }
@@ -346,25 +262,13 @@ async fn twenty_start_at_once_from_a_program_with_many_threads() {
     let world = World::new();
     let starts = (0..20).map(|_| {
         let engine = world.engine.clone();
-        tokio::spawn(async move {
-            engine
-                .start_container(spec(vec![node("/a", &["sleep"])]))
-                .await
-        })
+        tokio::spawn(async move { engine.start_container(spec(vec![node("/a", &["sleep"])])).await })
     });
     let mut servants = Vec::new();
     for start in starts.collect::<Vec<_>>() {
-        servants.push(
-            with_timeout(start)
-                .await
-                .unwrap()
-                .unwrap_or_else(|error| panic!("{error}")),
-        );
+        servants.push(with_timeout(start).await.unwrap().unwrap_or_else(|error| panic!("{error}")));
     }
-    let uids: std::collections::BTreeSet<_> = servants
-        .iter()
-        .map(|servant| servant.uid_range().0)
-        .collect();
+    let uids: std::collections::BTreeSet<_> = servants.iter().map(|servant| servant.uid_range().0).collect();
     assert_eq!(uids.len(), 20);
     for servant in servants {
         world.stop(servant).await;

@@ -9,9 +9,7 @@ async fn every_line_arrives_once_and_in_order() {
     const LINES: u64 = 200_000;
     // More than the default burst.
     let world = World::with_config(|config| config.quotas.log_rate = u64::MAX);
-    let servant = world
-        .start(spec(vec![node("/talks", &["print", &LINES.to_string()])]))
-        .await;
+    let servant = world.start(spec(vec![node("/talks", &["print", &LINES.to_string()])])).await;
     let mut lines = servant.follow(LogStart::First);
     let reader = tokio::spawn(async move {
         let mut expected = 0;
@@ -21,43 +19,22 @@ async fn every_line_arrives_once_and_in_order() {
         }
         expected
     });
-    assert_eq!(
-        with_timeout(servant.wait_node("/talks"))
-            .await
-            .unwrap()
-            .code,
-        Some(0)
-    );
-    let log = world
-        .servant_directory(servant.id())
-        .join(servant::logs::FILE);
+    assert_eq!(with_timeout(servant.wait_node("/talks")).await.unwrap().code, Some(0));
+    let log = world.servant_directory(servant.id()).join(servant::logs::FILE);
     assert!(log.exists());
     world.stop(servant).await;
-    assert_eq!(
-        with_timeout(reader).await.unwrap(),
-        LINES,
-        "also what was read after the end"
-    );
+    assert_eq!(with_timeout(reader).await.unwrap(), LINES, "also what was read after the end");
 }
 
 #[tokio::test]
 async fn a_follower_from_now_on_sees_only_what_comes() {
     let world = World::new();
-    let servant = world
-        .start(spec(vec![node("/early", &["print", "10"])]))
-        .await;
+    let servant = world.start(spec(vec![node("/early", &["print", "10"])])).await;
     let mut all = servant.follow(LogStart::First);
     lines_until(&mut all, |line| line.line == "9").await;
     let mut late = servant.follow(LogStart::Now);
-    servant
-        .start_node(node("/late", &["print", "2"]))
-        .await
-        .unwrap();
+    servant.start_node(node("/late", &["print", "2"])).await.unwrap();
     let seen = lines_until(&mut late, |line| line.line == "1").await;
-    assert!(
-        seen.iter()
-            .all(|line| line.node == "/late" && line.stream == "stdout"),
-        "{seen:?}"
-    );
+    assert!(seen.iter().all(|line| line.node == "/late" && line.stream == "stdout"), "{seen:?}");
     world.stop(servant).await;
 }

@@ -6,12 +6,7 @@ use std::time::Duration;
 
 /// Runs the action and returns the exit status.
 pub fn run_action(words: &[String]) -> i32 {
-    let number = |at: usize| {
-        words
-            .get(at)
-            .and_then(|word| word.parse::<u64>().ok())
-            .unwrap_or(0)
-    };
+    let number = |at: usize| words.get(at).and_then(|word| word.parse::<u64>().ok()).unwrap_or(0);
     match words.first().map(String::as_str).unwrap_or_default() {
         "exit" => return number(1) as i32,
         "sleep" => loop {
@@ -58,10 +53,7 @@ pub fn run_action(words: &[String]) -> i32 {
         }
         "environment" => {
             let variables: std::collections::BTreeMap<_, _> = std::env::vars().collect();
-            println!(
-                "{variables:?} {:?}",
-                std::env::current_dir().unwrap_or_default()
-            );
+            println!("{variables:?} {:?}", std::env::current_dir().unwrap_or_default());
         }
         "eat" => {
             let mut held: Vec<Vec<u8>> = Vec::new();
@@ -115,16 +107,8 @@ fn map_shared_memory(name: &str, flags: i32) -> io::Result<*mut u8> {
         return Err(io::Error::last_os_error());
     }
     // SAFETY: a new mapping; nothing else is there.
-    let at = unsafe {
-        libc::mmap(
-            std::ptr::null_mut(),
-            PIECE,
-            libc::PROT_READ | libc::PROT_WRITE,
-            libc::MAP_SHARED,
-            fd,
-            0,
-        )
-    };
+    let at =
+        unsafe { libc::mmap(std::ptr::null_mut(), PIECE, libc::PROT_READ | libc::PROT_WRITE, libc::MAP_SHARED, fd, 0) };
     if at == libc::MAP_FAILED {
         return Err(io::Error::last_os_error());
     }
@@ -208,15 +192,7 @@ fn exhaust() -> io::Result<()> {
     let mut queues = 0;
     let mut name = CString::new(format!("/queue-{queues}"))?;
     // SAFETY: a name that outlives the call; no attributes.
-    while unsafe {
-        libc::mq_open(
-            name.as_ptr(),
-            libc::O_CREAT | libc::O_RDWR,
-            0o600,
-            std::ptr::null::<u8>(),
-        )
-    } >= 0
-    {
+    while unsafe { libc::mq_open(name.as_ptr(), libc::O_CREAT | libc::O_RDWR, 0o600, std::ptr::null::<u8>()) } >= 0 {
         queues += 1;
         name = CString::new(format!("/queue-{queues}"))?;
     }
@@ -228,9 +204,7 @@ fn exhaust() -> io::Result<()> {
         libc::sigaddset(&mut blocked, signal);
         libc::sigprocmask(libc::SIG_BLOCK, &blocked, std::ptr::null_mut());
     }
-    let nothing = libc::sigval {
-        sival_ptr: std::ptr::null_mut(),
-    };
+    let nothing = libc::sigval { sival_ptr: std::ptr::null_mut() };
     let mut signals = 0;
     // SAFETY: this very process, which has blocked the signal.
     while unsafe { libc::sigqueue(libc::getpid(), signal, nothing) } == 0 {
@@ -300,11 +274,7 @@ fn chown(path: &str, owner: u32) -> i32 {
 /// Prints `name: error` or `name: allowed` for every call that must be refused.
 fn refused_calls() {
     let tell = |name: &str, result: i64| {
-        let outcome = if result < 0 {
-            io::Error::last_os_error().to_string()
-        } else {
-            "allowed".into()
-        };
+        let outcome = if result < 0 { io::Error::last_os_error().to_string() } else { "allowed".into() };
         println!("{name}: {outcome}");
     };
     let null = std::ptr::null::<u8>();
@@ -313,24 +283,11 @@ fn refused_calls() {
     let here = buffer.as_mut_ptr();
     // SAFETY: each call is refused before it looks at its arguments, or gets valid ones. A forked child exits at once.
     unsafe {
-        tell(
-            "unshare user",
-            i64::from(libc::unshare(libc::CLONE_NEWUSER)),
-        );
-        tell(
-            "unshare network",
-            i64::from(libc::unshare(libc::CLONE_NEWNET)),
-        );
-        tell(
-            "unshare mounts",
-            i64::from(libc::unshare(libc::CLONE_NEWNS)),
-        );
+        tell("unshare user", i64::from(libc::unshare(libc::CLONE_NEWUSER)));
+        tell("unshare network", i64::from(libc::unshare(libc::CLONE_NEWNET)));
+        tell("unshare mounts", i64::from(libc::unshare(libc::CLONE_NEWNS)));
         tell("setns", i64::from(libc::setns(0, 0)));
-        for (name, flag) in [
-            ("user", libc::CLONE_NEWUSER),
-            ("mount", libc::CLONE_NEWNS),
-            ("net", libc::CLONE_NEWNET),
-        ] {
+        for (name, flag) in [("user", libc::CLONE_NEWUSER), ("mount", libc::CLONE_NEWNS), ("net", libc::CLONE_NEWNET)] {
             let flags = (flag | libc::SIGCHLD) as i64;
             let result = libc::syscall(libc::SYS_clone, flags, 0, 0, 0, 0);
             if result == 0 {
@@ -341,13 +298,7 @@ fn refused_calls() {
         tell("clone3", libc::syscall(libc::SYS_clone3, here, 88));
         tell(
             "mount",
-            i64::from(libc::mount(
-                c"none".as_ptr(),
-                c"/tmp".as_ptr(),
-                c"tmpfs".as_ptr(),
-                0,
-                std::ptr::null(),
-            )),
+            i64::from(libc::mount(c"none".as_ptr(), c"/tmp".as_ptr(), c"tmpfs".as_ptr(), 0, std::ptr::null())),
         );
         tell(
             "remount",
@@ -360,136 +311,50 @@ fn refused_calls() {
             )),
         );
         tell("umount", i64::from(libc::umount2(c"/proc".as_ptr(), 0)));
-        tell(
-            "fsopen",
-            libc::syscall(libc::SYS_fsopen, c"tmpfs".as_ptr(), 0),
-        );
-        tell(
-            "open_tree",
-            libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, root.as_ptr(), 1),
-        );
-        tell(
-            "pivot_root",
-            libc::syscall(libc::SYS_pivot_root, root.as_ptr(), root.as_ptr()),
-        );
+        tell("fsopen", libc::syscall(libc::SYS_fsopen, c"tmpfs".as_ptr(), 0));
+        tell("open_tree", libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, root.as_ptr(), 1));
+        tell("pivot_root", libc::syscall(libc::SYS_pivot_root, root.as_ptr(), root.as_ptr()));
         tell("chroot", i64::from(libc::chroot(root.as_ptr())));
         tell("ptrace init", libc::ptrace(libc::PTRACE_ATTACH, 1, 0, 0));
         tell("ptrace me", libc::ptrace(libc::PTRACE_TRACEME, 0, 0, 0));
-        tell(
-            "process_vm_readv",
-            libc::syscall(libc::SYS_process_vm_readv, 1, null, 0, null, 0, 0),
-        );
+        tell("process_vm_readv", libc::syscall(libc::SYS_process_vm_readv, 1, null, 0, null, 0, 0));
         tell("pidfd_getfd", libc::syscall(libc::SYS_pidfd_getfd, 0, 0, 0));
         tell("keyctl", libc::syscall(libc::SYS_keyctl, 0, -3, 1, 0, 0));
-        tell(
-            "add_key",
-            libc::syscall(
-                libc::SYS_add_key,
-                c"user".as_ptr(),
-                c"x".as_ptr(),
-                here,
-                1,
-                -3,
-            ),
-        );
+        tell("add_key", libc::syscall(libc::SYS_add_key, c"user".as_ptr(), c"x".as_ptr(), here, 1, -3));
         tell("bpf", libc::syscall(libc::SYS_bpf, 5, here, 64));
-        tell(
-            "perf_event_open",
-            libc::syscall(libc::SYS_perf_event_open, here, 0, -1, -1, 0),
-        );
-        tell(
-            "io_uring_setup",
-            libc::syscall(libc::SYS_io_uring_setup, 8, here),
-        );
+        tell("perf_event_open", libc::syscall(libc::SYS_perf_event_open, here, 0, -1, -1, 0));
+        tell("io_uring_setup", libc::syscall(libc::SYS_io_uring_setup, 8, here));
         tell("userfaultfd", libc::syscall(libc::SYS_userfaultfd, 0));
-        tell(
-            "open_by_handle_at",
-            libc::syscall(libc::SYS_open_by_handle_at, 0, here, 0),
-        );
-        tell(
-            "kexec_load",
-            libc::syscall(libc::SYS_kexec_load, 0, 0, null, 0),
-        );
-        tell(
-            "reboot",
-            libc::syscall(libc::SYS_reboot, 0xfee1dead_u32, 672_274_793, 0, null),
-        );
-        tell(
-            "sethostname",
-            i64::from(libc::sethostname(c"x".as_ptr(), 1)),
-        );
-        tell(
-            "raw socket",
-            i64::from(libc::socket(libc::AF_INET, libc::SOCK_RAW, 1)),
-        );
-        tell(
-            "packet socket",
-            i64::from(libc::socket(libc::AF_PACKET, libc::SOCK_RAW, 0)),
-        );
+        tell("open_by_handle_at", libc::syscall(libc::SYS_open_by_handle_at, 0, here, 0));
+        tell("kexec_load", libc::syscall(libc::SYS_kexec_load, 0, 0, null, 0));
+        tell("reboot", libc::syscall(libc::SYS_reboot, 0xfee1dead_u32, 672_274_793, 0, null));
+        tell("sethostname", i64::from(libc::sethostname(c"x".as_ptr(), 1)));
+        tell("raw socket", i64::from(libc::socket(libc::AF_INET, libc::SOCK_RAW, 1)));
+        tell("packet socket", i64::from(libc::socket(libc::AF_PACKET, libc::SOCK_RAW, 0)));
         // Such requests count for the whole host (fs.aio-max-nr).
         let mut context = 0_u64;
-        tell(
-            "asynchronous input and output",
-            libc::syscall(libc::SYS_io_setup, 1, &raw mut context),
-        );
+        tell("asynchronous input and output", libc::syscall(libc::SYS_io_setup, 1, &raw mut context));
         let mut pair = [0; 2];
         for (name, family) in [("netlink", libc::AF_NETLINK), ("tipc", libc::AF_TIPC)] {
             tell(
                 &format!("{name} socketpair"),
-                i64::from(libc::socketpair(
-                    family,
-                    libc::SOCK_SEQPACKET,
-                    0,
-                    pair.as_mut_ptr(),
-                )),
+                i64::from(libc::socketpair(family, libc::SOCK_SEQPACKET, 0, pair.as_mut_ptr())),
             );
         }
-        tell(
-            "vsock",
-            i64::from(libc::socket(libc::AF_VSOCK, libc::SOCK_STREAM, 0)),
-        );
-        tell(
-            "alg socket",
-            i64::from(libc::socket(libc::AF_ALG, libc::SOCK_SEQPACKET, 0)),
-        );
-        tell(
-            "disk device",
-            i64::from(libc::mknod(
-                c"/tmp/disk".as_ptr(),
-                libc::S_IFBLK | 0o600,
-                libc::makedev(8, 0),
-            )),
-        );
+        tell("vsock", i64::from(libc::socket(libc::AF_VSOCK, libc::SOCK_STREAM, 0)));
+        tell("alg socket", i64::from(libc::socket(libc::AF_ALG, libc::SOCK_SEQPACKET, 0)));
+        tell("disk device", i64::from(libc::mknod(c"/tmp/disk".as_ptr(), libc::S_IFBLK | 0o600, libc::makedev(8, 0))));
         tell("setuid outside", i64::from(libc::setuid(70_000)));
     }
-    for path in [
-        "/proc/sys/kernel/core_pattern",
-        "/proc/sysrq-trigger",
-        "/x",
-        "/usr/x",
-        "/proc/1/mem",
-        "/dev/x",
-    ] {
-        let outcome = match std::fs::OpenOptions::new()
-            .create(true)
-            .truncate(false)
-            .write(true)
-            .open(path)
-        {
+    for path in ["/proc/sys/kernel/core_pattern", "/proc/sysrq-trigger", "/x", "/usr/x", "/proc/1/mem", "/dev/x"] {
+        let outcome = match std::fs::OpenOptions::new().create(true).truncate(false).write(true).open(path) {
             Ok(_) if path == "/dev/x" => "nothing but a file in its own tmpfs".to_owned(),
             Ok(_) => "allowed".to_owned(),
             Err(error) => error.to_string(),
         };
         println!("write {path}: {outcome}");
     }
-    for path in [
-        "/proc/kcore",
-        "/proc/keys",
-        "/proc/1/fd/3",
-        "/proc/1/environ",
-        "/proc/1/exe",
-        "/proc/1/root",
-    ] {
+    for path in ["/proc/kcore", "/proc/keys", "/proc/1/fd/3", "/proc/1/environ", "/proc/1/exe", "/proc/1/root"] {
         let outcome = match std::fs::read(path) {
             Ok(bytes) if bytes.is_empty() => "empty".to_owned(),
             Ok(_) => "allowed".to_owned(),

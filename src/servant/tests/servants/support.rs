@@ -26,10 +26,7 @@ static CHOOSE: extern "C" fn() = choose;
 
 extern "C" fn choose() {
     let words: Vec<String> = std::env::args().collect();
-    if words
-        .first()
-        .is_some_and(|name| name.ends_with("test-node"))
-    {
+    if words.first().is_some_and(|name| name.ends_with("test-node")) {
         let status = crate::node::run_action(&words[1..]);
         let _ = std::io::stdout().flush();
         std::process::exit(status);
@@ -94,14 +91,8 @@ fn attempt_escapes(socket: &Path, directory: &Path) -> String {
         ("read outside", std::fs::read("/etc/passwd").map(drop)),
         ("list outside", std::fs::read_dir("/etc").map(drop)),
         ("program", Command::new("/bin/true").status().map(drop)),
-        (
-            "socket of root",
-            std::os::unix::net::UnixStream::connect(socket).map(drop),
-        ),
-        (
-            "pair of sockets",
-            std::os::unix::net::UnixDatagram::pair().map(drop),
-        ),
+        ("socket of root", std::os::unix::net::UnixStream::connect(socket).map(drop)),
+        ("pair of sockets", std::os::unix::net::UnixDatagram::pair().map(drop)),
     ];
     let told = tries.map(|(name, outcome)| match outcome {
         Ok(()) => format!("{name}: allowed\n"),
@@ -124,29 +115,15 @@ impl World {
 
     /// Creates an environment with a changed configuration.
     pub fn with_config(change: impl FnOnce(&mut LocalEngineConfig)) -> Self {
-        assert!(
-            nix::unistd::geteuid().is_root(),
-            "these tests start containers: run them as root"
-        );
-        let home =
-            tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a directory for the test");
-        let shim: Vec<OsString> = vec![
-            std::env::current_exe().expect("our own path").into(),
-            "shim".into(),
-        ];
+        assert!(nix::unistd::geteuid().is_root(), "these tests start containers: run them as root");
+        let home = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).expect("a directory for the test");
+        let shim: Vec<OsString> = vec![std::env::current_exe().expect("our own path").into(), "shim".into()];
         let mut config = LocalEngineConfig::new(home.path().join("servants"), shim, init());
         config.isolation = Isolation::BestEffort;
-        config.grace = GracePeriods {
-            interrupt: Duration::from_millis(300),
-            terminate: Duration::from_millis(300),
-        };
+        config.grace = GracePeriods { interrupt: Duration::from_millis(300), terminate: Duration::from_millis(300) };
         change(&mut config);
         let engine = LocalEngine::new(config.clone()).expect("an engine");
-        Self {
-            engine,
-            home,
-            config,
-        }
+        Self { engine, home, config }
     }
 
     /// Creates another engine on the same directory, like a restarted daemon.
@@ -179,9 +156,7 @@ impl World {
     }
 
     pub fn runtime(&self, id: &str) -> RuntimeRecord {
-        launch::read_record(&self.servant_directory(id).join(launch::RUNTIME))
-            .unwrap()
-            .expect("a shim writes it first")
+        launch::read_record(&self.servant_directory(id).join(launch::RUNTIME)).unwrap().expect("a shim writes it first")
     }
 
     /// Returns the single servant that an engine on the same directory adopts.
@@ -193,10 +168,7 @@ impl World {
     }
 
     pub async fn start(&self, spec: ContainerSpec) -> Arc<LocalServant> {
-        self.engine
-            .start_container(spec)
-            .await
-            .unwrap_or_else(|error| panic!("{error}"))
+        self.engine.start_container(spec).await.unwrap_or_else(|error| panic!("{error}"))
     }
 
     /// Stops a servant and checks that nothing is left.
@@ -204,28 +176,16 @@ impl World {
         let id = servant.id().to_owned();
         let runtime = self.runtime(&id);
         let processes = servant.processes().unwrap_or_default();
-        servant
-            .stop()
-            .await
-            .unwrap_or_else(|error| panic!("{error}"));
+        servant.stop().await.unwrap_or_else(|error| panic!("{error}"));
         self.assert_gone(&id, &runtime, &processes);
     }
 
     pub fn assert_gone(&self, id: &str, runtime: &RuntimeRecord, processes: &[i32]) {
-        assert!(
-            !self.servant_directory(id).exists(),
-            "the directory is left"
-        );
+        assert!(!self.servant_directory(id).exists(), "the directory is left");
         assert!(!runtime.cgroup.exists(), "the cgroup is left");
         let of_shim = runtime.shim_cgroup.as_ref();
-        assert!(
-            !of_shim.is_some_and(servant::cgroup::Cgroup::exists),
-            "the shim's cgroup is left"
-        );
-        assert!(
-            runtime.shim.open_pidfd().unwrap().is_none(),
-            "the shim is left"
-        );
+        assert!(!of_shim.is_some_and(servant::cgroup::Cgroup::exists), "the shim's cgroup is left");
+        assert!(runtime.shim.open_pidfd().unwrap().is_none(), "the shim is left");
         for pid in processes {
             assert_ended(*pid, id);
         }
@@ -241,9 +201,7 @@ impl Drop for World {
             return;
         };
         for entry in entries.flatten() {
-            let Ok(Some(runtime)) =
-                launch::read_record::<RuntimeRecord>(&entry.path().join(launch::RUNTIME))
-            else {
+            let Ok(Some(runtime)) = launch::read_record::<RuntimeRecord>(&entry.path().join(launch::RUNTIME)) else {
                 continue;
             };
             if let Ok(Some(pidfd)) = runtime.shim.open_pidfd() {
@@ -259,10 +217,7 @@ impl Drop for World {
 /// Fails if a process of a servant does not end. A process that has ended keeps its entry in /proc, cgroup included,
 /// until its parent has reaped it: so its end is awaited, not the disappearance of the entry.
 fn assert_ended(pid: i32, id: &str) {
-    let of_servant = || {
-        std::fs::read_to_string(format!("/proc/{pid}/cgroup"))
-            .is_ok_and(|cgroup| cgroup.contains(id))
-    };
+    let of_servant = || std::fs::read_to_string(format!("/proc/{pid}/cgroup")).is_ok_and(|cgroup| cgroup.contains(id));
     let Ok(process) = servant::process::ProcessIdentity::from_pid(pid) else {
         return;
     };
@@ -273,10 +228,7 @@ fn assert_ended(pid: i32, id: &str) {
     let Ok(Some(pidfd)) = process.open_pidfd() else {
         return;
     };
-    let mut watched = [nix::poll::PollFd::new(
-        pidfd.as_fd(),
-        nix::poll::PollFlags::POLLIN,
-    )];
+    let mut watched = [nix::poll::PollFd::new(pidfd.as_fd(), nix::poll::PollFlags::POLLIN)];
     let ended = nix::poll::poll(&mut watched, 10_000_u16).unwrap();
     assert!(ended == 1, "process {pid} is left");
 }
@@ -286,18 +238,9 @@ pub fn kill(pidfd: &std::os::fd::OwnedFd) {
     use std::os::fd::AsRawFd;
     // SAFETY: a null siginfo is allowed.
     unsafe {
-        libc::syscall(
-            libc::SYS_pidfd_send_signal,
-            pidfd.as_raw_fd(),
-            Signal::SIGKILL as i32,
-            0_usize,
-            0,
-        );
+        libc::syscall(libc::SYS_pidfd_send_signal, pidfd.as_raw_fd(), Signal::SIGKILL as i32, 0_usize, 0);
     }
-    let mut watched = [nix::poll::PollFd::new(
-        pidfd.as_fd(),
-        nix::poll::PollFlags::POLLIN,
-    )];
+    let mut watched = [nix::poll::PollFd::new(pidfd.as_fd(), nix::poll::PollFlags::POLLIN)];
     let _ = nix::poll::poll(&mut watched, 5000_u16);
 }
 
@@ -323,10 +266,7 @@ pub fn spec(nodes: Vec<NodeSpec>) -> ContainerSpec {
 
 /// Creates a node that runs an action of [`crate::node::run_action`].
 pub fn node(name: &str, words: &[&str]) -> NodeSpec {
-    let argv = std::iter::once("/test-node")
-        .chain(words.iter().copied())
-        .map(str::to_owned)
-        .collect();
+    let argv = std::iter::once("/test-node").chain(words.iter().copied()).map(str::to_owned).collect();
     NodeSpec {
         name: name.to_owned(),
         argv,
@@ -345,9 +285,7 @@ pub async fn lines_until(
 ) -> Vec<LogLine> {
     let mut seen = Vec::new();
     loop {
-        let line = with_timeout(lines.recv())
-            .await
-            .unwrap_or_else(|| panic!("the log ended after {seen:?}"));
+        let line = with_timeout(lines.recv()).await.unwrap_or_else(|| panic!("the log ended after {seen:?}"));
         seen.push(line);
         if seen.last().is_some_and(&fits) {
             return seen;
@@ -379,26 +317,18 @@ pub async fn processes(servant: &LocalServant, count: usize) -> Vec<i32> {
 /// Waits until a servant has ended and returns its final state.
 pub async fn wait_until_ended(servant: &dyn ServantHandle) -> ContainerState {
     let mut state = servant.state();
-    with_timeout(state.wait_for(ContainerState::is_over))
-        .await
-        .expect("a state")
-        .clone()
+    with_timeout(state.wait_for(ContainerState::is_over)).await.expect("a state").clone()
 }
 
 /// Fails a test that waits too long, instead of letting it hang.
 pub async fn with_timeout<T>(future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(Duration::from_secs(60), future)
-        .await
-        .expect("it took more than a minute")
+    tokio::time::timeout(Duration::from_secs(60), future).await.expect("it took more than a minute")
 }
 
 /// Reads from a port until the connection closes.
 pub async fn read_from_port(servant: &LocalServant, port: u16) -> std::io::Result<String> {
     use tokio::io::AsyncReadExt;
-    let mut stream = servant
-        .network()
-        .connect(([127, 0, 0, 1], port).into())
-        .await?;
+    let mut stream = servant.network().connect(([127, 0, 0, 1], port).into()).await?;
     let mut text = String::new();
     stream.read_to_string(&mut text).await?;
     Ok(text)
@@ -408,8 +338,7 @@ pub async fn read_from_port(servant: &LocalServant, port: u16) -> std::io::Resul
 fn layer() -> PathBuf {
     static LAYER: OnceLock<PathBuf> = OnceLock::new();
     let make = || {
-        let layer =
-            Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
+        let layer = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
         std::fs::create_dir_all(layer.join("lib64")).unwrap();
         std::fs::create_dir_all(layer.join("usr")).unwrap();
         let own = std::env::current_exe().unwrap();
@@ -429,10 +358,7 @@ fn layer() -> PathBuf {
             // The file is libx.so.1.2.3, but programs ask for libx.so.1.
             if let Some((stem, version)) = library.split_once(".so.") {
                 let major = version.split('.').next().unwrap_or(version);
-                copy(
-                    Path::new(library),
-                    &layer.join(format!("{}.so.{major}", stem.trim_start_matches('/'))),
-                );
+                copy(Path::new(library), &layer.join(format!("{}.so.{major}", stem.trim_start_matches('/'))));
             }
             if library.contains("/ld-linux") {
                 let name = Path::new(library).file_name().unwrap();
@@ -453,8 +379,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 extern "C" fn remove_layer() {
-    let layer =
-        Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
+    let layer = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("layer-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(layer);
 }
 
@@ -465,21 +390,10 @@ fn init() -> PathBuf {
         if let Some(path) = std::env::var_os("CLOUDROID_INIT") {
             return path.into();
         }
-        let target = Path::new(env!("CARGO_TARGET_TMPDIR"))
-            .parent()
-            .expect("tmp is in the target directory");
+        let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("tmp is in the target directory");
         let triple = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
         let status = Command::new(env!("CARGO"))
-            .args([
-                "build",
-                "--quiet",
-                "--package",
-                "init",
-                "--profile",
-                "init",
-                "--target",
-                &triple,
-            ])
+            .args(["build", "--quiet", "--package", "init", "--profile", "init", "--target", &triple])
             .arg("--target-dir")
             .arg(target)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
@@ -496,15 +410,7 @@ fn init() -> PathBuf {
 pub fn status_field(pid: i32, field: &str) -> String {
     let mut text = String::new();
     let path = format!("/proc/{pid}/status");
-    std::fs::File::open(&path)
-        .unwrap()
-        .read_to_string(&mut text)
-        .unwrap();
-    let found = text
-        .lines()
-        .find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
-    found
-        .unwrap_or_else(|| panic!("{path} has no {field}"))
-        .trim()
-        .to_owned()
+    std::fs::File::open(&path).unwrap().read_to_string(&mut text).unwrap();
+    let found = text.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    found.unwrap_or_else(|| panic!("{path} has no {field}")).trim().to_owned()
 }

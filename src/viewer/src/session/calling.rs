@@ -88,21 +88,11 @@ struct CheckedCall {
 impl Session {
     pub(super) async fn call(&mut self, call: client::ServiceCallRequest<'_>) {
         let (service_id, call_id) = (call.service_id, call.call_id);
-        let found = self.check_call(&call).and_then(|(service, of)| {
-            match self.charge(call.payload.to_vec()) {
-                Ok(request) => Ok(CheckedCall {
-                    service,
-                    of,
-                    request,
-                }),
-                Err(source) => Err(CallRefusal::NoMemory { service, source }),
-            }
+        let found = self.check_call(&call).and_then(|(service, of)| match self.charge(call.payload.to_vec()) {
+            Ok(request) => Ok(CheckedCall { service, of, request }),
+            Err(source) => Err(CallRefusal::NoMemory { service, source }),
         });
-        let CheckedCall {
-            service,
-            of,
-            request,
-        } = match found {
+        let CheckedCall { service, of, request } = match found {
             Ok(found) => found,
             Err(refusal) => {
                 let failure = ServiceCallFailure::new(service_id, call_id, refusal.to_string());
@@ -139,10 +129,7 @@ impl Session {
         });
     }
 
-    fn check_call(
-        &self,
-        call: &client::ServiceCallRequest<'_>,
-    ) -> Result<(String, Arc<ServiceDef>), CallRefusal> {
+    fn check_call(&self, call: &client::ServiceCallRequest<'_>) -> Result<(String, Arc<ServiceDef>), CallRefusal> {
         let found = self.catalogue.service(call.service_id);
         let (service, of) = found.ok_or(CallRefusal::NoService(call.service_id))?;
         let encoding = self.format.encoding;

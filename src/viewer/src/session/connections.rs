@@ -3,9 +3,7 @@
 use std::sync::Arc;
 
 use foxglove::ws_protocol::server::ConnectionGraphUpdate;
-use foxglove::ws_protocol::server::connection_graph_update::{
-    AdvertisedService, PublishedTopic, SubscribedTopic,
-};
+use foxglove::ws_protocol::server::connection_graph_update::{AdvertisedService, PublishedTopic, SubscribedTopic};
 use ros::bus::Graph;
 
 use super::Session;
@@ -22,33 +20,21 @@ impl Session {
             let earlier = before.topics.get(name);
             if earlier.map(|earlier| &earlier.publishers) != Some(&topic.publishers) {
                 let publishers = topic.publishers.iter();
-                update
-                    .published_topics
-                    .push(PublishedTopic::new(name, publishers));
+                update.published_topics.push(PublishedTopic::new(name, publishers));
             }
             if earlier.map(|earlier| &earlier.subscribers) != Some(&topic.subscribers) {
                 let subscribers = topic.subscribers.iter();
-                update
-                    .subscribed_topics
-                    .push(SubscribedTopic::new(name, subscribers));
+                update.subscribed_topics.push(SubscribedTopic::new(name, subscribers));
             }
         }
         for (name, node) in &now.services {
             if before.services.get(name) != Some(node) {
-                update
-                    .advertised_services
-                    .push(AdvertisedService::new(name, [node]));
+                update.advertised_services.push(AdvertisedService::new(name, [node]));
             }
         }
-        let gone = before
-            .topics
-            .keys()
-            .filter(|name| !now.topics.contains_key(*name));
+        let gone = before.topics.keys().filter(|name| !now.topics.contains_key(*name));
         update.removed_topics = gone.cloned().collect();
-        let gone = before
-            .services
-            .keys()
-            .filter(|name| !now.services.contains_key(*name));
+        let gone = before.services.keys().filter(|name| !now.services.contains_key(*name));
         update.removed_services = gone.cloned().collect();
         if update != ConnectionGraphUpdate::default() {
             self.send_json(&update);

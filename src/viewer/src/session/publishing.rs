@@ -99,17 +99,13 @@ impl Session {
             return self.send_error(words);
         }
         let publishing = match self.open_publisher(&topic, &channel).await {
-            Ok((of, publisher)) => Some(PublicationSink {
-                of,
-                messages: self.spawn_publisher(&topic, publisher),
-            }),
+            Ok((of, publisher)) => Some(PublicationSink { of, messages: self.spawn_publisher(&topic, publisher) }),
             Err(error) => {
                 self.send_error(error.to_string());
                 None
             }
         };
-        self.publishers
-            .insert(id, ViewerPublication { topic, publishing });
+        self.publishers.insert(id, ViewerPublication { topic, publishing });
     }
 
     async fn open_publisher(
@@ -127,28 +123,15 @@ impl Session {
         }
         self.granted.check(Operation::Publish, topic)?;
         let message = self.registry.message(&channel.schema_name);
-        let message = message.map_err(|source| AdvertiseError::UnknownType {
-            topic: topic.to_owned(),
-            source,
-        })?;
+        let message = message.map_err(|source| AdvertiseError::UnknownType { topic: topic.to_owned(), source })?;
         let qos = QosProfile::keep_last(self.depth.max(PUBLISHED));
-        let publisher = self
-            .bus
-            .advertise(topic, WireType::from_message(&message), qos)
-            .await;
-        let publisher = publisher.map_err(|source| AdvertiseError::Bus {
-            topic: topic.to_owned(),
-            source,
-        })?;
+        let publisher = self.bus.advertise(topic, WireType::from_message(&message), qos).await;
+        let publisher = publisher.map_err(|source| AdvertiseError::Bus { topic: topic.to_owned(), source })?;
         Ok((message, publisher))
     }
 
     /// Spawns a task that publishes the messages sent to it once all present subscribers are connected.
-    fn spawn_publisher(
-        &mut self,
-        topic: &str,
-        publisher: Box<dyn Publisher>,
-    ) -> mpsc::Sender<Bytes> {
+    fn spawn_publisher(&mut self, topic: &str, publisher: Box<dyn Publisher>) -> mpsc::Sender<Bytes> {
         let (messages, mut waiting) = mpsc::channel::<Bytes>(OUTGOING);
         let graph = self.bus.graph();
         let listening = graph.borrow().topics.get(topic).map_or(0, |ends| {
@@ -157,11 +140,7 @@ impl Session {
         });
         self.tasks.spawn(async move {
             // Viewers publish immediately after advertising.
-            let _ = timeout(
-                CONNECTS,
-                wait_for_connected(publisher.matched_subscribers(), listening),
-            )
-            .await;
+            let _ = timeout(CONNECTS, wait_for_connected(publisher.matched_subscribers(), listening)).await;
             while let Some(message) = waiting.recv().await {
                 publisher.publish(message);
             }

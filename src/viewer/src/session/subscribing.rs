@@ -65,18 +65,12 @@ impl Session {
                 }
                 Err(error) => {
                     let words = format!("{listened} cannot be subscribed to: {error}");
-                    let _ = out
-                        .send(ViewerFrame::Text(Status::error(words).to_string().into()))
-                        .await;
+                    let _ = out.send(ViewerFrame::Text(Status::error(words).to_string().into())).await;
                 }
             }
             FinishedTask::Other
         });
-        let subscribed = ViewerSubscription {
-            channel,
-            topic,
-            task,
-        };
+        let subscribed = ViewerSubscription { channel, topic, task };
         self.subscriptions.insert(id, subscribed);
     }
 }

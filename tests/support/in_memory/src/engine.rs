@@ -120,10 +120,7 @@ impl Engine for MemoryEngine {
         self.world.started.lock().push(spec.clone());
         self.check_grants(&spec.grants)?;
         if let Some(reason) = self.world.broken.lock().get(&spec.image) {
-            return Err(Error::Start {
-                id: spec.id,
-                reason: reason.clone(),
-            });
+            return Err(Error::Start { id: spec.id, reason: reason.clone() });
         }
         let servant = MemoryServant::new(&spec, Arc::downgrade(&self.world));
         {
@@ -149,10 +146,7 @@ impl Engine for MemoryEngine {
                 adopted.running.push(servant);
                 continue;
             }
-            adopted.ended.push(EndedServant {
-                id: servant.id().to_owned(),
-                state: Some(state),
-            });
+            adopted.ended.push(EndedServant { id: servant.id().to_owned(), state: Some(state) });
         }
         Ok(adopted)
     }
@@ -161,10 +155,7 @@ impl Engine for MemoryEngine {
         for ended in ended {
             self.world.forget(&ended.id);
         }
-        let left = |id| Error::LeftOver {
-            id,
-            what: "a cgroup".to_owned(),
-        };
+        let left = |id| Error::LeftOver { id, what: "a cgroup".to_owned() };
         let leftovers = std::mem::take(&mut *self.world.leftovers.lock());
         leftovers.into_iter().map(left).collect()
     }
@@ -172,12 +163,7 @@ impl Engine for MemoryEngine {
     fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, Error> {
         let allowed = self.world.allowed.lock();
         let refused = |kind: &'static str, name: &str| {
-            Err(Error::Grant(
-                servant::local::grants::GrantError::NotAllowed {
-                    kind,
-                    name: name.to_owned(),
-                },
-            ))
+            Err(Error::Grant(servant::local::grants::GrantError::NotAllowed { kind, name: name.to_owned() }))
         };
         for device in &grants.devices {
             if !allowed.devices.contains(device) {

@@ -34,11 +34,7 @@ impl Process {
         let name = self.node.name.clone();
         self.register(|graph| {
             let ends = graph.topics.entry(topic.to_owned()).or_default();
-            *ends = TopicNodes {
-                type_name: type_name.to_owned(),
-                publishers: vec![name],
-                ..std::mem::take(ends)
-            };
+            *ends = TopicNodes { type_name: type_name.to_owned(), publishers: vec![name], ..std::mem::take(ends) };
         });
     }
 
@@ -72,11 +68,7 @@ impl Process {
         let served = served.unwrap_or_else(|error| panic!("{error}"));
         let server = self.node.name.clone();
         self.register(|graph| {
-            let ends = ActionNodes {
-                type_name: of.name.clone(),
-                servers: vec![server],
-                ..ActionNodes::default()
-            };
+            let ends = ActionNodes { type_name: of.name.clone(), servers: vec![server], ..ActionNodes::default() };
             graph.actions.insert(action.to_owned(), ends);
         });
         Box::new((served, node))

@@ -11,8 +11,8 @@ use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
 use reach::{
-    Error, FlowCounts, InsideView, Material, ObservedBus, Observer, Opener, Reach, ReachOptions,
-    RecordedRevision, Replay, ReplayPace, Tenant, UpgradedStream,
+    Error, FlowCounts, InsideView, Material, ObservedBus, Observer, Opener, Reach, ReachOptions, RecordedRevision,
+    Replay, ReplayPace, Tenant, UpgradedStream,
 };
 use ros::bus::{Bus, Graph, RosVersion};
 use ros::sizes::SizeSummary;
@@ -68,10 +68,7 @@ impl MemoryReach {
     async fn wait_until_closed(&self) -> String {
         let mut closed = self.closed.subscribe();
         let reason = closed.wait_for(Option::is_some).await;
-        reason
-            .ok()
-            .and_then(|reason| reason.clone())
-            .unwrap_or_default()
+        reason.ok().and_then(|reason| reason.clone()).unwrap_or_default()
     }
 }
 
@@ -85,21 +82,13 @@ impl Reach for MemoryReach {
         self.servant.graph.subscribe()
     }
 
-    async fn serve_rosbridge(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        _options: SessionOptions,
-    ) -> SessionEnd {
+    async fn serve_rosbridge(&self, client: WaitingConnection<UpgradedStream>, _options: SessionOptions) -> SessionEnd {
         let reason = self.wait_until_closed().await;
         client.refuse(1012, &reason).await;
         SessionEnd::Closed { code: 1012, reason }
     }
 
-    async fn serve_inside(
-        &self,
-        client: WaitingConnection<UpgradedStream>,
-        _options: SessionOptions,
-    ) -> SessionEnd {
+    async fn serve_inside(&self, client: WaitingConnection<UpgradedStream>, _options: SessionOptions) -> SessionEnd {
         let reason = self.wait_until_closed().await;
         client.refuse(1012, &reason).await;
         SessionEnd::Closed { code: 1012, reason }
@@ -121,11 +110,7 @@ impl Reach for MemoryReach {
     fn flows(&self) -> Vec<FlowCounts> {
         let (inputs, outputs) = *self.servant.flow.lock();
         let node = String::new();
-        vec![FlowCounts {
-            node,
-            inputs,
-            outputs,
-        }]
+        vec![FlowCounts { node, inputs, outputs }]
     }
 
     fn warn_flow(&self, _flow: &str, what: &str) {

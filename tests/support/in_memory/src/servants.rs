@@ -9,9 +9,7 @@ use parking_lot::Mutex;
 use ros::bus::Graph;
 use ros::sizes::InputSizes;
 use servant::Error;
-use servant::engine::{
-    ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage,
-};
+use servant::engine::{ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage};
 use servant::spec::{Limits, NodeSpec, Size, Spec};
 use tokio::sync::{broadcast, mpsc, watch};
 
@@ -76,12 +74,7 @@ impl Drop for TaskGuard {
 }
 
 fn exit(code: Option<i32>, signal: Option<i32>) -> NodeExit {
-    NodeExit {
-        code,
-        signal,
-        out_of_memory: false,
-        exec_error: None,
-    }
+    NodeExit { code, signal, out_of_memory: false, exec_error: None }
 }
 
 impl MemoryServant {
@@ -107,9 +100,7 @@ impl MemoryServant {
 
     /// Ends it like a broken container.
     pub fn fail(&self, reason: &str) {
-        self.end(ContainerState::Failed {
-            reason: reason.to_owned(),
-        });
+        self.end(ContainerState::Failed { reason: reason.to_owned() });
     }
 
     /// Ends it like the end of its nodes, without a monitor.
@@ -133,15 +124,10 @@ impl MemoryServant {
 
     fn ended_error(&self) -> Error {
         let reason = match &*self.state.borrow() {
-            ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
-                reason.clone()
-            }
+            ContainerState::Stopped { reason } | ContainerState::Failed { reason } => reason.clone(),
             _ => "it does not run".to_owned(),
         };
-        Error::Ended {
-            id: self.id.clone(),
-            reason,
-        }
+        Error::Ended { id: self.id.clone(), reason }
     }
 
     /// Waits until its shim responds.
@@ -151,11 +137,7 @@ impl MemoryServant {
     }
 
     fn check_runs(&self) -> Result<(), Error> {
-        if self.state.borrow().is_over() {
-            Err(self.ended_error())
-        } else {
-            Ok(())
-        }
+        if self.state.borrow().is_over() { Err(self.ended_error()) } else { Ok(()) }
     }
 
     pub(crate) fn print(&self, node: &str, line: &str) {
@@ -184,10 +166,7 @@ impl MemoryServant {
                 node.held += bytes;
             } else if let Some(running) = &node.running {
                 *self.oom_kills.lock() += 1;
-                let _ = running.send(NodeExit {
-                    out_of_memory: true,
-                    ..exit(None, Some(libc::SIGKILL))
-                });
+                let _ = running.send(NodeExit { out_of_memory: true, ..exit(None, Some(libc::SIGKILL)) });
             }
         });
         fits
@@ -201,19 +180,10 @@ impl MemoryServant {
             let reason = format!("there is no program {path}");
             self.record_node_end(
                 &node.name,
-                NodeExit {
-                    exec_error: Some(reason.clone()),
-                    ..exit(None, None)
-                },
-                NodeEvent::ExecFailed {
-                    node: node.name.clone(),
-                    reason: reason.clone(),
-                },
+                NodeExit { exec_error: Some(reason.clone()), ..exit(None, None) },
+                NodeEvent::ExecFailed { node: node.name.clone(), reason: reason.clone() },
             );
-            return Err(Error::Refused {
-                id: self.id.clone(),
-                reason,
-            });
+            return Err(Error::Refused { id: self.id.clone(), reason });
         };
         let (kill, mut killed) = mpsc::unbounded_channel();
         let mut start = 0;
@@ -228,11 +198,7 @@ impl MemoryServant {
         let task = TaskGuard::begin(self);
         world.runtime.spawn(async move {
             let _task = task;
-            let process = Process {
-                servant: Arc::clone(&servant),
-                node: node.clone(),
-                start,
-            };
+            let process = Process { servant: Arc::clone(&servant), node: node.clone(), start };
             let mut state = servant.state.subscribe();
             let exit = tokio::select! {
                 biased;
@@ -267,11 +233,7 @@ impl MemoryServant {
             let mut state = self.state.subscribe();
             let over = state.wait_for(ContainerState::is_over);
             let wanted = tokio::time::timeout(delay, over).await.is_err()
-                && self
-                    .nodes
-                    .borrow()
-                    .get(&node.name)
-                    .is_some_and(|known| !known.for_good);
+                && self.nodes.borrow().get(&node.name).is_some_and(|known| !known.for_good);
             if wanted {
                 let _ = self.run(node);
             }
@@ -316,10 +278,7 @@ impl ServantHandle for MemoryServant {
     }
 
     fn enforced_limits(&self) -> EnforcedLimits {
-        EnforcedLimits {
-            limits: *self.limits.borrow(),
-            ..EnforcedLimits::default()
-        }
+        EnforcedLimits { limits: *self.limits.borrow(), ..EnforcedLimits::default() }
     }
 
     async fn set_limits(&self, limits: Limits) -> Result<EnforcedLimits, Error> {
@@ -327,18 +286,10 @@ impl ServantHandle for MemoryServant {
         self.check_runs()?;
         let held: u64 = self.nodes.borrow().values().map(|node| node.held).sum();
         if limits.memory.is_some_and(|memory| memory < Size(held)) {
-            return Err(Error::Refused {
-                id: self.id.clone(),
-                reason: format!("{held} bytes of memory are in use"),
-            });
+            return Err(Error::Refused { id: self.id.clone(), reason: format!("{held} bytes of memory are in use") });
         }
-        let lifted = Limits {
-            cpus: None,
-            cpu_weight: None,
-            ..Limits::unlimited(0.0)
-        };
-        self.limits
-            .send_modify(|known| *known = limits.or(*known).without_equal(lifted));
+        let lifted = Limits { cpus: None, cpu_weight: None, ..Limits::unlimited(0.0) };
+        self.limits.send_modify(|known| *known = limits.or(*known).without_equal(lifted));
         Ok(self.enforced_limits())
     }
 
@@ -367,10 +318,7 @@ impl ServantHandle for MemoryServant {
             known.is_some_and(|known| known.running.is_some())
         };
         if running(&self.nodes.borrow()) {
-            return Err(Error::Refused {
-                id: self.id.clone(),
-                reason: format!("{} runs already", node.name),
-            });
+            return Err(Error::Refused { id: self.id.clone(), reason: format!("{} runs already", node.name) });
         }
         this.run(node)
     }
@@ -378,20 +326,14 @@ impl ServantHandle for MemoryServant {
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
         self.wait_until_responsive().await;
         let nodes = self.nodes.borrow();
-        let known = nodes.get(node).ok_or_else(|| Error::NoNode {
-            id: self.id.clone(),
-            node: node.to_owned(),
-        })?;
+        let known = nodes.get(node).ok_or_else(|| Error::NoNode { id: self.id.clone(), node: node.to_owned() })?;
         match &known.running {
             // No program sets a handler for it.
             Some(running) => {
                 let _ = running.send(exit(None, Some(signal)));
                 Ok(())
             }
-            None => Err(Error::Refused {
-                id: self.id.clone(),
-                reason: format!("{node} does not run"),
-            }),
+            None => Err(Error::Refused { id: self.id.clone(), reason: format!("{node} does not run") }),
         }
     }
 
@@ -406,10 +348,7 @@ impl ServantHandle for MemoryServant {
 
     async fn wait_node(&self, node: &str) -> Result<NodeExit, Error> {
         let mut nodes = self.nodes.subscribe();
-        let no_node = || Error::NoNode {
-            id: self.id.clone(),
-            node: node.to_owned(),
-        };
+        let no_node = || Error::NoNode { id: self.id.clone(), node: node.to_owned() };
         let ended = nodes.wait_for(|nodes| {
             let known = nodes.get(node);
             known.is_none_or(|known| known.exit.is_some())
@@ -459,9 +398,7 @@ impl ServantHandle for MemoryServant {
 
     async fn stop(&self) -> Result<(), Error> {
         self.wait_until_responsive().await;
-        self.end(ContainerState::Stopped {
-            reason: "it was stopped".to_owned(),
-        });
+        self.end(ContainerState::Stopped { reason: "it was stopped".to_owned() });
         let mut tasks = self.tasks.subscribe();
         let _ = tasks.wait_for(|tasks| *tasks == 0).await;
         if let Some(world) = self.world.upgrade() {

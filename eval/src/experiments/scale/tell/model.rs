@@ -16,18 +16,12 @@ const MANY: [u64; 2] = [1_000, 100_000];
 /// Fraction of a node's memory for servants, the daemon's default.
 const MEMORY_PART: f64 = 0.9;
 
-pub(super) fn add_model(
-    told: &[ReportedPoint],
-    node: &NodeModel,
-    section: &mut Section,
-) -> Result<()> {
+pub(super) fn add_model(told: &[ReportedPoint], node: &NodeModel, section: &mut Section) -> Result<()> {
     let most = told.iter().map(|one| one.plan.robots).max().unwrap_or(1);
-    let curve =
-        (1..=most as u64).map(|robots| (robots as f64, node.predict(robots).response * 1e3));
+    let curve = (1..=most as u64).map(|robots| (robots as f64, node.predict(robots).response * 1e3));
     let measured = |held_back: bool| -> Vec<(f64, f64)> {
         let some = told.iter().filter(|one| one.held_back == held_back);
-        some.filter_map(|one| Some((one.robots(), one.mean_response()? * 1e3)))
-            .collect()
+        some.filter_map(|one| Some((one.robots(), one.mean_response()? * 1e3))).collect()
     };
     let caption = "Mean response time by robots, and the queue that was fitted";
     let drawing = plots::curves(
@@ -62,20 +56,14 @@ fn held_back_error(told: &[ReportedPoint], node: &NodeModel) -> String {
     let errors: Vec<(usize, f64)> = held_back
         .filter_map(|one| {
             let predicted = node.predict(one.plan.robots as u64).response;
-            Some((
-                one.plan.robots,
-                (predicted / one.mean_response()? - 1.0) * 100.0,
-            ))
+            Some((one.plan.robots, (predicted / one.mean_response()? - 1.0) * 100.0))
         })
         .collect();
     let sizes: Vec<f64> = errors.iter().map(|error| error.1.abs()).collect();
     let (Some(mean), Some(most)) = (mean(&sizes), quantile(&sizes, 1.0)) else {
         return "what was not checked: no point that was held back was measured".to_owned();
     };
-    let each: Vec<String> = errors
-        .iter()
-        .map(|(robots, error)| format!("{error:+.1} % at {robots}"))
-        .collect();
+    let each: Vec<String> = errors.iter().map(|(robots, error)| format!("{error:+.1} % at {robots}")).collect();
     format!(
         "the mean response times that were held back within {mean:.1} % on average, {most:.1} % at most ({})",
         each.join(", ")
@@ -92,10 +80,7 @@ fn add_node_counts(told: &[ReportedPoint], node: &NodeModel, section: &mut Secti
     let last = &told[told.len() - 1];
     // Those robots run on other machines.
     let beside = last.point.used.robots / last.point.used.request_cores();
-    let alone = NodeModel {
-        service: node.service * (1.0 - beside),
-        ..*node
-    };
+    let alone = NodeModel { service: node.service * (1.0 - beside), ..*node };
     let memory = robots_in_memory(last);
     let admits = last.point.admits;
     let caption = format!(
@@ -111,18 +96,8 @@ fn add_node_counts(told: &[ReportedPoint], node: &NodeModel, section: &mut Secti
     for robots in MANY {
         let served = alone.robots_served(robots, T_MAX);
         let each = served.min(memory).min(admits);
-        let needed = if each == 0 {
-            "no number is enough".to_owned()
-        } else {
-            robots.div_ceil(each).to_string()
-        };
-        table.push([
-            robots.to_string(),
-            served.to_string(),
-            memory.to_string(),
-            admits.to_string(),
-            needed.clone(),
-        ]);
+        let needed = if each == 0 { "no number is enough".to_owned() } else { robots.div_ceil(each).to_string() };
+        table.push([robots.to_string(), served.to_string(), memory.to_string(), admits.to_string(), needed.clone()]);
         section.findings.push(format!(
             "{robots} such robots need {needed} nodes like this one for {:.0} ms at most on average: {}.",
             T_MAX * 1e3,

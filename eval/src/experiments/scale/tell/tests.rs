@@ -4,22 +4,10 @@ use crate::experiments::scale::counters::CoreUsage;
 use crate::words::assert_tells;
 
 /// A known node: 2 cores, 10 ms of a core per request, of which the robot uses 1 ms, and 2 ms of delay.
-const NODE: NodeModel = NodeModel {
-    cores: 2.0,
-    think: THINK,
-    service: 0.010,
-    delay: 0.002,
-};
+const NODE: NodeModel = NodeModel { cores: 2.0, think: THINK, service: 0.010, delay: 0.002 };
 
 fn measured_point(robots: usize) -> (ScalePlan, CachedResult<ScalePoint>) {
-    let plan = ScalePlan {
-        robots,
-        settles: 1.0,
-        lasts: 10.0,
-        think: THINK,
-        work: 8,
-        cores: 2.0,
-    };
+    let plan = ScalePlan { robots, settles: 1.0, lasts: 10.0, think: THINK, work: 8, cores: 2.0 };
     let closed = NODE.predict(robots as u64);
     let requests = (closed.throughput * 10.0).round() as usize;
     let point = ScalePoint {
@@ -41,20 +29,12 @@ fn measured_point(robots: usize) -> (ScalePlan, CachedResult<ScalePoint>) {
 }
 
 fn section_for(robots: &[usize]) -> Section {
-    let runs = ScaleRuns(
-        robots
-            .iter()
-            .map(|robots| measured_point(*robots))
-            .collect(),
-    );
+    let runs = ScaleRuns(robots.iter().map(|robots| measured_point(*robots)).collect());
     section(&runs).expect("it is told")
 }
 
 fn finding<'a>(section: &'a Section, word: &str) -> &'a str {
-    let found = section
-        .findings
-        .iter()
-        .find(|finding| finding.contains(word));
+    let found = section.findings.iter().find(|finding| finding.contains(word));
     found.unwrap_or_else(|| panic!("{word}: {:#?}", section.findings))
 }
 
@@ -87,9 +67,7 @@ fn the_bend_and_its_reason_are_told() {
     let section = section_for(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let bend = finding(&section, "times that alone");
     assert!(
-        bend.starts_with(
-            "At 64 robots the median is 10.0 times that alone, because the processor is used up"
-        ),
+        bend.starts_with("At 64 robots the median is 10.0 times that alone, because the processor is used up"),
         "{bend}"
     );
     // The same number as in the table of nodes.
@@ -99,33 +77,21 @@ fn the_bend_and_its_reason_are_told() {
     let few = section_for(&[1, 2, 4]);
     let bend = finding(&few, "does not bend");
     assert!(bend.starts_with("Up to 4 robots"), "{bend}");
-    assert!(
-        few.differs
-            .iter()
-            .any(|words| words.contains("was not checked"))
-    );
+    assert!(few.differs.iter().any(|words| words.contains("was not checked")));
 }
 
 #[test]
 fn a_machine_that_is_not_quiet_is_told_of() {
     let all = [1, 2, 4, 8, 16, 32, 64, 100];
     let quiet = section_for(&all);
-    assert!(
-        !quiet
-            .findings
-            .iter()
-            .any(|words| words.contains("Other programs"))
-    );
+    assert!(!quiet.findings.iter().any(|words| words.contains("Other programs")));
     let mut runs = ScaleRuns(all.map(measured_point).into());
     for (_, measured) in &mut runs.0 {
         let CachedResult::Done(point) = measured else {
             continue;
         };
         point.used.machine = 2.0;
-        point
-            .times
-            .iter_mut()
-            .for_each(|time| *time *= 1.0 + point.starts[0].0 as f64 / 10.0);
+        point.times.iter_mut().for_each(|time| *time *= 1.0 + point.starts[0].0 as f64 / 10.0);
     }
     let section = section(&runs).expect("it is told");
     assert!(finding(&section, "times that alone").contains("but other programs used"));
@@ -137,11 +103,7 @@ fn what_is_missing_is_named_and_the_rest_is_told() {
     let mut runs = ScaleRuns([1, 2, 4].map(measured_point).into());
     runs.0[2].1 = CachedResult::Missing("no room".to_owned());
     let section = section(&runs).expect("it is told");
-    let whats: Vec<&str> = section
-        .missing
-        .iter()
-        .map(|one| one.what.as_str())
-        .collect();
+    let whats: Vec<&str> = section.missing.iter().map(|one| one.what.as_str()).collect();
     assert_eq!(whats, ["4 robots", "the queueing model"]);
     assert_eq!(section.tables[0].rows[0][1..3], ["over 5", "0.30"]);
 }

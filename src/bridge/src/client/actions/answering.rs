@@ -28,10 +28,7 @@ impl BridgeClient {
         // The earlier one is dropped first, which aborts its goals.
         let earlier = self.actions.lock().served.remove(&name);
         if earlier.is_some() {
-            self.warn(
-                reply,
-                &format!("advertise_action: {name} was advertised before, the new one replaces it"),
-            );
+            self.warn(reply, &format!("advertise_action: {name} was advertised before, the new one replaces it"));
         }
         drop(earlier);
         // Under the lock, so that the answer to its first goal finds the server.
@@ -52,14 +49,8 @@ impl BridgeClient {
         let name = self.resolve(&op.action)?;
         let gone = self.actions.lock().served.remove(&*name);
         match gone {
-            Some(_) => self.info(
-                reply,
-                &format!("unadvertise_action: {name} is no longer advertised"),
-            ),
-            None => self.warn(
-                reply,
-                &format!("unadvertise_action: this client does not advertise {name}"),
-            ),
+            Some(_) => self.info(reply, &format!("unadvertise_action: {name} is no longer advertised")),
+            None => self.warn(reply, &format!("unadvertise_action: this client does not advertise {name}")),
         }
         Ok(())
     }
@@ -70,12 +61,7 @@ impl BridgeClient {
         let text = format!("the result cannot be used: {reason}");
         for server in servers {
             // Only one of them has the goal.
-            let ended = server.end_goal(
-                request,
-                GoalOutcome::Aborted,
-                &text,
-                server.default_result(),
-            );
+            let ended = server.end_goal(request, GoalOutcome::Aborted, &text, server.default_result());
             if ended.is_ok() {
                 return;
             }
@@ -88,20 +74,14 @@ impl BridgeClient {
         server.ok_or_else(|| ClientActionError::NotAdvertised(name.into_owned()))
     }
 
-    pub(in crate::client) fn action_feedback(
-        &self,
-        op: &ActionFeedback<'_>,
-    ) -> Result<(), ClientActionError> {
+    pub(in crate::client) fn action_feedback(&self, op: &ActionFeedback<'_>) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
         let request = op.id.to_string();
         let body = decode(&server.def.feedback, op.values, op.compression, None)?;
         server.publish_feedback(&request, body)
     }
 
-    pub(in crate::client) fn action_result(
-        &self,
-        op: &ActionResult<'_>,
-    ) -> Result<(), ClientActionError> {
+    pub(in crate::client) fn action_result(&self, op: &ActionResult<'_>) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
         let request = op.id.as_ref().ok_or(ClientActionError::NoId)?.to_string();
         let text = match op.values {
@@ -123,12 +103,7 @@ impl BridgeClient {
             Ok(body) => server.end_goal(&request, outcome, "", body),
             Err(error) => {
                 let text = format!("the result does not fit: {error}");
-                server.end_goal(
-                    &request,
-                    GoalOutcome::Aborted,
-                    &text,
-                    server.default_result(),
-                )?;
+                server.end_goal(&request, GoalOutcome::Aborted, &text, server.default_result())?;
                 Err(error.into())
             }
         }

@@ -86,10 +86,7 @@ impl SentGoal {
     }
 
     fn reply(&self) -> ReplyTarget {
-        ReplyTarget {
-            id: self.id.clone(),
-            format: payload_format(self.compression),
-        }
+        ReplyTarget { id: self.id.clone(), format: payload_format(self.compression) }
     }
 
     fn frame(
@@ -108,9 +105,7 @@ impl SentGoal {
             writer.text("compression", self.compression.name());
             writer.raw("values", None, body);
         } else {
-            writer.value("values", |out| {
-                client.print_payload(message_type, body, format, out)
-            })?;
+            writer.value("values", |out| client.print_payload(message_type, body, format, out))?;
         }
         rest(&mut writer);
         writer.end();

@@ -96,20 +96,8 @@ impl BridgeClient {
         let action = self.action_client(&name, def)?;
         // In the format of actionlib: neither another node nor a later one of the same name makes equal ids.
         let now = Time::now();
-        let goal_id = format!(
-            "{}-{}-{}.{:09}",
-            self.shared.bus.node(),
-            self.shared.next_number(),
-            now.secs,
-            now.nsecs
-        );
-        Ok(PreparedGoal {
-            action,
-            name,
-            goal_id,
-            body,
-            recalled: CancellationToken::new(),
-        })
+        let goal_id = format!("{}-{}-{}.{:09}", self.shared.bus.node(), self.shared.next_number(), now.secs, now.nsecs);
+        Ok(PreparedGoal { action, name, goal_id, body, recalled: CancellationToken::new() })
     }
 
     fn action_client(
@@ -137,10 +125,7 @@ impl BridgeClient {
         Ok(action)
     }
 
-    pub(in crate::client) fn cancel_action_goal(
-        &self,
-        op: &CancelActionGoal<'_>,
-    ) -> Result<(), ClientActionError> {
+    pub(in crate::client) fn cancel_action_goal(&self, op: &CancelActionGoal<'_>) -> Result<(), ClientActionError> {
         let goal_id = self.actions.lock().find_goal_id(&op.id);
         if goal_id.is_some_and(|goal_id| self.cancel_goal(&goal_id)) {
             Ok(())
@@ -169,13 +154,7 @@ impl BridgeClient {
 
 /// Sends a goal when its server is available.
 async fn run_goal(prepared: PreparedGoal, goal: Arc<SentGoal>) {
-    let PreparedGoal {
-        action,
-        name,
-        goal_id,
-        body,
-        recalled,
-    } = prepared;
+    let PreparedGoal { action, name, goal_id, body, recalled } = prepared;
     let Some((patience, ended)) = goal.client.upgrade().map(|client| {
         let patience = client.shared.options.action_timeout;
         (patience, client.ended.clone())

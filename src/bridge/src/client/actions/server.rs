@@ -40,12 +40,7 @@ impl ActionHandler for GoalHandler {
             && let Some(client) = server.client.upgrade()
         {
             let text = format!("advertise_action: action {}: {reason}", server.name);
-            client.send_status(
-                StatusLevel::Error,
-                None,
-                payload_format(server.compression),
-                &text,
-            );
+            client.send_status(StatusLevel::Error, None, payload_format(server.compression), &text);
         }
     }
 }
@@ -73,12 +68,7 @@ impl ActionServer {
         Ok(server)
     }
 
-    fn send_goal(
-        &self,
-        client: &BridgeClient,
-        id: &str,
-        body: &Bytes,
-    ) -> Result<(), Box<CodecError>> {
+    fn send_goal(&self, client: &BridgeClient, id: &str, body: &Bytes) -> Result<(), Box<CodecError>> {
         let number = client.shared.next_number();
         let request = format!("action_goal:{}:{number}", self.name);
         let frame = self.frame(client, &request, body)?;
@@ -87,29 +77,17 @@ impl ActionServer {
         Ok(())
     }
 
-    fn frame(
-        &self,
-        client: &BridgeClient,
-        request: &str,
-        body: &Bytes,
-    ) -> Result<EncodedFrame, Box<CodecError>> {
+    fn frame(&self, client: &BridgeClient, request: &str, body: &Bytes) -> Result<EncodedFrame, Box<CodecError>> {
         let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
-        let mut writer = Writer::op(
-            &mut out,
-            format,
-            "send_action_goal",
-            Some(&Id::from(request)),
-        );
+        let mut writer = Writer::op(&mut out, format, "send_action_goal", Some(&Id::from(request)));
         writer.text("action", &self.written);
         writer.text("action_type", &self.def.name);
         if self.compression == Compression::CborRaw {
             writer.text("compression", self.compression.name());
             writer.raw("args", None, body);
         } else {
-            writer.value("args", |out| {
-                client.print_payload(&self.def.goal, body, format, out)
-            })?;
+            writer.value("args", |out| client.print_payload(&self.def.goal, body, format, out))?;
         }
         writer.boolean("feedback", true);
         writer.end();
@@ -123,27 +101,17 @@ impl ActionServer {
             known.map(|(request, _)| request.clone())
         };
         if let (Some(request), Some(client)) = (request, self.client.upgrade()) {
-            let op = CancelActionGoal {
-                id: request.into(),
-                action: (&*self.written).into(),
-            };
+            let op = CancelActionGoal { id: request.into(), action: (&*self.written).into() };
             client.send(op.into(), payload_format(self.compression));
         }
     }
 
     fn no_such_goal(&self, request: &str) -> ClientActionError {
-        ClientActionError::NoServedGoal {
-            action: self.name.clone(),
-            request: request.to_owned(),
-        }
+        ClientActionError::NoServedGoal { action: self.name.clone(), request: request.to_owned() }
     }
 
     /// Publishes feedback on the goal that the client knows as `request`.
-    pub(super) fn publish_feedback(
-        &self,
-        request: &str,
-        body: Bytes,
-    ) -> Result<(), ClientActionError> {
+    pub(super) fn publish_feedback(&self, request: &str, body: Bytes) -> Result<(), ClientActionError> {
         let id = self.goals.lock().get(request).cloned();
         let told = match (id, self.bus.get()) {
             (Some(id), Some(bus)) => bus.publish_feedback(&id, body),
@@ -161,18 +129,12 @@ impl ActionServer {
         result: Bytes,
     ) -> Result<(), ClientActionError> {
         let id = self.goals.lock().remove(request);
-        let end = GoalEnd {
-            outcome,
-            text: text.to_owned(),
-            result,
-        };
+        let end = GoalEnd { outcome, text: text.to_owned(), result };
         let ended = match (id, self.bus.get()) {
             (Some(id), Some(bus)) => bus.end_goal(&id, end),
             _ => false,
         };
-        ended
-            .then_some(())
-            .ok_or_else(|| self.no_such_goal(request))
+        ended.then_some(()).ok_or_else(|| self.no_such_goal(request))
     }
 
     /// Returns a result with default values.
@@ -186,11 +148,8 @@ impl Drop for ActionServer {
         let goals = std::mem::take(self.goals.get_mut());
         for id in goals.into_values() {
             if let Some(bus) = self.bus.get() {
-                let end = GoalEnd {
-                    outcome: GoalOutcome::Aborted,
-                    text: GONE.to_owned(),
-                    result: self.default_result(),
-                };
+                let end =
+                    GoalEnd { outcome: GoalOutcome::Aborted, text: GONE.to_owned(), result: self.default_result() };
                 bus.end_goal(&id, end);
             }
         }

@@ -34,14 +34,8 @@ fn servant(id: &str, promised: u64, used: u64) -> ControlFacts<'_> {
 /// Adds a goal of 100 to 300 ms and requests that take `total` ms, half of it in the cloud.
 fn with_times(total: f64, facts: ControlFacts<'_>) -> ControlFacts<'_> {
     ControlFacts {
-        goal: Some(ResponseGoal {
-            desire: Some(100.0),
-            max: Some(300.0),
-        }),
-        measured: Some(MeasuredTimes {
-            total,
-            cloud: total / 2.0,
-        }),
+        goal: Some(ResponseGoal { desire: Some(100.0), max: Some(300.0) }),
+        measured: Some(MeasuredTimes { total, cloud: total / 2.0 }),
         ..facts
     }
 }
@@ -67,64 +61,31 @@ fn carry_out(all: &mut [ControlFacts<'_>], outcomes: &[ControlDecision]) {
     }
 }
 
-fn changes(
-    all: &[ControlFacts<'_>],
-    at: Instant,
-) -> Vec<(String, Option<u64>, Option<u64>, String)> {
+fn changes(all: &[ControlFacts<'_>], at: Instant) -> Vec<(String, Option<u64>, Option<u64>, String)> {
     let outcomes = control(CORES, all, at).into_iter().zip(all);
-    let changed =
-        outcomes.filter(|(outcome, _)| outcome.quota.is_some() || outcome.weight.is_some());
-    changed
-        .map(|(outcome, one)| {
-            (
-                one.id.to_owned(),
-                outcome.quota,
-                outcome.weight,
-                outcome.reason,
-            )
-        })
-        .collect()
+    let changed = outcomes.filter(|(outcome, _)| outcome.quota.is_some() || outcome.weight.is_some());
+    changed.map(|(outcome, one)| (one.id.to_owned(), outcome.quota, outcome.weight, outcome.reason)).collect()
 }
 
 #[test]
 fn one_that_is_near_gets_what_others_do_not_need() {
     let now = Instant::now();
-    let throttled = ControlFacts {
-        throttled: 0.5,
-        ..servant("a", 1000, 990)
-    };
+    let throttled = ControlFacts { throttled: 0.5, ..servant("a", 1000, 990) };
     let greedy = servant("b", 0, 3000);
     let owner = servant("c", 2000, 100);
     let near = "its requests take 290 ms; its robot accepts 300 ms";
     let needed = "servant a needs cores that are not reserved for this one";
     let changed = changes(&[with_times(290.0, throttled), greedy, owner], now);
-    let changed: Vec<_> = changed
-        .iter()
-        .map(|(id, quota, weight, why)| (&**id, *quota, *weight, &**why))
-        .collect();
-    assert_eq!(
-        changed,
-        [
-            ("a", Some(1250), Some(1250), near),
-            ("b", Some(2575), None, needed),
-        ]
-    );
+    let changed: Vec<_> = changed.iter().map(|(id, quota, weight, why)| (&**id, *quota, *weight, &**why)).collect();
+    assert_eq!(changed, [("a", Some(1250), Some(1250), near), ("b", Some(2575), None, needed),]);
     // A servant that is far from its goal, one without a goal, and one that cores do not help, are left alone.
-    let link = ControlFacts {
-        measured: Some(MeasuredTimes {
-            total: 290.0,
-            cloud: 30.0,
-        }),
-        ..with_times(290.0, throttled)
-    };
+    let link =
+        ControlFacts { measured: Some(MeasuredTimes { total: 290.0, cloud: 30.0 }), ..with_times(290.0, throttled) };
     for alone in [with_times(200.0, throttled), throttled, link] {
         assert_eq!(changes(&[alone, greedy, owner], now), []);
     }
     // Without measurements, throttling counts.
-    let unmeasured = ControlFacts {
-        measured: None,
-        ..with_times(0.0, throttled)
-    };
+    let unmeasured = ControlFacts { measured: None, ..with_times(0.0, throttled) };
     let changed = changes(&[unmeasured, greedy, owner], now);
     assert!(changed[0].3.contains("throttled 50 %"), "{changed:?}");
 }
@@ -132,15 +93,8 @@ fn one_that_is_near_gets_what_others_do_not_need() {
 #[test]
 fn what_was_moved_goes_back_when_it_is_over() {
     let began = Instant::now();
-    let held_up = ControlFacts {
-        throttled: 0.5,
-        ..servant("a", 1000, 990)
-    };
-    let near = vec![
-        with_times(290.0, held_up),
-        servant("b", 0, 3000),
-        servant("c", 2000, 100),
-    ];
+    let held_up = ControlFacts { throttled: 0.5, ..servant("a", 1000, 990) };
+    let near = vec![with_times(290.0, held_up), servant("b", 0, 3000), servant("c", 2000, 100)];
     let mut moved = run_looks(near.clone(), began, 0..20);
     // Except for the last step, which is not worthwhile.
     assert!(moved[0].quota * 10 > CORES * 9, "{:?}", moved[0]);
@@ -148,21 +102,13 @@ fn what_was_moved_goes_back_when_it_is_over() {
     let most = moved[0].quota;
     assert_eq!((moved[1].quota, moved[1].weight), (LEAST, 1));
     assert_eq!((moved[2].quota, moved[2].weight), (2000, 2000));
-    moved[0].measured = Some(MeasuredTimes {
-        total: 80.0,
-        cloud: 40.0,
-    });
+    moved[0].measured = Some(MeasuredTimes { total: 80.0, cloud: 40.0 });
     moved[0].throttled = 0.0;
     let still = run_looks(moved.clone(), began, 20..24);
     assert_eq!(still[0].quota, most, "it is not sure to be over");
     let back = run_looks(still, began, 24..60);
     for (one, before) in back.iter().zip(&near) {
-        assert_eq!(
-            (one.quota, one.weight),
-            (before.limit, before.plain),
-            "{}",
-            one.id
-        );
+        assert_eq!((one.quota, one.weight), (before.limit, before.plain), "{}", one.id);
     }
     assert_eq!(changes(&back, began + LOOK * 60), []);
 }
@@ -179,15 +125,7 @@ fn one_that_cannot_use_more_takes_no_more_from_others() {
 #[test]
 fn those_that_are_near_are_not_throttled_for_each_other() {
     let began = Instant::now();
-    let eager = |id| {
-        with_times(
-            290.0,
-            ControlFacts {
-                throttled: 0.5,
-                ..servant(id, 500, 490)
-            },
-        )
-    };
+    let eager = |id| with_times(290.0, ControlFacts { throttled: 0.5, ..servant(id, 500, 490) });
     let patient = |id| with_times(50.0, servant(id, 500, 60));
     let all = ["a", "b", "c", "d"].map(eager).into_iter();
     let all = all.chain(["e", "f", "g", "h"].map(patient)).collect();
@@ -196,10 +134,7 @@ fn those_that_are_near_are_not_throttled_for_each_other() {
     for one in eager {
         // The need of the patient ones, which use 60 each, is left to them.
         let beyond = CORES - 4 * (60 + 60 / HEADROOM + LEAST);
-        assert!(
-            one.quota <= beyond && one.quota * 10 > beyond * 9,
-            "{one:?}"
-        );
+        assert!(one.quota <= beyond && one.quota * 10 > beyond * 9, "{one:?}");
         assert_eq!(one.weight, 500, "what is promised to others stays theirs");
     }
     for one in patient {
@@ -214,10 +149,7 @@ fn sharing(id: &str, promised: u64, used: u64, total: f64) -> ControlFacts<'_> {
     ControlFacts {
         quota: CORES,
         measured: Some(MeasuredTimes { total, cloud }),
-        history: ControlHistory {
-            near: Some(Instant::now()),
-            ..ControlHistory::default()
-        },
+        history: ControlHistory { near: Some(Instant::now()), ..ControlHistory::default() },
         ..facts
     }
 }
@@ -225,69 +157,29 @@ fn sharing(id: &str, promised: u64, used: u64, total: f64) -> ControlFacts<'_> {
 #[test]
 fn where_the_cores_do_not_suffice_as_many_as_possible_are_in_time() {
     let now = Instant::now() + HOLD * 2;
-    let throttled = |facts| ControlFacts {
-        throttled: 0.5,
-        ..facts
-    };
+    let throttled = |facts| ControlFacts { throttled: 0.5, ..facts };
     let raised = |facts: ControlFacts<'static>| {
-        let history = ControlHistory {
-            raised: Some(now - HOLD / 2),
-            ..facts.history
-        };
+        let history = ControlHistory { raised: Some(now - HOLD / 2), ..facts.history };
         ControlFacts { history, ..facts }
     };
-    let unknown = |facts| ControlFacts {
-        used: None,
-        ..facts
-    };
+    let unknown = |facts| ControlFacts { used: None, ..facts };
     let idle = with_times(50.0, servant("d", 500, 100));
-    let [a, b, c] =
-        [("a", 1200), ("b", 900), ("c", 1500)].map(|(id, used)| sharing(id, 500, used, 360.0));
-    let in_time =
-        |facts: ControlFacts<'static>| sharing(facts.id, 500, facts.used.unwrap_or(0), 290.0);
+    let [a, b, c] = [("a", 1200), ("b", 900), ("c", 1500)].map(|(id, used)| sharing(id, 500, used, 360.0));
+    let in_time = |facts: ControlFacts<'static>| sharing(facts.id, 500, facts.used.unwrap_or(0), 290.0);
     for (what, all, yields) in [
         // 1440, 1080 and 1800 would be needed, of which two fit: those that need least.
         ("all are late", vec![a, b, c, idle], vec!["c"]),
         // 1440, 870 and 1450: the cores suffice.
         ("one is late", vec![a, in_time(b), in_time(c), idle], vec![]),
-        (
-            "all are in time",
-            vec![in_time(a), in_time(b), in_time(c), idle],
-            vec![],
-        ),
-        (
-            "one is alone",
-            vec![sharing("a", 500, 3600, 360.0), idle],
-            vec![],
-        ),
+        ("all are in time", vec![in_time(a), in_time(b), in_time(c), idle], vec![]),
+        ("one is alone", vec![sharing("a", 500, 3600, 360.0), idle], vec![]),
         // They are late for another reason than a lack of cores.
-        (
-            "cores are idle",
-            ["a", "b", "c"]
-                .map(|id| sharing(id, 500, 900, 900.0))
-                .to_vec(),
-            vec![],
-        ),
-        (
-            "cpu.max keeps them",
-            [a, b, c].map(throttled).to_vec(),
-            vec![],
-        ),
-        (
-            "they were raised just now",
-            [a, b, c].map(raised).to_vec(),
-            vec![],
-        ),
+        ("cores are idle", ["a", "b", "c"].map(|id| sharing(id, 500, 900, 900.0)).to_vec(), vec![]),
+        ("cpu.max keeps them", [a, b, c].map(throttled).to_vec(), vec![]),
+        ("they were raised just now", [a, b, c].map(raised).to_vec(), vec![]),
         ("one is not known", vec![a, b, c, unknown(idle)], vec!["c"]),
         // The one that needs less is helped nevertheless.
-        (
-            "none fits",
-            vec![
-                sharing("a", 500, 3000, 900.0),
-                sharing("b", 500, 900, 2000.0),
-            ],
-            vec!["a"],
-        ),
+        ("none fits", vec![sharing("a", 500, 3000, 900.0), sharing("b", 500, 900, 2000.0)], vec!["a"]),
     ] {
         let outcomes = control(CORES, &all, now);
         let named = all.iter().zip(&outcomes);
@@ -303,19 +195,13 @@ fn one_that_yields_has_what_it_was_promised_and_tries_again() {
     // 1680 for each: two fit.
     let late = ["a", "b", "c"].map(|id| sharing(id, 500, 1200, 420.0));
     let told = control(CORES, &late, began + HOLD * 2);
-    assert_eq!(
-        told[2].reason,
-        "servant a needs cores that are not reserved for this one"
-    );
+    assert_eq!(told[2].reason, "servant a needs cores that are not reserved for this one");
     let mut all = run_looks(late.to_vec(), began, 6..12);
     let quotas: Vec<u64> = all.iter().map(|one| one.quota).collect();
     assert_eq!(quotas, [CORES, CORES, 500]);
     // With that the others are in time. It tries again after a long time, in vain, and then not for twice as long.
     for one in &mut all[..2] {
-        let measured = one.measured.map(|_| MeasuredTimes {
-            total: 299.0,
-            cloud: 299.0,
-        });
+        let measured = one.measured.map(|_| MeasuredTimes { total: 299.0, cloud: 299.0 });
         one.measured = measured;
     }
     let helped = all.clone();
@@ -329,43 +215,24 @@ fn one_that_yields_has_what_it_was_promised_and_tries_again() {
             began_at.push(second);
         }
         yielded = yields;
-        assert!(
-            all[..2].iter().all(|one| one.quota == CORES),
-            "the others stay"
-        );
+        assert!(all[..2].iter().all(|one| one.quota == CORES), "the others stay");
     }
-    let [first, second] = began_at[..] else {
-        panic!("it tried at {began_at:?}")
-    };
+    let [first, second] = began_at[..] else { panic!("it tried at {began_at:?}") };
     assert!(first >= wait && second - first >= 2 * wait, "{began_at:?}");
     // Once the others are gone, it gets their cores, although it would need more than there are.
-    let alone = ControlFacts {
-        throttled: 0.5,
-        ..with_times(4200.0, helped[2])
-    };
+    let alone = ControlFacts { throttled: 0.5, ..with_times(4200.0, helped[2]) };
     let alone = run_looks(vec![alone], began, 20..40);
     assert!(alone[0].quota > 2000, "{alone:?}");
 }
 
 #[test]
 fn of_one_whose_use_is_not_known_nothing_is_taken() {
-    let near = with_times(
-        290.0,
-        ControlFacts {
-            throttled: 0.5,
-            ..servant("a", 1000, 990)
-        },
-    );
-    let unknown = |facts| ControlFacts {
-        used: None,
-        ..facts
-    };
+    let near = with_times(290.0, ControlFacts { throttled: 0.5, ..servant("a", 1000, 990) });
+    let unknown = |facts| ControlFacts { used: None, ..facts };
     let rest = unknown(servant("b", 0, 0));
     let content = unknown(with_times(50.0, servant("c", 2800, 0)));
     let changed = changes(&[near, rest, content], Instant::now());
-    let quotas = changed
-        .iter()
-        .filter_map(|(id, quota, ..)| Some((&**id, (*quota)?)));
+    let quotas = changed.iter().filter_map(|(id, quota, ..)| Some((&**id, (*quota)?)));
     // The satisfied one is assumed to need all of its quota.
     assert_eq!(quotas.collect::<Vec<_>>(), [("a", 1200)]);
 }
@@ -403,29 +270,20 @@ struct Observation {
 }
 
 fn any_observation() -> impl Strategy<Value = Observation> {
-    (
-        0u64..4500,
-        0.0f64..1.0,
-        0.0f64..1.0,
-        1.0f64..600.0,
-        0.0f64..1.0,
-    )
-        .prop_map(|(used, throttled, waited, total, cloud)| Observation {
+    (0u64..4500, 0.0f64..1.0, 0.0f64..1.0, 1.0f64..600.0, 0.0f64..1.0).prop_map(
+        |(used, throttled, waited, total, cloud)| Observation {
             used,
             throttled: (throttled - 0.7).max(0.0),
             waited: (waited - 0.7).max(0.0),
             total,
             cloud: total * cloud,
-        })
+        },
+    )
 }
 
 /// Promised cores, whether a goal was stated, whether requests are measured.
 fn any_kind() -> impl Strategy<Value = (u64, bool, bool)> {
-    (
-        prop_oneof![Just(0u64), 10u64..1500],
-        any::<bool>(),
-        any::<bool>(),
-    )
+    (prop_oneof![Just(0u64), 10u64..1500], any::<bool>(), any::<bool>())
 }
 
 const NAMES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
@@ -435,11 +293,7 @@ fn machine(kinds: &[(u64, bool, bool)]) -> Vec<ControlFacts<'static>> {
     named
         .map(|(name, (promised, stated, _))| {
             let facts = servant(name, *promised, 0);
-            if *stated {
-                with_times(1.0, facts)
-            } else {
-                facts
-            }
+            if *stated { with_times(1.0, facts) } else { facts }
         })
         .collect()
 }
@@ -449,10 +303,7 @@ fn measure(all: &mut [ControlFacts<'_>], kinds: &[(u64, bool, bool)], seen: &[Ob
         one.used = Some(seen.used.min(one.quota));
         one.throttled = seen.throttled;
         one.waited = seen.waited;
-        one.measured = measured.then_some(MeasuredTimes {
-            total: seen.total,
-            cloud: seen.cloud,
-        });
+        one.measured = measured.then_some(MeasuredTimes { total: seen.total, cloud: seen.cloud });
     }
 }
 
@@ -542,10 +393,7 @@ impl Plant {
         one.throttled = if cores + 10 >= one.quota { 0.4 } else { 0.0 };
         one.waited = if cores + 10 < one.quota { 0.4 } else { 0.0 };
         if one.goal.is_some() {
-            one.measured = Some(MeasuredTimes {
-                total: cloud + self.network,
-                cloud,
-            });
+            one.measured = Some(MeasuredTimes { total: cloud + self.network, cloud });
         }
     }
 }
@@ -559,26 +407,16 @@ fn a_closed_loop_brings_those_in_time_who_can_be() {
         with_times(1.0, servant("rich", 1500, 0)),
         servant("greedy", 0, 0),
     ];
-    let plants = [200.0, 200.0, 1.0].map(|work| Plant {
-        work,
-        network: 20.0,
-    });
+    let plants = [200.0, 200.0, 1.0].map(|work| Plant { work, network: 20.0 });
     let mut share_of_time = [0u32; 2];
     for second in 0..120u32 {
         // The kernel: each gets up to its cpu.max, by weight.
         let weights: u64 = all.iter().map(|one| one.weight).sum();
-        let mut gets: Vec<u64> = all
-            .iter()
-            .map(|one| one.quota.min(CORES * one.weight / weights))
-            .collect();
+        let mut gets: Vec<u64> = all.iter().map(|one| one.quota.min(CORES * one.weight / weights)).collect();
         for _ in 0..8 {
             let left = CORES - gets.iter().sum::<u64>().min(CORES);
-            let open: u64 = all
-                .iter()
-                .zip(&gets)
-                .filter(|(one, gets)| **gets < one.quota)
-                .map(|(one, _)| one.weight)
-                .sum();
+            let open: u64 =
+                all.iter().zip(&gets).filter(|(one, gets)| **gets < one.quota).map(|(one, _)| one.weight).sum();
             for (one, gets) in all.iter().zip(&mut gets) {
                 if *gets < one.quota && open > 0 {
                     *gets = one.quota.min(*gets + left * one.weight / open);

@@ -7,10 +7,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{
-    ControlFacts, ControlHistory, DOUBLED, HINDERED, HOLD, MeasuredTimes, ResponseGoal,
-    elapsed_since,
-};
+use super::{ControlFacts, ControlHistory, DOUBLED, HINDERED, HOLD, MeasuredTimes, ResponseGoal, elapsed_since};
 
 /// Fraction of the cores in use at which they count as used up: the rest is overhead.
 const FULL: f64 = 0.85;
@@ -20,9 +17,7 @@ pub(super) const RETRY: Duration = Duration::from_secs(120);
 impl ControlFacts<'_> {
     /// Returns true if its requests are late although it is not, and was not recently, throttled by `cpu.max`.
     fn is_late(&self, now: Instant) -> bool {
-        let measured = self
-            .measured
-            .zip(self.goal.and_then(ResponseGoal::upper_bound));
+        let measured = self.measured.zip(self.goal.and_then(ResponseGoal::upper_bound));
         measured.is_some_and(|(measured, bound)| measured.total > bound)
             && self.throttled < HINDERED
             && elapsed_since(self.history.raised, now) >= HOLD
@@ -31,16 +26,10 @@ impl ControlFacts<'_> {
     /// Returns the cores with which its requests would be in time: its usage, scaled by the necessary speed-up. `None`
     /// if nothing is measured.
     fn demanded_cores(&self) -> Option<u64> {
-        let (measured, bound) = self
-            .measured
-            .zip(self.goal.and_then(ResponseGoal::upper_bound))?;
+        let (measured, bound) = self.measured.zip(self.goal.and_then(ResponseGoal::upper_bound))?;
         let MeasuredTimes { total, cloud } = measured;
         let allowed = bound - (total - cloud);
-        let faster = if allowed > 0.0 {
-            cloud / allowed
-        } else {
-            f64::INFINITY
-        };
+        let faster = if allowed > 0.0 { cloud / allowed } else { f64::INFINITY };
         // No machine has so many cores, and sums do not overflow.
         Some((self.used? as f64 * faster).min(f64::from(u32::MAX)) as u64)
     }
@@ -61,25 +50,16 @@ impl ControlFacts<'_> {
 }
 
 /// Updates which servants yield.
-pub(super) fn update_yields(
-    cores: u64,
-    servants: &[ControlFacts<'_>],
-    histories: &mut [ControlHistory],
-    now: Instant,
-) {
+pub(super) fn update_yields(cores: u64, servants: &[ControlFacts<'_>], histories: &mut [ControlHistory], now: Instant) {
     for history in histories.iter_mut() {
         if history.near.is_none() {
             (history.yielded, history.vain) = (None, 0);
         }
     }
     let all = || servants.iter().zip(histories.iter());
-    let taken: u64 = all()
-        .map(|(one, history)| one.reserved_cores(history))
-        .sum();
+    let taken: u64 = all().map(|(one, history)| one.reserved_cores(history)).sum();
     let used: u64 = servants.iter().filter_map(|one| one.used).sum();
-    let sharing = all()
-        .filter(|(one, history)| one.is_sharing(history))
-        .count();
+    let sharing = all().filter(|(one, history)| one.is_sharing(history)).count();
     let near = |history: &ControlHistory| history.near.is_some() && history.yielded.is_none();
     let late = all().any(|(one, history)| near(history) && one.is_late(now));
     if late && used as f64 >= cores as f64 * FULL {
@@ -87,19 +67,13 @@ pub(super) fn update_yields(
         let mut needs: Vec<(u64, usize)> = all()
             .enumerate()
             .filter(|(_, (_, history))| near(history))
-            .filter_map(|(at, (one, _))| {
-                Some((one.demanded_cores()?.saturating_sub(one.floor()), at))
-            })
+            .filter_map(|(at, (one, _))| Some((one.demanded_cores()?.saturating_sub(one.floor()), at)))
             .collect();
         needs.sort_unstable();
         let (mut free, mut helped) = (cores, sharing - needs.len());
         for (at, (one, history)) in all().enumerate() {
             let asked = needs.iter().any(|(_, needing)| *needing == at);
-            free = free.saturating_sub(if asked {
-                one.floor()
-            } else {
-                one.reserved_cores(history)
-            });
+            free = free.saturating_sub(if asked { one.floor() } else { one.reserved_cores(history) });
         }
         for (more, at) in needs {
             // If all yield, none is helped.

@@ -3,10 +3,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-const CAPACITY: Amount = Amount {
-    millicpus: 4000,
-    memory: 8 << 30,
-};
+const CAPACITY: Amount = Amount { millicpus: 4000, memory: 8 << 30 };
 
 fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -> Row {
     Row {
@@ -14,10 +11,7 @@ fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -
         measure,
         value,
         aux: aux_of(aux),
-        limits: Limits {
-            cpus: Some(cpus),
-            ..Limits::default()
-        },
+        limits: Limits { cpus: Some(cpus), ..Limits::default() },
         spread: None,
         revision: None,
         written: 0,
@@ -25,27 +19,15 @@ fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -
 }
 
 fn aux_of(aux: &[(&str, &str)]) -> Aux {
-    aux.iter()
-        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
-        .collect()
+    aux.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
 }
 
 fn goal(desire: f64, bound: f64) -> Goal {
-    Goal {
-        measure: Measure::Rrt,
-        desire,
-        bound,
-    }
+    Goal { measure: Measure::Rrt, desire, bound }
 }
 
 fn view<'a>(rows: &'a [Row], aux: &'a Aux) -> DictionaryView<'a> {
-    DictionaryView {
-        rows,
-        aux,
-        own: Limits::default(),
-        reserve: (0.01, 64 << 20),
-        capacity: CAPACITY,
-    }
+    DictionaryView { rows, aux, own: Limits::default(), reserve: (0.01, 64 << 20), capacity: CAPACITY }
 }
 
 /// The number of the chosen row, and whether it reaches the desired value; otherwise the best one and the one that is
@@ -56,9 +38,7 @@ fn choice_outcome(choice: &RowChoice<'_>) -> ChoiceOutcome {
     match choice {
         RowChoice::Silent => Ok(None),
         RowChoice::Taken { row, desired, .. } => Ok(Some((row.id, *desired))),
-        RowChoice::Unmet { best, beyond, .. } => {
-            Err((best.map(|row| row.id), beyond.map(|row| row.id)))
-        }
+        RowChoice::Unmet { best, beyond, .. } => Err((best.map(|row| row.id), beyond.map(|row| row.id))),
     }
 }
 
@@ -91,11 +71,7 @@ fn the_cheapest_that_meets_the_goal_is_taken() {
         let choice = shelf.choose(&goal(desire, bound), |row| row.limits.cpus <= Some(most));
         assert_eq!(choice_outcome(&choice), expected, "{desire} {bound} {most}");
     }
-    let fps = |desire, bound| Goal {
-        measure: Measure::Fps,
-        desire,
-        bound,
-    };
+    let fps = |desire, bound| Goal { measure: Measure::Fps, desire, bound };
     for (desire, bound, expected) in [
         (4.0, 2.0, Ok(Some((5, true)))),
         (10.0, 2.0, Ok(Some((6, true)))),
@@ -105,11 +81,7 @@ fn the_cheapest_that_meets_the_goal_is_taken() {
         let choice = shelf.choose(&fps(desire, bound), |_| true);
         assert_eq!(choice_outcome(&choice), expected, "{desire} {bound}");
     }
-    let age = Goal {
-        measure: Measure::Age,
-        desire: 1.0,
-        bound: 1.0,
-    };
+    let age = Goal { measure: Measure::Age, desire: 1.0, bound: 1.0 };
     assert_eq!(shelf.choose(&age, |_| true), RowChoice::Silent);
     let next = |id: usize| {
         let (better, weaker) = shelf.neighbours(&rows[id - 1]);
@@ -140,14 +112,8 @@ fn cheap_is_what_takes_a_small_share_of_the_machine() {
     }
     // If a row names no memory, the service's own counts.
     let rows = [row(1, Measure::Rrt, 0.1, 1.0, &[]), with(2, 1.1, 1)];
-    let own = Limits {
-        memory: Some(Size(4 << 30)),
-        ..Limits::default()
-    };
-    let shelf = DictionaryView {
-        own,
-        ..view(&rows, &none)
-    };
+    let own = Limits { memory: Some(Size(4 << 30)), ..Limits::default() };
+    let shelf = DictionaryView { own, ..view(&rows, &none) };
     let choice = shelf.choose(&goal(0.1, 0.1), |_| true);
     assert_eq!(choice_outcome(&choice), Ok(Some((2, true))));
 }
@@ -157,52 +123,18 @@ fn auxiliary_parameters_say_which_rows_hold() {
     let rows = [
         row(1, Measure::Rrt, 0.1, 0.5, &[("width", "640")]),
         row(2, Measure::Rrt, 0.1, 2.0, &[("width", "1920")]),
-        row(
-            3,
-            Measure::Rrt,
-            0.1,
-            3.0,
-            &[("width", "640"), ("model", "big")],
-        ),
+        row(3, Measure::Rrt, 0.1, 3.0, &[("width", "640"), ("model", "big")]),
         row(4, Measure::Rrt, 0.05, 3.5, &[("model", "big")]),
     ];
     for (aux, desire, expected) in [
-        (
-            &[("width", "640"), ("model", "small")][..],
-            0.1,
-            Ok(Some((1, true))),
-        ),
-        (
-            &[("width", "320.5"), ("model", "small")],
-            0.1,
-            Ok(Some((1, true))),
-        ),
-        (
-            &[("width", "641"), ("model", "small")],
-            0.1,
-            Ok(Some((2, true))),
-        ),
+        (&[("width", "640"), ("model", "small")][..], 0.1, Ok(Some((1, true)))),
+        (&[("width", "320.5"), ("model", "small")], 0.1, Ok(Some((1, true)))),
+        (&[("width", "641"), ("model", "small")], 0.1, Ok(Some((2, true)))),
         // Nothing was measured for it.
-        (
-            &[("width", "1921"), ("model", "small")],
-            0.1,
-            Err((None, None)),
-        ),
-        (
-            &[("width", "wide"), ("model", "small")],
-            0.1,
-            Err((None, None)),
-        ),
-        (
-            &[("width", "wide"), ("model", "big")],
-            0.1,
-            Ok(Some((4, true))),
-        ),
-        (
-            &[("width", "640"), ("model", "big")],
-            0.05,
-            Ok(Some((4, true))),
-        ),
+        (&[("width", "1921"), ("model", "small")], 0.1, Err((None, None))),
+        (&[("width", "wide"), ("model", "small")], 0.1, Err((None, None))),
+        (&[("width", "wide"), ("model", "big")], 0.1, Ok(Some((4, true)))),
+        (&[("width", "640"), ("model", "big")], 0.05, Ok(Some((4, true)))),
         // An unknown parameter may have any value that rows name.
         (&[("model", "small")], 0.1, Ok(Some((2, true)))),
         (&[("width", "640")], 0.1, Ok(Some((1, true)))),
@@ -232,40 +164,20 @@ fn rows_that_cannot_be_are_refused_with_what_to_write() {
         (with(|row| row.value = 0.0), "rrt \"0\" is not a time"),
         (with(|row| row.value = f64::NAN), "rrt \"NaN\""),
         (with(|row| row.value = 1e9), "rrt \"1000000000\""),
-        (
-            with(|row| (row.measure, row.value) = (Measure::Fps, -1.0)),
-            "fps = \"-1\" is not a rate",
-        ),
-        (
-            with(|row| row.aux = aux_of(&[("a b", "1")])),
-            "aux.a b is not an auxiliary parameter",
-        ),
-        (
-            with(|row| row.aux = aux_of(&[("a", "")])),
-            "aux.a has no value",
-        ),
+        (with(|row| (row.measure, row.value) = (Measure::Fps, -1.0)), "fps = \"-1\" is not a rate"),
+        (with(|row| row.aux = aux_of(&[("a b", "1")])), "aux.a b is not an auxiliary parameter"),
+        (with(|row| row.aux = aux_of(&[("a", "")])), "aux.a has no value"),
         (with(|row| row.limits.cpus = Some(0.0)), "cpus = 0 is not"),
-        (
-            with(|row| row.limits.memory = Some(Size(1))),
-            "memory = 1 is too little",
-        ),
+        (with(|row| row.limits.memory = Some(Size(1))), "memory = 1 is too little"),
         (
             with(|row| {
-                row.spread = Some(api::dictionary::Spread {
-                    p50: f64::NAN,
-                    p95: 1.0,
-                    requests: 1,
-                });
+                row.spread = Some(api::dictionary::Spread { p50: f64::NAN, p95: 1.0, requests: 1 });
             }),
             "spread: p50 NaN",
         ),
         (
             with(|row| {
-                row.spread = Some(api::dictionary::Spread {
-                    p50: 0.2,
-                    p95: 0.1,
-                    requests: 1,
-                });
+                row.spread = Some(api::dictionary::Spread { p50: 0.2, p95: 0.1, requests: 1 });
             }),
             "spread: p95, 0.1, is less than p50, 0.2",
         ),
@@ -304,11 +216,7 @@ fn goals() -> impl Strategy<Value = Goal> {
     (measures(), value(), value()).prop_map(|(measure, one, other)| {
         let in_order = measure.reaches(one, other);
         let (desire, bound) = if in_order { (one, other) } else { (other, one) };
-        Goal {
-            measure,
-            desire,
-            bound,
-        }
+        Goal { measure, desire, bound }
     })
 }
 
@@ -445,11 +353,7 @@ fn what_comes_next_holds_for_the_same_robot() {
         let (better, weaker) = view(&rows, &aux).neighbours(&rows[taken - 1]);
         (better.map(|row| row.id), weaker.map(|row| row.id))
     };
-    assert_eq!(
-        next(&[("width", "640")], 1),
-        (Some(2), None),
-        "wider will do"
-    );
+    assert_eq!(next(&[("width", "640")], 1), (Some(2), None), "wider will do");
     assert_eq!(next(&[("width", "640")], 2), (Some(4), Some(1)));
     assert_eq!(next(&[("width", "320")], 2), (Some(3), Some(1)));
     // The row's width was assumed.
@@ -468,9 +372,7 @@ fn as_many_rows_as_there_may_be_are_chosen_from() {
         })
         .collect();
     let nothing = Aux::new();
-    let RowChoice::Taken { row, desired, .. } =
-        view(&rows, &nothing).choose(&goal(0.01, 0.1), |_| true)
-    else {
+    let RowChoice::Taken { row, desired, .. } = view(&rows, &nothing).choose(&goal(0.01, 0.1), |_| true) else {
         panic!("it is acceptable");
     };
     assert_eq!((row.id, desired), (MOST_ROWS as i64, false));

@@ -12,8 +12,8 @@ use crate::decide::capacity::{PushPromise, RoomPlan};
 use crate::decide::lifetime::{Retention, ServantStage, Tenancy, retention};
 use crate::decide::placement::{Placement, place};
 use crate::decide::warm_pool::{
-    PoolShortage, PoolSize, WantedPool, WarmContainer, choose_container, deserving_services,
-    pool_shortage, stale_containers,
+    PoolShortage, PoolSize, WantedPool, WarmContainer, choose_container, deserving_services, pool_shortage,
+    stale_containers,
 };
 use crate::decide::{Amount, ServantFacts, StopOrder, capacity};
 
@@ -22,10 +22,7 @@ const QUEUE: usize = 4;
 const POOL: usize = 2;
 
 fn cores(millicpus: u64) -> Amount {
-    Amount {
-        millicpus,
-        memory: 0,
-    }
+    Amount { millicpus, memory: 0 }
 }
 
 struct ModelServant {
@@ -54,11 +51,7 @@ impl ModelServant {
             anonymous: self.anonymous(),
             connections: self.connections,
             idle_since: self.idle_since,
-            grace: if self.anonymous() {
-                Duration::ZERO
-            } else {
-                GRACE
-            },
+            grace: if self.anonymous() { Duration::ZERO } else { GRACE },
         }
     }
 
@@ -224,11 +217,7 @@ impl MachineModel {
             .pushes
             .iter()
             .filter_map(|(ticket, push)| {
-                Some(PushPromise {
-                    ticket: *ticket,
-                    has: push.promised?,
-                    gives_way: push.gives_way,
-                })
+                Some(PushPromise { ticket: *ticket, has: push.promised?, gives_way: push.gives_way })
             })
             .collect();
         let decide = || {
@@ -248,36 +237,22 @@ impl MachineModel {
             let leave = self.pushes.iter();
             let leave = leave.filter(|(ticket, it)| it.gives_way || pushes.contains(ticket));
             let leave = leave.filter_map(|(_, it)| it.promised);
-            free.chain(pooled)
-                .chain(leave)
-                .fold(Amount::NONE, Amount::plus)
+            free.chain(pooled).chain(leave).fold(Amount::NONE, Amount::plus)
         };
         let warm = |id: &str| self.pool.iter().any(|it| it.id == id);
         let order: Vec<bool> = ends.iter().map(|end| warm(end.id)).collect();
-        assert!(
-            order.is_sorted_by(|one, other| one >= other),
-            "a robot's servant ends before what was made ahead"
-        );
+        assert!(order.is_sorted_by(|one, other| one >= other), "a robot's servant ends before what was made ahead");
         if let Some((_, others)) = ends.split_last() {
-            assert_ne!(
-                lacking.all.minus(having(others, &[])),
-                Amount::NONE,
-                "one end too many"
-            );
+            assert_ne!(lacking.all.minus(having(others, &[])), Amount::NONE, "one end too many");
         }
         let first = lacking.first_robot;
         let every: Vec<Ticket> = self.pushes.keys().copied().collect();
         assert!(
-            first.minus(having(&ends, &give_way)) == Amount::NONE
-                || first.minus(having(&ends, &every)) != Amount::NONE,
+            first.minus(having(&ends, &give_way)) == Amount::NONE || first.minus(having(&ends, &every)) != Amount::NONE,
             "a push keeps a robot from being admitted"
         );
         if let Some((_, others)) = give_way.split_last() {
-            assert_ne!(
-                first.minus(having(&ends, others)),
-                Amount::NONE,
-                "one push too many"
-            );
+            assert_ne!(first.minus(having(&ends, others)), Amount::NONE, "one push too many");
         }
         let ids: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         for id in ids {
@@ -300,10 +275,7 @@ impl MachineModel {
 
     /// Returns how much more capacity would have to be free for all waiting robots.
     fn shortage_for_robots(&self) -> Amount {
-        let waiting = self
-            .servants
-            .iter()
-            .filter(|it| self.line.iter().any(|one| one.ticket == it.ticket));
+        let waiting = self.servants.iter().filter(|it| self.line.iter().any(|one| one.ticket == it.ticket));
         let wanted = waiting.fold(Amount::NONE, |sum, it| sum.plus(it.wants));
         wanted.minus(self.book.capacity().minus(self.book.promised_total()))
     }
@@ -349,23 +321,15 @@ impl MachineModel {
             let warm = self.pool.remove(index.expect("the pool has it"));
             let of = (warm.service, warm.revision, warm.runs);
             assert_eq!(of, (service, current, true));
-            assert!(
-                robot % 2 == 0 || warm.promised.is_none(),
-                "it has other names"
-            );
+            assert!(robot % 2 == 0 || warm.promised.is_none(), "it has other names");
             ahead = warm.promised;
-            assert!(
-                self.used.insert(warm.id.clone()),
-                "two robots have the same container"
-            );
+            assert!(self.used.insert(warm.id.clone()), "two robots have the same container");
             warm.id
         });
         let wants = cores(SERVICES[service].1);
         let (verdict, others) = match ahead {
             Some(_) => (AdmissionVerdict::Admitted, Vec::new()),
-            None => self
-                .book
-                .request(ticket, AdmissionRequest::robot(wants, priority)),
+            None => self.book.request(ticket, AdmissionRequest::robot(wants, priority)),
         };
         let promised = match verdict {
             AdmissionVerdict::Admitted => {
@@ -386,11 +350,7 @@ impl MachineModel {
             ticket,
             key,
             revision: current,
-            stage: if promised.is_some() {
-                ServantStage::Admitted
-            } else {
-                ServantStage::Queued
-            },
+            stage: if promised.is_some() { ServantStage::Admitted } else { ServantStage::Queued },
             wants,
             promised,
             connections: 1,
@@ -398,11 +358,7 @@ impl MachineModel {
             ending: false,
         });
         if promised.is_none() {
-            self.line.push(QueuedRobot {
-                ticket,
-                priority,
-                overtaken: 0,
-            });
+            self.line.push(QueuedRobot { ticket, priority, overtaken: 0 });
             self.make_room();
         }
     }
@@ -419,11 +375,7 @@ impl MachineModel {
                 service: SERVICES[*service].0,
                 revision: revisions[*service],
                 image: "an image",
-                size: PoolSize {
-                    makes: 1,
-                    keeps: 1 + *service,
-                    nodes: 1,
-                },
+                size: PoolSize { makes: 1, keeps: 1 + *service, nodes: 1 },
             })
             .collect();
         let pool: Vec<WarmContainer<'_>> = self.pool.iter().map(ModelWarm::facts).collect();
@@ -472,11 +424,7 @@ impl MachineModel {
 
     pub(super) fn apply(&mut self, step: MachineStep) {
         match step {
-            MachineStep::Asks {
-                service,
-                robot,
-                priority,
-            } => self.request_servant(service, robot, priority),
+            MachineStep::Asks { service, robot, priority } => self.request_servant(service, robot, priority),
             MachineStep::Leaves(which) => {
                 let used = self.servants.iter_mut().filter(|it| it.connections > 0);
                 if let Some(servant) = nth(used, which) {
@@ -525,10 +473,7 @@ impl MachineModel {
                         Err(_) => assert_eq!(self.book, before, "refused, and yet changed"),
                     }
                     let grew = !cores(size).fits(promised);
-                    assert!(
-                        !grew || self.shortage_for_robots().fits(lacked),
-                        "a servant overtook who waits"
-                    );
+                    assert!(!grew || self.shortage_for_robots().fits(lacked), "a servant overtook who waits");
                 }
             }
             MachineStep::GivesUp(which) => {
@@ -540,9 +485,7 @@ impl MachineModel {
             }
             MachineStep::Pushes(size) => {
                 let (ticket, _) = self.next_id();
-                let (verdict, others) = self
-                    .book
-                    .request(ticket, AdmissionRequest::push(cores(size)));
+                let (verdict, others) = self.book.request(ticket, AdmissionRequest::push(cores(size)));
                 let promised = match verdict {
                     AdmissionVerdict::Admitted => {
                         assert!(self.line.is_empty(), "a push goes before a robot");
@@ -554,10 +497,7 @@ impl MachineModel {
                         return;
                     }
                 };
-                let push = ModelPush {
-                    promised,
-                    gives_way: false,
-                };
+                let push = ModelPush { promised, gives_way: false };
                 self.pushes.insert(ticket, push);
                 self.apply_admitted(others);
                 self.make_room();
@@ -602,10 +542,7 @@ impl MachineModel {
             .filter(|it| !it.ending)
             .filter(|it| {
                 let need = retention(&it.tenancy(), now);
-                assert!(
-                    it.connections == 0 || need == Retention::Stays,
-                    "its robot uses it"
-                );
+                assert!(it.connections == 0 || need == Retention::Stays, "its robot uses it");
                 matches!(need, Retention::Over(_))
             })
             .map(|it| it.id.clone())
@@ -619,32 +556,16 @@ impl MachineModel {
         let servants = self.servants.iter().filter_map(|it| it.promised);
         let pushes = self.pushes.values().filter_map(|push| push.promised);
         let pooled = self.pool.iter().filter_map(|it| it.promised);
-        let promised = servants
-            .chain(pushes)
-            .chain(pooled)
-            .fold(Amount::NONE, Amount::plus);
+        let promised = servants.chain(pushes).chain(pooled).fold(Amount::NONE, Amount::plus);
         assert_eq!(self.book.promised_total(), promised);
-        assert!(
-            promised.fits(self.book.capacity()),
-            "more is promised than there is"
-        );
+        assert!(promised.fits(self.book.capacity()), "more is promised than there is");
         assert!(self.line.len() <= QUEUE);
-        let waiting = self
-            .pushes
-            .values()
-            .filter(|it| it.promised.is_none())
-            .count();
+        let waiting = self.pushes.values().filter(|it| it.promised.is_none()).count();
         assert_eq!(self.book.waiting_count(), self.line.len() + waiting);
         let free = self.book.capacity().minus(promised);
-        let places: Vec<(Ticket, usize)> = self
-            .book
-            .queue_positions()
-            .map(|one| (one.0, one.1.place))
-            .collect();
+        let places: Vec<(Ticket, usize)> = self.book.queue_positions().map(|one| (one.0, one.1.place)).collect();
         assert_eq!(places.len(), self.line.len());
-        let first = places
-            .first()
-            .filter(|_| self.book.stall_reason().is_none());
+        let first = places.first().filter(|_| self.book.stall_reason().is_none());
         if let Some((first, _)) = first {
             let first = self.servants.iter().find(|it| it.ticket == *first);
             let first = first.expect("who waits is there");
@@ -652,10 +573,7 @@ impl MachineModel {
         }
         let mut given = BTreeSet::new();
         for servant in self.servants.iter().filter(|it| !it.ending) {
-            assert!(
-                given.insert(servant.key),
-                "a robot has two servants of one service"
-            );
+            assert!(given.insert(servant.key), "a robot has two servants of one service");
             assert_eq!(self.given.get(&servant.key), Some(&servant.id));
         }
     }
@@ -669,12 +587,9 @@ impl MachineModel {
             let lives = self.servants.iter().find(|it| it.promised.is_some());
             let lives = lives.map(|it| (it.id.clone(), it.ending));
             match (push, lives) {
-                (Some(_), _) => self.apply(MachineStep::Pushed(
-                    self.pushes
-                        .values()
-                        .take_while(|it| it.promised.is_none())
-                        .count(),
-                )),
+                (Some(_), _) => {
+                    self.apply(MachineStep::Pushed(self.pushes.values().take_while(|it| it.promised.is_none()).count()))
+                }
                 (None, Some((id, ending))) => {
                     if !ending {
                         self.end(&id);
@@ -688,10 +603,7 @@ impl MachineModel {
             self.check_invariants();
         }
         let pooled = self.pool.iter().filter_map(|it| it.promised);
-        assert_eq!(
-            self.book.promised_total(),
-            pooled.fold(Amount::NONE, Amount::plus)
-        );
+        assert_eq!(self.book.promised_total(), pooled.fold(Amount::NONE, Amount::plus));
         assert_eq!(self.book.waiting_count(), 0, "somebody waits for ever");
     }
 }

@@ -11,11 +11,7 @@ fn stats(servants: AttemptCounts, requests: AttemptCounts, millis: f64) -> Revis
     for _ in requests.failed..requests.all {
         times.record(millis);
     }
-    RevisionStats {
-        servants,
-        requests,
-        times,
-    }
+    RevisionStats { servants, requests, times }
 }
 
 fn rollout(canary: Option<Share>) -> Rollout {
@@ -26,10 +22,7 @@ fn rollout(canary: Option<Share>) -> Rollout {
         reason: String::new(),
         started: 1000,
         changed: 1000,
-        terms: RolloutTerms {
-            canary,
-            ..RolloutTerms::default()
-        },
+        terms: RolloutTerms { canary, ..RolloutTerms::default() },
         robots: Vec::new(),
         of_stable: RevisionStats::default(),
         of_candidate: RevisionStats::default(),
@@ -39,10 +32,7 @@ fn rollout(canary: Option<Share>) -> Rollout {
 #[test]
 fn the_first_robots_get_the_canary_and_keep_it() {
     let mut of = rollout(Some(Share::Robots(2)));
-    assert_eq!(
-        assign_revision(&of, "s", "r1"),
-        AssignedRevision::CandidateFromNow
-    );
+    assert_eq!(assign_revision(&of, "s", "r1"), AssignedRevision::CandidateFromNow);
     of.robots = vec!["r1".into(), "r2".into()];
     assert_eq!(assign_revision(&of, "s", "r1"), AssignedRevision::Candidate);
     assert_eq!(assign_revision(&of, "s", "r3"), AssignedRevision::Current);
@@ -54,11 +44,7 @@ fn the_first_robots_get_the_canary_and_keep_it() {
         RolloutState::Replaced,
     ] {
         of.state = state;
-        assert_eq!(
-            assign_revision(&of, "s", "r1"),
-            AssignedRevision::Current,
-            "{state}"
-        );
+        assert_eq!(assign_revision(&of, "s", "r1"), AssignedRevision::Current, "{state}");
     }
 }
 
@@ -68,18 +54,13 @@ fn a_share_of_the_robots_gets_the_canary() {
         let of = rollout(Some(Share::Percent(percent)));
         let robots = 10_000;
         let hit = (0..robots)
-            .filter(|n| {
-                assign_revision(&of, "s", &format!("robot-{n}")) == AssignedRevision::Candidate
-            })
+            .filter(|n| assign_revision(&of, "s", &format!("robot-{n}")) == AssignedRevision::Candidate)
             .count();
         let share = 100.0 * hit as f64 / f64::from(robots);
         assert!((share - percent).abs() < 1.5, "{percent}: {share}");
     }
     let all = rollout(Some(Share::Percent(100.0)));
-    assert!(
-        (0..1000)
-            .all(|n| assign_revision(&all, "s", &n.to_string()) == AssignedRevision::Candidate)
-    );
+    assert!((0..1000).all(|n| assign_revision(&all, "s", &n.to_string()) == AssignedRevision::Candidate));
 }
 
 #[test]
@@ -93,35 +74,15 @@ fn a_canary_is_taken_back_when_it_is_worse_and_not_before() {
         (sound, attempts(100, 0), 50.0, None),
         // Within the bound of a tenth.
         (sound, attempts(100, 0), 54.0, None),
-        (
-            sound,
-            attempts(100, 0),
-            60.0,
-            Some("p50 response time is 6"),
-        ),
+        (sound, attempts(100, 0), 60.0, Some("p50 response time is 6")),
         (sound, attempts(19, 0), 500.0, None),
         (sound, attempts(20, 0), 500.0, Some("p50")),
         (sound, attempts(19, 19), 0.0, None),
-        (
-            sound,
-            attempts(20, 20),
-            0.0,
-            Some("100 % of its 20 requests failed"),
-        ),
+        (sound, attempts(20, 20), 0.0, Some("100 % of its 20 requests failed")),
         (sound, attempts(100, 5), 50.0, None),
-        (
-            sound,
-            attempts(100, 60),
-            50.0,
-            Some("60 % of its 100 requests failed; previous revision: 0 % of 100"),
-        ),
+        (sound, attempts(100, 60), 50.0, Some("60 % of its 100 requests failed; previous revision: 0 % of 100")),
         (attempts(2, 2), attempts(0, 0), 0.0, None),
-        (
-            attempts(9, 9),
-            attempts(0, 0),
-            0.0,
-            Some("100 % of its 9 servants failed"),
-        ),
+        (attempts(9, 9), attempts(0, 0), 0.0, Some("100 % of its 9 servants failed")),
         (attempts(20, 1), attempts(0, 0), 0.0, None),
     ] {
         let reason = worse(&stats(servants, requests, millis));
@@ -141,16 +102,9 @@ fn a_canary_is_taken_back_when_it_is_worse_and_not_before() {
 #[test]
 fn steps_follow_what_was_seen_and_the_time() {
     let mut of = rollout(Some(Share::Robots(1)));
-    assert_eq!(
-        next_step(&of, 9_999_999),
-        RolloutStep::Stays,
-        "nobody promotes it"
-    );
+    assert_eq!(next_step(&of, 9_999_999), RolloutStep::Stays, "nobody promotes it");
     of.terms.promote_after = Some(60.0);
-    assert_eq!(
-        next_step(&of, 61_000),
-        RolloutStep::Waits(PromotionBlocker::Servant)
-    );
+    assert_eq!(next_step(&of, 61_000), RolloutStep::Waits(PromotionBlocker::Servant));
     of.of_candidate.servants = attempts(1, 0);
     of.of_candidate.requests = attempts(20, 0);
     assert_eq!(next_step(&of, 60_999), RolloutStep::Stays);
@@ -161,12 +115,7 @@ fn steps_follow_what_was_seen_and_the_time() {
     of.terms.deadline = Some(10.0);
     assert_eq!(next_step(&of, 10_999), RolloutStep::Stays);
     assert_eq!(next_step(&of, 11_000), RolloutStep::EndsOthers);
-    for state in [
-        RolloutState::Promoted,
-        RolloutState::RolledBack,
-        RolloutState::Aborted,
-        RolloutState::Replaced,
-    ] {
+    for state in [RolloutState::Promoted, RolloutState::RolledBack, RolloutState::Aborted, RolloutState::Replaced] {
         of.state = state;
         assert_eq!(next_step(&of, 99_000), RolloutStep::Stays, "{state}");
     }
@@ -180,11 +129,7 @@ fn a_canary_is_promoted_once_enough_requests_say_that_it_is_no_worse() {
     let requests = |seen| RolloutStep::Waits(PromotionBlocker::Requests { seen, needed: 20 });
     let promotes = RolloutStep::Promotes("it was not worse within 60 s and 20 requests".to_owned());
     let compares = |failed, seen| {
-        RolloutStep::Waits(PromotionBlocker::Comparison {
-            failed: attempts(20, failed),
-            seen,
-            needed: 20,
-        })
+        RolloutStep::Waits(PromotionBlocker::Comparison { failed: attempts(20, failed), seen, needed: 20 })
     };
     for (stable, candidate, expected) in [
         (attempts(0, 0), attempts(0, 0), requests(0)),
@@ -201,21 +146,13 @@ fn a_canary_is_promoted_once_enough_requests_say_that_it_is_no_worse() {
         of.of_candidate.requests = candidate;
         assert_eq!(next_step(&of, 61_000), expected, "{stable:?} {candidate:?}");
     }
-    let words = PromotionBlocker::Comparison {
-        failed: attempts(20, 3),
-        seen: 1,
-        needed: 20,
-    };
+    let words = PromotionBlocker::Comparison { failed: attempts(20, 3), seen: 1, needed: 20 };
     assert_eq!(
         words.to_string(),
         "3 of its 20 requests failed, but the previous revision has had 1 requests of the 20 required for a comparison \
             (--samples)"
     );
-    assert!(words.is_same_kind(&PromotionBlocker::Comparison {
-        failed: attempts(9, 9),
-        seen: 2,
-        needed: 20
-    }));
+    assert!(words.is_same_kind(&PromotionBlocker::Comparison { failed: attempts(9, 9), seen: 2, needed: 20 }));
     assert!(!words.is_same_kind(&PromotionBlocker::Servant));
 }
 
@@ -224,10 +161,7 @@ fn a_rollout_is_read_back_as_it_was_written() {
     let mut of = rollout(Some(Share::Percent(10.0)));
     of.of_stable = stats(attempts(2, 1), attempts(30, 2), 12.5);
     let text = serde_json::to_string(&of).expect("plain data");
-    assert_eq!(
-        serde_json::from_str::<Rollout>(&text).expect("a rollout"),
-        of
-    );
+    assert_eq!(serde_json::from_str::<Rollout>(&text).expect("a rollout"), of);
 }
 
 /// Returns random events of this probability, from numbers between 0 and 1.
@@ -271,22 +205,9 @@ fn count_rollbacks(chances: (f64, f64), runs: u64) -> u64 {
         let (mut stable, mut candidate) = (RevisionStats::default(), RevisionStats::default());
         for _ in 0..400 {
             let draws = [draw(), draw()];
-            stable
-                .requests
-                .record(flips(chances.0, &draws[..1]).all(|it| it));
-            candidate
-                .requests
-                .record(flips(chances.1, &draws[1..]).all(|it| it));
-            if regression(
-                &stable,
-                &candidate,
-                &RolloutTerms {
-                    bound: 0.05,
-                    ..RolloutTerms::default()
-                },
-            )
-            .is_some()
-            {
+            stable.requests.record(flips(chances.0, &draws[..1]).all(|it| it));
+            candidate.requests.record(flips(chances.1, &draws[1..]).all(|it| it));
+            if regression(&stable, &candidate, &RolloutTerms { bound: 0.05, ..RolloutTerms::default() }).is_some() {
                 count += 1;
                 break;
             }

@@ -27,25 +27,14 @@ pub(crate) struct DifferingField {
 
 impl DifferingField {
     /// Creates a difference of the whole answers.
-    pub(crate) fn whole_answer(
-        present: impl Into<String>,
-        candidate: impl Into<String>,
-    ) -> DifferingField {
-        DifferingField {
-            field: String::new(),
-            present: shorten(present.into()),
-            candidate: shorten(candidate.into()),
-        }
+    pub(crate) fn whole_answer(present: impl Into<String>, candidate: impl Into<String>) -> DifferingField {
+        DifferingField { field: String::new(), present: shorten(present.into()), candidate: shorten(candidate.into()) }
     }
 }
 
 /// Returns the fields in which two messages of one type differ, the first [`FIELDS`] of them. The sequence number and
 /// stamp of a header are ignored: both depend on the time of publication.
-pub(crate) fn differences(
-    present: &Value,
-    candidate: &Value,
-    tolerance: &Tolerance,
-) -> Vec<DifferingField> {
+pub(crate) fn differences(present: &Value, candidate: &Value, tolerance: &Tolerance) -> Vec<DifferingField> {
     let mut found = Vec::new();
     compare_fields(String::new(), present, candidate, tolerance, &mut found);
     found
@@ -73,11 +62,7 @@ fn compare_fields(
                 if header && name != "frame_id" {
                     continue;
                 }
-                let path = if field.is_empty() {
-                    name.clone()
-                } else {
-                    format!("{field}.{name}")
-                };
+                let path = if field.is_empty() { name.clone() } else { format!("{field}.{name}") };
                 let against = other.get(name).unwrap_or(&Value::Null);
                 compare_fields(path, value, against, tolerance, found);
             }
@@ -107,9 +92,7 @@ fn numbers_agree(one: &Number, other: &Number, tolerance: f64) -> bool {
         return (one - other).unsigned_abs() as f64 <= tolerance;
     }
     match (one.as_f64(), other.as_f64()) {
-        (Some(one), Some(other)) => {
-            (one - other).abs() <= tolerance * one.abs().max(other.abs()).max(1.0)
-        }
+        (Some(one), Some(other)) => (one - other).abs() <= tolerance * one.abs().max(other.abs()).max(1.0),
         _ => false,
     }
 }
@@ -123,12 +106,8 @@ fn is_header(value: &Value) -> bool {
         let parts = stamp.as_object();
         parts.is_some_and(|parts| parts.len() == 2 && parts.values().all(Value::is_number))
     };
-    let mut others = fields
-        .keys()
-        .filter(|name| !matches!(&***name, "seq" | "stamp" | "frame_id"));
-    others.next().is_none()
-        && fields.get("stamp").is_some_and(is_time)
-        && fields.contains_key("frame_id")
+    let mut others = fields.keys().filter(|name| !matches!(&***name, "seq" | "stamp" | "frame_id"));
+    others.next().is_none() && fields.get("stamp").is_some_and(is_time) && fields.contains_key("frame_id")
 }
 
 fn shorten(text: String) -> String {

@@ -40,11 +40,7 @@ pub(crate) struct Pairing<T> {
 
 impl<T> Default for Pairing<T> {
     fn default() -> Self {
-        Pairing {
-            present: VecDeque::new(),
-            candidate: VecDeque::new(),
-            paired: false,
-        }
+        Pairing { present: VecDeque::new(), candidate: VecDeque::new(), paired: false }
     }
 }
 
@@ -68,11 +64,7 @@ impl<T> Pairing<T> {
     }
 
     /// Pairs what can be paired; everything, if `last` says that no more comes.
-    pub(crate) fn settle(
-        &mut self,
-        last: bool,
-        equal: impl Fn(&T, &T) -> bool,
-    ) -> Vec<PairingResult<T>> {
+    pub(crate) fn settle(&mut self, last: bool, equal: impl Fn(&T, &T) -> bool) -> Vec<PairingResult<T>> {
         let mut settled = Vec::new();
         while let (Some(one), Some(other)) = (self.present.front(), self.candidate.front()) {
             let gap = if equal(one, other) {
@@ -103,11 +95,7 @@ impl<T> Pairing<T> {
             let missing = self.present.drain(..).map(PairingResult::Missing);
             let surplus = self.candidate.drain(..).map(PairingResult::Surplus);
             let left = missing.chain(surplus);
-            if edge {
-                settled.extend(left.map(|_| PairingResult::Edge))
-            } else {
-                settled.extend(left)
-            }
+            if edge { settled.extend(left.map(|_| PairingResult::Edge)) } else { settled.extend(left) }
         }
         settled
     }

@@ -4,18 +4,14 @@ use serde_json::json;
 use super::*;
 
 fn tolerance(ignore: &[&str]) -> Tolerance {
-    Tolerance {
-        number: 1e-3,
-        ignore: ignore.iter().map(|field| (*field).to_owned()).collect(),
-    }
+    Tolerance { number: 1e-3, ignore: ignore.iter().map(|field| (*field).to_owned()).collect() }
 }
 
 #[test]
 fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
     let header = |seq: u32, frame: &str| json!({"seq": seq, "stamp": {"secs": seq, "nsecs": 0}, "frame_id": frame});
     // The header of ROS 2.
-    let header_2 =
-        |sec: u32, frame: &str| json!({"stamp": {"sec": sec, "nanosec": 5}, "frame_id": frame});
+    let header_2 = |sec: u32, frame: &str| json!({"stamp": {"sec": sec, "nanosec": 5}, "frame_id": frame});
     for (present, candidate, ignore, fields) in [
         (json!({"sum": 3}), json!({"sum": 3}), &[][..], &[][..]),
         (json!({"sum": 3}), json!({"sum": 4}), &[], &["sum"]),
@@ -27,38 +23,13 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
         (json!({"x": "NaN"}), json!({"x": "NaN"}), &[], &[]),
         (json!({"x": "NaN"}), json!({"x": 1.0}), &[], &["x"]),
         // The time of publication is no difference, the frame is one.
-        (
-            json!({"header": header(1, "map")}),
-            json!({"header": header(7, "map")}),
-            &[],
-            &[],
-        ),
-        (
-            json!({"header": header(1, "map")}),
-            json!({"header": header(1, "odom")}),
-            &[],
-            &["header.frame_id"],
-        ),
-        (
-            json!({"header": header_2(1, "map"), "x": 1}),
-            json!({"header": header_2(7, "map"), "x": 1}),
-            &[],
-            &[],
-        ),
+        (json!({"header": header(1, "map")}), json!({"header": header(7, "map")}), &[], &[]),
+        (json!({"header": header(1, "map")}), json!({"header": header(1, "odom")}), &[], &["header.frame_id"]),
+        (json!({"header": header_2(1, "map"), "x": 1}), json!({"header": header_2(7, "map"), "x": 1}), &[], &[]),
         (header_2(1, "map"), header_2(7, "map"), &[], &[]),
-        (
-            json!({"header": header_2(1, "map")}),
-            json!({"header": header_2(1, "odom")}),
-            &[],
-            &["header.frame_id"],
-        ),
+        (json!({"header": header_2(1, "map")}), json!({"header": header_2(1, "odom")}), &[], &["header.frame_id"]),
         // Something else with that name belongs to the answer.
-        (
-            json!({"stamp": 1, "frame_id": "map"}),
-            json!({"stamp": 7, "frame_id": "map"}),
-            &[],
-            &["stamp"],
-        ),
+        (json!({"stamp": 1, "frame_id": "map"}), json!({"stamp": 7, "frame_id": "map"}), &[], &["stamp"]),
         (
             json!({"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "map", "mark": 1}),
             json!({"stamp": {"sec": 7, "nanosec": 5}, "frame_id": "map", "mark": 1}),
@@ -83,24 +54,14 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
         let named: Vec<&str> = found.iter().map(|one| one.field.as_str()).collect();
         assert_eq!(named, fields, "{present} {candidate}");
     }
-    let found = differences(
-        &json!({"data": "x".repeat(200)}),
-        &json!({"data": i64::MAX}),
-        &tolerance(&[]),
-    );
-    assert!(
-        found[0].present.ends_with("… (202 characters)"),
-        "{found:?}"
-    );
+    let found = differences(&json!({"data": "x".repeat(200)}), &json!({"data": i64::MAX}), &tolerance(&[]));
+    assert!(found[0].present.ends_with("… (202 characters)"), "{found:?}");
     // Adjacent, and equal as doubles: large integers have no larger tolerance.
     let one = json!({"id": u64::MAX});
     let other = json!({"id": u64::MAX - 1});
     assert_eq!(differences(&one, &one, &tolerance(&[])), []);
     assert_eq!(differences(&one, &other, &tolerance(&[])).len(), 1);
-    let wide = Tolerance {
-        number: 1.0,
-        ignore: Vec::new(),
-    };
+    let wide = Tolerance { number: 1.0, ignore: Vec::new() };
     assert_eq!(differences(&one, &other, &wide), []);
 }
 
@@ -143,11 +104,7 @@ fn sequences_go_on_alike_after_what_was_lost_or_differs() {
         (&[1, 2], &[], "--"),
         (&[], &[1, 2], "++"),
     ] {
-        assert_eq!(
-            pair_in_short(present, candidate, true),
-            expected,
-            "{present:?} {candidate:?}"
-        );
+        assert_eq!(pair_in_short(present, candidate, true), expected, "{present:?} {candidate:?}");
     }
     // Not before it is known how both continue.
     assert_eq!(pair_in_short(&[1, 2, 3], &[1, 3], false), "=");
@@ -192,13 +149,7 @@ proptest! {
 }
 
 fn row(equal: u64, different: u64, present: f64, candidate: f64) -> Compared {
-    let spread = |time| {
-        Some(TimeSpread {
-            p50: time,
-            p95: time,
-            max: time,
-        })
-    };
+    let spread = |time| Some(TimeSpread { p50: time, p95: time, max: time });
     Compared {
         name: "/sum".into(),
         equal,
@@ -213,33 +164,13 @@ fn row(equal: u64, different: u64, present: f64, candidate: f64) -> Compared {
 fn a_verdict_names_the_worst_that_was_found() {
     for (rows, failed, expected, words) in [
         (vec![], None, Verdict::Nothing, "no answers to compare"),
-        (
-            vec![row(20, 0, 10.0, 10.9)],
-            None,
-            Verdict::Equal,
-            "20 answers",
-        ),
-        (
-            vec![row(20, 0, 10.0, 13.0)],
-            None,
-            Verdict::Slower,
-            "/sum takes 13.0 ms instead of 10.0 ms",
-        ),
+        (vec![row(20, 0, 10.0, 10.9)], None, Verdict::Equal, "20 answers"),
+        (vec![row(20, 0, 10.0, 13.0)], None, Verdict::Slower, "/sum takes 13.0 ms instead of 10.0 ms"),
         // A hop, or too few to judge.
         (vec![row(20, 0, 0.1, 1.0)], None, Verdict::Equal, "20"),
         (vec![row(3, 0, 10.0, 99.0)], None, Verdict::Equal, "3"),
-        (
-            vec![row(20, 1, 10.0, 99.0)],
-            None,
-            Verdict::Different,
-            "1 of 21 answers differ: /sum",
-        ),
-        (
-            vec![row(20, 1, 1.0, 1.0)],
-            Some("ended: killed"),
-            Verdict::Failed,
-            "the candidate ended: killed",
-        ),
+        (vec![row(20, 1, 10.0, 99.0)], None, Verdict::Different, "1 of 21 answers differ: /sum"),
+        (vec![row(20, 1, 1.0, 1.0)], Some("ended: killed"), Verdict::Failed, "the candidate ended: killed"),
     ] {
         let (verdict, why) = overall_verdict(&rows, failed, 0.1);
         assert_eq!(verdict, expected, "{rows:?}");
@@ -250,11 +181,8 @@ fn a_verdict_names_the_worst_that_was_found() {
 #[test]
 fn elements_that_differ_count_once_in_each_answer() {
     let mut tally = Tally::new(Kind::Service, "/sum");
-    let differing = |value: &str| DifferingField {
-        field: "all[].x".into(),
-        present: value.into(),
-        candidate: "9".into(),
-    };
+    let differing =
+        |value: &str| DifferingField { field: "all[].x".into(), present: value.into(), candidate: "9".into() };
     tally.record_pair(vec![differing("1"), differing("2")]);
     tally.record_pair(vec![differing("3")]);
     tally.record_pair(Vec::new());

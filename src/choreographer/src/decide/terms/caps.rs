@@ -35,15 +35,11 @@ impl fmt::Display for Cap {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Cap { resource, most, by } = self;
         match by {
-            CapSource::Class(name) => write!(
-                out,
-                "{most}, the max_{resource} of class {name} ([class.{name}] of the configuration)"
-            ),
+            CapSource::Class(name) => {
+                write!(out, "{most}, the max_{resource} of class {name} ([class.{name}] of the configuration)")
+            }
             CapSource::Service(name) => {
-                write!(
-                    out,
-                    "{most}, the --max-{resource} with which {name} was pushed"
-                )
+                write!(out, "{most}, the --max-{resource} with which {name} was pushed")
             }
             CapSource::Machine => write!(out, "{most}, this machine's capacity for servants"),
         }
@@ -77,9 +73,7 @@ impl RobotCaps {
             (Some(most), service) if service.is_none_or(|service| most <= service) => {
                 Some((most, cap("memory", most.to_string(), by_class())))
             }
-            (_, service) => {
-                service.map(|most| (most, cap("memory", most.to_string(), by_service())))
-            }
+            (_, service) => service.map(|most| (most, cap("memory", most.to_string(), by_service()))),
         };
         RobotCaps { cpus, memory }
     }
@@ -115,15 +109,10 @@ impl RobotCaps {
             return Some(cap.clone());
         }
         let (amount, capacity) = (shelf.amount(row), shelf.capacity);
-        let machine = |resource, most| Cap {
-            resource,
-            most,
-            by: CapSource::Machine,
-        };
+        let machine = |resource, most| Cap { resource, most, by: CapSource::Machine };
         if amount.millicpus > capacity.millicpus {
             return Some(machine("cpus", capacity.cpus().to_string()));
         }
-        (amount.memory > capacity.memory)
-            .then(|| machine("memory", Size(capacity.memory).to_string()))
+        (amount.memory > capacity.memory).then(|| machine("memory", Size(capacity.memory).to_string()))
     }
 }

@@ -13,11 +13,7 @@ use crate::decide::dictionary::{Aux, DictionaryView, row_applies};
 pub fn explain(stated: &Stated, offer: &Offer<'_>) -> Explained {
     let all = BTreeMap::from([(String::new(), stated.clone())]);
     let outcome = compute_terms(&all, offer);
-    let mut explained = Explained {
-        service: offer.service.to_owned(),
-        stated: stated.clone(),
-        ..Explained::default()
-    };
+    let mut explained = Explained { service: offer.service.to_owned(), stated: stated.clone(), ..Explained::default() };
     let mut taken = Vec::new();
     match outcome {
         Ok(terms) => {
@@ -76,10 +72,7 @@ fn row_verdict(
     } else if !reaches(goal.bound) {
         format!("does not reach {}", measure.format_value(goal.bound))
     } else if !reaches(goal.desire) {
-        format!(
-            "is acceptable, but does not reach {}",
-            measure.format_value(goal.desire)
-        )
+        format!("is acceptable, but does not reach {}", measure.format_value(goal.desire))
     } else {
         let unsaid = row.aux.iter();
         let unsaid: Aux = unsaid
@@ -89,36 +82,22 @@ fn row_verdict(
         if unsaid.is_empty() {
             "would suffice, too".to_owned()
         } else {
-            format!(
-                "would suffice with {}, which is not given",
-                super::aux_pairs(&unsaid)
-            )
+            format!("would suffice with {}, which is not given", super::aux_pairs(&unsaid))
         }
     }
 }
 
 /// Returns the neighbouring rows in either direction, in words.
-fn neighbour_rows(
-    row: &Row,
-    shelf: &DictionaryView<'_>,
-    against: impl Fn(&Row) -> Option<Cap>,
-) -> Vec<String> {
+fn neighbour_rows(row: &Row, shelf: &DictionaryView<'_>, against: impl Fn(&Row) -> Option<Cap>) -> Vec<String> {
     let (better, weaker) = shelf.neighbours(row);
     let better = better.map(|row| {
         let capped = against(row).map(|cap| format!(", more {} than: {cap}", cap.resource));
-        format!(
-            "better: {}{}",
-            row_in_words(row),
-            capped.unwrap_or_default()
-        )
+        format!("better: {}{}", row_in_words(row), capped.unwrap_or_default())
     });
     let weaker = weaker.map(|row| format!("cheaper: {}", row_in_words(row)));
     let mut next: Vec<String> = better.into_iter().chain(weaker).collect();
     if next.is_empty() {
-        next.push(format!(
-            "{} is the only entry of this kind",
-            row_in_words(row)
-        ));
+        next.push(format!("{} is the only entry of this kind", row_in_words(row)));
     }
     next
 }

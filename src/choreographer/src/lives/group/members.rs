@@ -25,9 +25,7 @@ pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Optio
         let handle = one.lease.handle();
         let life = handle.life();
         if life.is_over() || handle.is_ending() {
-            let reason = life
-                .reason()
-                .unwrap_or_else(|| "it is being ended".to_owned());
+            let reason = life.reason().unwrap_or_else(|| "it is being ended".to_owned());
             match one.member {
                 Some(member) => {
                     shares.group.leave(member, &reason);
@@ -36,11 +34,7 @@ pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Optio
                         handle.id, shares.revision.service
                     );
                     if life.failure.is_some() {
-                        inner.journal.warning(
-                            "shared-servant-lost",
-                            &message,
-                            &handle.event_context(),
-                        );
+                        inner.journal.warning("shared-servant-lost", &message, &handle.event_context());
                     }
                 }
                 None => {
@@ -82,35 +76,16 @@ pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Optio
 }
 
 /// Starts one more servant, or takes an existing one; returns false if the daemon is ending.
-pub(super) fn start_servant(
-    inner: &Arc<ChoreographerInner>,
-    shares: &Arc<SharedGroup>,
-    reason: &str,
-) -> bool {
-    let taken: BTreeSet<usize> = shares
-        .servants
-        .lock()
-        .iter()
-        .map(|one| one.number)
-        .collect();
+pub(super) fn start_servant(inner: &Arc<ChoreographerInner>, shares: &Arc<SharedGroup>, reason: &str) -> bool {
+    let taken: BTreeSet<usize> = shares.servants.lock().iter().map(|one| one.number).collect();
     let number = (1..).find(|number| !taken.contains(number)).unwrap_or(1);
     let Some(lease) = find_or_start(inner, &shares.revision, number) else {
         return false;
     };
     let handle = Arc::clone(lease.handle());
-    let message = format!(
-        "servant {} of {} now answers robots, too: {reason}",
-        handle.id, shares.revision.service
-    );
-    inner
-        .journal
-        .info("shared-servant", &message, &handle.event_context());
-    shares.servants.lock().push(SharedServant {
-        number,
-        lease,
-        member: None,
-        retiring: false,
-    });
+    let message = format!("servant {} of {} now answers robots, too: {reason}", handle.id, shares.revision.service);
+    inner.journal.info("shared-servant", &message, &handle.event_context());
+    shares.servants.lock().push(SharedServant { number, lease, member: None, retiring: false });
     let shares = Arc::downgrade(shares);
     tokio::spawn(async move {
         let mut life = handle.watch();
@@ -131,9 +106,7 @@ pub(super) fn retire(inner: &ChoreographerInner, shares: &SharedGroup, reason: &
     let mut servants = shares.servants.lock();
     let ready = servants.iter_mut().filter(|one| !one.retiring);
     let fewest = ready.min_by_key(|one| {
-        let load = one
-            .member
-            .map_or(0, |member| shares.group.member_load(member));
+        let load = one.member.map_or(0, |member| shares.group.member_load(member));
         (load, std::cmp::Reverse(one.number))
     });
     let Some(one) = fewest else { return };
@@ -143,13 +116,8 @@ pub(super) fn retire(inner: &ChoreographerInner, shares: &SharedGroup, reason: &
     }
     let handle = one.lease.handle();
     let service = &shares.revision.service;
-    let message = format!(
-        "servant {} of {service} no longer answers robots: {reason}",
-        handle.id
-    );
-    inner
-        .journal
-        .info("shared-servant-retires", &message, &handle.event_context());
+    let message = format!("servant {} of {service} no longer answers robots: {reason}", handle.id);
+    inner.journal.info("shared-servant-retires", &message, &handle.event_context());
     // It may be idle already.
     shares.look.notify_one();
 }
@@ -159,9 +127,7 @@ pub(super) fn take_back(inner: &ChoreographerInner, shares: &SharedGroup, reason
     let mut servants = shares.servants.lock();
     let retiring = servants.iter_mut().filter(|one| one.retiring);
     let fewest = retiring.min_by_key(|one| {
-        let load = one
-            .member
-            .map_or(0, |member| shares.group.member_load(member));
+        let load = one.member.map_or(0, |member| shares.group.member_load(member));
         (load, one.number)
     });
     let Some(one) = fewest else { return };
@@ -170,32 +136,20 @@ pub(super) fn take_back(inner: &ChoreographerInner, shares: &SharedGroup, reason
         shares.group.reinstate(member);
     }
     let handle = one.lease.handle();
-    let message = format!(
-        "servant {} of {} answers robots again: {reason}",
-        handle.id, shares.revision.service
-    );
-    inner
-        .journal
-        .info("shared-servant", &message, &handle.event_context());
+    let message = format!("servant {} of {} answers robots again: {reason}", handle.id, shares.revision.service);
+    inner.journal.info("shared-servant", &message, &handle.event_context());
 }
 
 /// Returns a lease of a group's servant with this number: the existing one, or a new one; `None` if the daemon is
 /// ending.
-fn find_or_start(
-    inner: &Arc<ChoreographerInner>,
-    revision: &Arc<RevisionRecord>,
-    number: usize,
-) -> Option<Lease> {
+fn find_or_start(inner: &Arc<ChoreographerInner>, revision: &Arc<RevisionRecord>, number: usize) -> Option<Lease> {
     let robot = format!("{NAMED}{}-{number}", revision.number);
     let key = (revision.service.clone(), robot.clone());
     let mut servants = inner.servants.lock();
     if inner.is_ending() {
         return None;
     }
-    let has = servants
-        .given
-        .get(&key)
-        .filter(|handle| !handle.is_ending());
+    let has = servants.given.get(&key).filter(|handle| !handle.is_ending());
     if let Some(handle) = has {
         return Some(Lease::new(Arc::clone(handle), ""));
     }

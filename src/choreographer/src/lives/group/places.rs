@@ -63,11 +63,7 @@ pub(in crate::lives) async fn run_place(
 }
 
 /// Gives the robot its place as soon as a servant answers; returns when none does any more.
-async fn serve_place(
-    inner: &ChoreographerInner,
-    handle: &Arc<Handle>,
-    shares: &SharedGroup,
-) -> Failure {
+async fn serve_place(inner: &ChoreographerInner, handle: &Arc<Handle>, shares: &SharedGroup) -> Failure {
     let mut state = shares.state.subscribe();
     let mut reached = async |ready: bool| {
         let there = |stage: &GroupStage| match stage {
@@ -100,17 +96,9 @@ async fn serve_place(
     handle.set_reach(reach);
     handle.set_phase(Phase::Ready);
     let took = store::now().saturating_sub(handle.created);
-    let message = format!(
-        "robot {} shares the servants of {} after {took} ms",
-        handle.robot,
-        handle.service()
-    );
-    inner
-        .journal
-        .info("servant-ready", &message, &handle.event_context());
-    let over = state
-        .wait_for(|stage| matches!(stage, GroupStage::Over(_)))
-        .await;
+    let message = format!("robot {} shares the servants of {} after {took} ms", handle.robot, handle.service());
+    inner.journal.info("servant-ready", &message, &handle.event_context());
+    let over = state.wait_for(|stage| matches!(stage, GroupStage::Over(_))).await;
     match over.as_deref() {
         Ok(GroupStage::Over(failure)) => failure.clone(),
         _ => Failure::from_reason("lost its shared servants"),
@@ -118,10 +106,7 @@ async fn serve_place(
 }
 
 /// Returns the places of robots in the group.
-fn places<'a>(
-    servants: &'a Servants,
-    shares: &'a SharedGroup,
-) -> impl Iterator<Item = &'a Arc<Handle>> {
+fn places<'a>(servants: &'a Servants, shares: &'a SharedGroup) -> impl Iterator<Item = &'a Arc<Handle>> {
     servants.all.values().filter(|handle| {
         handle.is_place()
             && handle.revision.number == shares.revision.number
@@ -141,14 +126,9 @@ pub(super) fn end_excess_places(inner: &ChoreographerInner, shares: &SharedGroup
 }
 
 /// Returns the shortest response time desired by a robot of the group.
-pub(super) fn shortest_desired_time(
-    inner: &ChoreographerInner,
-    shares: &SharedGroup,
-) -> Option<Duration> {
+pub(super) fn shortest_desired_time(inner: &ChoreographerInner, shares: &SharedGroup) -> Option<Duration> {
     let servants = inner.servants.lock();
     let terms = places(&servants, shares).map(|handle| handle.terms());
     let times = terms.flat_map(|terms| terms.stated.into_values());
-    times
-        .filter_map(|stated| Some(stated.sla.rrt?.duration()))
-        .min()
+    times.filter_map(|stated| Some(stated.sla.rrt?.duration())).min()
 }

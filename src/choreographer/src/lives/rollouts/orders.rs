@@ -34,8 +34,7 @@ pub fn check_terms(terms: &RolloutTerms) -> Result<(), Error> {
     let sane = |number: f64| number.is_finite() && number >= 0.0;
     if !sane(terms.bound) || !times.into_iter().flatten().all(sane) || terms.samples == 0 {
         return Err(Error::Rollout(
-            "bound, deadline and promote_after must be 0 or greater, and samples at least 1"
-                .to_owned(),
+            "bound, deadline and promote_after must be 0 or greater, and samples at least 1".to_owned(),
         ));
     }
     if terms.promote_after.is_some() && terms.canary.is_none() {
@@ -56,10 +55,7 @@ impl Choreographer {
 
     /// Refuses a canary that would break robots of the current revision.
     pub fn check_canary(&self, candidate: &RevisionRecord) -> Result<(), Error> {
-        check_compatible(
-            &*self.inner.catalogue.current_revision(&candidate.service)?,
-            candidate,
-        )
+        check_compatible(&*self.inner.catalogue.current_revision(&candidate.service)?, candidate)
     }
 
     /// Returns the last rollout of a service.
@@ -89,15 +85,11 @@ impl Choreographer {
         let _turn = inner.rollouts.turn.lock().await;
         let current = inner.catalogue.current_revision(service)?;
         let Some(revision) = inner.state.revision(service, candidate)? else {
-            return Err(Error::Rollout(format!(
-                "{service} has no revision {candidate}"
-            )));
+            return Err(Error::Rollout(format!("{service} has no revision {candidate}")));
         };
         let is_canary = terms.canary.is_some();
         if is_canary && candidate == current.number {
-            return Err(Error::Rollout(format!(
-                "revision {candidate} of {service} is already the current one"
-            )));
+            return Err(Error::Rollout(format!("revision {candidate} of {service} is already the current one")));
         }
         if is_canary {
             check_compatible(&current, &revision)?;
@@ -127,10 +119,7 @@ impl Choreographer {
             }
             None => {
                 let catalogue = &inner.catalogue;
-                if !catalogue
-                    .promote(service, current.number, candidate)
-                    .await?
-                {
+                if !catalogue.promote(service, current.number, candidate).await? {
                     return Err(Error::Rollout(format!(
                         "another revision of {service} was published meanwhile; select the revision again"
                     )));
@@ -149,9 +138,7 @@ impl Choreographer {
         let inner = &self.inner;
         let _turn = inner.rollouts.turn.lock().await;
         let canary = self.canary(service)?;
-        inner
-            .promote(service, &canary, "requested by a user")
-            .await?;
+        inner.promote(service, &canary, "requested by a user").await?;
         self.rollout(service)
     }
 
@@ -183,14 +170,12 @@ impl Choreographer {
     fn canary(&self, service: &str) -> Result<Rollout, Error> {
         let shown = self.rollout(service)?;
         let rollout = self.inner.rollout(service);
-        rollout
-            .filter(|rollout| rollout.state == RolloutState::Canary)
-            .ok_or_else(|| {
-                Error::Rollout(format!(
-                    "revision {} of {service} is not a canary: {} ({})",
-                    shown.candidate, shown.state, shown.reason
-                ))
-            })
+        rollout.filter(|rollout| rollout.state == RolloutState::Canary).ok_or_else(|| {
+            Error::Rollout(format!(
+                "revision {} of {service} is not a canary: {} ({})",
+                shown.candidate, shown.state, shown.reason
+            ))
+        })
     }
 }
 

@@ -118,21 +118,9 @@ impl Exchanges {
                         None => to.call(&name, request, CALL).await,
                     };
                     over.cancel();
-                    (
-                        number,
-                        TapAnswer::from_call(&response),
-                        millis(asked.elapsed()),
-                    )
+                    (number, TapAnswer::from_call(&response), millis(asked.elapsed()))
                 });
-                Exchange {
-                    kind: Kind::Service,
-                    name: service,
-                    of,
-                    present: None,
-                    candidate: None,
-                    done,
-                    goal: None,
-                }
+                Exchange { kind: Kind::Service, name: service, of, present: None, candidate: None, done, goal: None }
             }
             TapEventKind::Goal { action, of, goal } => {
                 let client = match self.action_client(&action, &of) {
@@ -212,12 +200,7 @@ impl Exchanges {
         let tally = tally.or_insert_with(|| Tally::new(kind, &name));
         tally.record_time(ShadowSide::Present, took);
         tally.record_time(ShadowSide::Candidate, took_there);
-        tally.record_pair(answer_differences(
-            &present,
-            &candidate,
-            of.answer(),
-            tolerance,
-        ));
+        tally.record_pair(answer_differences(&present, &candidate, of.answer(), tolerance));
     }
 
     /// Ends the comparison: open requests have no answer of the candidate.
@@ -225,19 +208,14 @@ impl Exchanges {
         for exchange in std::mem::take(&mut self.under_way).into_values() {
             let name = exchange.name;
             match exchange.present {
-                None => notes.add(
-                    &name,
-                    "the robot had no answer yet when the comparison ended",
-                ),
+                None => notes.add(&name, "the robot had no answer yet when the comparison ended"),
                 Some((TapAnswer::GivenUp, _)) => {
                     notes.add(&name, "the robot did not wait for the answer");
                 }
                 Some(_) if cut => notes.add(&name, CUT),
                 Some(_) => {
                     let tally = self.tallies.entry((exchange.kind, name.clone()));
-                    tally
-                        .or_insert_with(|| Tally::new(exchange.kind, &name))
-                        .record_missing();
+                    tally.or_insert_with(|| Tally::new(exchange.kind, &name)).record_missing();
                 }
             }
         }
@@ -248,32 +226,20 @@ impl Exchanges {
     }
 
     /// Returns the type of a service's answers, and the digest with which its requests were serialized.
-    async fn resolve_service(
-        &mut self,
-        service: &str,
-        registry: &Registry,
-    ) -> (AnswerType, Option<ros::bus::Digest>) {
+    async fn resolve_service(&mut self, service: &str, registry: &Registry) -> (AnswerType, Option<ros::bus::Digest>) {
         let asked = tokio::time::timeout(TYPE, self.from.service_type(service)).await;
         let Ok(Ok(known)) = asked else {
             return (AnswerType::Unknown, None);
         };
         let of = self.services.entry(service.to_owned()).or_insert_with(|| {
             let of = registry.service(&known.name).ok();
-            let of = of.filter(|of| {
-                known
-                    .digest
-                    .is_compatible_with(&ros::bus::Digest::from(&of.md5))
-            });
+            let of = of.filter(|of| known.digest.is_compatible_with(&ros::bus::Digest::from(&of.md5)));
             of.map_or(AnswerType::Unknown, AnswerType::Service)
         });
         (of.clone(), Some(known.digest))
     }
 
-    fn action_client(
-        &mut self,
-        action: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Arc<dyn ActionClient>, BusError> {
+    fn action_client(&mut self, action: &str, of: &Arc<ActionDef>) -> Result<Arc<dyn ActionClient>, BusError> {
         if let Some(known) = self.clients.get(action) {
             return Ok(Arc::clone(known));
         }
@@ -334,27 +300,16 @@ fn answer_differences(
 ) -> Vec<DifferingField> {
     match (present, candidate) {
         (TapAnswer::Given(one, _), TapAnswer::Given(other, _)) if one != other => {
-            vec![DifferingField::whole_answer(
-                outcome_in_words(*one),
-                outcome_in_words(*other),
-            )]
+            vec![DifferingField::whole_answer(outcome_in_words(*one), outcome_in_words(*other))]
         }
-        (TapAnswer::Given(_, one), TapAnswer::Given(_, other)) => {
-            compare(of, one, other, tolerance)
-        }
+        (TapAnswer::Given(_, one), TapAnswer::Given(_, other)) => compare(of, one, other, tolerance),
         (TapAnswer::Refused(_), TapAnswer::Refused(_)) => Vec::new(),
-        (one, other) => vec![DifferingField::whole_answer(
-            answer_in_words(one),
-            answer_in_words(other),
-        )],
+        (one, other) => vec![DifferingField::whole_answer(answer_in_words(one), answer_in_words(other))],
     }
 }
 
 fn outcome_in_words(outcome: Option<GoalOutcome>) -> String {
-    outcome.map_or_else(
-        || "answered".to_owned(),
-        |outcome| format!("{outcome:?}").to_lowercase(),
-    )
+    outcome.map_or_else(|| "answered".to_owned(), |outcome| format!("{outcome:?}").to_lowercase())
 }
 
 fn answer_in_words(answer: &TapAnswer) -> String {
@@ -371,30 +326,19 @@ mod tests {
 
     #[test]
     fn refusals_are_the_same_and_a_refusal_is_no_answer() {
-        let tolerance = Tolerance {
-            number: 0.0,
-            ignore: Vec::new(),
-        };
+        let tolerance = Tolerance { number: 0.0, ignore: Vec::new() };
         let given = |outcome, bytes: &'static [u8]| TapAnswer::Given(outcome, bytes.into());
         let refused = |why: &str| TapAnswer::Refused(why.into());
         for (present, candidate, words) in [
             (given(None, b"a"), given(None, b"a"), None),
             (refused("one"), refused("other"), None),
-            (
-                given(None, b"a"),
-                refused("no"),
-                Some(("answered", "failed: no")),
-            ),
+            (given(None, b"a"), refused("no"), Some(("answered", "failed: no"))),
             (
                 given(Some(GoalOutcome::Succeeded), b""),
                 given(Some(GoalOutcome::Aborted), b""),
                 Some(("succeeded", "aborted")),
             ),
-            (
-                given(None, b"a"),
-                given(None, b"bc"),
-                Some(("1 bytes", "2 bytes")),
-            ),
+            (given(None, b"a"), given(None, b"bc"), Some(("1 bytes", "2 bytes"))),
         ] {
             let found = answer_differences(&present, &candidate, None, &tolerance);
             let said = found.first();

@@ -30,19 +30,10 @@ pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(),
         )));
     }
     // Parameters of the push belong to the revision: the candidate gets its own with its nodes.
-    let given: BTreeSet<&str> = linked
-        .iter()
-        .flat_map(|one| one.given.iter().map(|(key, _)| key.as_str()))
-        .collect();
+    let given: BTreeSet<&str> = linked.iter().flat_map(|one| one.given.iter().map(|(key, _)| key.as_str())).collect();
     let (from, to) = (there.bus(), candidate.bus());
     let failed = |error| Error::Reach(reach::Error::Bus(error));
-    for key in from
-        .parameters()
-        .map_err(failed)?
-        .names()
-        .await
-        .map_err(failed)?
-    {
+    for key in from.parameters().map_err(failed)?.names().await.map_err(failed)? {
         let own = is_set_by_master(&key) || key.starts_with(RUNS);
         if own || given.contains(key.as_str()) {
             continue;
@@ -71,9 +62,7 @@ fn has_endpoints(graph: &Graph, wanted: &Graph, nodes: &[&str]) -> bool {
     let of_them = |node: &String| nodes.contains(&node.as_str());
     let services = wanted.services.iter().filter(|(_, node)| of_them(node));
     let topics = wanted.topics.iter();
-    services
-        .into_iter()
-        .all(|(service, _)| graph.services.contains_key(service))
+    services.into_iter().all(|(service, _)| graph.services.contains_key(service))
         && topics
             .filter(|(_, ends)| ends.publishers.iter().chain(&ends.subscribers).any(of_them))
             .all(|(topic, _)| graph.topics.contains_key(topic))

@@ -19,9 +19,7 @@ use tokio::time::Instant;
 
 use super::exchanges::Exchanges;
 use super::topics::{self, HeardMessage, MirroredTopics};
-use crate::decide::shadow::{
-    DifferingField, ShadowSide, Tally, Tolerance, differences, overall_verdict,
-};
+use crate::decide::shadow::{DifferingField, ShadowSide, Tally, Tolerance, differences, overall_verdict};
 use crate::lives::handle::{Failure, Handle, Life};
 use crate::{Choreographer, Error, MeasuredServant};
 
@@ -65,9 +63,7 @@ impl ComparisonNotes {
 
     fn into_not_compared(self) -> Vec<NotCompared> {
         let notes = self.0.into_iter();
-        notes
-            .map(|((what, why), count)| NotCompared { what, why, count })
-            .collect()
+        notes.map(|((what, why), count)| NotCompared { what, why, count }).collect()
     }
 }
 
@@ -87,12 +83,7 @@ impl<'a> Mirror<'a> {
         options: &'a ShadowOptions,
         budget: &Budget,
     ) -> Result<Mirror<'a>, Error> {
-        let gone = || {
-            Error::Shadow(format!(
-                "robot {} left while the candidate was starting",
-                present.robot
-            ))
-        };
+        let gone = || Error::Shadow(format!("robot {} left while the candidate was starting", present.robot));
         let there = present.reach().ok_or_else(gone)?;
         let tap = there.tap().ok_or_else(gone)?;
         let tapping = tap.listen(budget).ok_or_else(|| {
@@ -105,26 +96,15 @@ impl<'a> Mirror<'a> {
         let opener = &choreographer.inner.opener;
         // A robot of a shared service has no servant of its own, and no topics. The look connects to no external host.
         let look = match present.container() {
-            Some(container) => Some(
-                opener
-                    .observe(
-                        &container,
-                        revision.flavour.ros.ros_version(),
-                        topics::NODE,
-                        &[],
-                    )
-                    .await?,
-            ),
+            Some(container) => {
+                Some(opener.observe(&container, revision.flavour.ros.ros_version(), topics::NODE, &[]).await?)
+            }
             None => None,
         };
         let definitions = &revision.interface.definitions;
         let ros = revision.flavour.ros.ros_version();
-        let registry = Registry::with_definitions(ros, definitions).map_err(|error| {
-            Error::Shadow(format!(
-                "invalid message definition of {}: {error}",
-                revision.service
-            ))
-        })?;
+        let registry = Registry::with_definitions(ros, definitions)
+            .map_err(|error| Error::Shadow(format!("invalid message definition of {}: {error}", revision.service)))?;
         let registry = Arc::new(registry);
         let (from, to) = (there.bus(), reach.bus());
         let mut notes = ComparisonNotes::default();
@@ -134,10 +114,7 @@ impl<'a> Mirror<'a> {
         let graph = from.graph();
         let mut mirror = Mirror {
             options,
-            tolerance: Tolerance {
-                number: options.tolerance,
-                ignore: options.ignore.clone(),
-            },
+            tolerance: Tolerance { number: options.tolerance, ignore: options.ignore.clone() },
             present,
             candidate,
             registry,
@@ -174,10 +151,7 @@ impl<'a> Mirror<'a> {
         let mut present = self.present.watch();
         let (reason, failed) = loop {
             if self.has_enough() {
-                break (
-                    format!("{} requests were compared", self.given_count()),
-                    None,
-                );
+                break (format!("{} requests were compared", self.given_count()), None);
             }
             let end = tokio::select! {
                 told = self.tapping.told.recv() => self.on_tapped(told, false).await,
@@ -264,16 +238,12 @@ impl<'a> Mirror<'a> {
     }
 
     fn has_enough(&self) -> bool {
-        self.options
-            .requests
-            .is_some_and(|enough| self.given_count() >= enough)
+        self.options.requests.is_some_and(|enough| self.given_count() >= enough)
     }
 
     async fn on_tapped(&mut self, told: Option<TapEvent>, ending: bool) -> Option<ComparisonEnd> {
         let Some(TapEvent { number, at, what }) = told else {
-            return Some(ComparisonEnd::Soon(
-                "the robot's servant has ended".to_owned(),
-            ));
+            return Some(ComparisonEnd::Soon("the robot's servant has ended".to_owned()));
         };
         match what {
             TapEventKind::Answered { answer, took } => {
@@ -294,17 +264,13 @@ impl<'a> Mirror<'a> {
 
     async fn on_heard(&mut self, heard: HeardMessage, ending: bool) {
         if !self.topics.is_request(&heard) {
-            self.topics
-                .on_output(heard, &self.tolerance, &mut self.notes);
+            self.topics.on_output(heard, &self.tolerance, &mut self.notes);
         } else if !ending {
             self.topics.give(heard, &mut self.notes).await;
         }
     }
 
-    fn on_candidate_answer(
-        &mut self,
-        answer: Result<(u64, TapAnswer, f64), tokio::task::JoinError>,
-    ) {
+    fn on_candidate_answer(&mut self, answer: Result<(u64, TapAnswer, f64), tokio::task::JoinError>) {
         if let Ok(answer) = answer {
             self.on_answer(ShadowSide::Candidate, answer);
         }
@@ -315,13 +281,7 @@ impl<'a> Mirror<'a> {
         self.exchanges.record_answer(side, answer, tolerance, notes);
     }
 
-    fn into_report(
-        mut self,
-        seconds: f64,
-        ended: String,
-        failed: Option<String>,
-        cut: bool,
-    ) -> Shadow {
+    fn into_report(mut self, seconds: f64, ended: String, failed: Option<String>, cut: bool) -> Shadow {
         let given = self.given_count();
         self.exchanges.end(cut, &mut self.notes);
         self.topics.end(cut, &self.tolerance, &mut self.notes);
@@ -330,10 +290,7 @@ impl<'a> Mirror<'a> {
             let why = "too many arrived at once";
             self.notes.add_many("calls and goals", why, left_out);
         }
-        let tallies = self
-            .topics
-            .into_tallies()
-            .chain(self.exchanges.into_tallies());
+        let tallies = self.topics.into_tallies().chain(self.exchanges.into_tallies());
         let compared: Vec<_> = tallies.map(Tally::into_compared).collect();
         let (verdict, why) = overall_verdict(&compared, failed.as_deref(), self.options.bound);
         let revision = &self.present.revision;
@@ -379,10 +336,7 @@ fn note_interfaces(present: &Handle, candidate: &Handle, notes: &mut ComparisonN
     let difference = Difference::compare(&one.interface, &other.interface);
     let breaking = difference.changes.iter().filter(|it| !it.compatible);
     for change in breaking.take(NAMED) {
-        let why = format!(
-            "the interfaces of revisions {} and {} differ",
-            one.number, other.number
-        );
+        let why = format!("the interfaces of revisions {} and {} differ", one.number, other.number);
         notes.add_many(&change.to_string(), &why, 0);
     }
     if one.plan.stateful || other.plan.stateful {
@@ -399,11 +353,7 @@ pub(super) fn millis(time: Duration) -> f64 {
 pub(super) type JsonMessage = Option<Value>;
 
 pub(super) fn read_json(of: Option<&MessageType>, message: &[u8]) -> JsonMessage {
-    let options = JsonOptions {
-        non_finite: NonFinite::String,
-        max_bytes: LONGEST,
-        ..JsonOptions::default()
-    };
+    let options = JsonOptions { non_finite: NonFinite::String, max_bytes: LONGEST, ..JsonOptions::default() };
     let mut json = Vec::new();
     to_json(of?, message, &mut json, &options).ok()?;
     serde_json::from_slice(&json).ok()

@@ -9,8 +9,7 @@ use api::shadow::Kind;
 use budget::Budget;
 use reach::ObservedBus;
 use ros::bus::{
-    Bus, BusError, Graph, PeerId, Publisher, QosProfile, SerializedMessage, Subscription, WireType,
-    wait_for_connected,
+    Bus, BusError, Graph, PeerId, Publisher, QosProfile, SerializedMessage, Subscription, WireType, wait_for_connected,
 };
 use ros::codec::{Time, header_stamp};
 use ros::schema::{MessageType, Registry};
@@ -103,12 +102,7 @@ impl UnpairedMessage {
         self.read.get_or_init(read).as_ref()
     }
 
-    fn equals(
-        &self,
-        other: &UnpairedMessage,
-        of: Option<&MessageType>,
-        tolerance: &Tolerance,
-    ) -> bool {
+    fn equals(&self, other: &UnpairedMessage, of: Option<&MessageType>, tolerance: &Tolerance) -> bool {
         self.message == other.message || self.differences(other, of, tolerance).is_empty()
     }
 
@@ -147,8 +141,8 @@ impl RequestHistory {
         let stamped = stamp.is_some() && self.last.iter().any(|(_, stamp, _)| stamp.is_some());
         let mut latest_first = self.last.iter().rev();
         // An output may be handled only after the next request.
-        let (number, _, asked) = latest_first
-            .find(|(_, of, asked)| if stamped { *of == stamp } else { *asked <= at })?;
+        let (number, _, asked) =
+            latest_first.find(|(_, of, asked)| if stamped { *of == stamp } else { *asked <= at })?;
         let first = *answered != *number;
         *answered = *number;
         (stamped || first).then(|| millis(at.saturating_duration_since(*asked)))
@@ -229,28 +223,14 @@ impl MirroredTopics {
         let heard_there = known.is_some_and(|known| known.candidate.is_some());
         let mut candidate = None;
         if output && !heard_there {
-            candidate = Some(
-                self.subscribe(ShadowSide::Candidate, &self.to, name, true)
-                    .await?,
-            );
+            candidate = Some(self.subscribe(ShadowSide::Candidate, &self.to, name, true).await?);
         }
         let key = (name.to_owned(), None);
         if let Some(of) = of.as_ref().filter(|_| input)
             && !self.publishers.contains_key(&key)
         {
-            let publisher = self
-                .to
-                .advertise(
-                    name,
-                    WireType::from_message(of),
-                    QosProfile::keep_last(QUEUE),
-                )
-                .await?;
-            let listens = tokio::time::timeout(
-                PATIENCE,
-                wait_for_connected(publisher.matched_subscribers(), 1),
-            )
-            .await;
+            let publisher = self.to.advertise(name, WireType::from_message(of), QosProfile::keep_last(QUEUE)).await?;
+            let listens = tokio::time::timeout(PATIENCE, wait_for_connected(publisher.matched_subscribers(), 1)).await;
             self.publishers.insert(key, publisher);
             if listens.is_err() {
                 // Later messages are sent to it nevertheless.
@@ -264,9 +244,7 @@ impl MirroredTopics {
                 }
             }
             None => {
-                let present = self
-                    .subscribe(ShadowSide::Present, from, name, output)
-                    .await?;
+                let present = self.subscribe(ShadowSide::Present, from, name, output).await?;
                 let listened = ListenedTopic {
                     of,
                     _present: present,
@@ -296,12 +274,7 @@ impl MirroredTopics {
         // A later publisher is received later.
         let _ = tokio::time::timeout(PATIENCE, connected).await;
         let (topic, told) = (Arc::from(name), self.told.clone());
-        Ok(AbortOnDropHandle::new(tokio::spawn(forward(
-            side,
-            topic,
-            subscription,
-            told,
-        ))))
+        Ok(AbortOnDropHandle::new(tokio::spawn(forward(side, topic, subscription, told))))
     }
 
     /// Records a call or a goal that was sent to both: outputs may answer it.
@@ -337,9 +310,7 @@ impl MirroredTopics {
 
     /// Sends a message of the robot to the candidate.
     pub(super) async fn give(&mut self, heard: HeardMessage, notes: &mut ComparisonNotes) {
-        let HeardMessage {
-            topic, at, message, ..
-        } = heard;
+        let HeardMessage { topic, at, message, .. } = heard;
         let Some(listened) = self.listened.get(&*topic) else {
             return;
         };
@@ -349,11 +320,8 @@ impl MirroredTopics {
         let key = (topic.to_string(), whose);
         if !self.publishers.contains_key(&key) {
             let wire_type = WireType::clone(&message.wire_type);
-            let advertised = self.to.advertise(
-                &topic,
-                wire_type,
-                QosProfile::keep_last(QUEUE).latching(message.latching),
-            );
+            let advertised =
+                self.to.advertise(&topic, wire_type, QosProfile::keep_last(QUEUE).latching(message.latching));
             match advertised.await {
                 Ok(publisher) => drop(self.publishers.insert(key.clone(), publisher)),
                 Err(error) => return notes.add(&topic, &error.to_string()),
@@ -367,18 +335,8 @@ impl MirroredTopics {
     }
 
     /// Handles an output of one side.
-    pub(super) fn on_output(
-        &mut self,
-        heard: HeardMessage,
-        tolerance: &Tolerance,
-        notes: &mut ComparisonNotes,
-    ) {
-        let HeardMessage {
-            side,
-            topic,
-            at,
-            message,
-        } = heard;
+    pub(super) fn on_output(&mut self, heard: HeardMessage, tolerance: &Tolerance, notes: &mut ComparisonNotes) {
+        let HeardMessage { side, topic, at, message } = heard;
         let Some(listened) = self.listened.get_mut(&*topic) else {
             return;
         };
@@ -396,20 +354,13 @@ impl MirroredTopics {
             ShadowSide::Present => (&self.present, &mut listened.answered.0),
             ShadowSide::Candidate => (&self.candidate, &mut listened.answered.1),
         };
-        if let Some(took) = requests
-            .response_time(stamp, answered, at)
-            .filter(|_| !message.latching)
-        {
+        if let Some(took) = requests.response_time(stamp, answered, at).filter(|_| !message.latching) {
             listened.tally.record_time(side, took);
         }
         let Ok(permit) = self.budget.take(message.bytes.len()) else {
             return notes.add(&topic, "the memory limit is reached");
         };
-        let item = UnpairedMessage {
-            message: permit.wrap_bytes(message.bytes),
-            early,
-            read: OnceLock::new(),
-        };
+        let item = UnpairedMessage { message: permit.wrap_bytes(message.bytes), early, read: OnceLock::new() };
         if early {
             if listened.early.len() >= EARLY.1 {
                 listened.early.pop_front();
@@ -437,38 +388,25 @@ impl MirroredTopics {
     /// Returns the tallies of the compared topics.
     pub(super) fn into_tallies(self) -> impl Iterator<Item = Tally> {
         let compared = self.listened.into_values();
-        compared
-            .filter(|listened| listened.candidate.is_some())
-            .map(|listened| listened.tally)
+        compared.filter(|listened| listened.candidate.is_some()).map(|listened| listened.tally)
     }
 }
 
 impl ListenedTopic {
-    fn settle(
-        &mut self,
-        (last, cut): (bool, bool),
-        tolerance: &Tolerance,
-        notes: &mut ComparisonNotes,
-        topic: &str,
-    ) {
+    fn settle(&mut self, (last, cut): (bool, bool), tolerance: &Tolerance, notes: &mut ComparisonNotes, topic: &str) {
         let of = self.of.as_deref();
-        let equal =
-            |one: &UnpairedMessage, other: &UnpairedMessage| one.equals(other, of, tolerance);
+        let equal = |one: &UnpairedMessage, other: &UnpairedMessage| one.equals(other, of, tolerance);
         for paired in self.pairing.settle(last, equal) {
             match paired {
                 PairingResult::Both(_, _, true) => self.tally.record_pair(Vec::new()),
                 PairingResult::Both(one, other, false) => {
-                    self.tally
-                        .record_pair(one.differences(&other, of, tolerance));
+                    self.tally.record_pair(one.differences(&other, of, tolerance));
                 }
                 PairingResult::Missing(one) if one.early => {}
                 PairingResult::Missing(_) if cut => notes.add(topic, CUT),
                 PairingResult::Missing(_) => self.tally.record_missing(),
                 PairingResult::Surplus(_) => self.tally.record_surplus(),
-                PairingResult::Edge => notes.add(
-                    topic,
-                    "its counterpart had not arrived when the comparison ended",
-                ),
+                PairingResult::Edge => notes.add(topic, "its counterpart had not arrived when the comparison ended"),
             }
         }
     }
@@ -476,24 +414,12 @@ impl ListenedTopic {
 
 /// Returns true for the topics of an action that carry requests and results; the others report progress.
 fn is_goal_topic(topic: &str) -> bool {
-    ["/goal", "/cancel", "/result"]
-        .iter()
-        .any(|end| topic.ends_with(end))
+    ["/goal", "/cancel", "/result"].iter().any(|end| topic.ends_with(end))
 }
 
-async fn forward(
-    side: ShadowSide,
-    topic: Arc<str>,
-    mut subscription: Subscription,
-    told: mpsc::Sender<HeardMessage>,
-) {
+async fn forward(side: ShadowSide, topic: Arc<str>, mut subscription: Subscription, told: mpsc::Sender<HeardMessage>) {
     while let Some(message) = subscription.messages.recv().await {
-        let heard = HeardMessage {
-            side,
-            topic: Arc::clone(&topic),
-            at: Instant::now(),
-            message,
-        };
+        let heard = HeardMessage { side, topic: Arc::clone(&topic), at: Instant::now(), message };
         if told.send(heard).await.is_err() {
             return;
         }
@@ -513,26 +439,14 @@ mod tests {
         let mut answered = 0;
         assert_eq!(requests.response_time(None, &mut answered, at(0)), None);
         requests.record(None, at(10));
-        assert_eq!(
-            requests.response_time(None, &mut answered, at(30)),
-            Some(20.0)
-        );
+        assert_eq!(requests.response_time(None, &mut answered, at(30)), Some(20.0));
         // An output without a request answers nothing.
         assert_eq!(requests.response_time(None, &mut answered, at(90)), None);
         requests.record(stamp(1), at(100));
         requests.record(stamp(2), at(110));
-        assert_eq!(
-            requests.response_time(stamp(1), &mut answered, at(150)),
-            Some(50.0)
-        );
-        assert_eq!(
-            requests.response_time(stamp(2), &mut answered, at(150)),
-            Some(40.0)
-        );
-        assert_eq!(
-            requests.response_time(stamp(9), &mut answered, at(150)),
-            None
-        );
+        assert_eq!(requests.response_time(stamp(1), &mut answered, at(150)), Some(50.0));
+        assert_eq!(requests.response_time(stamp(2), &mut answered, at(150)), Some(40.0));
+        assert_eq!(requests.response_time(stamp(9), &mut answered, at(150)), None);
         for secs in 0..1000 {
             requests.record(stamp(secs), at(200));
         }

@@ -13,8 +13,8 @@ use super::{NOBODY, UNMADE};
 use crate::Error;
 use crate::decide::forecast::INTERVAL;
 use crate::decide::warm_pool::{
-    PoolBudget, PoolDemand, PoolShortage, WantedPool, WarmContainer as Facts, deserving_services,
-    pool_shortage, pool_sizes, stale_containers,
+    PoolBudget, PoolDemand, PoolShortage, WantedPool, WarmContainer as Facts, deserving_services, pool_shortage,
+    pool_sizes, stale_containers,
 };
 use crate::lives::{ChoreographerInner, reaching, starting};
 use store::{NewEvent, RevisionRecord, ServantRecord};
@@ -33,9 +33,7 @@ pub(crate) async fn run(inner: Arc<ChoreographerInner>) {
 }
 
 /// Returns the revisions that are to have containers, with their demand, most deserving first.
-fn wanted_revisions(
-    inner: &ChoreographerInner,
-) -> Result<Vec<(Arc<RevisionRecord>, PoolDemand)>, Error> {
+fn wanted_revisions(inner: &ChoreographerInner) -> Result<Vec<(Arc<RevisionRecord>, PoolDemand)>, Error> {
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
     let now = Instant::now().into_std();
@@ -50,8 +48,7 @@ fn wanted_revisions(
         let demand = PoolDemand {
             rate: arrivals.map_or(0.0, |arrivals| arrivals.expected_rate(now)),
             lead: lead.map_or(LEAD, |lead| lead.mean),
-            nodes: can_run_ahead(inner, &revision)
-                .then(|| inner.promised_amount(&revision.plan.limits).memory),
+            nodes: can_run_ahead(inner, &revision).then(|| inner.promised_amount(&revision.plan.limits).memory),
         };
         wanted.push((revision, demand));
     }
@@ -60,13 +57,7 @@ fn wanted_revisions(
         let demand = wanted.iter().find(|it| of(it)).map(|it| it.1);
         if let (Some(demand), Some(revision)) = (demand, inner.state.revision(&service, number)?) {
             // Few robots get it: one container is enough.
-            wanted.push((
-                revision,
-                PoolDemand {
-                    rate: 0.0,
-                    ..demand
-                },
-            ));
+            wanted.push((revision, PoolDemand { rate: 0.0, ..demand }));
         }
     }
     Ok(wanted)
@@ -77,13 +68,9 @@ fn wanted_revisions(
 fn can_run_ahead(inner: &ChoreographerInner, revision: &RevisionRecord) -> bool {
     let grants = &revision.plan.grants;
     let holds = !grants.devices.is_empty() || !grants.volumes.is_empty();
-    let failing = inner
-        .back_offs
-        .find_refusal(&revision.service, NOBODY, revision);
+    let failing = inner.back_offs.find_refusal(&revision.service, NOBODY, revision);
     // If no container can be made, other services' nodes run.
-    let unmade = inner
-        .back_offs
-        .is_failing(&revision.service, UNMADE, revision);
+    let unmade = inner.back_offs.is_failing(&revision.service, UNMADE, revision);
     let shared = revision.plan.shared.is_some();
     !revision.plan.nodes.is_empty() && !holds && !shared && failing.is_none() && !unmade
 }
@@ -94,10 +81,7 @@ pub(crate) async fn tidy(inner: &Arc<ChoreographerInner>, make_missing: bool) ->
     let _turn = pool.turn.lock().await;
     let revisions = wanted_revisions(inner)?;
     let demands: Vec<PoolDemand> = revisions.iter().map(|(_, demand)| *demand).collect();
-    let budget = PoolBudget {
-        memory: inner.options.warm_memory,
-        nodes: inner.options.warm_nodes,
-    };
+    let budget = PoolBudget { memory: inner.options.warm_memory, nodes: inner.options.warm_nodes };
     let sizes = pool_sizes(&demands, budget);
     let wanted: Vec<WantedPool<'_>> = revisions
         .iter()
@@ -115,8 +99,7 @@ pub(crate) async fn tidy(inner: &Arc<ChoreographerInner>, make_missing: bool) ->
         let ends = stale_containers(&facts, &wanted);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         // A service that is to have none any more.
-        kept.leads
-            .retain(|service, _| wanted.iter().any(|it| it.service == service));
+        kept.leads.retain(|service, _| wanted.iter().any(|it| it.service == service));
         let removed: Vec<WarmServant> = ends.iter().filter_map(|id| kept.take(id)).collect();
         for warm in &removed {
             let promised = warm.promised_amount(inner).unwrap_or_default();
@@ -142,9 +125,7 @@ pub(crate) async fn tidy(inner: &Arc<ChoreographerInner>, make_missing: bool) ->
                     PoolShortage::Containers(_) => Some(None),
                     PoolShortage::Nodes(id) => Some(Some(id.to_owned())),
                 };
-                if let (None | Some(Some(_)), Some(lead)) =
-                    (&lacks, kept.leads.get_mut(wanted.service))
-                {
+                if let (None | Some(Some(_)), Some(lead)) = (&lacks, kept.leads.get_mut(wanted.service)) {
                     lead.clear();
                 }
                 lacks
@@ -194,27 +175,15 @@ async fn report_dead(inner: &ChoreographerInner, warm: &WarmServant) {
             how = format!("{} {}", node.name, reach::describe_exit(&exit, &limits));
         }
     }
-    let about = NewEvent {
-        service: Some(service),
-        ..NewEvent::default()
-    };
+    let about = NewEvent { service: Some(service), ..NewEvent::default() };
     let message = format!("a warm servant of {service} failed: {how}");
     inner.journal.warning("warm-failed", &message, &about);
     let back_offs = &inner.back_offs;
-    back_offs.record_failure(
-        service,
-        NOBODY,
-        &warm.revision,
-        None,
-        &format!("lost {how}"),
-    );
+    back_offs.record_failure(service, NOBODY, &warm.revision, None, &format!("lost {how}"));
 }
 
 /// Makes a container; if that fails, reports it and retries after a pause.
-async fn make_or_report(
-    inner: &Arc<ChoreographerInner>,
-    revision: &Arc<RevisionRecord>,
-) -> Option<WarmServant> {
+async fn make_or_report(inner: &Arc<ChoreographerInner>, revision: &Arc<RevisionRecord>) -> Option<WarmServant> {
     let (service, back_offs) = (&revision.service, &inner.back_offs);
     if back_offs.find_refusal(service, UNMADE, revision).is_some() {
         return None;
@@ -225,10 +194,7 @@ async fn make_or_report(
             Some(warm)
         }
         Err(error) => {
-            let about = NewEvent {
-                service: Some(service),
-                ..NewEvent::default()
-            };
+            let about = NewEvent { service: Some(service), ..NewEvent::default() };
             let message = format!("cannot prepare a servant of {service} in advance: {error}");
             inner.journal.warning("warm-failed", &message, &about);
             let reason = format!("could not be prepared in advance: {error}");
@@ -238,10 +204,7 @@ async fn make_or_report(
     }
 }
 
-async fn make(
-    inner: &Arc<ChoreographerInner>,
-    revision: Arc<RevisionRecord>,
-) -> Result<WarmServant, Error> {
+async fn make(inner: &Arc<ChoreographerInner>, revision: Arc<RevisionRecord>) -> Result<WarmServant, Error> {
     let id = names::servant_id(&revision.service);
     let limits = inner.push_limits(&revision).limits();
     let robot = tracing::field::Empty;
@@ -252,21 +215,10 @@ async fn make(
     let opening = reaching::open(inner, &revision, &container).instrument(span.clone());
     let reached = tokio::time::timeout(limit, opening).await;
     match reached {
-        Ok(Ok(reach)) => Ok(WarmServant {
-            container,
-            reach,
-            limits,
-            nodes: false,
-            permit: None,
-            span,
-            revision,
-        }),
+        Ok(Ok(reach)) => Ok(WarmServant { container, reach, limits, nodes: false, permit: None, span, revision }),
         failed => {
             container.stop().await?;
-            tracing::debug!(
-                "warm container {id}: {:?}",
-                failed.map(|reached| reached.err())
-            );
+            tracing::debug!("warm container {id}: {:?}", failed.map(|reached| reached.err()));
             Err(Error::Internal("reaching a warm container's ROS Master"))
         }
     }
@@ -302,9 +254,7 @@ async fn start_nodes(inner: &Arc<ChoreographerInner>, id: &str) -> Option<WarmSe
     let started = join_all(nodes.map(|node| warm.container.start_node(node))).await;
     if recorded.is_err() || started.iter().any(Result::is_err) {
         let (service, reason) = (&revision.service, "could not be started");
-        inner
-            .back_offs
-            .record_failure(service, NOBODY, &revision, None, reason);
+        inner.back_offs.record_failure(service, NOBODY, &revision, None, reason);
         warm.end(inner).await;
         return None;
     }

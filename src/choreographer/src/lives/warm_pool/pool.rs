@@ -69,9 +69,6 @@ pub(super) struct LeadTime {
 
 impl Default for LeadTime {
     fn default() -> LeadTime {
-        LeadTime {
-            mean: LEAD,
-            taken: VecDeque::new(),
-        }
+        LeadTime { mean: LEAD, taken: VecDeque::new() }
     }
 }

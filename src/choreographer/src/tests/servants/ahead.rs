@@ -35,16 +35,10 @@ async fn a_robot_gets_a_servant_whose_nodes_run_already() {
     world.publish("greet", "/greet", |_| {});
     let daemon = daemon_with_pool(&world, 1);
     wait_for_pool(&daemon, (1, 1)).await;
-    assert_eq!(
-        promised_cores(&daemon),
-        1.0,
-        "nodes that run are promised a core"
-    );
+    assert_eq!(promised_cores(&daemon), 1.0, "nodes that run are promised a core");
     let ids = world.engine.servants();
     assert!(daemon.servants().is_empty(), "it is nobody's");
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     assert_eq!(ids, [lease.handle().id.clone()]);
     let shown = daemon.describe(lease.handle()).await;
@@ -67,22 +61,14 @@ async fn only_what_is_measured_with_so_much_memory_starts_nodes_of_its_own() {
     wait_for_pool(&daemon, (1, 1)).await;
     let ahead = world.engine.servants();
     let memory = Some(api::Size(64 << 20));
-    let set = api::Limits {
-        memory,
-        ..api::Limits::default()
-    };
-    let measured = daemon
-        .start_measured("greet", "calibrate", set)
-        .expect("a lease");
+    let set = api::Limits { memory, ..api::Limits::default() };
+    let measured = daemon.start_measured("greet", "calibrate", set).expect("a lease");
     measured.lease.wait_ready().await.expect("ready");
     assert_ne!(ahead, [measured.lease.handle().id.clone()]);
     drop(measured);
     wait_for_pool(&daemon, (1, 1)).await;
     let ahead = world.engine.servants();
-    let stated = api::Stated {
-        memory,
-        ..api::Stated::default()
-    };
+    let stated = api::Stated { memory, ..api::Stated::default() };
     let request = ServantRequest::new("greet", "~abc").with_stated(stated);
     let lease = daemon.ensure(request.anonymous()).expect("a lease");
     lease.wait_ready().await.expect("ready");
@@ -97,9 +83,7 @@ async fn a_robots_stubs_get_no_servant_whose_nodes_have_other_names() {
     let daemon = daemon_with_pool(&world, 1);
     wait_for_pool(&daemon, (1, 1)).await;
     let ids = world.engine.servants();
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1").with_stub("/greeter"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1").with_stub("/greeter")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     assert!(!ids.contains(&lease.handle().id));
     let servant = world.engine.servant(&lease.handle().id).expect("it runs");
@@ -116,9 +100,7 @@ async fn what_is_kept_ready_ends_before_a_robot_waits() {
     let daemon = daemon_with_pool(&world, 2);
     // The second of them does not fit beside the first.
     wait_for_pool(&daemon, (2, 1)).await;
-    let lease = daemon
-        .ensure(ServantRequest::new("map", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("map", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
     assert_eq!(promised_cores(&daemon), 2.0);
     assert_eq!(daemon.warm_pool().1, 0, "there is no capacity for it");
@@ -132,9 +114,7 @@ async fn a_service_that_cannot_be_made_ahead_keeps_no_other_cold() {
     }
     // Whatever the order in which they are made, one comes before another.
     for broken in ["a", "z"] {
-        world
-            .engine
-            .break_image(&format!("sha256:{broken}"), "its image is damaged");
+        world.engine.break_image(&format!("sha256:{broken}"), "its image is damaged");
     }
     let daemon = daemon_with_pool(&world, 1);
     wait_for_pool(&daemon, (1, 1)).await;
@@ -167,9 +147,7 @@ async fn whether_one_more_fits_knows_that_what_is_kept_ready_would_end() {
 #[tokio::test(start_paused = true)]
 async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
     let world = World::new();
-    world
-        .engine
-        .program("/fails", |process| fails(process, SECOND));
+    world.engine.program("/fails", |process| fails(process, SECOND));
     world.publish("greet", "/fails", |_| {});
     let daemon = daemon_with_pool(&world, 1);
     tokio::time::sleep(SECOND * 600).await;
@@ -186,14 +164,9 @@ async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
     };
     let back_offs = tokio::time::timeout(SECOND * 600, backs_off).await;
     let back_offs = back_offs.expect("it fails again");
-    assert_eq!(
-        (&*back_offs[0].robot, &*back_offs[0].service),
-        ("~warm", "greet")
-    );
+    assert_eq!((&*back_offs[0].robot, &*back_offs[0].service), ("~warm", "greet"));
     // A robot's back-off is separate.
-    daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
 }
 
 #[tokio::test]
@@ -242,24 +215,15 @@ async fn a_servant_that_fails_again_and_again_is_started_after_pauses_that_grow(
                 assert!(reason.contains("status 3"), "{reason}");
                 starts += 1;
             }
-            Err(Error::BackOff {
-                failures,
-                reason,
-                again,
-                ..
-            }) => {
+            Err(Error::BackOff { failures, reason, again, .. }) => {
                 assert_eq!(failures, starts);
                 assert!(reason.contains("status 3"), "{reason}");
                 pauses.push(seconds(again));
                 let shown = daemon.back_offs();
                 assert_eq!((&*shown[0].robot, shown[0].failures), ("r1", starts));
                 // Others are served meanwhile.
-                daemon
-                    .ensure(ServantRequest::new("greet", "r2"))
-                    .expect("a lease");
-                daemon
-                    .ensure(ServantRequest::new("other", "r1"))
-                    .expect("a lease");
+                daemon.ensure(ServantRequest::new("greet", "r2")).expect("a lease");
+                daemon.ensure(ServantRequest::new("other", "r1")).expect("a lease");
                 tokio::time::sleep(again).await;
             }
             Err(error) => panic!("{error}"),
@@ -267,25 +231,12 @@ async fn a_servant_that_fails_again_and_again_is_started_after_pauses_that_grow(
     }
     assert_eq!(pauses, [1, 2, 4, 8]);
     let told = world.event_messages("servant-back-off");
-    assert!(
-        told[0].contains("2 times in a row") && told[0].contains("in 1 s"),
-        "{told:?}"
-    );
+    assert!(told[0].contains("2 times in a row") && told[0].contains("in 1 s"), "{told:?}");
     assert!(daemon.back_offs().is_empty(), "its pause is over");
-    failure(
-        &daemon
-            .ensure(ServantRequest::new("greet", "r1"))
-            .expect("a lease"),
-    )
-    .await;
-    daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .err()
-        .expect("a pause");
+    failure(&daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease")).await;
+    daemon.ensure(ServantRequest::new("greet", "r1")).err().expect("a pause");
     // A new push is started at once.
     world.publish("greet", "/greet", |_| {});
-    let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1"))
-        .expect("a lease");
+    let lease = daemon.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");
 }

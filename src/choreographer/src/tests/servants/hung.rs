@@ -20,10 +20,7 @@ async fn run_hanging(
     let daemon = world.daemon_with(|options| {
         (options.hung, options.hung_after) = (hung, 5.0);
         (options.warm_pool, options.warm_nodes) = if warm { (8, 1) } else { (0, 0) };
-        let by_default = ClassOptions {
-            sla: read(&[("rrt", "300ms")]).sla,
-            ..ClassOptions::default()
-        };
+        let by_default = ClassOptions { sla: read(&[("rrt", "300ms")]).sla, ..ClassOptions::default() };
         let name = DEFAULT_CLASS.to_owned();
         options.classes.extend(class.then_some((name, by_default)));
     });
@@ -78,8 +75,7 @@ async fn a_node_that_hangs_is_told_and_started_again_wherever_its_time_comes_fro
 
 #[tokio::test(start_paused = true)]
 async fn a_node_that_hangs_is_shown_until_it_answers() {
-    let (world, lease) =
-        run_hanging((HungPolicy::Report, true), true, false, &[("rrt", "300ms")]).await;
+    let (world, lease) = run_hanging((HungPolicy::Report, true), true, false, &[("rrt", "300ms")]).await;
     let hung = lease.handle().hung_nodes();
     assert!(hung[0].contains("/greeter answered none of"), "{hung:?}");
     let container = world.engine.servant(&lease.handle().id).expect("it runs");
@@ -93,11 +89,7 @@ async fn a_node_that_hangs_is_shown_until_it_answers() {
 async fn without_a_time_nothing_hangs() {
     for (class, stated) in [(false, &[][..]), (true, &[("cpus", "0.5")])] {
         let (world, _lease) = run_hanging((HungPolicy::Report, true), false, class, stated).await;
-        assert_eq!(
-            world.event_messages("node-hung"),
-            Vec::<String>::new(),
-            "{stated:?}"
-        );
+        assert_eq!(world.event_messages("node-hung"), Vec::<String>::new(), "{stated:?}");
     }
 }
 
@@ -107,8 +99,5 @@ async fn a_node_that_nobody_starts_again_is_not_killed() {
     let (world, lease) = run_hanging((HungPolicy::Restart, false), false, false, &stated).await;
     let told = world.event_messages("node-hung");
     assert!(told[0].contains("it is not killed"), "{told:?}");
-    assert!(
-        !lease.handle().hung_nodes().is_empty(),
-        "it runs, and hangs"
-    );
+    assert!(!lease.handle().hung_nodes().is_empty(), "it runs, and hangs");
 }

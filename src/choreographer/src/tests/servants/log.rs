@@ -6,9 +6,7 @@ use super::*;
 async fn a_line_of_a_servants_task_says_which_servant_it_is_about() {
     let file = tempfile::NamedTempFile::new().expect("a file");
     let writer = Arc::new(file.reopen().expect("it exists"));
-    let log = tracing_subscriber::fmt()
-        .with_writer(writer)
-        .with_ansi(false);
+    let log = tracing_subscriber::fmt().with_writer(writer).with_ansi(false);
     let _writing = tracing::subscriber::set_default(log.finish());
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
@@ -18,8 +16,5 @@ async fn a_line_of_a_servants_task_says_which_servant_it_is_about() {
     let about = format!(" servant{{id=\"{id}\" service=\"greet\" robot=\"r2d2\"}}: ");
     let lines = std::fs::read_to_string(file.path()).expect("written");
     let mut of_servant = lines.lines().filter(|line| line.contains(&about));
-    assert!(
-        of_servant.any(|line| line.contains("is ready for r2d2")),
-        "{lines}"
-    );
+    assert!(of_servant.any(|line| line.contains("is ready for r2d2")), "{lines}");
 }

@@ -20,11 +20,7 @@ fn two_revisions() -> World {
 }
 
 fn canary(share: Share) -> RolloutTerms {
-    RolloutTerms {
-        canary: Some(share),
-        samples: 5,
-        ..RolloutTerms::default()
-    }
+    RolloutTerms { canary: Some(share), samples: 5, ..RolloutTerms::default() }
 }
 
 /// Starts a daemon that runs rollouts.
@@ -59,10 +55,7 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
     let daemon = daemon_with_rollouts(&world);
     let first = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     first.await.expect("it begins");
-    let (first, second) = (
-        lease_of_revision(&daemon, "r1", 2).await,
-        lease_of_revision(&daemon, "r2", 1).await,
-    );
+    let (first, second) = (lease_of_revision(&daemon, "r1", 2).await, lease_of_revision(&daemon, "r2", 1).await);
     let rollouts = &daemon.inner.rollouts;
     for _ in 0..20 {
         rollouts.note_request("greet", 1, Some(5.0));
@@ -71,17 +64,11 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
     }
     first.handle().wait_ended().await;
     let reason = first.handle().life().reason().expect("a reason");
-    assert!(
-        reason.contains("100 % of its 20 requests failed"),
-        "{reason}"
-    );
+    assert!(reason.contains("100 % of its 20 requests failed"), "{reason}");
     drop(first);
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.state, RolloutState::RolledBack);
-    assert_eq!(
-        (shown.of_stable.requests, shown.of_candidate.requests),
-        (20, 20)
-    );
+    assert_eq!((shown.of_stable.requests, shown.of_candidate.requests), (20, 20));
     assert_eq!(shown.of_candidate.servants, 1);
     lease_of_revision(&daemon, "r1", 1).await;
     assert_eq!(second.handle().life().phase, Phase::Ready, "others go on");
@@ -100,16 +87,10 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
     use reach::links::RequestUpdate;
     let world = two_revisions();
     let daemon = daemon_with_rollouts(&world);
-    let terms = RolloutTerms {
-        promote_after: Some(0.0),
-        ..canary(Share::Robots(1))
-    };
+    let terms = RolloutTerms { promote_after: Some(0.0), ..canary(Share::Robots(1)) };
     let begun = daemon.begin_rollout("greet", None, 2, terms).await;
     begun.expect("it begins");
-    let (first, second) = (
-        lease_of_revision(&daemon, "r1", 2).await,
-        lease_of_revision(&daemon, "r2", 1).await,
-    );
+    let (first, second) = (lease_of_revision(&daemon, "r1", 2).await, lease_of_revision(&daemon, "r2", 1).await);
     let waits = async |words: &str| {
         tokio::time::sleep(SECOND * 3).await;
         let shown = daemon.rollout("greet").expect("a rollout");
@@ -128,10 +109,7 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
     assert_eq!(told.len(), 3, "each reason once: {told:?}");
     assert!(told[0].contains("none of its servants"), "{told:?}");
     // The other revision answers: now it is known to be worse.
-    let answered = RequestTiming {
-        total: Some(5.0),
-        ..late.clone()
-    };
+    let answered = RequestTiming { total: Some(5.0), ..late.clone() };
     let stable = observer_of(&daemon, &second);
     for _ in 0..20 {
         stable.on_request_measured(&answered, RequestUpdate::Answered);
@@ -143,10 +121,7 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.waits, None);
     let of = shown.of_candidate;
-    assert_eq!(
-        (of.requests, of.requests_failed, of.p50.is_some()),
-        (25, 25, true)
-    );
+    assert_eq!((of.requests, of.requests_failed, of.p50.is_some()), (25, 25, true));
 }
 
 #[tokio::test(start_paused = true)]
@@ -180,22 +155,10 @@ async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
     let next = daemon_with_rollouts(&world);
     drop(lease_of_revision(&next, "r2", 1).await);
     drop(lease_of_revision(&next, "r1", 2).await);
-    assert_eq!(
-        next.rollout("greet")
-            .expect("a rollout")
-            .of_candidate
-            .servants,
-        2
-    );
+    assert_eq!(next.rollout("greet").expect("a rollout").of_candidate.servants, 2);
     next.abort_rollout("greet").await.expect("it is one");
-    let refused = next
-        .abort_rollout("greet")
-        .await
-        .expect_err("it is none any more");
-    assert!(
-        refused.to_string().contains("not a canary: aborted"),
-        "{refused}"
-    );
+    let refused = next.abort_rollout("greet").await.expect_err("it is none any more");
+    assert!(refused.to_string().contains("not a canary: aborted"), "{refused}");
     next.stop("the test goes on", |_| true).await;
     drop(lease_of_revision(&next, "r1", 1).await);
 }
@@ -204,41 +167,21 @@ async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
 async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
     let world = two_revisions();
     let daemon = daemon_with_rollouts(&world);
-    let terms = RolloutTerms {
-        deadline: Some(0.0),
-        promote_after: Some(0.0),
-        ..canary(Share::Robots(1))
-    };
-    daemon
-        .begin_rollout("greet", None, 2, terms)
-        .await
-        .expect("it begins");
+    let terms = RolloutTerms { deadline: Some(0.0), promote_after: Some(0.0), ..canary(Share::Robots(1)) };
+    daemon.begin_rollout("greet", None, 2, terms).await.expect("it begins");
     let old = lease_of_revision(&daemon, "r1", 2).await;
     for _ in 0..5 {
         daemon.inner.rollouts.note_request("greet", 2, Some(5.0));
     }
     wait_for_state(&daemon, RolloutState::Promoted).await;
     drop(lease_of_revision(&daemon, "r2", 2).await);
-    assert_eq!(
-        old.handle().life().phase,
-        Phase::Ready,
-        "it is of that revision"
-    );
+    assert_eq!(old.handle().life().phase, Phase::Ready, "it is of that revision");
     // A rollout without a canary: robots keep their servants until the deadline.
-    let terms = RolloutTerms {
-        deadline: Some(0.0),
-        ..RolloutTerms::default()
-    };
-    daemon
-        .begin_rollout("greet", None, 1, terms)
-        .await
-        .expect("it begins");
+    let terms = RolloutTerms { deadline: Some(0.0), ..RolloutTerms::default() };
+    daemon.begin_rollout("greet", None, 1, terms).await.expect("it begins");
     old.handle().wait_ended().await;
     let reason = old.handle().life().reason().expect("a reason");
-    assert!(
-        reason.contains("its deadline has passed: revision 1"),
-        "{reason}"
-    );
+    assert!(reason.contains("its deadline has passed: revision 1"), "{reason}");
     drop(lease_of_revision(&daemon, "r1", 1).await);
 }
 
@@ -260,31 +203,11 @@ async fn what_makes_no_sense_or_would_break_robots_is_refused() {
     for (service, revision, terms, words) in [
         ("greet", 9, share, "no revision 9"),
         ("greet", 1, share, "is already the current one"),
-        (
-            "greet",
-            3,
-            share,
-            "its interface breaks robots of revision 1",
-        ),
-        (
-            "greet",
-            2,
-            wrong(|terms| terms.bound = f64::NAN),
-            "must be 0 or greater",
-        ),
-        (
-            "greet",
-            2,
-            wrong(|terms| terms.deadline = Some(-1.0)),
-            "must be 0 or greater",
-        ),
+        ("greet", 3, share, "its interface breaks robots of revision 1"),
+        ("greet", 2, wrong(|terms| terms.bound = f64::NAN), "must be 0 or greater"),
+        ("greet", 2, wrong(|terms| terms.deadline = Some(-1.0)), "must be 0 or greater"),
         ("greet", 2, wrong(|terms| terms.samples = 0), "at least 1"),
-        (
-            "greet",
-            2,
-            wrong(|terms| (terms.canary, terms.promote_after) = (None, Some(1.0))),
-            "needs a canary",
-        ),
+        ("greet", 2, wrong(|terms| (terms.canary, terms.promote_after) = (None, Some(1.0))), "needs a canary"),
         ("gone", 2, share, "gone"),
     ] {
         let refused = daemon.begin_rollout(service, None, revision, terms).await;
@@ -315,11 +238,7 @@ async fn another_revision_ends_a_rollout() {
 
 /// Returns the current revision.
 fn current(world: &World) -> u64 {
-    world
-        .catalogue
-        .current_revision("greet")
-        .expect("published")
-        .number
+    world.catalogue.current_revision("greet").expect("published").number
 }
 
 #[tokio::test(start_paused = true)]
@@ -418,10 +337,7 @@ async fn a_revision_with_a_deadline_alone_follows_the_one_before() {
     world.publish("greet", "/greet", |record| {
         record.image = format!("sha256:{:064}", 1);
     });
-    let terms = RolloutTerms {
-        deadline: Some(60.0),
-        ..RolloutTerms::default()
-    };
+    let terms = RolloutTerms { deadline: Some(60.0), ..RolloutTerms::default() };
     let shown = daemon.begin_rollout("greet", Some(1), 3, terms).await;
     let shown = shown.expect("it begins");
     assert_eq!((shown.stable, shown.candidate), (1, 3));

@@ -10,20 +10,12 @@ use crate::network::{self, Variable};
 
 const INDEX: &str = "share/ament_index/resource_index";
 /// Middleware implementations of ROS 2 that use RTPS and were tested with stubs.
-const TRIED: [&str; 3] = [
-    "rmw_fastrtps_cpp",
-    "rmw_fastrtps_dynamic_cpp",
-    "rmw_cyclonedds_cpp",
-];
+const TRIED: [&str; 3] = ["rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp"];
 
 /// Runs all checks for ROS 2.
 pub async fn checks(stub: &ExaminedStub, variable: Variable<'_>) -> Vec<Check> {
     let prefixes = prefixes(variable);
-    let mut checks = vec![
-        shadowing(stub, &prefixes),
-        middleware(variable),
-        domain(variable).await,
-    ];
+    let mut checks = vec![shadowing(stub, &prefixes), middleware(variable), domain(variable).await];
     checks.extend(security(variable));
     checks.extend(messages(stub, &prefixes));
     checks
@@ -48,10 +40,7 @@ fn middleware(variable: Variable<'_>) -> Check {
     const NAME: &str = "RMW_IMPLEMENTATION";
     let chosen = variable(NAME).filter(|value| !value.is_empty());
     match chosen.as_deref() {
-        None => Check::good(
-            "middleware",
-            format!("{NAME} is not set: default of the distribution"),
-        ),
+        None => Check::good("middleware", format!("{NAME} is not set: default of the distribution")),
         Some(tried) if TRIED.contains(&tried) => Check::good("middleware", tried),
         Some(zenoh) if zenoh.starts_with("rmw_zenoh") => Check::bad(
             "middleware",
@@ -59,15 +48,11 @@ fn middleware(variable: Variable<'_>) -> Check {
                 "{zenoh} does not use DDS, the only protocol of stubs: this robot's nodes and the stub cannot \
                     communicate"
             ),
-            format!(
-                "export {NAME}=rmw_fastrtps_cpp (or rmw_cyclonedds_cpp), for all nodes of this robot"
-            ),
+            format!("export {NAME}=rmw_fastrtps_cpp (or rmw_cyclonedds_cpp), for all nodes of this robot"),
         ),
         Some(other) => Check::warning(
             "middleware",
-            format!(
-                "{other} is untested with stubs; it works if it implements RTPS as specified by OMG"
-            ),
+            format!("{other} is untested with stubs; it works if it implements RTPS as specified by OMG"),
             format!("if nodes cannot communicate: export {NAME}=rmw_fastrtps_cpp"),
         ),
     }
@@ -105,8 +90,10 @@ fn security(variable: Variable<'_>) -> Option<Check> {
     enabled.then(|| {
         Check::bad(
             "security",
-            format!("{NAME} is true: this robot's nodes use encryption (SROS 2), which stubs do not support, so they \
-                cannot communicate"),
+            format!(
+                "{NAME} is true: this robot's nodes use encryption (SROS 2), which stubs do not support, so they \
+                cannot communicate"
+            ),
             format!("unset {NAME} for the nodes that use this service"),
         )
     })
@@ -121,9 +108,7 @@ fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
     if !entry.join(&stub.package).is_file() || overlay.join(&library).exists() {
         return None;
     }
-    let original = prefixes
-        .iter()
-        .find(|prefix| prefix.join(&library).exists())?;
+    let original = prefixes.iter().find(|prefix| prefix.join(&library).exists())?;
     Some(Check::warning(
         "messages",
         format!(
@@ -131,10 +116,7 @@ fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
             stub.package,
             original.display()
         ),
-        format!(
-            "{} again, from a shell with ROS 2 sourced",
-            stub.installer()
-        ),
+        format!("{} again, from a shell with ROS 2 sourced", stub.installer()),
     ))
 }
 
@@ -167,10 +149,7 @@ mod tests {
 
         /// Runs the checks with these entries of AMENT_PREFIX_PATH, and other variables.
         async fn run_checks(&self, prefixes: &str, others: &[(&str, &str)]) -> Vec<Check> {
-            let stub = ExaminedStub {
-                share: self.path("stub/share/p"),
-                package: "p".into(),
-            };
+            let stub = ExaminedStub { share: self.path("stub/share/p"), package: "p".into() };
             let prefixes = prefixes.split(':').map(|prefix| self.path(prefix));
             let prefixes = std::env::join_paths(prefixes).expect("no colons");
             let prefixes = prefixes.into_string().expect("UTF-8");
@@ -194,27 +173,16 @@ mod tests {
         let robot = Robot::new();
         for prefixes in ["stub:ros", "other:stub:ros"] {
             let checks = robot.run_checks(prefixes, &[]).await;
-            assert!(
-                checks
-                    .iter()
-                    .all(|check| check.verdict == CheckVerdict::Good),
-                "{checks:?}"
-            );
+            assert!(checks.iter().all(|check| check.verdict == CheckVerdict::Good), "{checks:?}");
         }
-        for (prefixes, said) in [
-            ("ros:stub", "ros before this stub"),
-            ("other", "AMENT_PREFIX_PATH does not include this stub"),
-        ] {
+        for (prefixes, said) in
+            [("ros:stub", "ros before this stub"), ("other", "AMENT_PREFIX_PATH does not include this stub")]
+        {
             let checks = robot.run_checks(prefixes, &[]).await;
             let check = find_check(&checks, "shadowing").expect("a check");
             assert_eq!(check.verdict, CheckVerdict::Bad);
             assert!(check.found.contains(said), "{check:?}");
-            assert!(
-                check
-                    .fix
-                    .as_ref()
-                    .is_some_and(|fix| fix.contains("stub/setup.sh"))
-            );
+            assert!(check.fix.as_ref().is_some_and(|fix| fix.contains("stub/setup.sh")));
         }
     }
 
@@ -222,41 +190,11 @@ mod tests {
     async fn what_keeps_nodes_from_hearing_each_other_is_said() {
         let robot = Robot::new();
         for (name, value, check, verdict, said) in [
-            (
-                "RMW_IMPLEMENTATION",
-                "rmw_cyclonedds_cpp",
-                "middleware",
-                CheckVerdict::Good,
-                "cyclone",
-            ),
-            (
-                "RMW_IMPLEMENTATION",
-                "rmw_connextdds",
-                "middleware",
-                CheckVerdict::Warning,
-                "untested",
-            ),
-            (
-                "RMW_IMPLEMENTATION",
-                "rmw_zenoh_cpp",
-                "middleware",
-                CheckVerdict::Bad,
-                "does not use DDS",
-            ),
-            (
-                "ROS_DOMAIN_ID",
-                "7",
-                "domain",
-                CheckVerdict::Good,
-                "7, on all networks",
-            ),
-            (
-                "ROS_LOCALHOST_ONLY",
-                "1",
-                "domain",
-                CheckVerdict::Good,
-                "0, on this machine only",
-            ),
+            ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp", "middleware", CheckVerdict::Good, "cyclone"),
+            ("RMW_IMPLEMENTATION", "rmw_connextdds", "middleware", CheckVerdict::Warning, "untested"),
+            ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "middleware", CheckVerdict::Bad, "does not use DDS"),
+            ("ROS_DOMAIN_ID", "7", "domain", CheckVerdict::Good, "7, on all networks"),
+            ("ROS_LOCALHOST_ONLY", "1", "domain", CheckVerdict::Good, "0, on this machine only"),
             (
                 "ROS_DISCOVERY_SERVER",
                 "10.0.0.7;10.0.0.8:14520",
@@ -264,27 +202,9 @@ mod tests {
                 CheckVerdict::Good,
                 "0, on all networks of this robot, through discovery servers at 10.0.0.7:11811 and 10.0.0.8:14520",
             ),
-            (
-                "ROS_DISCOVERY_SERVER",
-                "TCPv4:[10.0.0.7]:42100",
-                "domain",
-                CheckVerdict::Bad,
-                "which uses TCP",
-            ),
-            (
-                "ROS_DOMAIN_ID",
-                "300",
-                "domain",
-                CheckVerdict::Bad,
-                "ROS_DOMAIN_ID is \"300\"",
-            ),
-            (
-                "ROS_SECURITY_ENABLE",
-                "true",
-                "security",
-                CheckVerdict::Bad,
-                "SROS 2",
-            ),
+            ("ROS_DISCOVERY_SERVER", "TCPv4:[10.0.0.7]:42100", "domain", CheckVerdict::Bad, "which uses TCP"),
+            ("ROS_DOMAIN_ID", "300", "domain", CheckVerdict::Bad, "ROS_DOMAIN_ID is \"300\""),
+            ("ROS_SECURITY_ENABLE", "true", "security", CheckVerdict::Bad, "SROS 2"),
         ] {
             let checks = robot.run_checks("stub:ros", &[(name, value)]).await;
             let found = find_check(&checks, check).expect("a check");
@@ -298,10 +218,7 @@ mod tests {
         let robot = Robot::new();
         robot.file("stub", &format!("{INDEX}/rosidl_interfaces/p"));
         let examined = || robot.run_checks("stub:ros", &[]);
-        assert!(
-            find_check(&examined().await, "messages").is_none(),
-            "nobody has it"
-        );
+        assert!(find_check(&examined().await, "messages").is_none(), "nobody has it");
         robot.file("ros", "lib/libp__rosidl_typesupport_cpp.so");
         let checks = examined().await;
         let check = find_check(&checks, "messages").expect("a check");

@@ -9,10 +9,7 @@ use crate::network::Variable;
 
 /// Checks that the package's name resolves to the stub.
 pub fn shadowing(stub: &ExaminedStub, variable: Variable<'_>) -> Check {
-    for (name, below, held_by) in [
-        ("CMAKE_PREFIX_PATH", "", "share"),
-        ("ROS_PACKAGE_PATH", "share", ""),
-    ] {
+    for (name, below, held_by) in [("CMAKE_PREFIX_PATH", "", "share"), ("ROS_PACKAGE_PATH", "share", "")] {
         let value = variable(name).unwrap_or_default();
         let entries: Vec<PathBuf> = std::env::split_paths(&value).collect();
         let holds = |entry: &&PathBuf| {
@@ -51,16 +48,10 @@ mod tests {
         }
 
         fn run_check(&self, prefixes: &str, packages: &str) -> Check {
-            let stub = ExaminedStub {
-                share: self.path("stub/share/p"),
-                package: "p".into(),
-            };
+            let stub = ExaminedStub { share: self.path("stub/share/p"), package: "p".into() };
             let filled = |template: &str| {
                 let parts = template.split(':').map(|part| self.path(part));
-                std::env::join_paths(parts)
-                    .expect("no colons")
-                    .into_string()
-                    .expect("UTF-8")
+                std::env::join_paths(parts).expect("no colons").into_string().expect("UTF-8")
             };
             let (prefixes, packages) = (filled(prefixes), filled(packages));
             shadowing(&stub, &|name: &str| match name {

@@ -26,10 +26,7 @@ pub(super) struct LocalContext {
 impl LocalContext {
     /// Creates the context of a process that does not run; the inputs of these pairs are requests.
     pub(super) fn new(pairs: &[TopicPair]) -> Self {
-        let mut context = Self {
-            local: LocalState::Stopped,
-            requests: BTreeSet::new(),
-        };
+        let mut context = Self { local: LocalState::Stopped, requests: BTreeSet::new() };
         context.learn(pairs);
         context
     }
@@ -55,8 +52,7 @@ impl LocalContext {
         let type_name = type_name.replacen("/msg/", "/", 1);
         match self.local {
             LocalState::Starting => {
-                let is_command =
-                    actions::carries_goal_id(&type_name) || actions::is_command_type(&type_name);
+                let is_command = actions::carries_goal_id(&type_name) || actions::is_command_type(&type_name);
                 !is_command && !self.requests.contains(topic)
             }
             LocalState::Ready => OF_SPACE_AND_TIME.contains(&type_name.as_str()),
@@ -67,15 +63,9 @@ impl LocalContext {
 
 impl Keeper {
     /// Feeds the local original an input that it may be waiting for, unless it is fed all inputs.
-    pub(super) fn feed_context(
-        &self,
-        state: &mut State,
-        topic: &Arc<str>,
-        message: &SerializedMessage,
-    ) {
-        let is_due = !message.latching
-            && !state.governor.sides().local
-            && state.context.accepts(topic, &message.wire_type.name);
+    pub(super) fn feed_context(&self, state: &mut State, topic: &Arc<str>, message: &SerializedMessage) {
+        let is_due =
+            !message.latching && !state.governor.sides().local && state.context.accepts(topic, &message.wire_type.name);
         let Some(original) = self.original.as_ref().filter(|_| is_due) else {
             return;
         };
@@ -101,9 +91,7 @@ mod tests {
             ("/move_base/cancel", "actionlib_msgs/GoalID"),
         ];
         let taken = |context: &LocalContext| {
-            let taken = inputs
-                .iter()
-                .filter(|(topic, of)| context.accepts(topic, of));
+            let taken = inputs.iter().filter(|(topic, of)| context.accepts(topic, of));
             taken.map(|(topic, _)| *topic).collect::<Vec<_>>().join(" ")
         };
         assert_eq!(taken(&context), "");

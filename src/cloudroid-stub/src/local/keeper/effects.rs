@@ -5,9 +5,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use bytes::Bytes;
-use qos::{
-    DecisionReason, Effect, Failure, HandOver, QosEvent, RequestChannel, RequestId, Responder,
-};
+use qos::{DecisionReason, Effect, Failure, HandOver, QosEvent, RequestChannel, RequestId, Responder};
 use ros::bus::FailureReason;
 
 use super::{Keeper, Payload, PendingAnswer, State};
@@ -21,10 +19,7 @@ impl Keeper {
             let result = change(&mut state, now);
             let effects: Vec<_> = std::iter::from_fn(|| state.governor.next_effect()).collect();
             for effect in &effects {
-                if let Effect::Fail {
-                    request, reason, ..
-                } = effect
-                {
+                if let Effect::Fail { request, reason, .. } = effect {
                     state.reply(*request, Err(FailureReason::new(reason.as_str())));
                     state.goals.fail(*request);
                 }
@@ -45,12 +40,7 @@ impl Keeper {
 
     fn apply_effect(&self, effect: Effect<Payload>) {
         match effect {
-            Effect::Give {
-                side,
-                request,
-                channel,
-                payload,
-            } => match (side, channel, payload, request) {
+            Effect::Give { side, request, channel, payload } => match (side, channel, payload, request) {
                 // Both sides have received it already.
                 (_, _, Payload::Input(kept), _) if kept.is_latched => {}
                 (Responder::Cloud, RequestChannel::Topic(topic), Payload::Input(kept), _) => {
@@ -58,23 +48,14 @@ impl Keeper {
                         self.cloud.publish(&topic, &message);
                     }
                 }
-                (
-                    Responder::Cloud,
-                    RequestChannel::Call(service),
-                    Payload::Call(bytes),
-                    Some(id),
-                ) => {
+                (Responder::Cloud, RequestChannel::Call(service), Payload::Call(bytes), Some(id)) => {
                     self.cloud.call(id, &service, bytes);
                 }
                 (side, _, Payload::Goal(sent), Some(id)) => self.give_goal(side, id, &sent),
-                (Responder::Local, channel, payload, request) => {
-                    self.give_local(&channel, payload, request)
-                }
+                (Responder::Local, channel, payload, request) => self.give_local(&channel, payload, request),
                 _ => unreachable!("calls carry requests, topics carry messages"),
             },
-            Effect::Fail {
-                reason, channel, ..
-            } => tracing::debug!(?channel, reason, "a request failed"),
+            Effect::Fail { reason, channel, .. } => tracing::debug!(?channel, reason, "a request failed"),
             Effect::SafeStop => {
                 if let Some(stop) = &self.safe_stop {
                     self.robot.safe_stop(stop);
@@ -138,25 +119,14 @@ impl State {
         let mut to = None;
         for effect in effects {
             match effect {
-                Effect::Give {
-                    payload: Payload::Input(kept),
-                    ..
-                } if kept.is_latched => {}
-                Effect::Give {
-                    side,
-                    channel: RequestChannel::Topic(name) | RequestChannel::Call(name),
-                    ..
-                } => ledger.record_delivery(*side, name),
+                Effect::Give { payload: Payload::Input(kept), .. } if kept.is_latched => {}
+                Effect::Give { side, channel: RequestChannel::Topic(name) | RequestChannel::Call(name), .. } => {
+                    ledger.record_delivery(*side, name)
+                }
                 Effect::Event(QosEvent::Start(_) | QosEvent::Crashed(_)) => ledger.on_local_start(),
-                Effect::Event(QosEvent::Feed(DecisionReason::LinkDown)) => {
-                    to = Some(Responder::Local)
-                }
-                Effect::Event(QosEvent::Feed(_)) if !self.is_stateful => {
-                    to = Some(Responder::Local)
-                }
-                Effect::Event(QosEvent::StopFeeding(DecisionReason::LinkUp)) => {
-                    to = Some(Responder::Cloud)
-                }
+                Effect::Event(QosEvent::Feed(DecisionReason::LinkDown)) => to = Some(Responder::Local),
+                Effect::Event(QosEvent::Feed(_)) if !self.is_stateful => to = Some(Responder::Local),
+                Effect::Event(QosEvent::StopFeeding(DecisionReason::LinkUp)) => to = Some(Responder::Cloud),
                 _ => {}
             }
         }

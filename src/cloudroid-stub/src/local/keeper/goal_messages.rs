@@ -82,13 +82,8 @@ mod tests {
         assert_eq!(goal_id(&cancel_request(&id)), Some(id));
         assert_eq!(goal_id(&HEADER), None);
         let accepted = goal_response(true, 3_000_000_004);
-        assert_eq!(
-            accepted[..],
-            [0, 1, 0, 0, 1, 0, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0]
-        );
-        assert!(
-            is_accepted(&accepted) && !is_accepted(&goal_response(false, 0)) && !is_accepted(&[])
-        );
+        assert_eq!(accepted[..], [0, 1, 0, 0, 1, 0, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0]);
+        assert!(is_accepted(&accepted) && !is_accepted(&goal_response(false, 0)) && !is_accepted(&[]));
         assert!(
             has_canceled_goals(&cancel_response(&[id]))
                 && !has_canceled_goals(&cancel_response(&[]))

@@ -103,10 +103,7 @@ impl KeeperGoals {
         let old = |goal: &KeeperGoal| goal.ended.is_some_and(|ended| now - ended > KEPT);
         self.0.retain(|_, goal| !old(goal));
         if self.0.len() >= MOST {
-            let ended = self
-                .0
-                .iter()
-                .filter_map(|(id, goal)| Some((goal.ended?, *id)));
+            let ended = self.0.iter().filter_map(|(id, goal)| Some((goal.ended?, *id)));
             if let Some((_, oldest)) = ended.min() {
                 self.0.remove(&oldest);
             }
@@ -134,8 +131,7 @@ impl KeeperGoals {
 
 /// Returns the key by which feedback is matched with its goal.
 pub(super) fn feedback_key(topic: &str, message: &SerializedMessage) -> Option<CorrelationKey> {
-    let of_action =
-        message.wire_type.format == WireFormat::Cdr && topic.ends_with("/_action/feedback");
+    let of_action = message.wire_type.format == WireFormat::Cdr && topic.ends_with("/_action/feedback");
     let id = messages::goal_id(&message.bytes).filter(|_| of_action)?;
     Some(goal_key(&id))
 }
@@ -146,51 +142,28 @@ fn goal_key(id: &GoalId) -> CorrelationKey {
 
 impl Keeper {
     /// Handles a goal of the application. An action server cannot give a reason for a refusal.
-    pub async fn send_goal(
-        &self,
-        action: &Arc<str>,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn send_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, FailureReason> {
         let Some(id) = messages::goal_id(&request) else {
             return Err(FailureReason::new(format!("a goal of {action} has no id")));
         };
         let (sender, answer) = oneshot::channel();
-        let sent = GoalRequest {
-            id,
-            action: action.clone(),
-            request,
-        };
+        let sent = GoalRequest { id, action: action.clone(), request };
         let is_new = self.update(|state, now| {
-            if state
-                .goals
-                .0
-                .get(&id)
-                .is_some_and(|goal| goal.ended.is_none())
-            {
+            if state.goals.0.get(&id).is_some_and(|goal| goal.ended.is_none()) {
                 return false;
             }
             state.ledger.record_input(now, action);
             let payload = Payload::Goal(Arc::new(sent));
             let request = state.governor.goal(now, action, goal_key(&id), payload);
-            state
-                .goals
-                .insert(now, id, KeeperGoal::new(request, action, sender));
+            state.goals.insert(now, id, KeeperGoal::new(request, action, sender));
             true
         });
         let refused = || messages::goal_response(false, clock::now());
-        if is_new {
-            Ok(answer.await.unwrap_or_else(|_| refused()))
-        } else {
-            Ok(refused())
-        }
+        if is_new { Ok(answer.await.unwrap_or_else(|_| refused())) } else { Ok(refused()) }
     }
 
     /// Handles a request of the application for a goal's result.
-    pub async fn get_result(
-        &self,
-        action: &Arc<str>,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn get_result(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, FailureReason> {
         let (sender, answer) = oneshot::channel();
         let known = self.update(|state, _| {
             let goal = state.goals.0.get_mut(&messages::goal_id(&request)?)?;
@@ -201,23 +174,14 @@ impl Keeper {
             Some(())
         });
         match known {
-            Some(()) => answer
-                .await
-                .map_err(|_| FailureReason::new("the result of this goal is no longer available")),
+            Some(()) => answer.await.map_err(|_| FailureReason::new("the result of this goal is no longer available")),
             // The goal was sent before this stub started.
-            None => {
-                self.forward(&action_service(action, "get_result"), request)
-                    .await
-            }
+            None => self.forward(&action_service(action, "get_result"), request).await,
         }
     }
 
     /// Handles a request of the application to cancel a goal, or all.
-    pub async fn cancel_goal(
-        &self,
-        action: &Arc<str>,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn cancel_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, FailureReason> {
         let wanted = messages::goal_id(&request).unwrap_or(ALL);
         let (ids, sides) = self.update(|state, _| {
             let (mut ids, mut sides) = (Vec::new(), [false; 2]);
@@ -243,9 +207,8 @@ impl Keeper {
         }
         let given = [Responder::Cloud, Responder::Local].into_iter();
         let given = given.filter(|side| sides[side.index()]);
-        let mut answers: FuturesUnordered<_> = given
-            .map(|side| tokio::spawn(self.call_side(side, &service, request.clone())))
-            .collect();
+        let mut answers: FuturesUnordered<_> =
+            given.map(|side| tokio::spawn(self.call_side(side, &service, request.clone()))).collect();
         let mut last = Err(FailureReason::new("the goals are no longer known"));
         while let Some(answer) = answers.next().await {
             match answer {
@@ -271,13 +234,7 @@ impl Keeper {
             *round += 1;
             *round
         };
-        let carrying = GoalRun {
-            keeper: self.this.clone(),
-            side,
-            request,
-            sent: Arc::clone(sent),
-            round,
-        };
+        let carrying = GoalRun { keeper: self.this.clone(), side, request, sent: Arc::clone(sent), round };
         tokio::spawn(carrying.run());
     }
 }

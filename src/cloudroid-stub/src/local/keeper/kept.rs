@@ -43,12 +43,7 @@ pub(super) struct RetainedInputs {
 
 impl Default for RetainedInputs {
     fn default() -> Self {
-        Self {
-            most: MOST,
-            inputs: VecDeque::new(),
-            bytes: 0,
-            held: 0,
-        }
+        Self { most: MOST, inputs: VecDeque::new(), bytes: 0, held: 0 }
     }
 }
 
@@ -57,11 +52,7 @@ impl RetainedInputs {
     pub(super) fn insert(&mut self, message: SerializedMessage) -> Arc<RetainedInput> {
         let bytes = message.bytes.len();
         let is_goal = actions::carries_goal_id(&message.wire_type.name);
-        let input = Arc::new(RetainedInput {
-            is_latched: message.latching,
-            bytes,
-            message: Mutex::new(Some(message)),
-        });
+        let input = Arc::new(RetainedInput { is_latched: message.latching, bytes, message: Mutex::new(Some(message)) });
         if is_goal {
             return input;
         }
@@ -75,10 +66,7 @@ impl RetainedInputs {
             if let Some(oldest) = oldest.upgrade() {
                 self.bytes -= oldest.bytes;
                 *oldest.message.lock() = None;
-                tracing::debug!(
-                    bytes = oldest.bytes,
-                    "dropped an input without an answer in favour of newer ones"
-                );
+                tracing::debug!(bytes = oldest.bytes, "dropped an input without an answer in favour of newer ones");
             }
         }
         self.bytes += bytes;
@@ -112,10 +100,7 @@ mod tests {
 
     #[test]
     fn goals_do_not_give_way_to_pictures() {
-        let mut kept = RetainedInputs {
-            most: 100,
-            ..RetainedInputs::default()
-        };
+        let mut kept = RetainedInputs { most: 100, ..RetainedInputs::default() };
         let mut goal = message(30);
         goal.wire_type = Arc::new(WireType::with_name("move_base_msgs/MoveBaseActionGoal"));
         let goal = kept.insert(goal);
@@ -125,10 +110,7 @@ mod tests {
 
     #[test]
     fn the_oldest_give_way_and_what_is_answered_takes_nothing() {
-        let mut kept = RetainedInputs {
-            most: 100,
-            ..RetainedInputs::default()
-        };
+        let mut kept = RetainedInputs { most: 100, ..RetainedInputs::default() };
         let there = |inputs: &[Arc<RetainedInput>]| {
             let there = inputs.iter().map(|input| input.message().is_some());
             there.collect::<Vec<_>>()

@@ -19,15 +19,10 @@ impl Keeper {
         passed.map(|(_, answer)| answer)
     }
 
-    async fn call_active_side(
-        &self,
-        service: &str,
-        request: Bytes,
-    ) -> Result<(Responder, Bytes), FailureReason> {
+    async fn call_active_side(&self, service: &str, request: Bytes) -> Result<(Responder, Bytes), FailureReason> {
         let is_up = self.state.lock().governor.sides().cloud;
         let cloud = if is_up {
-            self.call_side(Responder::Cloud, service, request.clone())
-                .await
+            self.call_side(Responder::Cloud, service, request.clone()).await
         } else {
             Err(Failure::Unreachable("the link is down".to_owned()))
         };
@@ -38,18 +33,11 @@ impl Keeper {
         };
         let local = self.call_side(Responder::Local, service, request).await;
         let local = local.map(|answer| (Responder::Local, answer));
-        local.map_err(|failure| {
-            FailureReason::new(format!("cloud: {reason}; local: {}", failure.text()))
-        })
+        local.map_err(|failure| FailureReason::new(format!("cloud: {reason}; local: {}", failure.text())))
     }
 
     /// Changes a setting of the node: on the side that answers, and on the other side, now or when it starts.
-    pub async fn manage(
-        &self,
-        service: &str,
-        what: &ServiceUse,
-        request: Bytes,
-    ) -> Result<Bytes, FailureReason> {
+    pub async fn manage(&self, service: &str, what: &ServiceUse, request: Bytes) -> Result<Bytes, FailureReason> {
         // Serializes changes by the same service: a replay to a new node sees this one or an earlier one.
         let turn = self.remembered.acquire_turn(service).await;
         let (side, answer) = self.call_active_side(service, request.clone()).await?;
@@ -65,11 +53,7 @@ impl Keeper {
                         let told = timeout(PATIENCE, told).await;
                         if let Ok(Err(failure)) = told {
                             let reason = failure.text();
-                            tracing::debug!(
-                                service,
-                                reason,
-                                "cannot forward the request to the local original"
-                            );
+                            tracing::debug!(service, reason, "cannot forward the request to the local original");
                         }
                     });
                 }

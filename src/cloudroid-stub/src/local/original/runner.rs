@@ -11,8 +11,7 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use super::{
-    Expected, ExpectedInterface, OriginalCommand, OriginalEvent, OriginalSetup, Publishers, SETTLE,
-    Sources, call,
+    Expected, ExpectedInterface, OriginalCommand, OriginalEvent, OriginalSetup, Publishers, SETTLE, Sources, call,
 };
 use crate::local::private_system::PrivateSystem;
 use crate::local::process::{self, OriginalProgram};
@@ -141,9 +140,7 @@ impl OriginalRunner {
         let node = &self.setting.node;
         let requests: Vec<_> = {
             let inputs = self.publishers.lock();
-            let due = inputs
-                .iter()
-                .filter(|(topic, _)| expected.is_required_input(topic));
+            let due = inputs.iter().filter(|(topic, _)| expected.is_required_input(topic));
             due.map(|(_, input)| input.matched_subscribers()).collect()
         };
         for end in requests {
@@ -153,9 +150,7 @@ impl OriginalRunner {
         let nodes = self.system.nodes_of(&graph, node);
         let ends: Vec<_> = {
             let inputs = self.publishers.lock();
-            let due = inputs
-                .iter()
-                .filter(|(topic, _)| any_subscribes(&graph, &nodes, topic));
+            let due = inputs.iter().filter(|(topic, _)| any_subscribes(&graph, &nodes, topic));
             due.map(|(_, input)| input.matched_subscribers()).collect()
         };
         for end in ends {

@@ -71,9 +71,7 @@ enum LatchedAdvertisement {
 
 impl LatchedOutput {
     fn set_advertised(&mut self, advertised: LatchedAdvertisement) {
-        if let LatchedAdvertisement::Beside(ended) =
-            std::mem::replace(&mut self.advertised, advertised)
-        {
+        if let LatchedAdvertisement::Beside(ended) = std::mem::replace(&mut self.advertised, advertised) {
             self.dropped += ended.dropped_count();
         }
     }
@@ -81,16 +79,9 @@ impl LatchedOutput {
 
 impl OutputTopic {
     /// Advertises an output with the quality of service that its node offers.
-    pub(super) async fn advertise(
-        bus: &dyn Bus,
-        told: &OutputChannel,
-        of: WireType,
-    ) -> Result<Self, BusError> {
+    pub(super) async fn advertise(bus: &dyn Bus, told: &OutputChannel, of: WireType) -> Result<Self, BusError> {
         let qos = match &told.qos {
-            Some(qos) if qos.transient_local && told.topic != LOG => QosProfile {
-                depth: 1,
-                ..qos.to_bus(1)
-            },
+            Some(qos) if qos.transient_local && told.topic != LOG => QosProfile { depth: 1, ..qos.to_bus(1) },
             Some(qos) => qos.to_bus(QUEUE),
             None => QosProfile::keep_last(QUEUE),
         };
@@ -206,19 +197,12 @@ impl OutputTopic {
 
     /// Makes a requested advertisement, before the next subscriber. Returns whether it replaced the plain one.
     pub(super) async fn advertise_pending(&self, bus: &dyn Bus) -> bool {
-        if !matches!(
-            self.latched.lock().advertised,
-            LatchedAdvertisement::Asked(_)
-        ) {
+        if !matches!(self.latched.lock().advertised, LatchedAdvertisement::Asked(_)) {
             return false;
         }
         let wire_type = WireType::clone(&self.wire_type);
         let replaces = self.qos.is_latching();
-        let qos = if replaces {
-            self.qos
-        } else {
-            self.qos.latching(true)
-        };
+        let qos = if replaces { self.qos } else { self.qos.latching(true) };
         let advertised = bus.advertise(&self.name, wire_type, qos).await;
         let advertised = advertised.inspect_err(|error| {
             tracing::warn!(topic = self.name, %error, "new subscribers do not get latched messages");

@@ -10,10 +10,7 @@ use crate::local::OriginalSetup;
 #[tokio::test]
 async fn ends_have_the_quality_of_service_of_the_node() {
     let scene = Scene::new(RosVersion::Two, "/node").await;
-    let weak = QosProfile {
-        reliability: QosReliability::BestEffort,
-        ..QosProfile::keep_last(5)
-    };
+    let weak = QosProfile { reliability: QosReliability::BestEffort, ..QosProfile::keep_last(5) };
     let string = || string_type(RosVersion::Two);
     let scan = scene.real.advertise("/scan", string(), weak).await.unwrap();
     let _command = scene.real.subscribe("/command", string(), weak).await;
@@ -27,8 +24,7 @@ async fn ends_have_the_quality_of_service_of_the_node() {
     })
     .await;
     let node = app.graph().borrow().ends["/node"].clone();
-    let is_weak =
-        |qos: &QosProfile| qos.reliability == QosReliability::BestEffort && !qos.is_latching();
+    let is_weak = |qos: &QosProfile| qos.reliability == QosReliability::BestEffort && !qos.is_latching();
     assert!(is_weak(&node.publishers["/scan"].1), "{node:?}");
     assert!(is_weak(&node.subscribers["/command"].1), "{node:?}");
     let of_map = node.publishers["/map"].1;
@@ -47,10 +43,7 @@ async fn ends_have_the_quality_of_service_of_the_node() {
     let mut late = subscribe(&latecomer, "/map").await;
     assert_eq!(next_text(&mut late).await, "two");
     drop(scan);
-    wait_for_graph(&app, "no scan", |graph| {
-        !graph.ends["/node"].publishers.contains_key("/scan")
-    })
-    .await;
+    wait_for_graph(&app, "no scan", |graph| !graph.ends["/node"].publishers.contains_key("/scan")).await;
 }
 
 #[tokio::test]
@@ -62,10 +55,7 @@ async fn the_cloud_is_told_with_whom_no_messages_pass() {
     let _command = scene.real.subscribe("/command", string(), qos).await;
     let _link = scene.connect().await;
     let app = scene.robot.node("/app").await;
-    let other = || WireType {
-        name: "std_msgs/msg/Int32".to_owned(),
-        ..string()
-    };
+    let other = || WireType { name: "std_msgs/msg/Int32".to_owned(), ..string() };
     let state = app.subscribe("/state", other(), qos).await.unwrap();
     let command = app.advertise("/command", other(), qos).await.unwrap();
     let told = async |expected: &[&str]| {
@@ -82,10 +72,7 @@ async fn the_cloud_is_told_with_whom_no_messages_pass() {
     };
     let refused = told(&["/command", "/state"]).await;
     assert_eq!(refused[1].node, "/app");
-    assert!(
-        refused[1].why.contains("its type is std_msgs/msg/Int32"),
-        "{refused:?}"
-    );
+    assert!(refused[1].why.contains("its type is std_msgs/msg/Int32"), "{refused:?}");
     drop(command);
     told(&["/state"]).await;
     drop(state);
@@ -138,20 +125,10 @@ async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
             let watcher = scene.robot.node("/node_cloudroid").await;
             let diagnostics = Diagnostics::new(&watcher, "/node", "robot").await;
             let sla = serde_json::json!({"t_desire": 50, "t_max": 100, "local": "none"});
-            let setting = OriginalSetup {
-                program: None,
-                node: "/node".to_owned(),
-                domain: scene.robot.domain(),
-                patience: SOON,
-            };
+            let setting =
+                OriginalSetup { program: None, node: "/node".to_owned(), domain: scene.robot.domain(), patience: SOON };
             let sla = QosSla::parse(sla).unwrap();
-            let promise = scene.mirror.start_promise(
-                sla,
-                setting,
-                Vec::new(),
-                diagnostics.unwrap(),
-                &watcher,
-            );
+            let promise = scene.mirror.start_promise(sla, setting, Vec::new(), diagnostics.unwrap(), &watcher);
             promise.await.unwrap();
         }
         let (sender, mut goals) = mpsc::unbounded_channel();
@@ -169,11 +146,7 @@ async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
         assert_eq!((taken.as_str(), &goal), (id, &number(7)));
         assert!(server.publish_feedback(id, number(3)));
         assert_eq!(hears().await, "at 3");
-        let end = |outcome, result| GoalEnd {
-            outcome,
-            text: String::new(),
-            result,
-        };
+        let end = |outcome, result| GoalEnd { outcome, text: String::new(), result };
         assert!(server.end_goal(id, end(GoalOutcome::Succeeded, number(8))));
         assert_eq!(hears().await, "Succeeded 8");
         // A canceled goal.

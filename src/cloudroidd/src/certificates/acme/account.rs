@@ -8,9 +8,7 @@ use anyhow::{Context, anyhow};
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full};
 use hyper::Request;
-use instant_acme::{
-    Account, AccountCredentials, BodyWrapper, BytesResponse, Error, HttpClient, NewAccount,
-};
+use instant_acme::{Account, AccountCredentials, BodyWrapper, BytesResponse, Error, HttpClient, NewAccount};
 use serde::{Deserialize, Serialize};
 use store::private;
 
@@ -66,29 +64,19 @@ pub async fn load_or_create(acme: &config::AcmeConfig, home: &Path) -> anyhow::R
     .await
     .with_context(|| format!("cannot read {}", path.display()))?;
     let kept = kept.map(|bytes| serde_json::from_slice::<StoredAccount>(&bytes));
-    let kept = kept.transpose().with_context(|| {
-        format!(
-            "{} contains no account; remove it, and a new account is created",
-            path.display()
-        )
-    })?;
+    let kept = kept
+        .transpose()
+        .with_context(|| format!("{} contains no account; remove it, and a new account is created", path.display()))?;
     if let Some(kept) = kept.filter(|kept| kept.directory == acme.directory) {
         return Ok(builder.from_credentials(kept.credentials).await?);
     }
     let contact: Vec<&str> = acme.contact.iter().map(String::as_str).collect();
-    let new = NewAccount {
-        contact: &contact,
-        terms_of_service_agreed: acme.accept_terms,
-        only_return_existing: false,
-    };
+    let new = NewAccount { contact: &contact, terms_of_service_agreed: acme.accept_terms, only_return_existing: false };
     let (account, credentials) = builder
         .create(&new, acme.directory.clone(), None)
         .await
         .map_err(|error| anyhow!("cannot create an account: {error}"))?;
-    let text = serde_json::to_vec(&StoredAccount {
-        directory: acme.directory.clone(),
-        credentials,
-    })?;
+    let text = serde_json::to_vec(&StoredAccount { directory: acme.directory.clone(), credentials })?;
     let file = path.clone();
     privilege::run(async move { private::write_atomically(&file, &text) })
         .await

@@ -5,8 +5,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use instant_acme::{
-    Account, AuthorizationStatus, ChallengeType, Identifier, NewOrder, Order, OrderStatus,
-    RetryPolicy,
+    Account, AuthorizationStatus, ChallengeType, Identifier, NewOrder, Order, OrderStatus, RetryPolicy,
 };
 use portal::{Challenge, Tls, TlsError};
 use rcgen::{CertificateParams, CustomExtension, DistinguishedName, KeyPair};
@@ -31,10 +30,7 @@ pub async fn order_certificate(
     looked_at: SocketAddr,
 ) -> anyhow::Result<IssuedCertificate> {
     let identifiers: Vec<Identifier> = names.iter().cloned().map(Identifier::Dns).collect();
-    let mut order = account
-        .new_order(&NewOrder::new(&identifiers))
-        .await
-        .context("the authority refused the order")?;
+    let mut order = account.new_order(&NewOrder::new(&identifiers)).await.context("the authority refused the order")?;
     let patience = RetryPolicy::new().timeout(PATIENCE);
     if order.state().status == OrderStatus::Pending {
         prove_names(&mut order, tls).await?;
@@ -56,18 +52,9 @@ pub async fn order_certificate(
     let mut params = CertificateParams::new(names)?;
     params.distinguished_name = DistinguishedName::new();
     let request = params.serialize_request(&key)?;
-    order
-        .finalize_csr(request.der())
-        .await
-        .context("the authority refused to sign")?;
-    let chain = order
-        .poll_certificate(&patience)
-        .await
-        .context("cannot fetch the certificate")?;
-    Ok(IssuedCertificate {
-        chain,
-        key: key.serialize_pem(),
-    })
+    order.finalize_csr(request.der()).await.context("the authority refused to sign")?;
+    let chain = order.poll_certificate(&patience).await.context("cannot fetch the certificate")?;
+    Ok(IssuedCertificate { chain, key: key.serialize_pem() })
 }
 
 /// Presents the challenge of each name and tells the authority that it may validate.
@@ -97,10 +84,7 @@ async fn prove_names(order: &mut Order, tls: &Tls) -> anyhow::Result<()> {
             continue;
         }
         if let Some(mut challenge) = name.challenge(ChallengeType::TlsAlpn01) {
-            challenge
-                .set_ready()
-                .await
-                .context("cannot start the authority's challenge")?;
+            challenge.set_ready().await.context("cannot start the authority's challenge")?;
         }
     }
     Ok(())
@@ -128,10 +112,7 @@ async fn failure_reasons(order: &mut Order) -> Vec<String> {
             continue;
         };
         let of = state.identifier().to_string();
-        let failed = state
-            .challenges
-            .iter()
-            .filter_map(|challenge| challenge.error.as_ref());
+        let failed = state.challenges.iter().filter_map(|challenge| challenge.error.as_ref());
         reasons.extend(failed.map(|problem| format!("{of}: {problem}")));
     }
     reasons

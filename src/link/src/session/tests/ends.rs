@@ -34,11 +34,7 @@ async fn a_session_ends_although_the_other_end_takes_nothing_any_more() {
         robot.close(1000, "the node has ended");
     });
     assert!(matches!(lost, DisconnectReason::Ended), "{lost}");
-    assert!(
-        begun.elapsed() < Duration::from_secs(5),
-        "{:?}",
-        begun.elapsed()
-    );
+    assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
@@ -58,9 +54,5 @@ async fn a_close_is_heard_though_whoever_sent_it_reads_nothing_any_more() {
         panic!("{lost}");
     };
     assert_eq!(reason, "the service moves");
-    assert!(
-        begun.elapsed() < Duration::from_secs(5),
-        "{:?}",
-        begun.elapsed()
-    );
+    assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
 }

@@ -27,12 +27,7 @@ fn deliver<O: ControlMessage>(to: &Session<O>, frame: Frame) -> Result<Option<Re
     let incoming = &mut to.state.lock().incoming;
     let bytes = match frame {
         Frame::Whole { number, record } => incoming.receive_whole(number, record)?,
-        Frame::Begin {
-            stream,
-            number,
-            total,
-            bytes,
-        } => incoming.receive_begin(stream, number, total, &bytes)?,
+        Frame::Begin { stream, number, total, bytes } => incoming.receive_begin(stream, number, total, &bytes)?,
         Frame::More { stream, bytes } => incoming.receive_more(stream, &bytes)?,
         other => panic!("{other:?}"),
     };
@@ -60,22 +55,14 @@ fn lines(came: &[Record]) -> Vec<String> {
 }
 
 fn line(text: impl ToString) -> FromCloud {
-    FromCloud::Line {
-        error: false,
-        text: text.to_string(),
-    }
+    FromCloud::Line { error: false, text: text.to_string() }
 }
 
 /// A graph with this many inputs of about 60 bytes of text each.
 fn graph(inputs: usize) -> FromCloud {
-    let inputs = (0..inputs).map(|number| RequestedInput {
-        topic: format!("/input_{number}"),
-        ..RequestedInput::default()
-    });
-    FromCloud::Graph(Graph {
-        inputs: inputs.collect(),
-        ..Graph::default()
-    })
+    let inputs =
+        (0..inputs).map(|number| RequestedInput { topic: format!("/input_{number}"), ..RequestedInput::default() });
+    FromCloud::Graph(Graph { inputs: inputs.collect(), ..Graph::default() })
 }
 
 #[test]
@@ -86,9 +73,7 @@ fn a_message_does_not_wait_for_a_thousand_lines() {
     }
     cloud.publish(data(1, 10), DeliveryMode::Newest);
     let came = carry(&cloud, &robot);
-    let at = came
-        .iter()
-        .position(|record| matches!(record, Record::Data(_)));
+    let at = came.iter().position(|record| matches!(record, Record::Data(_)));
     assert!(at < Some(3), "it is record {at:?}");
     assert_eq!(lines(&came).len(), 1000, "and all lines come after it");
 }
@@ -107,10 +92,7 @@ fn lines_take_a_small_share_while_messages_wait() {
             _ => of_lines += 1,
         }
     }
-    assert!(
-        of_lines * 10 < of_messages,
-        "{of_lines} lines beside {of_messages} messages"
-    );
+    assert!(of_lines * 10 < of_messages, "{of_lines} lines beside {of_messages} messages");
     assert!(of_lines > 10, "they come all the same: {of_lines}");
 }
 
@@ -122,11 +104,7 @@ fn lines_for_a_link_that_is_away_do_not_end_the_session_and_those_left_out_are_t
     }
     assert_eq!(cloud.state.lock().out.overflow_reason(), None);
     let came = lines(&carry(&cloud, &robot));
-    assert_eq!(
-        came.last().map(String::as_str),
-        Some("99999"),
-        "the newest stay"
-    );
+    assert_eq!(came.last().map(String::as_str), Some("99999"), "the newest stay");
     let kept = came.len() - 1;
     let told = format!("{} lines", 100_000 - kept);
     assert!(came[0].contains(&told), "{}: {}", came[0], told);

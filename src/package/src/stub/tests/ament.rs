@@ -43,14 +43,8 @@ fn write_original(place: &Path) -> PathBuf {
     for (path, text) in [
         ("share/ament_index/resource_index/packages/p", ""),
         ("share/ament_index/resource_index/packages/q", ""),
-        (
-            "share/ament_index/resource_index/rclcpp_components/p",
-            "p::Node;lib/libp.so\n",
-        ),
-        (
-            "share/ament_index/resource_index/p__plugins/p",
-            "plugins.xml",
-        ),
+        ("share/ament_index/resource_index/rclcpp_components/p", "p::Node;lib/libp.so\n"),
+        ("share/ament_index/resource_index/p__plugins/p", "plugins.xml"),
         ("share/p/package.xml", "original"),
         ("lib/p/node", "original"),
         ("lib/libp__rosidl_typesupport_cpp.so", ""),
@@ -117,18 +111,12 @@ fn all_that_tools_of_ros_2_look_for_is_there() {
     );
     // Executables are searched only in lib/PKG, so each outsourced one is there, whatever else is shared.
     for name in ["node", "made_up"] {
-        assert!(
-            text(&files[&format!("lib/p/{name}")]).contains(" run "),
-            "{name}"
-        );
+        assert!(text(&files[&format!("lib/p/{name}")]).contains(" run "), "{name}");
     }
     let revision: toml::Table = text(&files["share/p/revision.toml"]).parse().expect("TOML");
     assert_eq!(revision["ros"].as_integer(), Some(2));
     let settings = text(&files["share/p/stub.toml"]);
-    assert!(
-        settings.contains("`ros2 run p cloudroid-stub doctor`"),
-        "{settings}"
-    );
+    assert!(settings.contains("`ros2 run p cloudroid-stub doctor`"), "{settings}");
     assert!(text(&files["README.md"]).contains("ros2 run p made_up\n"));
 }
 
@@ -136,15 +124,7 @@ fn all_that_tools_of_ros_2_look_for_is_there() {
 fn nothing_of_ros_1_is_said_and_no_placeholder_is_left() {
     for (path, content) in compose_ament_stub(&["node"]) {
         let text = text(&content);
-        for word in [
-            "rosrun",
-            "roslaunch ",
-            "odelet",
-            "@ROS@",
-            "@RUN@",
-            "@ORDER@",
-            "@PLUGINS@",
-        ] {
+        for word in ["rosrun", "roslaunch ", "odelet", "@ROS@", "@RUN@", "@ORDER@", "@PLUGINS@"] {
             assert!(!text.contains(word), "{path}: {word}");
         }
     }
@@ -160,10 +140,7 @@ fn components_name_a_library_that_says_why() {
         .map(|line| {
             let (class, library) = line.split_once(';').expect("two halves");
             assert!(library.starts_with("p runs in the cloud: its components"));
-            assert!(
-                !library.contains([';', '/']) && library.len() < 255,
-                "{library}"
-            );
+            assert!(!library.contains([';', '/']) && library.len() < 255, "{library}");
             class
         })
         .collect();
@@ -208,12 +185,9 @@ fn sourcing_puts_the_overlay_in_front_once() {
         let text = |bytes| String::from_utf8(bytes).expect("text");
         (text(output.stdout), text(output.stderr))
     };
-    for (shell, file) in [
-        ("sh", "setup.sh"),
-        ("sh", "local_setup.sh"),
-        ("bash", "setup.bash"),
-        ("bash", "local_setup.bash"),
-    ] {
+    for (shell, file) in
+        [("sh", "setup.sh"), ("sh", "local_setup.sh"), ("bash", "setup.bash"), ("bash", "local_setup.bash")]
+    {
         let (said, wrong) = source(shell, file, "", "/opt/ros/jazzy:/home/me/install");
         let expected = format!("{overlay}:/opt/ros/jazzy:/home/me/install\n0\n");
         assert_eq!((said, wrong), (expected, String::new()), "{file}");
@@ -225,20 +199,12 @@ fn sourcing_puts_the_overlay_in_front_once() {
     // ROS 2 would put its own packages first if it were sourced later.
     let (said, wrong) = source("sh", "setup.sh", "unset AMENT_PREFIX_PATH;", "");
     assert_eq!(said, format!("{overlay}\n0\n"));
-    assert!(
-        wrong.contains("ROS 2's own set-up file was not sourced"),
-        "{wrong}"
-    );
+    assert!(wrong.contains("ROS 2's own set-up file was not sourced"), "{wrong}");
     // An unpacked but not installed stub is found by colcon's variable.
     let unpacked = stub.path().display();
-    let script = format!(
-        "COLCON_CURRENT_PREFIX={unpacked}; . {unpacked}/local_setup.sh; echo \"$AMENT_PREFIX_PATH\""
-    );
-    let output = Command::new("sh")
-        .args(["-c", &script])
-        .env("AMENT_PREFIX_PATH", "/opt/ros/jazzy")
-        .output()
-        .expect("a shell");
+    let script = format!("COLCON_CURRENT_PREFIX={unpacked}; . {unpacked}/local_setup.sh; echo \"$AMENT_PREFIX_PATH\"");
+    let output =
+        Command::new("sh").args(["-c", &script]).env("AMENT_PREFIX_PATH", "/opt/ros/jazzy").output().expect("a shell");
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert_eq!(said, format!("{unpacked}:/opt/ros/jazzy\n"));
 }
@@ -252,29 +218,16 @@ fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
     let overlay = place.path().join("overlay");
     let original = write_original(place.path());
     let (good, said) = install(stub.path(), &overlay, &original);
-    assert!(
-        good && said.contains("ros2 run p cloudroid-stub doctor"),
-        "{said}"
-    );
+    assert!(good && said.contains("ros2 run p cloudroid-stub doctor"), "{said}");
     let (good, said) = install(one.path(), &overlay, &original);
     assert!(
-        !good
-            && said.contains(
-                "contains stubs of ROS 2, but this one is of ROS 1: choose another --prefix"
-            ),
+        !good && said.contains("contains stubs of ROS 2, but this one is of ROS 1: choose another --prefix"),
         "{said}"
     );
     // The code of its messages is the original's, for this package only.
     let link = overlay.join("lib/libp__rosidl_typesupport_cpp.so");
-    assert_eq!(
-        std::fs::read_link(&link).expect("a link"),
-        original.join("lib/libp__rosidl_typesupport_cpp.so")
-    );
-    assert!(
-        !overlay
-            .join("lib/libpq__rosidl_typesupport_cpp.so")
-            .exists()
-    );
+    assert_eq!(std::fs::read_link(&link).expect("a link"), original.join("lib/libp__rosidl_typesupport_cpp.so"));
+    assert!(!overlay.join("lib/libpq__rosidl_typesupport_cpp.so").exists());
     // A later archive without components registers none.
     let mut without = contents();
     without.components.clear();
@@ -296,9 +249,8 @@ fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
 /// prefix that it returns.
 #[test]
 fn ros_2_s_own_tools_find_the_stub_before_the_original() {
-    let ros = std::env::var("CLOUDROID_ROS2_PREFIX").expect(
-        "CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test",
-    );
+    let ros = std::env::var("CLOUDROID_ROS2_PREFIX")
+        .expect("CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the tests by make test");
     let place = tempfile::tempdir().expect("a directory");
     let place = place.path().canonicalize().expect("there");
     // Tools require names of at least two letters.
@@ -346,10 +298,7 @@ for found in [
     print(found)
 "#;
     // With bash the overlay is found where it is, installed or not.
-    let setup = format!(
-        ". '{}'; exec \"$0\" -c \"$1\"",
-        overlay.join("setup.bash").display()
-    );
+    let setup = format!(". '{}'; exec \"$0\" -c \"$1\"", overlay.join("setup.bash").display());
     let output = Command::new("bash")
         .args(["-c", &setup, &format!("{ros}/bin/python"), script])
         .env("AMENT_PREFIX_PATH", format!("{}:{ros}", original.display()))
@@ -368,10 +317,5 @@ for found in [
         original.display().to_string(),
     ];
     let said: Vec<&str> = said.lines().collect();
-    assert_eq!(
-        said,
-        expected,
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    assert_eq!(said, expected, "{}", String::from_utf8_lossy(&output.stderr));
 }

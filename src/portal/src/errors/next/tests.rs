@@ -28,20 +28,10 @@ fn portal_errors() -> Vec<Error> {
     let (name, exists) = (x(), Vec::new());
     let limit = Size(1);
     vec![
-        Error::UnknownRobot {
-            name: x(),
-            exists: Vec::new(),
-        },
-        Error::UnknownRow {
-            service: x(),
-            id: x(),
-            exists: Vec::new(),
-        },
+        Error::UnknownRobot { name: x(), exists: Vec::new() },
+        Error::UnknownRow { service: x(), id: x(), exists: Vec::new() },
         Error::UnknownPath { path: x() },
-        Error::OtherMethod {
-            method: x(),
-            path: x(),
-        },
+        Error::OtherMethod { method: x(), path: x() },
         Error::BadRequest(x()),
         Error::WebSocketVersion,
         Error::Unauthorised("x"),
@@ -55,20 +45,11 @@ fn portal_errors() -> Vec<Error> {
         PairingCodeRefusal::Unknown.into(),
         Error::Uncertifiable(authority::Error::Kind),
         Error::Uncertifiable(authority::Error::Nameless(x())),
-        Error::UnknownPairing {
-            name: x(),
-            exists: Vec::new(),
-        },
+        Error::UnknownPairing { name: x(), exists: Vec::new() },
         Error::PlainText { instead: x() },
-        Error::Foreign {
-            what: x(),
-            next: x(),
-        },
+        Error::Foreign { what: x(), next: x() },
         Error::Forbidden { what: x() },
-        Error::UnknownToken {
-            name: x(),
-            exists: Vec::new(),
-        },
+        Error::UnknownToken { name: x(), exists: Vec::new() },
         Error::TokenExists(x()),
         Error::UnknownAccount { name, exists },
         Error::AccountExists(x()),
@@ -79,38 +60,18 @@ fn portal_errors() -> Vec<Error> {
         Error::PairingExists(x()),
         Error::SignInBusy,
         Error::TooManyStreams { most: 1 },
-        Error::TooManyLook {
-            servant: x(),
-            most: 1,
-            each: 1,
-        },
+        Error::TooManyLook { servant: x(), most: 1, each: 1 },
         Error::NotThereYet(x()),
         Error::NoBlackBox(x()),
         Error::UnknownRecording(x()),
-        Error::NotRecorded {
-            servant: x(),
-            reason: x(),
-        },
-        Error::RecordedLately {
-            servant: x(),
-            again: 1,
-        },
-        Error::UnknownRule {
-            id: x(),
-            exists: Vec::new(),
-        },
+        Error::NotRecorded { servant: x(), reason: x() },
+        Error::RecordedLately { servant: x(), again: 1 },
+        Error::UnknownRule { id: x(), exists: Vec::new() },
         Error::RobotTaken(x()),
         Error::BodyTooLarge { limit },
         Error::TrialTooLarge { limit },
-        Error::Memory(budget::Exceeded {
-            name: x(),
-            asked: 2,
-            used: 0,
-            limit: 1,
-        }),
-        Error::Unfinished {
-            after: Duration::from_secs(1),
-        },
+        Error::Memory(budget::Exceeded { name: x(), asked: 2, used: 0, limit: 1 }),
+        Error::Unfinished { after: Duration::from_secs(1) },
         Error::Internal("x"),
     ]
 }
@@ -118,18 +79,10 @@ fn portal_errors() -> Vec<Error> {
 fn push_errors() -> Vec<Error> {
     use push::Error as P;
     let pushes = [
-        P::NameTaken {
-            name: x(),
-            package: x(),
-            newcomer: x(),
-        },
+        P::NameTaken { name: x(), package: x(), newcomer: x() },
         P::NotAllowed(x()),
         P::Options(push::OptionsError::Exported),
-        P::Failed {
-            message: x(),
-            next: None,
-            log: Vec::new(),
-        },
+        P::Failed { message: x(), next: None, log: Vec::new() },
         P::TooLarge { limit: Size(1) },
         P::Ending,
         P::Engine(E::Exists { id: x() }),
@@ -141,96 +94,37 @@ fn push_errors() -> Vec<Error> {
 fn servant_errors() -> Vec<Error> {
     let amount = Amount::new(1.0, 1);
     let refused = [
-        AdmissionError::TooBig {
-            wanted: amount,
-            capacity: amount,
-        },
-        AdmissionError::NoMore {
-            wanted: amount,
-            free: amount,
-        },
+        AdmissionError::TooBig { wanted: amount, capacity: amount },
+        AdmissionError::NoMore { wanted: amount, free: amount },
         AdmissionError::QueueFull { waiting: 1 },
-        AdmissionError::Deadline {
-            waited: Duration::ZERO,
-            place: None,
-        },
-        AdmissionError::Stalled {
-            why: x(),
-            waited: Duration::ZERO,
-            place: None,
-        },
+        AdmissionError::Deadline { waited: Duration::ZERO, place: None },
+        AdmissionError::Stalled { why: x(), waited: Duration::ZERO, place: None },
         AdmissionError::NoMoreNow { why: x() },
     ];
-    let unchanged = |reason| C::NotResized {
-        servant: x(),
-        service: x(),
-        stated: x(),
-        reason: Box::new(reason),
-    };
-    let kept = refused
-        .clone()
-        .map(|refused| unchanged(ResizeError::Full(refused)));
+    let unchanged = |reason| C::NotResized { servant: x(), service: x(), stated: x(), reason: Box::new(reason) };
+    let kept = refused.clone().map(|refused| unchanged(ResizeError::Full(refused)));
     let others = [
         unchanged(ResizeError::Many),
-        unchanged(ResizeError::Used {
-            used: Size(2),
-            wanted: Size(1),
-        }),
-        C::Terms(TermsError::UnknownClass {
-            name: x(),
-            exists: Vec::new(),
-        }),
-        C::UnknownServant {
-            id: x(),
-            exists: Vec::new(),
-        },
-        C::Place {
-            id: x(),
-            service: x(),
-            robot: x(),
-        },
-        C::Servant {
-            service: x(),
-            robot: x(),
-            reason: x(),
-            log: Vec::new(),
-        },
-        C::BackOff {
-            service: x(),
-            robot: x(),
-            failures: 1,
-            reason: x(),
-            again: Duration::ZERO,
-        },
+        unchanged(ResizeError::Used { used: Size(2), wanted: Size(1) }),
+        C::Terms(TermsError::UnknownClass { name: x(), exists: Vec::new() }),
+        C::UnknownServant { id: x(), exists: Vec::new() },
+        C::Place { id: x(), service: x(), robot: x() },
+        C::Servant { service: x(), robot: x(), reason: x(), log: Vec::new() },
+        C::BackOff { service: x(), robot: x(), failures: 1, reason: x(), again: Duration::ZERO },
         C::NoRollout(x()),
         C::Rollout(x()),
         C::Ending,
-        C::OutOfMemory {
-            service: x(),
-            memory: api::Size(1),
-            ready: true,
-        },
+        C::OutOfMemory { service: x(), memory: api::Size(1), ready: true },
         C::Calibration(x()),
         C::Shadow(x()),
         C::Reach(reach::Error::Elsewhere(x())),
-        C::Reach(reach::Error::Linked(Box::new(
-            reach::links::NodeError::ServantEnded,
-        ))),
+        C::Reach(reach::Error::Linked(Box::new(reach::links::NodeError::ServantEnded))),
         C::Reach(reach::Error::Trial(x())),
         C::Internal("x"),
-        C::Engine(E::Call {
-            call: "x",
-            source: io(),
-        }),
-        C::Engine(E::Refused {
-            id: x(),
-            reason: x(),
-        }),
+        C::Engine(E::Call { call: "x", source: io() }),
+        C::Engine(E::Refused { id: x(), reason: x() }),
         C::Engine(E::NoUidRange { base: 1, ranges: 1 }),
-        C::Engine(E::Image {
-            image: x(),
-            source: x().into(),
-        }),
+        C::Engine(E::Image { image: x(), source: x().into() }),
     ];
     let full = refused.map(C::from);
     let all = full.into_iter().chain(kept).chain(others);
@@ -240,38 +134,15 @@ fn servant_errors() -> Vec<Error> {
 fn storage_errors() -> Vec<Error> {
     use catalogue::Error as K;
     let path = PathBuf::from("x");
-    let state = store::Error::Record {
-        what: x(),
-        source: not_json(),
-    };
-    let full = image::Error::DiskFull {
-        path: path.clone(),
-        needed: None,
-        free: None,
-    };
-    let damaged = image::Error::Json {
-        path,
-        source: not_json(),
-    };
+    let state = store::Error::Record { what: x(), source: not_json() };
+    let full = image::Error::DiskFull { path: path.clone(), needed: None, free: None };
+    let damaged = image::Error::Json { path, source: not_json() };
     let kept = [
-        K::UnknownService {
-            name: x(),
-            exists: vec![x()],
-        },
-        K::UnknownRevision {
-            service: x(),
-            revision: x(),
-            exists: Vec::new(),
-        },
+        K::UnknownService { name: x(), exists: vec![x()] },
+        K::UnknownRevision { service: x(), revision: x(), exists: Vec::new() },
         K::UnknownImage { what: x() },
-        K::NoStub {
-            service: x(),
-            reason: x(),
-        },
-        K::UnknownArchitecture {
-            asked: x(),
-            exists: Vec::new(),
-        },
+        K::NoStub { service: x(), reason: x() },
+        K::UnknownArchitecture { asked: x(), exists: Vec::new() },
         K::Name(NameError::Service(x())),
         K::Name(NameError::Reserved(x())),
         K::Name(NameError::Robot(x())),
@@ -292,12 +163,7 @@ fn is_instruction(next: &str) -> bool {
 
 #[test]
 fn every_refusal_says_what_to_do() {
-    let all = [
-        portal_errors(),
-        push_errors(),
-        servant_errors(),
-        storage_errors(),
-    ];
+    let all = [portal_errors(), push_errors(), servant_errors(), storage_errors()];
     for error in all.into_iter().flatten() {
         let problem = error.problem();
         let next = problem.next.as_deref().unwrap_or_default();
@@ -308,11 +174,7 @@ fn every_refusal_says_what_to_do() {
 
 #[test]
 fn want_of_memory_is_mended_where_the_memory_was_named() {
-    let error = choreographer::Error::OutOfMemory {
-        service: "people".into(),
-        memory: api::Size(1),
-        ready: true,
-    };
+    let error = choreographer::Error::OutOfMemory { service: "people".into(), memory: api::Size(1), ready: true };
     let next = Error::from(error).problem().next.unwrap_or_default();
     for option in ["--robot-memory", "push it with a larger --memory"] {
         assert!(next.contains(option), "{next}");

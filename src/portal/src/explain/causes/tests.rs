@@ -17,10 +17,7 @@ fn served_with(link: Link) -> Served {
             connections: 1,
             idle_until: None,
             terms: None,
-            limits: api::Limits {
-                cpus: Some(0.5),
-                ..api::Limits::default()
-            },
+            limits: api::Limits { cpus: Some(0.5), ..api::Limits::default() },
             enforced: None,
             cgroup_version: 2,
             usage: Some(api::Usage::default()),
@@ -70,23 +67,10 @@ fn late_requests_are_blamed_on_the_part_that_takes_longest() {
     let late_in = Part::from_samples("compute", vec![90.0]);
     let late = Link { late: 20, ..link() };
     let unanswered = texts(served_with(late.clone()));
-    assert!(
-        unanswered[0]
-            .1
-            .contains("; none of these was answered; see"),
-        "{unanswered:?}"
-    );
-    let upward = Link {
-        late_in: Part::from_samples("up", vec![400.0]),
-        ..late.clone()
-    };
+    assert!(unanswered[0].1.contains("; none of these was answered; see"), "{unanswered:?}");
+    let upward = Link { late_in: Part::from_samples("up", vec![400.0]), ..late.clone() };
     let network = texts(served_with(upward));
-    assert!(
-        network[0]
-            .1
-            .contains("is spent in up (400 ms); check the robot's network"),
-        "{network:?}"
-    );
+    assert!(network[0].1.contains("is spent in up (400 ms); check the robot's network"), "{network:?}");
     let causes = texts(served_with(Link { late_in, ..late }));
     assert_eq!(causes.len(), 1);
     assert!(
@@ -125,11 +109,7 @@ fn each_thing_that_can_be_wrong_is_named() {
     all.servant.hung = vec!["/detect answered none of 9 inputs in 3.0 s".into()];
     all.servant.usage = Some(api::Usage {
         oom_kills: 1,
-        pressure: Some(api::Pressure {
-            cpu: 80.0,
-            memory: 30.0,
-            io: 0.0,
-        }),
+        pressure: Some(api::Pressure { cpu: 80.0, memory: 30.0, io: 0.0 }),
         ..api::Usage::default()
     });
     let causes = texts(all);
@@ -153,10 +133,7 @@ fn each_thing_that_can_be_wrong_is_named() {
         "answered 7 of the last 100 requests of /detect, Q is 2.5",
     ];
     for words in words {
-        assert!(
-            causes.iter().any(|(_, text)| text.contains(words)),
-            "{words}: {causes:?}"
-        );
+        assert!(causes.iter().any(|(_, text)| text.contains(words)), "{words}: {causes:?}");
     }
     assert_eq!(causes.len(), words.len(), "{causes:?}");
     assert!(causes.is_sorted_by_key(|(weight, _)| *weight));
@@ -197,17 +174,10 @@ fn what_a_hand_over_has_lost_is_named() {
         event("local-hands-back", "the link is up again"),
     ];
     let causes = find_causes(&[], &events, &[], &[]);
-    let lost: Vec<_> = causes
-        .iter()
-        .filter(|cause| cause.weight == Weight::Hint)
-        .collect();
+    let lost: Vec<_> = causes.iter().filter(|cause| cause.weight == Weight::Hint).collect();
     assert_eq!(lost.len(), 1);
     assert_eq!(lost[0].what, "the cloud goes on without 3 of /scan");
-    assert!(
-        lost[0].next.contains("local = \"none\""),
-        "{}",
-        lost[0].next
-    );
+    assert!(lost[0].next.contains("local = \"none\""), "{}", lost[0].next);
 }
 
 #[test]
@@ -220,11 +190,7 @@ fn a_links_requests_are_summed_up() {
         satisfaction: 6.0,
         ..RequestTiming::default()
     };
-    let dropped = |cause, count| TopicDropCount {
-        topic: "/image".into(),
-        cause,
-        count,
-    };
+    let dropped = |cause, count| TopicDropCount { topic: "/image".into(), cause, count };
     let seen = crate::explain::to_link(LinkStatus {
         node: "/detect".into(),
         up: true,
@@ -233,17 +199,10 @@ fn a_links_requests_are_summed_up() {
         throughput: None,
         drops: vec![dropped(Cause::Slow, 2)],
         dropped: vec![dropped(Cause::Replaced, 30)],
-        sla: link::control::SlaTargets {
-            desire: Some(0.05),
-            max: Some(0.1),
-            ..Default::default()
-        },
+        sla: link::control::SlaTargets { desire: Some(0.05), max: Some(0.1), ..Default::default() },
         requests: vec![
             request(Some(50.0), false),
-            RequestTiming {
-                up: 90.0,
-                ..request(Some(150.0), true)
-            },
+            RequestTiming { up: 90.0, ..request(Some(150.0), true) },
             request(None, true),
         ],
         unsent: 0,
@@ -262,16 +221,10 @@ fn a_links_requests_are_summed_up() {
     assert_eq!(seen.dropped, 32);
     assert!(seen.drops[0].starts_with("in the cloud 2 messages of /image were dropped: "));
     assert!(seen.drops[1].starts_with("on the robot 30 messages of /image were dropped: "));
-    assert_eq!(
-        seen.refused,
-        ["no messages on /seen pass between /view and /detect: durability"]
-    );
+    assert_eq!(seen.refused, ["no messages on /seen pass between /view and /detect: durability"]);
     assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
     let total = seen.phases.last().expect("parts");
-    assert_eq!(
-        (total.name.as_str(), total.p50, total.max),
-        ("total", 50.0, 150.0)
-    );
+    assert_eq!((total.name.as_str(), total.p50, total.max), ("total", 50.0, 150.0));
     let name = |part: Option<&Part>| part.map(|part| part.name.clone());
     assert_eq!(name(seen.dominant()).as_deref(), Some("compute"));
     let late_in = name(seen.late_in.as_ref());
@@ -294,10 +247,7 @@ fn what_was_never_promised_is_not_late() {
         throughput: None,
         drops: vec![],
         dropped: vec![],
-        sla: link::control::SlaTargets {
-            fallback_after: Some(3.0),
-            ..Default::default()
-        },
+        sla: link::control::SlaTargets { fallback_after: Some(3.0), ..Default::default() },
         requests: vec![request(Some(9000.0)), request(None)],
         unsent: 0,
         given: 0,
@@ -313,10 +263,7 @@ fn what_was_never_promised_is_not_late() {
         "the link of /detect is down; if the original is installed on the robot, it takes over after 3.0 s",
         "answered 1 of the last 2 requests of /detect; it takes over while the link is down",
     ] {
-        assert!(
-            causes.iter().any(|(_, text)| text.contains(words)),
-            "{words}: {causes:?}"
-        );
+        assert!(causes.iter().any(|(_, text)| text.contains(words)), "{words}: {causes:?}");
     }
     assert_eq!(causes.len(), 2, "{causes:?}");
 }
@@ -345,9 +292,5 @@ fn a_canary_that_waits_is_told_with_what_to_do() {
         found.what,
         "revision 2 of people, a canary, is not promoted yet: it has had 3 requests of the 20 required"
     );
-    assert!(
-        found.next.contains("rollout people promote"),
-        "{}",
-        found.next
-    );
+    assert!(found.next.contains("rollout people promote"), "{}", found.next);
 }

@@ -17,11 +17,10 @@ use api::shadow::{Compared, FieldDifference, NotCompared};
 use api::stream::{Machine, Update};
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
-    BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost,
-    Doctor, Event, Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node,
-    NodeDown, Phase, Pressure, Problem, PushEvent, PushOptions, Revision, Rollback, Servant,
-    ServiceDetail, ServiceSummary, Shadow, ShadowEvent, ShadowOptions, Size, Sla, Span, Stated,
-    Status, Stopped, Stream, Terms, Usage, Volume,
+    BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor, Event,
+    Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, NodeDown, Phase, Pressure, Problem,
+    PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Shadow, ShadowEvent,
+    ShadowOptions, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
 };
 use serde_json::Value;
 
@@ -47,10 +46,7 @@ fn limits() -> Limits {
 }
 
 fn usage() -> Usage {
-    Usage {
-        pressure: Some(Pressure::default()),
-        ..Usage::default()
-    }
+    Usage { pressure: Some(Pressure::default()), ..Usage::default() }
 }
 
 fn event() -> Event {
@@ -82,28 +78,17 @@ fn servant() -> Servant {
         enforced: Some(limits()),
         cgroup_version: 2,
         usage: Some(usage()),
-        response: Some(api::ResponseTimes {
-            requests: 1,
-            p50_ms: 1.5,
-            p95_ms: 1.5,
-        }),
+        response: Some(api::ResponseTimes { requests: 1, p50_ms: 1.5, p95_ms: 1.5 }),
         pids: vec![1],
         dropped: 1,
-        drops: vec![api::TopicDrops {
-            topic: "/x".into(),
-            count: 1,
-        }],
+        drops: vec![api::TopicDrops { topic: "/x".into(), count: 1 }],
         hung: vec!["/x answered none of 3 inputs in 1.0 s".into()],
         lifecycle: vec![api::NodeStage {
             node: "/x".into(),
             state: "inactive".into(),
             refused: Some("it did not activate".into()),
         }],
-        down: vec![NodeDown {
-            node: "/x".into(),
-            failures: 2,
-            again: 1,
-        }],
+        down: vec![NodeDown { node: "/x".into(), failures: 2, again: 1 }],
     }
 }
 
@@ -117,11 +102,7 @@ fn rollout_terms() -> RolloutTerms {
 }
 
 fn rollout() -> Rollout {
-    let arm = Arm {
-        p50: Some(1.5),
-        p95: Some(1.5),
-        ..Arm::default()
-    };
+    let arm = Arm { p50: Some(1.5), p95: Some(1.5), ..Arm::default() };
     Rollout {
         service: "x".into(),
         stable: 1,
@@ -138,14 +119,7 @@ fn rollout() -> Rollout {
 }
 
 fn back_off() -> BackOff {
-    BackOff {
-        service: "x".into(),
-        revision: 1,
-        robot: "r1".into(),
-        failures: 2,
-        reason: "ended".into(),
-        again: 1,
-    }
+    BackOff { service: "x".into(), revision: 1, robot: "r1".into(), failures: 2, reason: "ended".into(), again: 1 }
 }
 
 fn terms() -> Terms {
@@ -181,28 +155,15 @@ fn row() -> Row {
         value: 0.1,
         aux: [("width".to_owned(), "640".to_owned())].into(),
         limits: limits(),
-        spread: Some(Spread {
-            p50: 0.05,
-            p95: 0.1,
-            requests: 100,
-        }),
+        spread: Some(Spread { p50: 0.05, p95: 0.1, requests: 100 }),
         revision: Some(1),
         written: 1,
     }
 }
 
 fn new_rows() -> NewRows {
-    let bare = Row {
-        id: 0,
-        aux: Default::default(),
-        spread: None,
-        revision: None,
-        ..row()
-    };
-    NewRows {
-        rows: vec![row(), bare],
-        replace: true,
-    }
+    let bare = Row { id: 0, aux: Default::default(), spread: None, revision: None, ..row() };
+    NewRows { rows: vec![row(), bare], replace: true }
 }
 
 fn explained_sla() -> Explained {
@@ -219,11 +180,7 @@ fn explained_sla() -> Explained {
             measure: Measure::Fps,
             desire: 5.0,
             bound: 2.0,
-            rows: vec![Considered {
-                row: row(),
-                taken: true,
-                why: "taken".into(),
-            }],
+            rows: vec![Considered { row: row(), taken: true, why: "taken".into() }],
         }],
     }
 }
@@ -236,11 +193,7 @@ fn history() -> api::history::ServantHistory {
         began: 1,
         seen: 2,
         step: 60,
-        figures: api::history::ServantFigures {
-            time: vec![1, 2],
-            cores: vec![Some(0.5), None],
-            ..Default::default()
-        },
+        figures: api::history::ServantFigures { time: vec![1, 2], cores: vec![Some(0.5), None], ..Default::default() },
         local: [None, Some(2)]
             .map(|ended| api::history::LocalPeriod {
                 node: "/n".into(),
@@ -276,10 +229,7 @@ fn detail() -> ServiceDetail {
             source: "--apt x".into(),
             current: true,
         }],
-        nodes: vec![Node {
-            name: node.clone(),
-            argv: one_text("x"),
-        }],
+        nodes: vec![Node { name: node.clone(), argv: one_text("x") }],
         interface: Interface {
             topics: vec![Topic {
                 name: name.clone(),
@@ -295,34 +245,19 @@ fn detail() -> ServiceDetail {
                     ..api::interface::Qos::default()
                 }),
             }],
-            services: vec![Service {
-                name: name.clone(),
-                type_name: type_name.clone(),
-                node: node.clone(),
-            }],
-            actions: vec![Action {
-                name: name.clone(),
-                type_name,
-                node,
-            }],
+            services: vec![Service { name: name.clone(), type_name: type_name.clone(), node: node.clone() }],
+            actions: vec![Action { name: name.clone(), type_name, node }],
             parameters: vec![Parameter {
                 name: name.clone(),
                 node: Some("/x".into()),
                 value: Some(Value::from(1)),
                 descriptor: Some(api::interface::Descriptor {
-                    range: Some(api::interface::Range {
-                        from: Some(0.5),
-                        to: Some(1.5),
-                        step: Some(0.5),
-                    }),
+                    range: Some(api::interface::Range { from: Some(0.5), to: Some(1.5), step: Some(0.5) }),
                     ..api::interface::Descriptor::default()
                 }),
             }],
             lifecycle: one_text("/n"),
-            needs: vec![Need {
-                name: name.clone(),
-                nodes: one_text("/n"),
-            }],
+            needs: vec![Need { name: name.clone(), nodes: one_text("/n") }],
             requests: vec![api::interface::Request {
                 node: "/n".into(),
                 input: name.clone(),
@@ -335,12 +270,7 @@ fn detail() -> ServiceDetail {
         groups: vec![api::Group {
             revision: 1,
             robots: 2,
-            servants: vec![api::GroupServant {
-                id: "x-1".into(),
-                ready: true,
-                retiring: false,
-                under_way: 1,
-            }],
+            servants: vec![api::GroupServant { id: "x-1".into(), ready: true, retiring: false, under_way: 1 }],
             waiting: 0,
             answered: 1,
             failed: 0,
@@ -366,21 +296,11 @@ fn options() -> PushOptions {
         map: names(),
         with: one_text("x"),
         limits: limits(),
-        caps: Caps {
-            cpus: Some(2.0),
-            memory: Some(Size(1 << 30)),
-        },
-        sla: Sla {
-            rrt: Span::from_millis(100),
-            max_rrt: Span::from_millis(300),
-            ..Sla::default()
-        },
+        caps: Caps { cpus: Some(2.0), memory: Some(Size(1 << 30)) },
+        sla: Sla { rrt: Span::from_millis(100), max_rrt: Span::from_millis(300), ..Sla::default() },
         grants: Grants {
             devices: one_text("nvidia.com/gpu=0"),
-            volumes: vec![Volume {
-                source: "/a".into(),
-                target: "/b".into(),
-            }],
+            volumes: vec![Volume { source: "/a".into(), target: "/b".into() }],
             egress: one_text("example.org:80"),
         },
         requests: vec!["/a=/b".into()],
@@ -426,17 +346,8 @@ fn explanation() -> Explanation {
     };
     Explanation {
         robot: "r1".into(),
-        causes: vec![Cause {
-            weight: Weight::Slows,
-            what: "it is slow".into(),
-            next: "wait".into(),
-        }],
-        servants: vec![Served {
-            servant: servant(),
-            throttled: 0.5,
-            cores: 1.5,
-            links: vec![link, Link::default()],
-        }],
+        causes: vec![Cause { weight: Weight::Slows, what: "it is slow".into(), next: "wait".into() }],
+        servants: vec![Served { servant: servant(), throttled: 0.5, cores: 1.5, links: vec![link, Link::default()] }],
         events: vec![event()],
     }
 }
@@ -485,12 +396,7 @@ fn update() -> Update {
 fn trial() -> Trial {
     Trial {
         service: "x".into(),
-        inputs: vec![Fed {
-            from: vec!["/recorded".into()],
-            topic: "/x".into(),
-            type_name: "p/T".into(),
-            sent: 1,
-        }],
+        inputs: vec![Fed { from: vec!["/recorded".into()], topic: "/x".into(), type_name: "p/T".into(), sent: 1 }],
         outputs: vec![Heard {
             topic: "/x".into(),
             type_name: "p/T".into(),
@@ -498,13 +404,7 @@ fn trial() -> Trial {
             bytes: 1,
             last: Some(Value::from(1)),
         }],
-        rrt: Some(Times {
-            p50: 1.5,
-            p90: 1.5,
-            max: 1.5,
-            desire: 1.5,
-            acceptable: 1.5,
-        }),
+        rrt: Some(Times { p50: 1.5, p90: 1.5, max: 1.5, desire: 1.5, acceptable: 1.5 }),
         ..Trial::default()
     }
 }
@@ -515,10 +415,7 @@ fn calibration() -> Calibration {
         inputs: trial().inputs,
         pace: Some(1.5),
         network: Some(TimeSpread::default()),
-        points: vec![Point {
-            compute: Some(TimeSpread::default()),
-            ..Point::default()
-        }],
+        points: vec![Point { compute: Some(TimeSpread::default()), ..Point::default() }],
         rows: vec![row()],
         ..Calibration::default()
     }
@@ -635,20 +532,10 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         more: Some(1),
         beyond_cpus: 0.5,
         beyond_memory: Size(1),
-        expected: Some(Expected {
-            rrt: 0.1,
-            from: "x".into(),
-        }),
+        expected: Some(Expected { rrt: 0.1, from: "x".into() }),
         shared: Some(1),
     };
-    let bare = Fit {
-        stalled: None,
-        never: None,
-        more: None,
-        expected: None,
-        shared: None,
-        ..fits.clone()
-    };
+    let bare = Fit { stalled: None, never: None, more: None, expected: None, shared: None, ..fits.clone() };
     let mut samples = vec![
         sample("ShadowOptions", shadow_options()),
         sample("ShadowOptions", ShadowOptions::default()),
@@ -660,23 +547,9 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("NewToken", new_token()),
         sample(
             "NewToken",
-            NewToken {
-                services: Vec::new(),
-                robot: None,
-                classes: Vec::new(),
-                lifetime: None,
-                ..new_token()
-            },
+            NewToken { services: Vec::new(), robot: None, classes: Vec::new(), lifetime: None, ..new_token() },
         ),
-        sample(
-            "Rule",
-            Rule {
-                id: 1,
-                who: new_rule().who,
-                services: new_rule().services,
-                allow: new_rule().allow,
-            },
-        ),
+        sample("Rule", Rule { id: 1, who: new_rule().who, services: new_rule().services, allow: new_rule().allow }),
         sample(
             "Audited",
             Audited {
@@ -691,23 +564,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 more: 3,
             },
         ),
-        sample(
-            "Secret",
-            Secret {
-                token: token(),
-                secret: "x".into(),
-            },
-        ),
-        sample(
-            "Token",
-            Token {
-                robot: None,
-                expires: None,
-                last_used: None,
-                revoked: None,
-                ..token()
-            },
-        ),
+        sample("Secret", Secret { token: token(), secret: "x".into() }),
+        sample("Token", Token { robot: None, expires: None, last_used: None, revoked: None, ..token() }),
         sample(
             "Whoami",
             Whoami {
@@ -717,13 +575,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 robot: some_text("r1"),
             },
         ),
-        sample(
-            "SignIn",
-            SignIn {
-                name: "alice".into(),
-                password: "x".into(),
-            },
-        ),
+        sample("SignIn", SignIn { name: "alice".into(), password: "x".into() }),
         sample(
             "Session",
             Session {
@@ -733,10 +585,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 expires: Some(1),
                 needed: true,
                 accounts: true,
-                provider: Some(ProviderLink {
-                    name: "Lab".into(),
-                    path: "/x".into(),
-                }),
+                provider: Some(ProviderLink { name: "Lab".into(), path: "/x".into() }),
             },
         ),
         sample("Session", Session::default()),
@@ -802,13 +651,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("Rollout", rollout()),
         sample("RolloutOrder", RolloutOrder::Promote),
         sample("RolloutOrder", RolloutOrder::Abort),
-        sample(
-            "RolloutOrder",
-            RolloutOrder::Start {
-                revision: 1,
-                terms: rollout_terms(),
-            },
-        ),
+        sample("RolloutOrder", RolloutOrder::Start { revision: 1, terms: rollout_terms() }),
         sample("Servant", servant()),
         sample(
             "Differences",
@@ -827,72 +670,37 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("ServantHistory", history()),
         sample(
             "MachineHistory",
-            api::history::MachineHistory {
-                step: 60,
-                figures: api::history::MachineFigures::default(),
-            },
+            api::history::MachineHistory { step: 60, figures: api::history::MachineFigures::default() },
         ),
         sample("ServiceDetail", detail()),
         sample("Status", status()),
         sample("Update", update()),
         sample("Update", Update::default()),
-        sample(
-            "Stopped",
-            Stopped {
-                stopped: one_text("x"),
-            },
-        ),
+        sample("Stopped", Stopped { stopped: one_text("x") }),
         sample("Trial", trial()),
         sample("Trial", Trial::default()),
     ];
-    let check = |status, fix| Check {
-        name: "cgroups".into(),
-        status,
-        found: "none".into(),
-        fix,
-    };
-    let checks = vec![
-        check(CheckStatus::Missing, some_text("mount them")),
-        check(CheckStatus::Ok, None),
-    ];
+    let check = |status, fix| Check { name: "cgroups".into(), status, found: "none".into(), fix };
+    let checks = vec![check(CheckStatus::Missing, some_text("mount them")), check(CheckStatus::Ok, None)];
     samples.push(sample("Doctor", Doctor { checks }));
     for stream in [Stream::Stdout, Stream::Stderr] {
-        let line = LogLine {
-            time: 1,
-            node: "/n".into(),
-            stream,
-            line: "x".into(),
-        };
+        let line = LogLine { time: 1, node: "/n".into(), stream, line: "x".into() };
         samples.push(sample("LogLine", line));
     }
     for event in [
         CalibrationEvent::Step { title: "x".into() },
-        CalibrationEvent::Measured {
-            point: Point::default(),
-            times: vec![1.5],
-        },
-        CalibrationEvent::Kept {
-            servant: "x".into(),
-            calibration: Box::default(),
-        },
-        CalibrationEvent::Done {
-            calibration: Box::new(calibration()),
-        },
-        CalibrationEvent::Done {
-            calibration: Box::default(),
-        },
+        CalibrationEvent::Measured { point: Point::default(), times: vec![1.5] },
+        CalibrationEvent::Kept { servant: "x".into(), calibration: Box::default() },
+        CalibrationEvent::Done { calibration: Box::new(calibration()) },
+        CalibrationEvent::Done { calibration: Box::default() },
         CalibrationEvent::Error { problem: problem() },
     ] {
         samples.push(sample("CalibrationEvent", event));
     }
     for event in [
         ShadowEvent::Step { title: "x".into() },
-        ShadowEvent::Done {
-            shadow: Box::new(shadow()),
-        },
-        ShadowEvent::Done {
-            shadow: Box::default(),
-        },
+        ShadowEvent::Done { shadow: Box::new(shadow()) },
+        ShadowEvent::Done { shadow: Box::default() },
         ShadowEvent::Error { problem: problem() },
     ] {
         samples.push(sample("ShadowEvent", event));
@@ -900,22 +708,11 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     for event in [
         PushEvent::Step { title: "x".into() },
         PushEvent::Log { line: "x".into() },
-        PushEvent::Progress {
-            unit: "bytes".into(),
-            done: 1,
-            total: Some(2),
-        },
-        PushEvent::Warning {
-            message: "x".into(),
-        },
+        PushEvent::Progress { unit: "bytes".into(), done: 1, total: Some(2) },
+        PushEvent::Warning { message: "x".into() },
         PushEvent::Done {
             service: Box::new(detail()),
-            layers: vec![Layer {
-                name: "base".into(),
-                digest: "sha256:0".into(),
-                size: 1,
-                cached: true,
-            }],
+            layers: vec![Layer { name: "base".into(), digest: "sha256:0".into(), size: 1, cached: true }],
             took: 1,
         },
         PushEvent::Error { problem: problem() },

@@ -12,9 +12,7 @@ const HEAD: &str = "\
 pub fn write_types(document: &Value) -> String {
     let schemas = document["components"]["schemas"].as_object();
     let types = schemas.into_iter().flatten();
-    let types: Vec<String> = types
-        .map(|(name, schema)| write_type(name, schema))
-        .collect();
+    let types: Vec<String> = types.map(|(name, schema)| write_type(name, schema)).collect();
     format!("{HEAD}\n{}", types.join("\n"))
 }
 
@@ -32,15 +30,8 @@ fn write_type(name: &str, schema: &Value) -> String {
         };
     }
     let parents: Vec<String> = parts.iter().filter_map(|part| target(part)).collect();
-    let extends = if parents.is_empty() {
-        String::new()
-    } else {
-        format!(" extends {}", parents.join(", "))
-    };
-    format!(
-        "export interface {name}{extends} {{\n  {};\n}}\n",
-        members.join(";\n  ")
-    )
+    let extends = if parents.is_empty() { String::new() } else { format!(" extends {}", parents.join(", ")) };
+    format!("export interface {name}{extends} {{\n  {};\n}}\n", members.join(";\n  "))
 }
 
 /// Writes the members of an object, with a question mark behind those that may be absent.
@@ -102,11 +93,7 @@ fn write_object(schema: &Value) -> String {
         return format!("{{ {} }}", members.join("; "));
     }
     let values = &schema["additionalProperties"];
-    let values = if values.is_object() {
-        choices(values).join(" | ")
-    } else {
-        "unknown".to_owned()
-    };
+    let values = if values.is_object() { choices(values).join(" | ") } else { "unknown".to_owned() };
     format!("Record<string, {values}>")
 }
 

@@ -21,11 +21,7 @@ fn world() -> World {
     let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
     let state = Arc::new(state);
     let principals = Principals::new(Tokens::default(), Arc::clone(&state)).expect("readable");
-    World {
-        _home: home,
-        state,
-        principals,
-    }
+    World { _home: home, state, principals }
 }
 
 fn alice() -> NewAccount {
@@ -40,9 +36,7 @@ fn alice() -> NewAccount {
 impl World {
     /// Creates the account `alice`, whose password hash is `hash`.
     fn with_alice(self) -> World {
-        self.principals
-            .create_account(&alice(), "hash")
-            .expect("made");
+        self.principals.create_account(&alice(), "hash").expect("made");
         self
     }
 
@@ -53,8 +47,7 @@ impl World {
     }
 
     fn recognise(&self, secret: &str, now: Millis) -> Result<CallerIdentity, AuthenticationError> {
-        self.principals
-            .with_recogniser(|known| known.recognise_session(secret, now))
+        self.principals.with_recogniser(|known| known.recognise_session(secret, now))
     }
 }
 
@@ -68,34 +61,22 @@ fn a_session_ends_at_its_end_and_when_it_is_not_used() {
     assert!(!world.principals.has_no_credentials());
     let begun = world.begin();
     let who = world.recognise(&begun.secret, store::now()).expect("good");
-    assert_eq!(
-        (&*who.principal.name, &*who.principal.roles),
-        ("alice", &[Role::Deployer][..])
-    );
+    assert_eq!((&*who.principal.name, &*who.principal.roles), ("alice", &[Role::Deployer][..]));
     assert_eq!(who.owner.as_deref(), Some("person:alice"));
     assert!(who.principal.scope.includes("lab_1") && !who.principal.scope.includes("other"));
     let idle = milliseconds(SessionLifetimes::default().idle);
     let used = world.principals.sessions()[0].last_used;
     let over = Err(AuthenticationError::SessionOver);
-    world
-        .recognise(&begun.secret, used + idle - 1)
-        .expect("just");
+    world.recognise(&begun.secret, used + idle - 1).expect("just");
     assert_eq!(world.recognise(&begun.secret, used + idle), over);
     // Use extends the session, up to its end.
     world.principals.record_use(&who, used + idle - 1);
-    world
-        .recognise(&begun.secret, used + idle)
-        .expect("used meanwhile");
+    world.recognise(&begun.secret, used + idle).expect("used meanwhile");
     world.principals.record_use(&who, begun.expires - 1);
-    world
-        .recognise(&begun.secret, begun.expires - 1)
-        .expect("the last moment");
+    world.recognise(&begun.secret, begun.expires - 1).expect("the last moment");
     assert_eq!(world.recognise(&begun.secret, begun.expires), over);
     assert_eq!(world.recognise("another", store::now()), over);
-    assert_eq!(
-        world.recognise(&tokens::hash(&begun.secret), store::now()),
-        over
-    );
+    assert_eq!(world.recognise(&tokens::hash(&begun.secret), store::now()), over);
 }
 
 #[test]
@@ -107,17 +88,9 @@ fn uses_are_kept_when_something_else_changes() {
     world.begin();
     let sessions = world.principals.sessions();
     assert_eq!(sessions[0].last_used, later, "not written yet, but known");
-    assert_eq!(
-        world.state.sessions().expect("readable")[0].last_used,
-        sessions[0].created
-    );
-    world
-        .principals
-        .record_use(&begun.identity, later + USED_LATER);
-    assert_eq!(
-        world.state.sessions().expect("readable")[0].last_used,
-        later + USED_LATER
-    );
+    assert_eq!(world.state.sessions().expect("readable")[0].last_used, sessions[0].created);
+    world.principals.record_use(&begun.identity, later + USED_LATER);
+    assert_eq!(world.state.sessions().expect("readable")[0].last_used, later + USED_LATER);
 }
 
 /// Interval after which uses are written to disk.
@@ -126,26 +99,12 @@ const USED_LATER: Millis = 60_000;
 #[test]
 fn changes_of_an_account_end_its_sessions_and_no_others() {
     let world = world().with_alice();
-    let other = NewAccount {
-        name: "bob".into(),
-        role: Role::Admin,
-        services: Vec::new(),
-        ..alice()
-    };
-    world
-        .principals
-        .create_account(&other, "hash")
-        .expect("made");
+    let other = NewAccount { name: "bob".into(), role: Role::Admin, services: Vec::new(), ..alice() };
+    world.principals.create_account(&other, "hash").expect("made");
     let candidate = world.principals.candidate("bob").expect("an account");
     let bob = expect_begun(world.principals.begin_session(&candidate, "x"));
-    let role = AccountChange {
-        role: Some(Role::Operator),
-        ..AccountChange::default()
-    };
-    let disabled = |disabled| AccountChange {
-        disabled: Some(disabled),
-        ..AccountChange::default()
-    };
+    let role = AccountChange { role: Some(Role::Operator), ..AccountChange::default() };
+    let disabled = |disabled| AccountChange { disabled: Some(disabled), ..AccountChange::default() };
     let changes: [(AccountChange, Option<&str>); 4] = [
         (role, None),
         (AccountChange::default(), Some("another hash")),
@@ -158,10 +117,7 @@ fn changes_of_an_account_end_its_sessions_and_no_others() {
         changed.expect("there");
         if let Some(begun) = begun {
             let standing = world.principals.connection_access(&begun.identity, "lab_1");
-            assert_eq!(
-                standing,
-                ConnectionAccess::Ended("this session was ended".into())
-            );
+            assert_eq!(standing, ConnectionAccess::Ended("this session was ended".into()));
         }
     }
     assert_eq!(world.principals.accounts()[0].role, Role::Operator);
@@ -169,53 +125,29 @@ fn changes_of_an_account_end_its_sessions_and_no_others() {
     world.principals.remove_account("alice").expect("there");
     assert!(world.recognise(&begun.secret, store::now()).is_err());
     assert!(world.principals.candidate("alice").is_none());
-    world
-        .recognise(&bob.secret, store::now())
-        .expect("another's");
+    world.recognise(&bob.secret, store::now()).expect("another's");
     let unknown = world.principals.remove_account("alice").expect_err("once");
     assert_eq!(unknown.problem().status, 404);
     world.principals.remove_account("bob").expect("there");
-    assert!(
-        !world.principals.has_no_credentials(),
-        "the door does not open again"
-    );
+    assert!(!world.principals.has_no_credentials(), "the door does not open again");
 }
 
 #[test]
 fn nobody_begins_by_what_an_account_was_before() {
     let world = world().with_alice();
     let before = world.principals.candidate("alice").expect("an account");
-    let role = AccountChange {
-        role: Some(Role::Viewer),
-        services: alice().services,
-        ..AccountChange::default()
-    };
+    let role = AccountChange { role: Some(Role::Viewer), services: alice().services, ..AccountChange::default() };
     for (change, password) in [(&role, None), (&AccountChange::default(), Some("another"))] {
         let changed = world.principals.change_account("alice", change, password);
         changed.expect("there");
-        let begun = world
-            .principals
-            .begin_session(&before, "x")
-            .expect("readable");
-        assert!(
-            begun.is_none(),
-            "its password was looked at before the change"
-        );
+        let begun = world.principals.begin_session(&before, "x").expect("readable");
+        assert!(begun.is_none(), "its password was looked at before the change");
     }
-    let disabled = AccountChange {
-        disabled: Some(true),
-        ..AccountChange::default()
-    };
+    let disabled = AccountChange { disabled: Some(true), ..AccountChange::default() };
     let before = world.principals.candidate("alice").expect("an account");
     let changed = world.principals.change_account("alice", &disabled, None);
     changed.expect("there");
-    assert!(
-        world
-            .principals
-            .begin_session(&before, "x")
-            .expect("readable")
-            .is_none()
-    );
+    assert!(world.principals.begin_session(&before, "x").expect("readable").is_none());
     assert!(world.principals.candidate("alice").is_none());
 }
 
@@ -224,18 +156,10 @@ fn a_hash_made_anew_ends_no_session() {
     let world = world().with_alice();
     let begun = world.begin();
     let mut candidate = world.principals.candidate("alice").expect("an account");
-    world
-        .principals
-        .rehash(&mut candidate, "better".into())
-        .expect("written");
-    world
-        .recognise(&begun.secret, store::now())
-        .expect("good still");
+    world.principals.rehash(&mut candidate, "better".into()).expect("written");
+    world.recognise(&begun.secret, store::now()).expect("good still");
     expect_begun(world.principals.begin_session(&candidate, "x"));
-    assert_eq!(
-        world.principals.candidate("alice").expect("there").password,
-        "better"
-    );
+    assert_eq!(world.principals.candidate("alice").expect("there").password, "better");
 }
 
 #[test]
@@ -249,30 +173,14 @@ fn accounts_and_tokens_share_their_names() {
         classes: Vec::new(),
         lifetime: None,
     };
-    let taken = world
-        .principals
-        .create_token(&token)
-        .expect_err("an account's")
-        .problem();
+    let taken = world.principals.create_token(&token).expect_err("an account's").problem();
     assert_eq!(taken.status, 409, "{taken:?}");
-    let bob = NewToken {
-        name: "bob".into(),
-        ..token
-    };
+    let bob = NewToken { name: "bob".into(), ..token };
     world.principals.create_token(&bob).expect("made");
-    let new = NewAccount {
-        name: "bob".into(),
-        ..alice()
-    };
-    let taken = world
-        .principals
-        .create_account(&new, "hash")
-        .expect_err("a token's");
+    let new = NewAccount { name: "bob".into(), ..alice() };
+    let taken = world.principals.create_account(&new, "hash").expect_err("a token's");
     assert_eq!(taken.problem().status, 409);
-    let taken = world
-        .principals
-        .create_account(&alice(), "hash")
-        .expect_err("an account's");
+    let taken = world.principals.create_account(&alice(), "hash").expect_err("an account's");
     assert_eq!(taken.problem().status, 409);
 }
 
@@ -281,29 +189,16 @@ fn guesses_at_an_account_are_slowed_wherever_they_come_from() {
     let world = world().with_alice();
     let from = |number: u8| std::net::IpAddr::from([10, 0, 0, number]);
     for number in 0..access::guesses::FREE as u8 {
-        world
-            .principals
-            .check_sign_in("alice", from(number), 5_000)
-            .expect("free");
-        world
-            .principals
-            .record_wrong_password("alice", from(number), 5_000);
+        world.principals.check_sign_in("alice", from(number), 5_000).expect("free");
+        world.principals.record_wrong_password("alice", from(number), 5_000);
     }
     let slowed = world.principals.check_sign_in("alice", from(99), 5_000);
     assert_eq!(slowed, Err(AuthenticationError::SlowedSignIn(1_000)));
-    world
-        .principals
-        .check_sign_in("bob", from(99), 5_000)
-        .expect("another account");
-    assert_eq!(
-        world.principals.password_counts(),
-        (u64::from(access::guesses::FREE), 1)
-    );
+    world.principals.check_sign_in("bob", from(99), 5_000).expect("another account");
+    assert_eq!(world.principals.password_counts(), (u64::from(access::guesses::FREE), 1));
     // Also from one address, whatever the account.
     for number in 0..access::guesses::FREE {
-        world
-            .principals
-            .record_wrong_password(&format!("name{number}"), from(50), 5_000);
+        world.principals.record_wrong_password(&format!("name{number}"), from(50), 5_000);
     }
     let slowed = world.principals.check_sign_in("bob", from(50), 5_000);
     assert_eq!(slowed, Err(AuthenticationError::SlowedSignIn(1_000)));
@@ -338,10 +233,7 @@ fn a_person_has_so_many_sessions_and_no_more() {
         world.begin();
     }
     assert_eq!(world.principals.sessions().len(), 32);
-    assert!(
-        world.recognise(&first.secret, store::now()).is_err(),
-        "the oldest"
-    );
+    assert!(world.recognise(&first.secret, store::now()).is_err(), "the oldest");
 }
 
 #[tokio::test]

@@ -19,11 +19,7 @@ fn roles(viewers: &str, services: &str) -> Roles {
 }
 
 fn person(subject: &str, name: &str) -> Person {
-    Person {
-        subject: subject.into(),
-        name: name.into(),
-        groups: vec!["students".into(), "others".into()],
-    }
+    Person { subject: subject.into(), name: name.into(), groups: vec!["students".into(), "others".into()] }
 }
 
 struct World {
@@ -35,10 +31,7 @@ impl World {
     fn new() -> World {
         let home = tempfile::tempdir().expect("a directory");
         let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
-        World {
-            _home: home,
-            state: Arc::new(state),
-        }
+        World { _home: home, state: Arc::new(state) }
     }
 
     /// Loads the principals as a daemon with this configuration does.
@@ -53,9 +46,7 @@ impl World {
 
 fn begin(principals: &Principals, roles: &Roles, person: &Person) -> StartedSession {
     let granted = roles.grant_for_groups(&person.groups).expect("a role");
-    principals
-        .begin_provider_session(ISSUER, person, &granted, "127.0.0.1:5000")
-        .expect("begun")
+    principals.begin_provider_session(ISSUER, person, &granted, "127.0.0.1:5000").expect("begun")
 }
 
 #[test]
@@ -65,10 +56,7 @@ fn people_of_a_provider_are_told_apart_by_its_word_for_them() {
     assert!(!principals.has_no_credentials(), "a provider names people");
     let alice = begin(&principals, &roles, &person("1", "alice"));
     let principal = &alice.identity.principal;
-    assert_eq!(
-        (&*principal.name, principal.has_role(Role::Viewer)),
-        ("oidc:alice", true)
-    );
+    assert_eq!((&*principal.name, principal.has_role(Role::Viewer)), ("oidc:alice", true));
     assert!(principal.scope.includes("lab_1") && !principal.scope.includes("other"));
     let other = begin(&principals, &roles, &person("2", "alice"));
     assert_eq!(other.identity.principal.name, "oidc:alice~2");
@@ -91,22 +79,14 @@ fn at_a_start_sessions_end_that_would_be_others_today() {
     let principals = world.start(Some((ISSUER, &first)));
     let begun = begin(&principals, &first, &person("1", "alice"));
     let good = |principals: &Principals| {
-        principals
-            .with_recogniser(|known| known.recognise_session(&begun.secret, store::now()))
-            .is_ok()
+        principals.with_recogniser(|known| known.recognise_session(&begun.secret, store::now())).is_ok()
     };
     assert!(good(&world.start(Some((ISSUER, &first)))), "as before");
-    for (what, other) in [
-        ("another group", roles("staff", "lab_*")),
-        ("another scope", roles("students", "*")),
-    ] {
+    for (what, other) in [("another group", roles("staff", "lab_*")), ("another scope", roles("students", "*"))] {
         let world = World::new();
         let principals = world.start(Some((ISSUER, &first)));
         begin(&principals, &first, &person("1", "alice"));
-        assert!(
-            world.start(Some((ISSUER, &other))).sessions().is_empty(),
-            "{what}"
-        );
+        assert!(world.start(Some((ISSUER, &other))).sessions().is_empty(), "{what}");
     }
     let world_of_another = World::new();
     let principals = world_of_another.start(Some((ISSUER, &first)));
@@ -115,10 +95,7 @@ fn at_a_start_sessions_end_that_would_be_others_today() {
     assert!(elsewhere.sessions().is_empty(), "another provider");
     let without = world.start(None);
     assert!(!good(&without));
-    assert!(
-        !without.has_no_credentials(),
-        "the door does not open again"
-    );
+    assert!(!without.has_no_credentials(), "the door does not open again");
 }
 
 #[test]
@@ -133,9 +110,7 @@ fn sessions_of_accounts_are_not_a_providers() {
     };
     principals.create_account(&new, "hash").expect("made");
     let candidate = principals.candidate("bob").expect("an account");
-    let begun = principals
-        .begin_session(&candidate, "127.0.0.1:1")
-        .expect("written");
+    let begun = principals.begin_session(&candidate, "127.0.0.1:1").expect("written");
     assert!(begun.is_some());
     assert_eq!(world.start(None).sessions().len(), 1);
 }

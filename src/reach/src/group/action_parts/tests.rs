@@ -36,11 +36,7 @@ impl PartsWorld {
         let ros = RosVersion::Two;
         let registry = Registry::with_definitions(ros, &interface.definitions);
         let registry = Arc::new(registry.expect("definitions"));
-        let rules = Rules {
-            window: 1,
-            replicas: 1,
-            idempotent: false,
-        };
+        let rules = Rules { window: 1, replicas: 1, idempotent: false };
         PartsWorld {
             group: ServantGroup::new(ros, "jazzy", &interface, rules),
             of: registry.action("x_msgs/action/Count").expect("an action"),
@@ -55,22 +51,14 @@ impl PartsWorld {
         let node = system.join("/counter");
         let server = node.serve_action("/count", &self.of, Arc::new(Handler { told, takes }));
         let member = self.group.join("servant-1", system.join("/daemon"));
-        Servant {
-            server: server.expect("served"),
-            heard,
-            member,
-        }
+        Servant { server: server.expect("served"), heard, member }
     }
 
     fn robot(&self) -> Robot {
         let (notices, told) = mpsc::unbounded_channel();
         let budget = Budget::new("the robot", BYTES);
         let (bus, _) = self.group.create_buses(&self.registry, &budget, &notices);
-        Robot {
-            bus,
-            of: Arc::clone(&self.of),
-            told,
-        }
+        Robot { bus, of: Arc::clone(&self.of), told }
     }
 
     fn waiting(&self) -> usize {
@@ -87,11 +75,7 @@ struct Handler {
 impl ActionHandler for Handler {
     fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), FailureReason> {
         let _ = self.told.send((id.to_owned(), true));
-        if self.takes {
-            Ok(())
-        } else {
-            Err(FailureReason::new(""))
-        }
+        if self.takes { Ok(()) } else { Err(FailureReason::new("")) }
     }
 
     fn on_cancel(&self, id: &str) {
@@ -166,9 +150,7 @@ impl Robot {
     }
 
     fn registry_service(&self, name: &str) -> Arc<ros::schema::ServiceDef> {
-        Registry::for_version(RosVersion::Two)
-            .service(name)
-            .expect("known to all")
+        Registry::for_version(RosVersion::Two).service(name).expect("known to all")
     }
 
     /// Returns status and result.
@@ -177,10 +159,7 @@ impl Robot {
         let request = cdr(&of.request, &json!({ "goal_id": id(number) }));
         let answer = self.bus.call(RESULT, request, LONG).await;
         let answer = read(&of.response, &answer.expect("an answer"));
-        (
-            answer["status"].as_u64().unwrap_or_default(),
-            answer["result"]["all"].as_i64().unwrap_or_default(),
-        )
+        (answer["status"].as_u64().unwrap_or_default(), answer["result"]["all"].as_i64().unwrap_or_default())
     }
 
     async fn subscribe(&self, topic: &str) -> Subscription {
@@ -217,11 +196,7 @@ const CANCELED: u64 = 5;
 const ABORTED: u64 = 6;
 
 fn end(of: &ActionDef, all: i64) -> GoalEnd {
-    GoalEnd {
-        outcome: GoalOutcome::Succeeded,
-        text: String::new(),
-        result: cdr(&of.result, &json!({ "all": all })),
-    }
+    GoalEnd { outcome: GoalOutcome::Succeeded, text: String::new(), result: cdr(&of.result, &json!({ "all": all })) }
 }
 
 #[tokio::test]
@@ -270,10 +245,7 @@ async fn a_goal_that_waits_for_a_servant_is_accepted_and_can_be_cancelled() {
     }
     assert_eq!(robot.cancel_goals(2).await, (vec![2], 0));
     assert_eq!(servant.next_goal().await, (goal.clone(), false));
-    let canceled = GoalEnd {
-        outcome: GoalOutcome::Canceled,
-        ..end(&world.of, 1)
-    };
+    let canceled = GoalEnd { outcome: GoalOutcome::Canceled, ..end(&world.of, 1) };
     assert!(servant.server.end_goal(&goal, canceled));
     assert_eq!(robot.result(2).await, (CANCELED, 1));
     // The goal has ended.
@@ -370,9 +342,7 @@ async fn the_group_has_the_ends_of_an_action_server() {
     let again = node_ends::collect_node_ends(view, &world.group.interface, &world.registry);
     assert_eq!(again, graph.ends);
     // Services are not topics.
-    let refused = robot
-        .bus
-        .subscribe(SEND, WireType::any(), QosProfile::keep_last(1));
+    let refused = robot.bus.subscribe(SEND, WireType::any(), QosProfile::keep_last(1));
     assert!(matches!(refused.await, Err(BusError::NotShared(_))));
     let refused = robot.bus.node_parameters().err().expect("refused");
     assert!(refused.to_string().contains("robots share"), "{refused}");

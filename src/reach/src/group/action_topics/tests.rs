@@ -18,11 +18,7 @@ fn group() -> (Arc<ServantGroup>, Arc<dyn Bus>) {
     }))
     .expect("an interface");
     let registry = Registry::from_definitions(&interface.definitions).expect("definitions");
-    let rules = Rules {
-        window: 1,
-        replicas: 1,
-        idempotent: false,
-    };
+    let rules = Rules { window: 1, replicas: 1, idempotent: false };
     let group = ServantGroup::new(RosVersion::One, "noetic", &interface, rules);
     let budget = Budget::new("the robot", BYTES);
     let bus = group.create_bus(&Arc::new(registry), &budget);
@@ -49,31 +45,20 @@ impl Robot {
         let goals = bus.advertise("/count/goal", any(), qos).await;
         let results = bus.subscribe("/count/result", any(), qos).await;
         let states = bus.subscribe("/count/status", any(), qos).await;
-        Robot {
-            goals: goals.expect("a topic"),
-            results: results.expect("a topic"),
-            states: states.expect("a topic"),
-        }
+        Robot { goals: goals.expect("a topic"), results: results.expect("a topic"), states: states.expect("a topic") }
     }
 
     fn send_goal(&self, id: &str, bytes: usize) {
-        let id = GoalId {
-            id: id.to_owned(),
-            ..GoalId::default()
-        };
+        let id = GoalId { id: id.to_owned(), ..GoalId::default() };
         let body = [&(bytes as u32).to_le_bytes()[..], &vec![b'x'; bytes]].concat();
-        self.goals
-            .publish(messages::write_goal(Time::default(), &id, &body));
+        self.goals.publish(messages::write_goal(Time::default(), &id, &body));
     }
 
     /// Returns the results so far: id, status and text.
     fn results(&mut self) -> Vec<(String, ActionlibStatus, String)> {
         let read = |bytes: &Bytes| messages::read_state(bytes).expect("a result").0;
         let results = drain(&mut self.results.messages).into_iter();
-        results
-            .map(|bytes| read(&bytes))
-            .map(|state| (state.goal.id, state.status, state.text))
-            .collect()
+        results.map(|bytes| read(&bytes)).map(|state| (state.goal.id, state.status, state.text)).collect()
     }
 
     /// Returns the last status.
@@ -84,9 +69,7 @@ impl Robot {
 }
 
 fn drain(messages: &mut MessageReceiver) -> Vec<Bytes> {
-    std::iter::from_fn(|| messages.try_recv())
-        .map(|message| message.bytes)
-        .collect()
+    std::iter::from_fn(|| messages.try_recv()).map(|message| message.bytes).collect()
 }
 
 fn waiting(group: &Arc<ServantGroup>) -> usize {
@@ -157,10 +140,7 @@ async fn robots_with_goals_of_one_name_hear_of_their_own() {
     other.send_goal("same", 8);
     assert_eq!(waiting(&group), 2);
     let cancel = bus.advertise("/count/cancel", WireType::any(), QosProfile::keep_last(1));
-    let same = GoalId {
-        id: "same".to_owned(),
-        ..GoalId::default()
-    };
+    let same = GoalId { id: "same".to_owned(), ..GoalId::default() };
     let cancel = cancel.await.expect("a topic");
     cancel.publish(messages::write_cancel(&same));
     let ended = one.results.messages.recv().await.expect("it ends");

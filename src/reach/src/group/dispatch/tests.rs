@@ -2,11 +2,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-const RULES: Rules = Rules {
-    window: 2,
-    replicas: 1,
-    idempotent: false,
-};
+const RULES: Rules = Rules { window: 2, replicas: 1, idempotent: false };
 
 fn group(rules: Rules, members: u64) -> Dispatcher {
     let mut group = Dispatcher::new(rules);
@@ -29,20 +25,11 @@ fn the_servant_with_the_fewest_requests_is_asked() {
     let mut group = group(RULES, 2);
     assert_eq!(group.ask(7, &call()), (1, vec![DispatchOrder::Ask(1, 1)]));
     assert_eq!(group.ask(7, &call()), (2, vec![DispatchOrder::Ask(2, 2)]));
-    assert_eq!(
-        group.finish_attempt(2, 2, AttemptOutcome::Answered),
-        (true, vec![])
-    );
+    assert_eq!(group.finish_attempt(2, 2, AttemptOutcome::Answered), (true, vec![]));
     assert_eq!(group.ask(8, &call()), (3, vec![DispatchOrder::Ask(3, 2)]));
     // Of two with equal load, the one that got fewer requests.
-    assert_eq!(
-        group.finish_attempt(3, 2, AttemptOutcome::Answered),
-        (true, vec![])
-    );
-    assert_eq!(
-        group.finish_attempt(1, 1, AttemptOutcome::Answered),
-        (true, vec![])
-    );
+    assert_eq!(group.finish_attempt(3, 2, AttemptOutcome::Answered), (true, vec![]));
+    assert_eq!(group.finish_attempt(1, 1, AttemptOutcome::Answered), (true, vec![]));
     assert_eq!(group.ask(8, &call()), (4, vec![DispatchOrder::Ask(4, 1)]));
 }
 
@@ -53,14 +40,10 @@ fn requests_without_a_free_servant_wait_and_robots_take_turns() {
         group.ask(1, &call());
     }
     group.ask(2, &call());
-    let load = GroupLoad {
-        waiting: 4,
-        under_way: 2,
-    };
+    let load = GroupLoad { waiting: 4, under_way: 2 };
     assert_eq!(group.load(), load);
     // The third of the greedy robot, then the other robot's, then the rest.
-    let next =
-        |group: &mut Dispatcher, ended| group.finish_attempt(ended, 1, AttemptOutcome::Answered).1;
+    let next = |group: &mut Dispatcher, ended| group.finish_attempt(ended, 1, AttemptOutcome::Answered).1;
     assert_eq!(next(&mut group, 1), [DispatchOrder::Ask(3, 1)]);
     assert_eq!(next(&mut group, 2), [DispatchOrder::Ask(6, 1)]);
     assert_eq!(next(&mut group, 3), [DispatchOrder::Ask(4, 1)]);
@@ -77,10 +60,7 @@ fn a_servant_carries_out_goals_of_one_robot_at_a_time() {
     // The robot's next goal goes to the same servant, because the node knows how to treat it.
     assert_eq!(group.ask(2, &goal()).1, [DispatchOrder::Ask(4, 2)]);
     assert_eq!(group.finish_attempt(2, 2, AttemptOutcome::Answered).1, []);
-    assert_eq!(
-        group.finish_attempt(4, 2, AttemptOutcome::Answered).1,
-        [DispatchOrder::Ask(3, 2)]
-    );
+    assert_eq!(group.finish_attempt(4, 2, AttemptOutcome::Answered).1, [DispatchOrder::Ask(3, 2)]);
     // Another action is independent.
     let other = Kind::Goal("/dock".into());
     assert_eq!(group.ask(4, &other).1, [DispatchOrder::Ask(5, 1)]);
@@ -96,10 +76,7 @@ fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
         let (ticket, orders) = group.ask(1, &goal());
         let begins = orders == [DispatchOrder::Ask(ticket, 1)];
         if begins {
-            assert_eq!(
-                group.finish_attempt(before, 1, AttemptOutcome::Answered).1,
-                []
-            );
+            assert_eq!(group.finish_attempt(before, 1, AttemptOutcome::Answered).1, []);
             before = ticket;
         }
         (begins, before)
@@ -118,13 +95,7 @@ fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
         "the first robot's next ones wait for their turn"
     );
     let first = other + 1 + AHEAD as u64;
-    assert_eq!(
-        group
-            .finish_attempt(other, 1, AttemptOutcome::Answered)
-            .1
-            .first(),
-        Some(&DispatchOrder::Ask(first, 1))
-    );
+    assert_eq!(group.finish_attempt(other, 1, AttemptOutcome::Answered).1.first(), Some(&DispatchOrder::Ask(first, 1)));
 }
 
 #[test]
@@ -132,31 +103,15 @@ fn requests_of_a_lost_servant_fail_or_are_retried() {
     let mut strict = group(RULES, 2);
     strict.ask(1, &call());
     let orders = strict.leave(1);
-    let fails = [
-        DispatchOrder::Drop(1, 1),
-        DispatchOrder::Fail(1, LossReason::NotAskedAgain),
-    ];
+    let fails = [DispatchOrder::Drop(1, 1), DispatchOrder::Fail(1, LossReason::NotAskedAgain)];
     assert_eq!(orders, fails);
-    assert_eq!(
-        strict.finish_attempt(1, 1, AttemptOutcome::Answered),
-        (false, vec![]),
-        "late"
-    );
+    assert_eq!(strict.finish_attempt(1, 1, AttemptOutcome::Answered), (false, vec![]), "late");
 
-    let rules = Rules {
-        idempotent: true,
-        ..RULES
-    };
+    let rules = Rules { idempotent: true, ..RULES };
     let mut group = group(rules, 4);
     group.ask(1, &call());
-    assert_eq!(
-        group.leave(1),
-        [DispatchOrder::Drop(1, 1), DispatchOrder::Ask(1, 2)]
-    );
-    assert_eq!(
-        group.finish_attempt(1, 2, AttemptOutcome::Lost),
-        (false, vec![DispatchOrder::Ask(1, 3)])
-    );
+    assert_eq!(group.leave(1), [DispatchOrder::Drop(1, 1), DispatchOrder::Ask(1, 2)]);
+    assert_eq!(group.finish_attempt(1, 2, AttemptOutcome::Lost), (false, vec![DispatchOrder::Ask(1, 3)]));
     // This request may be the cause of the crashes.
     let (_, orders) = group.finish_attempt(1, 3, AttemptOutcome::Lost);
     assert_eq!(orders, [DispatchOrder::Fail(1, LossReason::AskedOften)]);
@@ -166,10 +121,7 @@ fn requests_of_a_lost_servant_fail_or_are_retried() {
 fn what_was_not_taken_waits_for_a_servant_that_takes_it() {
     let mut group = group(RULES, 2);
     group.ask(1, &call());
-    assert_eq!(
-        group.finish_attempt(1, 1, AttemptOutcome::NotTaken).1,
-        [DispatchOrder::Ask(1, 2)]
-    );
+    assert_eq!(group.finish_attempt(1, 1, AttemptOutcome::NotTaken).1, [DispatchOrder::Ask(1, 2)]);
     assert_eq!(group.finish_attempt(1, 2, AttemptOutcome::NotTaken).1, []);
     assert_eq!(group.load().waiting, 1);
     // The waiting call blocks no other service, neither for this robot nor for another.
@@ -198,35 +150,20 @@ fn a_servant_that_loses_a_request_does_not_get_those_that_follow() {
 
 #[test]
 fn the_first_answer_of_replicas_wins() {
-    let rules = Rules {
-        replicas: 2,
-        ..RULES
-    };
+    let rules = Rules { replicas: 2, ..RULES };
     let mut group = group(rules, 1);
     // There is only one.
     assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(1, 1)]);
     group.join(2);
     let (ticket, orders) = group.ask(1, &call());
-    assert_eq!(
-        orders,
-        [DispatchOrder::Ask(ticket, 2), DispatchOrder::Ask(ticket, 1)]
-    );
+    assert_eq!(orders, [DispatchOrder::Ask(ticket, 2), DispatchOrder::Ask(ticket, 1)]);
     let answered = group.finish_attempt(ticket, 1, AttemptOutcome::Answered);
     assert_eq!(answered, (true, vec![DispatchOrder::Drop(ticket, 2)]));
-    assert_eq!(
-        group.finish_attempt(ticket, 2, AttemptOutcome::Answered),
-        (false, vec![])
-    );
+    assert_eq!(group.finish_attempt(ticket, 2, AttemptOutcome::Answered), (false, vec![]));
     // If one is lost the other remains; after that it is retried.
     let (ticket, _) = group.ask(1, &call());
-    assert_eq!(
-        group.finish_attempt(ticket, 2, AttemptOutcome::Lost),
-        (false, vec![])
-    );
-    assert_eq!(
-        group.finish_attempt(ticket, 1, AttemptOutcome::Lost),
-        (false, vec![])
-    );
+    assert_eq!(group.finish_attempt(ticket, 2, AttemptOutcome::Lost), (false, vec![]));
+    assert_eq!(group.finish_attempt(ticket, 1, AttemptOutcome::Lost), (false, vec![]));
     assert_eq!(group.resume(2, &call()), [DispatchOrder::Ask(ticket, 2)]);
 }
 
@@ -238,10 +175,7 @@ fn a_retired_servant_ends_what_it_has_and_gets_no_more() {
     assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(2, 2)]);
     assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(3, 2)]);
     assert_eq!(group.ask(1, &call()).1, [], "though it has a place");
-    assert_eq!(
-        group.finish_attempt(1, 1, AttemptOutcome::Answered),
-        (true, vec![])
-    );
+    assert_eq!(group.finish_attempt(1, 1, AttemptOutcome::Answered), (true, vec![]));
     assert_eq!(group.member_load(1), 0);
     assert_eq!(group.reinstate(1), [DispatchOrder::Ask(4, 1)]);
 }
@@ -317,11 +251,7 @@ impl DispatchWorld {
                     assert!(seen.lost < ATTEMPTS);
                 }
                 DispatchOrder::Drop(ticket, member) => {
-                    self.seen
-                        .get_mut(&ticket)
-                        .expect("asked for")
-                        .at
-                        .remove(&member);
+                    self.seen.get_mut(&ticket).expect("asked for").at.remove(&member);
                 }
                 DispatchOrder::Fail(ticket, why) => {
                     let seen = self.seen.get_mut(&ticket).expect("asked for");
@@ -348,11 +278,7 @@ impl DispatchWorld {
                 };
                 self.members.remove(&member);
                 self.paused.retain(|(of, _)| *of != member);
-                for seen in self
-                    .seen
-                    .values_mut()
-                    .filter(|seen| seen.at.contains(&member))
-                {
+                for seen in self.seen.values_mut().filter(|seen| seen.at.contains(&member)) {
                     seen.lost += 1;
                 }
                 let orders = self.group.leave(member);
@@ -379,20 +305,13 @@ impl DispatchWorld {
                     number => Kind::Goal(format!("/{number}").into()),
                 };
                 let (ticket, orders) = self.group.ask(robot, &kind);
-                let seen = TrackedRequest {
-                    robot,
-                    kind,
-                    at: BTreeSet::new(),
-                    lost: 0,
-                    over: false,
-                };
+                let seen = TrackedRequest { robot, kind, at: BTreeSet::new(), lost: 0, over: false };
                 assert!(self.seen.insert(ticket, seen).is_none(), "given twice");
                 self.apply_orders(orders);
             }
             Step::Ends(which, end) => {
                 let works = self.seen.iter();
-                let works =
-                    works.flat_map(|(ticket, seen)| seen.at.iter().map(|at| (*ticket, *at)));
+                let works = works.flat_map(|(ticket, seen)| seen.at.iter().map(|at| (*ticket, *at)));
                 let works: Vec<_> = works.collect();
                 let Some((ticket, member)) = works.get(which % works.len().max(1)).copied() else {
                     return;
@@ -434,16 +353,12 @@ impl DispatchWorld {
             assert!(seen.at.is_empty(), "nobody waits for it");
         }
         for member in self.members.keys() {
-            let here: Vec<&&TrackedRequest> = open
-                .iter()
-                .filter(|seen| seen.at.contains(member))
-                .collect();
+            let here: Vec<&&TrackedRequest> = open.iter().filter(|seen| seen.at.contains(member)).collect();
             assert_eq!(self.group.member_load(*member), here.len());
             let calls = here.iter().filter(|seen| seen.is_call()).count();
             assert!(calls <= self.rules.window, "{calls} calls");
             for seen in &here {
-                let crosses =
-                    |other: &&&TrackedRequest| other.kind == seen.kind && other.robot != seen.robot;
+                let crosses = |other: &&&TrackedRequest| other.kind == seen.kind && other.robot != seen.robot;
                 let goal = !seen.is_call();
                 assert!(!goal || !here.iter().any(crosses), "of two robots");
             }
@@ -452,24 +367,18 @@ impl DispatchWorld {
         let count = waiting.clone().count();
         assert_eq!(self.group.load().waiting, count);
         assert_eq!(self.group.load().under_way, open.len() - count);
-        let able = |member: &Member, kind: &Kind| {
-            !self.members[member] && !self.paused.contains(&(*member, kind.clone()))
-        };
+        let able =
+            |member: &Member, kind: &Kind| !self.members[member] && !self.paused.contains(&(*member, kind.clone()));
         let has_servant = |of: &TrackedRequest| {
             let mut same = open.iter();
             same.any(|other| {
                 let here = other.kind == of.kind && other.robot == of.robot;
-                here && other
-                    .at
-                    .iter()
-                    .any(|it| self.members.contains_key(it) && able(it, &of.kind))
+                here && other.at.iter().any(|it| self.members.contains_key(it) && able(it, &of.kind))
             })
         };
         let others_wait = |seen: &TrackedRequest| {
             let mut others = open.iter().filter(|other| other.at.is_empty());
-            others.any(|other| {
-                other.kind == seen.kind && other.robot != seen.robot && !has_servant(other)
-            })
+            others.any(|other| other.kind == seen.kind && other.robot != seen.robot && !has_servant(other))
         };
         // Nothing waits that could be sent.
         for seen in waiting {
@@ -478,13 +387,9 @@ impl DispatchWorld {
             let free = able.iter().filter(|member| {
                 let mut here = open.iter().filter(|other| other.at.contains(**member));
                 match seen.kind {
-                    Kind::Call(_) => {
-                        here.filter(|other| other.is_call()).count() < self.rules.window
-                    }
+                    Kind::Call(_) => here.filter(|other| other.is_call()).count() < self.rules.window,
                     // Further goals of a robot give way to others'.
-                    _ => here.all(|other| {
-                        other.kind != seen.kind || (other.robot == seen.robot && !others_wait(seen))
-                    }),
+                    _ => here.all(|other| other.kind != seen.kind || (other.robot == seen.robot && !others_wait(seen))),
                 }
             });
             let wanted = match seen.kind {
@@ -494,11 +399,7 @@ impl DispatchWorld {
             assert!(free.count() < wanted, "{seen:?} waits");
         }
         for seen in &open {
-            let most = if seen.is_call() {
-                self.rules.replicas
-            } else {
-                1
-            };
+            let most = if seen.is_call() { self.rules.replicas } else { 1 };
             assert!(seen.at.len() <= most);
         }
     }

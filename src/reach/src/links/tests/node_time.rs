@@ -29,8 +29,7 @@ async fn set_sim_time(bus: &MemoryBus, simulated: bool) {
 async fn node(system: &Arc<MemorySystem>, name: &str) -> (Arc<MemoryBus>, Box<dyn Send + Sync>) {
     let bus = system.join(name);
     set_sim_time(&bus, false).await;
-    let of =
-        ServiceType::new("rcl_interfaces/srv/GetParameters", "*").with_version(RosVersion::Two);
+    let of = ServiceType::new("rcl_interfaces/srv/GetParameters", "*").with_version(RosVersion::Two);
     let service = format!("{name}/get_parameters");
     let served = bus.serve(&service, of, Arc::new(SilentService)).await;
     let served = served.expect("it is served");
@@ -56,20 +55,14 @@ async fn nodes_of_ros_2_simulate_their_time_each_for_itself_and_change_it() {
     let registry = Arc::new(Registry::for_version(RosVersion::Two));
     let (nodes, options) = (Arc::new(QuietNodes::default()), HubOptions::default());
     let hub = Hub::new("s1", system.join("/bridge"), registry, nodes, options);
-    hub.skew.on_clock_sample(ClockSample {
-        offset: HOUR,
-        delay: 0,
-    });
+    hub.skew.on_clock_sample(ClockSample { offset: HOUR, delay: 0 });
     let (detect, _serves) = node(&system, "/detect").await;
     let (plan, _serves_too) = node(&system, "/plan").await;
     // One of them was set before there was a link, as after a restart of the daemon.
     set_sim_time(&plan, true).await;
     let mut robots = Vec::new();
     for name in ["/detect", "/plan"] {
-        let hello = Hello {
-            ros: 2,
-            ..hello(name, 1)
-        };
+        let hello = Hello { ros: 2, ..hello(name, 1) };
         robots.push(send_hello(&hub, &hello).await);
     }
     wait_shifts(&hub, [true, false]).await;
@@ -86,10 +79,7 @@ async fn the_parameter_server_simulates_the_time_of_all_but_no_kept_stamp_is_cha
     let (hub, _nodes) = hub().await;
     let mut robots = Vec::new();
     for (name, keep_stamps) in [("/detect", true), ("/plan", false)] {
-        let hello = Hello {
-            keep_stamps,
-            ..hello(name, 1)
-        };
+        let hello = Hello { keep_stamps, ..hello(name, 1) };
         robots.push(send_hello(&hub, &hello).await);
     }
     wait_shifts(&hub, [false, true]).await;

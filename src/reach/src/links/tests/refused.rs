@@ -33,17 +33,13 @@ async fn master() -> SocketAddr {
 /// Calls a method of a Master and returns the response.
 async fn call_master(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
     let parameters = parameters.iter();
-    let parameters: String = parameters
-        .map(|text| format!("<param><value>{text}</value></param>"))
-        .collect();
+    let parameters: String = parameters.map(|text| format!("<param><value>{text}</value></param>")).collect();
     let call = format!(
         "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{parameters}</params></methodCall>"
     );
     let mut stream = TcpStream::connect(master).await.unwrap();
     let length = call.len();
-    let head = format!(
-        "POST / HTTP/1.1\r\nHost: here\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n"
-    );
+    let head = format!("POST / HTTP/1.1\r\nHost: here\r\nContent-Type: text/xml\r\nContent-Length: {length}\r\n\r\n");
     let request = [head, call].concat();
     stream.write_all(request.as_bytes()).await.unwrap();
     let mut answer = Vec::new();
@@ -57,25 +53,13 @@ impl RetryScene {
     async fn new() -> Self {
         let address = master().await;
         let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
-        let (bus, node) = (
-            join("/bridge").await.unwrap(),
-            join("/detect").await.unwrap(),
-        );
+        let (bus, node) = (join("/bridge").await.unwrap(), join("/detect").await.unwrap());
         let known = node.serve("/known", echo_type(), Arc::new(Echo));
         let known = known.await.unwrap();
-        let (nodes, registry) = (
-            Arc::new(QuietNodes::default()),
-            Arc::new(Registry::default()),
-        );
+        let (nodes, registry) = (Arc::new(QuietNodes::default()), Arc::new(Registry::default()));
         let hub = Hub::new("s1", bus, registry, nodes, HubOptions::default());
         let (robot, _) = send_hello(&hub, &hello("/detect", 1)).await;
-        Self {
-            master: address,
-            hub,
-            node,
-            _known: known,
-            _robot: robot,
-        }
+        Self { master: address, hub, node, _known: known, _robot: robot }
     }
 
     fn link(&self) -> Arc<NodeLink> {
@@ -127,9 +111,7 @@ fn echo_type() -> ServiceType {
 async fn a_service_that_hangs_keeps_no_other_waiting() {
     let scene = RetryScene::new().await;
     let hangs = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    scene
-        .register_service("/a", hangs.local_addr().unwrap())
-        .await;
+    scene.register_service("/a", hangs.local_addr().unwrap()).await;
     let asked = timeout(PATIENCE, hangs.accept()).await;
     let (mut asked, _) = asked.expect("it is asked").unwrap();
     let given_up = async { while asked.read_buf(&mut Vec::new()).await.unwrap_or(0) > 0 {} };
@@ -152,16 +134,10 @@ async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
     let _serving = serving.await.unwrap();
     let found = call_master(other, "lookupService", &["/test", "/a"]).await;
     let begin = found.rfind("rosrpc://").expect("its address") + "rosrpc://".len();
-    let real = found[begin..]
-        .split(['<', '/', ']'])
-        .next()
-        .unwrap()
-        .to_owned();
+    let real = found[begin..].split(['<', '/', ']']).next().unwrap().to_owned();
     // The node's own service, behind something that refuses at first.
     let before = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    scene
-        .register_service("/a", before.local_addr().unwrap())
-        .await;
+    scene.register_service("/a", before.local_addr().unwrap()).await;
     let answers = async {
         for _ in 0..2 {
             drop(before.accept().await.unwrap());
@@ -182,23 +158,11 @@ async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
 async fn an_input_that_cannot_be_published_is_tried_again() {
     let scene = RetryScene::new().await;
     // Somebody publishes the topic with another type.
-    let other = WireType::new(
-        "std_msgs/String",
-        "992ce8a1687cec8c8bd883ec73ca41d1",
-        "string data",
-    );
+    let other = WireType::new("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data");
     let qos = QosProfile::keep_last(1);
     let other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
-    let of = WireType::new(
-        "std_msgs/UInt8",
-        "7c8164229e7d2c17eb95e9231617fdee",
-        "uint8 data",
-    );
-    let mut heard = scene
-        .node
-        .subscribe("/image", of.clone(), qos)
-        .await
-        .unwrap();
+    let of = WireType::new("std_msgs/UInt8", "7c8164229e7d2c17eb95e9231617fdee", "uint8 data");
+    let mut heard = scene.node.subscribe("/image", of.clone(), qos).await.unwrap();
     scene.send_record(Record::Control(FromRobot::Open(InputChannel {
         channel: 1,
         topic: "/image".into(),
@@ -226,9 +190,7 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
     };
-    timeout(PATIENCE, refused)
-        .await
-        .expect("what waits is too old by the next time");
+    timeout(PATIENCE, refused).await.expect("what waits is too old by the next time");
     drop(other);
     let connected = heard.matched.wait_for(|now| now.connected_count() > 0);
     let connected = timeout(PATIENCE, connected).await;
@@ -241,11 +203,7 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
 #[tokio::test]
 async fn an_input_that_is_refused_counts_as_its_robots_until_its_channel_is_closed() {
     let scene = RetryScene::new().await;
-    let other = WireType::new(
-        "std_msgs/String",
-        "992ce8a1687cec8c8bd883ec73ca41d1",
-        "string data",
-    );
+    let other = WireType::new("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data");
     let qos = QosProfile::keep_last(1);
     let _other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
     let told = Budget::new("what robot x tells", 1 << 20);

@@ -41,15 +41,8 @@ struct Change {
 
 /// Creates the two ends of a watch. Queued changes are charged to `budget`.
 pub(crate) fn param_change_channel(budget: &Budget) -> (ParamChangeSender, ParamChangeReceiver) {
-    let queue = Arc::new(ChangeQueue {
-        waiting: Mutex::default(),
-        told: Notify::new(),
-        budget: budget.clone(),
-    });
-    (
-        ParamChangeSender(Arc::clone(&queue)),
-        ParamChangeReceiver(queue),
-    )
+    let queue = Arc::new(ChangeQueue { waiting: Mutex::default(), told: Notify::new(), budget: budget.clone() });
+    (ParamChangeSender(Arc::clone(&queue)), ParamChangeReceiver(queue))
 }
 
 impl ParamChangeSender {
@@ -69,10 +62,7 @@ impl ParamChangeSender {
             let number = waiting.next;
             waiting.next += 1;
             waiting.numbers.insert(key.clone(), number);
-            let change = Change {
-                change: (key, value),
-                _held: held,
-            };
+            let change = Change { change: (key, value), _held: held };
             waiting.changes.insert(number, change);
         }
         self.0.told.notify_one();
@@ -115,10 +105,9 @@ impl ParamValue {
             Self::String(text) => text.len(),
             Self::Binary(bytes) => bytes.len(),
             Self::List(items) => items.iter().map(Self::bytes_held).sum(),
-            Self::Map(members) => members
-                .iter()
-                .map(|(name, member)| size_of::<String>() + name.len() + member.bytes_held())
-                .sum(),
+            Self::Map(members) => {
+                members.iter().map(|(name, member)| size_of::<String>() + name.len() + member.bytes_held()).sum()
+            }
         }
     }
 }
@@ -161,11 +150,7 @@ mod tests {
         let told = (0..1000).map(|number| teller.send(format!("/{number}"), text()));
         let told = told.filter(Result::is_ok).count();
         assert!((90..=104).contains(&told), "{told} are told");
-        assert!(
-            budget.used_bytes() > 900_000,
-            "{} bytes count",
-            budget.used_bytes()
-        );
+        assert!(budget.used_bytes() > 900_000, "{} bytes count", budget.used_bytes());
         let refused = teller.send("/more".into(), text()).expect_err("no memory");
         assert_eq!(refused.name, "parameters");
         // Reading one change makes room for another.

@@ -22,10 +22,7 @@ impl ParamValue {
 impl<'de> Deserialize<'de> for ParamValue {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let values = Cell::new(Self::MAX_VALUES);
-        let reader = ParamValueReader {
-            depth: Self::MAX_DEPTH,
-            values: &values,
-        };
+        let reader = ParamValueReader { depth: Self::MAX_DEPTH, values: &values };
         reader.deserialize(deserializer)
     }
 }
@@ -44,10 +41,7 @@ impl ParamValueReader<'_> {
     fn descend<E: Error>(self) -> Result<Self, E> {
         match self.depth.checked_sub(1) {
             Some(depth) => Ok(Self { depth, ..self }),
-            None => Err(E::custom(format_args!(
-                "lists and maps are nested more than {} deep",
-                ParamValue::MAX_DEPTH
-            ))),
+            None => Err(E::custom(format_args!("lists and maps are nested more than {} deep", ParamValue::MAX_DEPTH))),
         }
     }
 }
@@ -57,10 +51,7 @@ impl<'de> DeserializeSeed<'de> for ParamValueReader<'_> {
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<ParamValue, D::Error> {
         let Some(left) = self.values.get().checked_sub(1) else {
-            return Err(D::Error::custom(format_args!(
-                "there are more than {} values",
-                ParamValue::MAX_VALUES
-            )));
+            return Err(D::Error::custom(format_args!("there are more than {} values", ParamValue::MAX_VALUES)));
         };
         self.values.set(left);
         deserializer.deserialize_any(self)
@@ -146,19 +137,13 @@ mod tests {
             ("[]", List(vec![])),
             ("[1,[true]]", List(vec![Int(1), List(vec![Bool(true)])])),
             ("{}", Map(BTreeMap::new())),
-            (
-                r#"{"b":1,"a":"x","b":2}"#,
-                Map([("a".to_owned(), text("x")), ("b".to_owned(), Int(2))].into()),
-            ),
+            (r#"{"b":1,"a":"x","b":2}"#, Map([("a".to_owned(), text("x")), ("b".to_owned(), Int(2))].into())),
         ] {
             assert_eq!(read(json), Ok(value), "{json}");
         }
         for none in ["null", "[1,null]", r#"{"a":null}"#] {
             let error = read(none).expect_err("ROS has no null");
-            assert!(
-                error.contains("a boolean, number, text, list or map"),
-                "{error}"
-            );
+            assert!(error.contains("a boolean, number, text, list or map"), "{error}");
         }
     }
 

@@ -89,24 +89,13 @@ impl OutputLayout for Aligned {
             out.extend_from_slice(&written[piece]);
             return;
         }
-        let mut realign = Realign {
-            from: &written[..piece.end],
-            at: piece.start,
-            out,
-            origin: self.origin,
-        };
+        let mut realign = Realign { from: &written[..piece.end], at: piece.start, out, origin: self.origin };
         realign.value(&member.kind);
     }
 }
 
 impl Aligned {
-    fn put_initial(
-        self,
-        out: &mut Vec<u8>,
-        kind: &Kind,
-        initial: Option<&Initial>,
-        now: Option<Time>,
-    ) {
+    fn put_initial(self, out: &mut Vec<u8>, kind: &Kind, initial: Option<&Initial>, now: Option<Time>) {
         let items = initial.map_or(&[][..], |initial| &initial.0);
         match kind {
             Kind::Scalar(scalar) => {

@@ -15,23 +15,11 @@ fn registry(definitions: &[(&str, &str)]) -> Registry {
 /// tf2_msgs/TFMessage and its dependencies.
 fn tf() -> Arc<MessageType> {
     registry(&[
-        (
-            "tf2_msgs/TFMessage",
-            "geometry_msgs/TransformStamped[] transforms",
-        ),
-        (
-            "geometry_msgs/TransformStamped",
-            "Header header\nstring child_frame_id\nTransform transform",
-        ),
-        (
-            "geometry_msgs/Transform",
-            "Vector3 translation\nQuaternion rotation",
-        ),
+        ("tf2_msgs/TFMessage", "geometry_msgs/TransformStamped[] transforms"),
+        ("geometry_msgs/TransformStamped", "Header header\nstring child_frame_id\nTransform transform"),
+        ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation"),
         ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z"),
-        (
-            "geometry_msgs/Quaternion",
-            "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-        ),
+        ("geometry_msgs/Quaternion", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w"),
     ])
     .message("tf2_msgs/TFMessage")
     .unwrap()
@@ -119,9 +107,7 @@ fn every_shape_of_field_is_passed() {
 
 #[test]
 fn a_type_without_a_stamp_costs_nothing() {
-    let text = registry(&[("std_msgs/String", "string data")])
-        .message("std_msgs/String")
-        .unwrap();
+    let text = registry(&[("std_msgs/String", "string data")]).message("std_msgs/String").unwrap();
     assert!(Stamps::for_type(&text).is_empty());
     assert!(Stamps::default().find(b"anything").unwrap().is_empty());
 }
@@ -130,19 +116,10 @@ fn a_type_without_a_stamp_costs_nothing() {
 fn a_definition_that_doubles_with_each_level_is_no_trouble() {
     let names: Vec<String> = (0..24).map(|level| format!("a/L{level}")).collect();
     let texts: Vec<String> = (1..=24)
-        .map(|level| {
-            if level == 24 {
-                "string s".to_owned()
-            } else {
-                format!("L{level} x\nL{level} y")
-            }
-        })
+        .map(|level| if level == 24 { "string s".to_owned() } else { format!("L{level} x\nL{level} y") })
         .collect();
-    let definitions: Vec<(&str, &str)> = names
-        .iter()
-        .zip(&texts)
-        .map(|(name, text)| (name.as_str(), text.as_str()))
-        .collect();
+    let definitions: Vec<(&str, &str)> =
+        names.iter().zip(&texts).map(|(name, text)| (name.as_str(), text.as_str())).collect();
     // Either refused earlier, or cheap.
     if let Ok(message) = registry(&definitions).message("a/L0") {
         assert!(Stamps::for_type(&message).is_empty());

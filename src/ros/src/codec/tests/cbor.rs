@@ -43,16 +43,9 @@ fn a_message_is_a_map_with_typed_arrays() {
     assert_eq!(cbor_of(&arrays, &arrays_bytes()), expected);
     assert_eq!(ros_of(&arrays, &expected).unwrap(), arrays_bytes());
     let mut plain = Vec::new();
-    let options = CborOptions {
-        typed_arrays: false,
-        ..CborOptions::default()
-    };
+    let options = CborOptions { typed_arrays: false, ..CborOptions::default() };
     to_cbor(&arrays, &arrays_bytes(), &mut plain, &options).unwrap();
-    assert!(
-        plain
-            .windows(9)
-            .any(|part| part == b"\x65words\x82\x00\x1a")
-    );
+    assert!(plain.windows(9).any(|part| part == b"\x65words\x82\x00\x1a"));
     assert_eq!(ros_of(&arrays, &plain).unwrap(), arrays_bytes());
 }
 
@@ -79,32 +72,13 @@ fn numbers_are_written_shortest() {
 fn strings_in_chunks_and_containers_without_length() {
     let string = message("std_msgs/String");
     let expected = Bytes::default().text("strea").0;
-    assert_eq!(
-        ros_of(&string, b"\xbf\x64data\x7f\x63str\x62ea\xff\xff").unwrap(),
-        expected
-    );
-    assert_eq!(
-        ros_of(&string, b"\xbf\x7f\x62da\x62ta\xff\x65strea\xff").unwrap(),
-        expected
-    );
-    assert_eq!(
-        ros_of(&string, b"\xd9\xd9\xf7\xa1\x64data\x65strea").unwrap(),
-        expected
-    );
+    assert_eq!(ros_of(&string, b"\xbf\x64data\x7f\x63str\x62ea\xff\xff").unwrap(), expected);
+    assert_eq!(ros_of(&string, b"\xbf\x7f\x62da\x62ta\xff\x65strea\xff").unwrap(), expected);
+    assert_eq!(ros_of(&string, b"\xd9\xd9\xf7\xa1\x64data\x65strea").unwrap(), expected);
     let arrays = message("t/Arrays");
     let listed = ros_of(&arrays, b"\xa1\x65words\x9f\x01\x18\x20\xff").unwrap();
-    assert_eq!(
-        listed,
-        ros_of(&arrays, b"\xa1\x65words\x82\x01\x18\x20").unwrap()
-    );
-    assert_eq!(
-        listed,
-        ros_of(
-            &arrays,
-            b"\xa1\x65words\xd8\x46\x5f\x44\x01\0\0\0\x44\x20\0\0\0\xff"
-        )
-        .unwrap()
-    );
+    assert_eq!(listed, ros_of(&arrays, b"\xa1\x65words\x82\x01\x18\x20").unwrap());
+    assert_eq!(listed, ros_of(&arrays, b"\xa1\x65words\xd8\x46\x5f\x44\x01\0\0\0\x44\x20\0\0\0\xff").unwrap());
     assert_eq!(
         ros_of(&string, b"\xa1\x64data\x62\xff\xff").unwrap_err(),
         "field data of std_msgs/String: the text is not UTF-8"
@@ -135,21 +109,9 @@ fn typed_arrays_of_every_width_and_order() {
         (86, b"\x50\0\0\0\0\0\0\xf0\x3f\0\0\0\0\0\0\0\x40"),
     ] {
         let value = [&[0xd8, tag], bytes].concat();
-        assert_eq!(
-            list("words", &value).unwrap(),
-            list("words", b"\x82\x01\x02").unwrap(),
-            "tag {tag}"
-        );
-        assert_eq!(
-            list("singles", &value).unwrap(),
-            list("singles", b"\x82\x01\x02").unwrap(),
-            "tag {tag}"
-        );
-        assert_eq!(
-            list("bytes", &value).unwrap(),
-            list("bytes", b"\x82\x01\x02").unwrap(),
-            "tag {tag}"
-        );
+        assert_eq!(list("words", &value).unwrap(), list("words", b"\x82\x01\x02").unwrap(), "tag {tag}");
+        assert_eq!(list("singles", &value).unwrap(), list("singles", b"\x82\x01\x02").unwrap(), "tag {tag}");
+        assert_eq!(list("bytes", &value).unwrap(), list("bytes", b"\x82\x01\x02").unwrap(), "tag {tag}");
     }
     assert_eq!(
         list("bytes", b"\xd8\x4d\x44\x01\0\0\x01").unwrap_err(),
@@ -167,21 +129,9 @@ fn typed_arrays_of_every_width_and_order() {
         list("pair", b"\xd8\x4d\x42\x01\0").unwrap_err(),
         "field pair of t/Arrays: takes exactly 2 elements, got 1"
     );
-    assert!(
-        list("words", b"\xd8\x46\x43\x01\0\0")
-            .unwrap_err()
-            .contains("not a multiple of its element")
-    );
-    assert!(
-        list("words", b"\xd8\x46\x82\x01\x02")
-            .unwrap_err()
-            .contains("not a byte string")
-    );
-    assert!(
-        list("words", b"\xd8\x57\x50")
-            .unwrap_err()
-            .contains("takes a list of uint32")
-    );
+    assert!(list("words", b"\xd8\x46\x43\x01\0\0").unwrap_err().contains("not a multiple of its element"));
+    assert!(list("words", b"\xd8\x46\x82\x01\x02").unwrap_err().contains("not a byte string"));
+    assert!(list("words", b"\xd8\x57\x50").unwrap_err().contains("takes a list of uint32"));
 }
 
 #[test]
@@ -202,11 +152,7 @@ fn floats_of_every_width() {
         (b"\x3b\xff\xff\xff\xff\xff\xff\xff\xff", -(2f64.powi(64))),
         (b"\xc1\x05", 5.0),
     ] {
-        assert_eq!(
-            ros_of(&double, &data(cbor)).unwrap(),
-            value.to_le_bytes(),
-            "{value}"
-        );
+        assert_eq!(ros_of(&double, &data(cbor)).unwrap(), value.to_le_bytes(), "{value}");
     }
     for cbor in [&b"\xf9\x7e\x00"[..], b"\xf6", b"\xf7"] {
         let bytes = ros_of(&double, &data(cbor)).unwrap();
@@ -217,28 +163,10 @@ fn floats_of_every_width() {
 #[test]
 fn order_defaults_and_stamps_are_as_in_json() {
     let pose = message("geometry_msgs/PoseStamped");
-    let now = FillOptions {
-        now: Some(Time { secs: 1, nsecs: 2 }),
-        ..FillOptions::default()
-    };
+    let now = FillOptions { now: Some(Time { secs: 1, nsecs: 2 }), ..FillOptions::default() };
     let mut out = Vec::new();
-    from_cbor(
-        &pose,
-        b"\xa2\x64pose\xa1\x68position\xa1\x61z\x03\x66header\xa1\x63seq\x07",
-        &mut out,
-        &now,
-    )
-    .unwrap();
-    let expected = Bytes::default()
-        .u32(7)
-        .u32(1)
-        .u32(2)
-        .u32(0)
-        .f64(0.0)
-        .f64(0.0)
-        .f64(3.0)
-        .raw(&[0; 32])
-        .0;
+    from_cbor(&pose, b"\xa2\x64pose\xa1\x68position\xa1\x61z\x03\x66header\xa1\x63seq\x07", &mut out, &now).unwrap();
+    let expected = Bytes::default().u32(7).u32(1).u32(2).u32(0).f64(0.0).f64(0.0).f64(3.0).raw(&[0; 32]).0;
     assert_eq!(out, expected);
     out.clear();
     from_cbor(&message("std_msgs/Time"), &data(b"\x63now"), &mut out, &now).unwrap();
@@ -249,12 +177,7 @@ fn order_defaults_and_stamps_are_as_in_json() {
 fn bytes_may_come_as_text_or_numbers_too() {
     let image = message("sensor_msgs/Image");
     let expected = ros_of(&image, b"\xa1\x64data\x43\x01\x02\x03").unwrap();
-    for form in [
-        &b"\x64AQID"[..],
-        b"\x83\x01\x02\x03",
-        b"\x5f\x41\x01\x42\x02\x03\xff",
-        b"\xd8\x40\x43\x01\x02\x03",
-    ] {
+    for form in [&b"\x64AQID"[..], b"\x83\x01\x02\x03", b"\x5f\x41\x01\x42\x02\x03\xff", b"\xd8\x40\x43\x01\x02\x03"] {
         assert_eq!(ros_of(&image, &data(form)).unwrap(), expected);
     }
 }
@@ -264,9 +187,6 @@ fn strings_that_are_not_utf8_are_replaced() {
     let string = message("std_msgs/String");
     let bytes = Bytes::default().u32(2).raw(b"a\xff").0;
     assert_eq!(cbor_of(&string, &bytes), data("\x64a\u{fffd}".as_bytes()));
-    let options = CborOptions {
-        invalid_utf8: InvalidUtf8::Refuse,
-        ..CborOptions::default()
-    };
+    let options = CborOptions { invalid_utf8: InvalidUtf8::Refuse, ..CborOptions::default() };
     assert!(to_cbor(&string, &bytes, &mut Vec::new(), &options).is_err());
 }

@@ -11,27 +11,15 @@ fn registry() -> Registry {
         ("a/msg/Nothing", ""),
         ("a/msg/Text", "string data"),
         ("a/msg/Wide", "wstring data\nuint8 last"),
-        (
-            "a/msg/Steps",
-            "uint8 a\nfloat64 b\nint16 c\nuint32 d\nbool e\nint64 f",
-        ),
+        ("a/msg/Steps", "uint8 a\nfloat64 b\nint16 c\nuint32 d\nbool e\nint64 f"),
         (
             "a/msg/Lists",
             "float64[] none\nuint8 after\nint64[] longs\nuint16[2] pair\nNothing[] nothings\nbyte[] bytes\n\
              builtin_interfaces/Time[] times\nstring[] texts",
         ),
-        (
-            "a/msg/Bounds",
-            "string<=3 text\nint32[<=2] some\nwstring<=2 wide\nuint8[<=2] bytes",
-        ),
-        (
-            "a/msg/Place",
-            "std_msgs/Header header\nfloat64 x\nstring name 'here'\nuint8 n 7",
-        ),
-        (
-            "a/msg/Way",
-            "Place[] places\nPlace one\nNothing nothing\nbuiltin_interfaces/Duration took",
-        ),
+        ("a/msg/Bounds", "string<=3 text\nint32[<=2] some\nwstring<=2 wide\nuint8[<=2] bytes"),
+        ("a/msg/Place", "std_msgs/Header header\nfloat64 x\nstring name 'here'\nuint8 n 7"),
+        ("a/msg/Way", "Place[] places\nPlace one\nNothing nothing\nbuiltin_interfaces/Duration took"),
     ] {
         registry.insert(key, text).unwrap();
     }
@@ -50,10 +38,7 @@ fn json_of(message: &MessageType, bytes: &[u8]) -> Result<String, String> {
 
 fn cdr_of(message: &MessageType, json: &str) -> Result<Vec<u8>, String> {
     let mut out = b"kept".to_vec();
-    let options = FillOptions {
-        now: Some(Time { secs: 9, nsecs: 8 }),
-        ..FillOptions::default()
-    };
+    let options = FillOptions { now: Some(Time { secs: 9, nsecs: 8 }), ..FillOptions::default() };
     let result = from_json(message, json.as_bytes(), &mut out, &options);
     let bytes = out.split_off(4);
     assert_eq!(out, b"kept");
@@ -74,19 +59,12 @@ fn hex(digits: &str) -> Vec<u8> {
 #[track_caller]
 fn both_ways(message: &MessageType, bytes: &str, json: &str) {
     assert_eq!(json_of(message, &hex(bytes)).unwrap(), json);
-    assert_eq!(
-        hex::encode(cdr_of(message, json).unwrap()),
-        hex::encode(hex(bytes))
-    );
+    assert_eq!(hex::encode(cdr_of(message, json).unwrap()), hex::encode(hex(bytes)));
 }
 
 #[test]
 fn texts_count_their_nul_and_wide_ones_have_four_bytes_per_unit() {
-    both_ways(
-        &message("a/Text"),
-        "00010000 04000000 61626300",
-        r#"{"data":"abc"}"#,
-    );
+    both_ways(&message("a/Text"), "00010000 04000000 61626300", r#"{"data":"abc"}"#);
     both_ways(&message("a/Text"), "00010000 01000000 00", r#"{"data":""}"#);
     both_ways(
         &message("a/Wide"),
@@ -98,10 +76,7 @@ fn texts_count_their_nul_and_wide_ones_have_four_bytes_per_unit() {
         ("00010000 00000000", r#"{"data":""}"#),
         ("00010000 03000000 616263", r#"{"data":"abc"}"#),
         ("00010000 05000000 6100626300", r#"{"data":"a\u0000bc"}"#),
-        (
-            "00010000 04000000 61626300 99999999 99",
-            r#"{"data":"abc"}"#,
-        ),
+        ("00010000 04000000 61626300 99999999 99", r#"{"data":"abc"}"#),
         ("00000000 00000004 61626300", r#"{"data":"abc"}"#),
     ] {
         assert_eq!(json_of(&text, &hex(bytes)).unwrap(), json, "{bytes}");
@@ -109,19 +84,10 @@ fn texts_count_their_nul_and_wide_ones_have_four_bytes_per_unit() {
     // Half a surrogate is replaced or refused, like invalid UTF-8.
     let half = hex("00010000 02000000 3dd80000 61000000 05");
     let wide = message("a/Wide");
-    assert_eq!(
-        json_of(&wide, &half).unwrap(),
-        "{\"data\":\"\u{fffd}a\",\"last\":5}"
-    );
-    let refuse = JsonOptions {
-        invalid_utf8: InvalidUtf8::Refuse,
-        ..JsonOptions::default()
-    };
+    assert_eq!(json_of(&wide, &half).unwrap(), "{\"data\":\"\u{fffd}a\",\"last\":5}");
+    let refuse = JsonOptions { invalid_utf8: InvalidUtf8::Refuse, ..JsonOptions::default() };
     let refused = to_json(&wide, &half, &mut Vec::new(), &refuse).unwrap_err();
-    assert_eq!(
-        refused.to_string(),
-        "field data of a/msg/Wide: the text is not UTF-8"
-    );
+    assert_eq!(refused.to_string(), "field data of a/msg/Wide: the text is not UTF-8");
 }
 
 #[test]
@@ -134,9 +100,7 @@ fn numbers_are_aligned_from_the_body_on_in_both_orders_of_bytes() {
         json,
     );
     // Padding may have any value.
-    let big = hex(
-        "00000000 01aaaaaaaaaaaaaa 3fe0000000000000 fffebbbb 00000003 01cccccccccccccc ffffffffffffffff",
-    );
+    let big = hex("00000000 01aaaaaaaaaaaaaa 3fe0000000000000 fffebbbb 00000003 01cccccccccccccc ffffffffffffffff");
     assert_eq!(json_of(&steps, &big).unwrap(), json);
 }
 
@@ -165,16 +129,9 @@ fn left_out_fields_have_the_definitions_values_and_stamps_the_clock() {
         )
     );
     let place = message("a/Place");
-    for stamp in [
-        r#""now""#,
-        r#"{"secs":9,"nsecs":8}"#,
-        r#"{"nanosec":8,"sec":9}"#,
-    ] {
+    for stamp in [r#""now""#, r#"{"secs":9,"nsecs":8}"#, r#"{"nanosec":8,"sec":9}"#] {
         let bytes = cdr_of(&place, &format!(r#"{{"header":{{"stamp":{stamp}}}}}"#)).unwrap();
-        assert_eq!(
-            header_stamp(&place, &bytes),
-            Some(Time { secs: 9, nsecs: 8 })
-        );
+        assert_eq!(header_stamp(&place, &bytes), Some(Time { secs: 9, nsecs: 8 }));
         assert_eq!(Stamps::for_type(&place).find(&bytes), Some(vec![4]));
         let value = Value::read(&place, &bytes).unwrap();
         assert_eq!(value.field("name").unwrap().text().unwrap(), "here");
@@ -214,60 +171,30 @@ fn fields_out_of_order_are_aligned_where_they_belong() {
 #[test]
 fn writers_keep_to_bounds_and_readers_do_not_ask() {
     let bounds = message("a/Bounds");
-    cdr_of(
-        &bounds,
-        r#"{"text":"äöü","some":[1,2],"wide":"机😀","bytes":"AQI="}"#,
-    )
-    .unwrap();
+    cdr_of(&bounds, r#"{"text":"äöü","some":[1,2],"wide":"机😀","bytes":"AQI="}"#).unwrap();
     for (json, error) in [
-        (
-            r#"{"text":"äöüa"}"#,
-            "field text of a/msg/Bounds: takes at most 3 characters, got 4",
-        ),
-        (
-            r#"{"some":[1,2,3,4]}"#,
-            "field some of a/msg/Bounds: takes at most 2 elements, got 3",
-        ),
-        (
-            r#"{"wide":"abc"}"#,
-            "field wide of a/msg/Bounds: takes at most 2 characters, got 3",
-        ),
-        (
-            r#"{"bytes":"AQID"}"#,
-            "field bytes of a/msg/Bounds: takes at most 2 elements, got 3",
-        ),
-        (
-            r#"{"bytes":[1,2,3]}"#,
-            "field bytes of a/msg/Bounds: takes at most 2 elements, got 3",
-        ),
+        (r#"{"text":"äöüa"}"#, "field text of a/msg/Bounds: takes at most 3 characters, got 4"),
+        (r#"{"some":[1,2,3,4]}"#, "field some of a/msg/Bounds: takes at most 2 elements, got 3"),
+        (r#"{"wide":"abc"}"#, "field wide of a/msg/Bounds: takes at most 2 characters, got 3"),
+        (r#"{"bytes":"AQID"}"#, "field bytes of a/msg/Bounds: takes at most 2 elements, got 3"),
+        (r#"{"bytes":[1,2,3]}"#, "field bytes of a/msg/Bounds: takes at most 2 elements, got 3"),
     ] {
         assert_eq!(cdr_of(&bounds, json).unwrap_err(), error);
     }
-    let beyond = hex(
-        "00010000 05000000 6162636400 000000 03000000 010000000200000003000000 00000000 00000000",
-    );
-    assert_eq!(
-        json_of(&bounds, &beyond).unwrap(),
-        r#"{"text":"abcd","some":[1,2,3],"wide":"","bytes":""}"#
-    );
+    let beyond = hex("00010000 05000000 6162636400 000000 03000000 010000000200000003000000 00000000 00000000");
+    assert_eq!(json_of(&bounds, &beyond).unwrap(), r#"{"text":"abcd","some":[1,2,3],"wide":"","bytes":""}"#);
 }
 
 #[test]
 fn bytes_that_are_no_message_are_refused_with_their_place() {
     let text = message("a/Text");
     for (bytes, error) in [
-        (
-            "0001",
-            "a/msg/Text: the serialized message ends here, 2 bytes too early",
-        ),
+        ("0001", "a/msg/Text: the serialized message ends here, 2 bytes too early"),
         (
             "00030000 00000000",
             "a/msg/Text: serialized as representation 0x0003, of which only plain CDR is read (0x0000 and 0x0001)",
         ),
-        (
-            "00010000 0400",
-            "field data of a/msg/Text: the serialized message ends here, 2 bytes too early",
-        ),
+        ("00010000 0400", "field data of a/msg/Text: the serialized message ends here, 2 bytes too early"),
         (
             "00010000 ffffffff 61",
             "field data of a/msg/Text: a length of 4294967295 cannot be true with 1 bytes to follow",
@@ -283,27 +210,15 @@ fn bytes_that_are_no_message_are_refused_with_their_place() {
         assert_eq!(Value::read(&way, &bytes[..end]), None, "{end}");
     }
     let broken = json_of(&way, &bytes[..60]).unwrap_err();
-    assert!(
-        broken.starts_with("field places[1].header.frame_id of a/msg/Way: "),
-        "{broken}"
-    );
-    let wrong = cdr_of(
-        &way,
-        r#"{"places":[{},{"header":{"stamp":{"nanosec":-1}}}]}"#,
-    );
-    assert_eq!(
-        wrong.unwrap_err(),
-        "field places[1].header.stamp.nanosec of a/msg/Way: -1 does not fit into uint32"
-    );
+    assert!(broken.starts_with("field places[1].header.frame_id of a/msg/Way: "), "{broken}");
+    let wrong = cdr_of(&way, r#"{"places":[{},{"header":{"stamp":{"nanosec":-1}}}]}"#);
+    assert_eq!(wrong.unwrap_err(), "field places[1].header.stamp.nanosec of a/msg/Way: -1 does not fit into uint32");
 }
 
 #[test]
 fn what_may_be_written_is_limited() {
     let way = message("a/Way");
-    let options = FillOptions {
-        now: None,
-        max_bytes: 100,
-    };
+    let options = FillOptions { now: None, max_bytes: 100 };
     let json = format!(r#"{{"places":[{}]}}"#, ["{}"; 40].join(","));
     let mut out = Vec::new();
     let refused = from_json(&way, json.as_bytes(), &mut out, &options).unwrap_err();

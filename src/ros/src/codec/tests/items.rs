@@ -8,28 +8,17 @@ fn the_end_of_a_json_value_is_found() {
         ("null", "null"),
         ("true ]", "true"),
         (r#""a\"b\\",x"#, r#""a\"b\\""#),
-        (
-            r#"{"a":[1,{"b":"]}"}],"c":"\\"}, "more""#,
-            r#"{"a":[1,{"b":"]}"}],"c":"\\"}"#,
-        ),
+        (r#"{"a":[1,{"b":"]}"}],"c":"\\"}, "more""#, r#"{"a":[1,{"b":"]}"}],"c":"\\"}"#),
         ("\n[ ]]", "\n[ ]"),
         ("{}{}", "{}"),
     ] {
-        assert_eq!(
-            json_value_len(text.as_bytes()).map(|length| &text[..length]),
-            Ok(value)
-        );
+        assert_eq!(json_value_len(text.as_bytes()).map(|length| &text[..length]), Ok(value));
     }
-    for text in [
-        "", "  ", "[", "{\"a\"", "\"a", "\"a\\", "]", ",", ":1", "\"\\\"",
-    ] {
+    for text in ["", "  ", "[", "{\"a\"", "\"a", "\"a\\", "]", ",", ":1", "\"\\\""] {
         assert!(json_value_len(text.as_bytes()).is_err(), "{text}");
     }
     let deep = "[".repeat(1_000_000);
-    assert_eq!(
-        json_value_len(deep.as_bytes()).unwrap_err().to_string(),
-        "nested deeper than 128 levels"
-    );
+    assert_eq!(json_value_len(deep.as_bytes()).unwrap_err().to_string(), "nested deeper than 128 levels");
     let allowed = "[".repeat(128) + &"]".repeat(128);
     assert_eq!(json_value_len(allowed.as_bytes()), Ok(256));
 }
@@ -59,10 +48,7 @@ fn the_end_of_a_cbor_item_is_found() {
         let followed = [item, b"\x01\x02"].concat();
         assert_eq!(cbor_item_len(&followed), Ok(item.len()), "{item:x?}");
         for end in 0..item.len() {
-            assert!(
-                cbor_item_len(&item[..end]).is_err(),
-                "{item:x?} up to {end}"
-            );
+            assert!(cbor_item_len(&item[..end]).is_err(), "{item:x?} up to {end}");
         }
     }
     for item in [
@@ -83,14 +69,7 @@ fn the_end_of_a_cbor_item_is_found() {
     }
     for nesting in [b"\x81", b"\x9f", b"\xc1", b"\xbf"] {
         let error = cbor_item_len(&nesting.repeat(100_000)).unwrap_err();
-        let expected = if nesting == b"\xbf" {
-            "invalid"
-        } else {
-            "nested deeper than 128 levels"
-        };
-        assert!(
-            error.to_string().starts_with(expected) || nesting == b"\xbf",
-            "{error}"
-        );
+        let expected = if nesting == b"\xbf" { "invalid" } else { "nested deeper than 128 levels" };
+        assert!(error.to_string().starts_with(expected) || nesting == b"\xbf", "{error}");
     }
 }

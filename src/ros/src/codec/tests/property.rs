@@ -97,13 +97,7 @@ impl Writer {
             RosVersion::One => Vec::new(),
             RosVersion::Two => vec![0, u8::from(!big_endian), 0, 0],
         };
-        Writer {
-            out,
-            version,
-            big_endian,
-            padding,
-            times: Vec::new(),
-        }
+        Writer { out, version, big_endian, padding, times: Vec::new() }
     }
 
     /// Writes a number given as little-endian bytes.
@@ -172,9 +166,7 @@ impl Writer {
             }
             Primitive::String | Primitive::Wstring => {
                 let text: String = (0..choices.choose_below(12))
-                    .map(|_| {
-                        ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.choose_below(9)]
-                    })
+                    .map(|_| ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.choose_below(9)])
                     .collect();
                 self.text(&text, primitive == Primitive::Wstring);
             }
@@ -216,12 +208,7 @@ fn random(version: RosVersion, choices: &[u8]) -> (Arc<MessageType>, Vec<u8>) {
     (message, writer.out)
 }
 
-fn random_of(
-    version: RosVersion,
-    choices: &[u8],
-    big_endian: bool,
-    padding: u8,
-) -> (Arc<MessageType>, Writer) {
+fn random_of(version: RosVersion, choices: &[u8], big_endian: bool, padding: u8) -> (Arc<MessageType>, Writer) {
     let mut choices = Choices(choices.iter());
     let message = random_type(version, &mut choices);
     let mut writer = Writer::new(version, big_endian, padding);
@@ -235,9 +222,9 @@ fn is_same(value: &Value<'_>, json: &serde_json::Value) -> bool {
     match (value, json) {
         (Value::Number(number), Json::Bool(json)) => *number == f64::from(u8::from(*json)),
         // Integers are rounded, singles are written in short form.
-        (Value::Number(number), Json::Number(json)) => json
-            .as_f64()
-            .is_some_and(|json| json == *number || json as f32 == *number as f32),
+        (Value::Number(number), Json::Number(json)) => {
+            json.as_f64().is_some_and(|json| json == *number || json as f32 == *number as f32)
+        }
         (Value::Number(number), Json::String(_)) => !number.is_finite(),
         (Value::Text(_), Json::String(json)) => value.text().as_ref() == Some(json),
         (Value::Time(time), Json::Object(json)) => {
@@ -253,9 +240,7 @@ fn is_same(value: &Value<'_>, json: &serde_json::Value) -> bool {
             list.len() == json.len() && list.iter().zip(json).all(|(a, b)| is_same(a, b))
         }
         (Value::Message(fields), Json::Object(json)) => {
-            let same = |(name, value): &(&str, Value<'_>)| {
-                json.get(*name).is_some_and(|json| is_same(value, json))
-            };
+            let same = |(name, value): &(&str, Value<'_>)| json.get(*name).is_some_and(|json| is_same(value, json));
             fields.len() == json.len() && fields.iter().all(same)
         }
         _ => false,
@@ -263,18 +248,11 @@ fn is_same(value: &Value<'_>, json: &serde_json::Value) -> bool {
 }
 
 fn json_options() -> JsonOptions {
-    JsonOptions {
-        non_finite: NonFinite::String,
-        max_bytes: 1 << 20,
-        ..JsonOptions::default()
-    }
+    JsonOptions { non_finite: NonFinite::String, max_bytes: 1 << 20, ..JsonOptions::default() }
 }
 
 fn fill_options() -> FillOptions {
-    FillOptions {
-        now: Some(Time { secs: 1, nsecs: 2 }),
-        max_bytes: 1 << 20,
-    }
+    FillOptions { now: Some(Time { secs: 1, nsecs: 2 }), max_bytes: 1 << 20 }
 }
 
 fn damage(bytes: &mut Vec<u8>, edits: &[(u16, u8, u8)]) {
@@ -312,28 +290,14 @@ fn many_elements_of_a_type_without_fields_are_written_up_to_the_limit() {
     validate(&message, &bytes).unwrap();
     for limit in [0, 1, 1 << 10, 1 << 15] {
         let (mut json, mut cbor) = (Vec::new(), Vec::new());
-        let options = JsonOptions {
-            max_bytes: limit,
-            ..json_options()
-        };
+        let options = JsonOptions { max_bytes: limit, ..json_options() };
         let refused = to_json(&message, &bytes, &mut json, &options).unwrap_err();
         assert_eq!(refused.kind, CodecErrorKind::TooLarge(limit), "{refused}");
-        assert!(
-            json.len() <= limit + 16,
-            "{} bytes were written with a limit of {limit}",
-            json.len()
-        );
-        let options = CborOptions {
-            max_bytes: limit,
-            ..CborOptions::default()
-        };
+        assert!(json.len() <= limit + 16, "{} bytes were written with a limit of {limit}", json.len());
+        let options = CborOptions { max_bytes: limit, ..CborOptions::default() };
         let refused = to_cbor(&message, &bytes, &mut cbor, &options).unwrap_err();
         assert_eq!(refused.kind, CodecErrorKind::TooLarge(limit), "{refused}");
-        assert!(
-            cbor.len() <= limit + 16,
-            "{} bytes were written with a limit of {limit}",
-            cbor.len()
-        );
+        assert!(cbor.len() <= limit + 16, "{} bytes were written with a limit of {limit}", cbor.len());
     }
 }
 

@@ -35,21 +35,15 @@ pub enum ActionlibStatus {
 impl ActionlibStatus {
     fn from_number(number: u8) -> Option<Self> {
         use ActionlibStatus::*;
-        [
-            Pending, Active, Preempted, Succeeded, Aborted, Rejected, Preempting, Recalling,
-            Recalled, Lost,
-        ]
-        .into_iter()
-        .find(|status| *status as u8 == number)
+        [Pending, Active, Preempted, Succeeded, Aborted, Rejected, Preempting, Recalling, Recalled, Lost]
+            .into_iter()
+            .find(|status| *status as u8 == number)
     }
 
     /// Returns true if the goal has ended.
     pub fn is_terminal(self) -> bool {
         use ActionlibStatus::*;
-        matches!(
-            self,
-            Preempted | Succeeded | Aborted | Rejected | Recalled | Lost
-        )
+        matches!(self, Preempted | Succeeded | Aborted | Rejected | Recalled | Lost)
     }
 }
 
@@ -167,10 +161,7 @@ impl ActionlibReader<'_> {
     }
 
     fn time(&mut self) -> Option<Time> {
-        Some(Time {
-            secs: self.word()?,
-            nsecs: self.word()?,
-        })
+        Some(Time { secs: self.word()?, nsecs: self.word()? })
     }
 
     fn header(&mut self) -> Option<()> {
@@ -180,21 +171,14 @@ impl ActionlibReader<'_> {
     }
 
     fn goal_id(&mut self) -> Option<GoalId> {
-        Some(GoalId {
-            stamp: self.time()?,
-            id: self.string()?,
-        })
+        Some(GoalId { stamp: self.time()?, id: self.string()? })
     }
 
     fn goal_state(&mut self) -> Option<GoalState> {
         let goal = self.goal_id()?;
         let status = ActionlibStatus::from_number(*self.bytes.get(self.at)?)?;
         self.at += 1;
-        Some(GoalState {
-            goal,
-            status,
-            text: self.string()?,
-        })
+        Some(GoalState { goal, status, text: self.string()? })
     }
 }
 
@@ -234,56 +218,26 @@ mod tests {
     use super::*;
 
     fn state() -> GoalState {
-        let goal = GoalId {
-            stamp: Time { secs: 5, nsecs: 6 },
-            id: "g-1".to_owned(),
-        };
-        GoalState {
-            goal,
-            status: ActionlibStatus::Active,
-            text: "on it".to_owned(),
-        }
+        let goal = GoalId { stamp: Time { secs: 5, nsecs: 6 }, id: "g-1".to_owned() };
+        GoalState { goal, status: ActionlibStatus::Active, text: "on it".to_owned() }
     }
 
     #[test]
     fn goals_and_results_survive() {
         let now = Time { secs: 1, nsecs: 2 };
         let goal = write_goal(now, &state().goal, b"body");
-        assert_eq!(
-            read_goal(&goal),
-            Some((state().goal, Bytes::from_static(b"body")))
-        );
+        assert_eq!(read_goal(&goal), Some((state().goal, Bytes::from_static(b"body"))));
         let result = write_state(now, &state(), b"body");
-        assert_eq!(
-            read_state(&result),
-            Some((state(), Bytes::from_static(b"body")))
-        );
-        assert_eq!(
-            read_cancel(&write_cancel(&state().goal)),
-            Some(state().goal)
-        );
-        let states = [
-            state(),
-            GoalState {
-                status: ActionlibStatus::Lost,
-                ..state()
-            },
-        ];
-        assert_eq!(
-            read_states(&write_states(now, states.iter())).unwrap(),
-            states
-        );
+        assert_eq!(read_state(&result), Some((state(), Bytes::from_static(b"body"))));
+        assert_eq!(read_cancel(&write_cancel(&state().goal)), Some(state().goal));
+        let states = [state(), GoalState { status: ActionlibStatus::Lost, ..state() }];
+        assert_eq!(read_states(&write_states(now, states.iter())).unwrap(), states);
     }
 
     #[test]
     fn the_layout_is_that_of_the_generated_messages() {
         let registry = crate::schema::Registry::new();
-        registry
-            .insert(
-                "x/action/Do",
-                "int32 order\n---\nint32 sum\n---\nint32 part\n",
-            )
-            .unwrap();
+        registry.insert("x/action/Do", "int32 order\n---\nint32 sum\n---\nint32 part\n").unwrap();
         let action = registry.action("x/Do").unwrap();
         let goal = write_goal(Time::default(), &state().goal, &7i32.to_le_bytes());
         crate::codec::validate(&action.action_goal, &goal).unwrap();

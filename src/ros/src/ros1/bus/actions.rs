@@ -28,18 +28,14 @@ struct ActionTopicSet<'a> {
 impl<'a> ActionTopicSet<'a> {
     fn new(bus: &'a Arc<Ros1BusState>, name: &'a str, of: &'a ActionDef) -> Result<Self, BusError> {
         let known = Registry::new();
-        let unusable = |error: SchemaError| BusError::Protocol {
-            what: format!("action {name}"),
-            reason: error.to_string(),
-        };
+        let unusable =
+            |error: SchemaError| BusError::Protocol { what: format!("action {name}"), reason: error.to_string() };
         Ok(Self {
             bus,
             name,
             of,
             goal_id: known.message("actionlib_msgs/GoalID").map_err(unusable)?,
-            states: known
-                .message("actionlib_msgs/GoalStatusArray")
-                .map_err(unusable)?,
+            states: known.message("actionlib_msgs/GoalStatusArray").map_err(unusable)?,
         })
     }
 

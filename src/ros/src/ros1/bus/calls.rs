@@ -97,10 +97,7 @@ pub(super) async fn call(
                     let connection = open_connection(bus, service, ("persistent", "1")).await?;
                     let said = connection.header().get("callerid");
                     let address = said.and_then(|node| bus.graph.borrow().nodes.get(node).cloned());
-                    IdleConnection {
-                        connection,
-                        address,
-                    }
+                    IdleConnection { connection, address }
                 }
             };
             check_type(service, digest, kept.connection.header())?;
@@ -122,21 +119,12 @@ pub(super) async fn call(
                         CallError::NotTaken => CallFate::NotTaken,
                         _ => CallFate::Unknown,
                     };
-                    return Err(BusError::CallFailed {
-                        service: service.to_owned(),
-                        reason: error.to_string(),
-                        fate,
-                    });
+                    return Err(BusError::CallFailed { service: service.to_owned(), reason: error.to_string(), fate });
                 }
             }
         }
     });
-    called.await.unwrap_or_else(|_| {
-        Err(BusError::Timeout {
-            what: format!("service {service}"),
-            after: time,
-        })
-    })
+    called.await.unwrap_or_else(|_| Err(BusError::Timeout { what: format!("service {service}"), after: time }))
 }
 
 fn check_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusError> {
@@ -152,10 +140,7 @@ fn check_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusEr
 }
 
 /// Asks a server for its type and identity.
-pub(super) async fn probe(
-    bus: &Arc<Ros1BusState>,
-    service: &str,
-) -> Result<ServiceProvider, BusError> {
+pub(super) async fn probe(bus: &Arc<Ros1BusState>, service: &str) -> Result<ServiceProvider, BusError> {
     let own = bus.services.lock().get(service).cloned();
     if let Some(served) = own {
         // A node that is told the type may call: the Master must know the server by then.
@@ -186,10 +171,7 @@ async fn open_connection(
     service: &str,
     (purpose, flag): (&str, &str),
 ) -> Result<ServiceConnection, BusError> {
-    let found = bus
-        .master
-        .ask("lookupService", vec![service.into()])
-        .await?;
+    let found = bus.master.ask("lookupService", vec![service.into()]).await?;
     let uri = match &found {
         Ok(value) => value.as_str().unwrap_or_default(),
         Err(_) => return Err(BusError::NoService(service.to_owned())),
@@ -199,12 +181,8 @@ async fn open_connection(
         what: what(),
         reason: "its address should look like rosrpc://host:port".to_owned(),
     })?;
-    let header = Header::new([
-        ("callerid", bus.node.as_str()),
-        ("service", service),
-        ("md5sum", "*"),
-    ])
-    .with_field(purpose, flag);
+    let header =
+        Header::new([("callerid", bus.node.as_str()), ("service", service), ("md5sum", "*")]).with_field(purpose, flag);
     let opening = async {
         let resolved = bus.sockets.resolve(&place.host, place.port).await;
         let address = resolved.map_err(Error::Io)?;
@@ -212,16 +190,11 @@ async fn open_connection(
     };
     match timeout(HANDSHAKE, opening).await {
         Ok(Ok(connection)) => Ok(connection),
-        Ok(Err(Error::Refused(reason))) => Err(BusError::CallFailed {
-            service: service.to_owned(),
-            reason,
-            fate: CallFate::NotTaken,
-        }),
+        Ok(Err(Error::Refused(reason))) => {
+            Err(BusError::CallFailed { service: service.to_owned(), reason, fate: CallFate::NotTaken })
+        }
         Ok(Err(error)) => Err(from_tcpros_error(&what(), error)),
-        Err(_) => Err(BusError::Timeout {
-            what: what(),
-            after: HANDSHAKE,
-        }),
+        Err(_) => Err(BusError::Timeout { what: what(), after: HANDSHAKE }),
     }
 }
 
@@ -262,10 +235,7 @@ mod tests {
         let _served = server.serve("/who", service_type, Arc::new(Echo)).await;
         let connection = || async {
             let opened = open_connection(&caller.inner, "/who", ("persistent", "1")).await;
-            IdleConnection {
-                connection: opened.unwrap(),
-                address: Some("http://a/".to_owned()),
-            }
+            IdleConnection { connection: opened.unwrap(), address: Some("http://a/".to_owned()) }
         };
         let pool = CallPool::default();
         let graph = watch::Sender::new(graph_with_server("/old", "http://a/"));

@@ -45,10 +45,7 @@ async fn close_idle_clients(bus: Arc<Ros1BusState>) {
 }
 
 /// Returns the connections over which the topic's publishers report that they send to us.
-pub(super) async fn connections(
-    bus: &Arc<Ros1BusState>,
-    topic: &str,
-) -> Result<BTreeSet<PeerId>, BusError> {
+pub(super) async fn connections(bus: &Arc<Ros1BusState>, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
     let graph = bus.graph.borrow().clone();
     let ends = graph.topics.get(topic);
     let publishers = ends.map(|ends| ends.publishers.clone());
@@ -67,9 +64,8 @@ pub(super) async fn connections(
             let [Value::Int(id), peer, direction, _, of, ..] = row.as_array()? else {
                 return None;
             };
-            let ours = peer.as_str() == Some(&bus.node)
-                && direction.as_str() == Some("o")
-                && of.as_str() == Some(topic);
+            let ours =
+                peer.as_str() == Some(&bus.node) && direction.as_str() == Some("o") && of.as_str() == Some(topic);
             ours.then(|| PeerId::new(node.as_str(), id.unsigned_abs().into()))
         });
         found.extend(ours);

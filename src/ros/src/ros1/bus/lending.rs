@@ -36,20 +36,11 @@ impl Loans {
         };
         let mut lent = self.lent.lock();
         lent.retain(|_, served| !served.has_ended());
-        let Some(LentService {
-            service_type,
-            handler,
-            gone,
-        }) = found
-        else {
+        let Some(LentService { service_type, handler, gone }) = found else {
             lent.remove(service);
             return false;
         };
-        let served = ServiceEntry {
-            service_type,
-            handler,
-            ended: gone,
-        };
+        let served = ServiceEntry { service_type, handler, ended: gone };
         lent.insert(service.to_owned(), Arc::new(served));
         true
     }

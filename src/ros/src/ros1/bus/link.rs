@@ -36,8 +36,7 @@ impl PublisherLink {
     }
 
     pub(super) fn set_listed(&self, listed: bool) {
-        self.listed
-            .send_if_modified(|before| std::mem::replace(before, listed) != listed);
+        self.listed.send_if_modified(|before| std::mem::replace(before, listed) != listed);
     }
 
     pub(super) fn abort(&self) {
@@ -58,11 +57,7 @@ impl PublisherLink {
 }
 
 /// Starts to maintain a connection to the publisher at `uri`.
-pub(super) fn start(
-    bus: &Arc<Ros1BusState>,
-    topic: &Arc<TopicIn>,
-    uri: &str,
-) -> Arc<PublisherLink> {
+pub(super) fn start(bus: &Arc<Ros1BusState>, topic: &Arc<TopicIn>, uri: &str) -> Arc<PublisherLink> {
     let link = Arc::new(PublisherLink {
         id: bus.next_id(),
         uri: uri.to_owned(),
@@ -74,20 +69,12 @@ pub(super) fn start(
         messages: AtomicU64::new(0),
         bytes: AtomicU64::new(0),
     });
-    let task = bus.spawn(maintain_connection(
-        bus.clone(),
-        topic.clone(),
-        link.clone(),
-    ));
+    let task = bus.spawn(maintain_connection(bus.clone(), topic.clone(), link.clone()));
     *link.task.lock() = Some(task);
     link
 }
 
-async fn maintain_connection(
-    bus: Arc<Ros1BusState>,
-    topic: Arc<TopicIn>,
-    link: Arc<PublisherLink>,
-) {
+async fn maintain_connection(bus: Arc<Ros1BusState>, topic: Arc<TopicIn>, link: Arc<PublisherLink>) {
     let mut listed = link.listed.subscribe();
     let mut pause = PAUSE;
     let mut told = String::new();
@@ -140,18 +127,9 @@ async fn connect_and_read(
 ) -> Result<(), BusError> {
     let wanted = topic.requested_type();
     let connection = connect(bus, &topic.name, &link.uri, &wanted).await?;
-    let PublisherConnection {
-        mut stream,
-        mut frames,
-        publisher,
-        latching,
-        wire_type,
-    } = connection;
+    let PublisherConnection { mut stream, mut frames, publisher, latching, wire_type } = connection;
     let wire_type = Arc::new(wire_type);
-    *link.offer.lock() = Some(Offer {
-        wire_type: wire_type.clone(),
-        latching,
-    });
+    *link.offer.lock() = Some(Offer { wire_type: wire_type.clone(), latching });
     topic.on_connected(link, &publisher);
     loop {
         let next = frames.next(&mut stream).await;
@@ -162,12 +140,7 @@ async fn connect_and_read(
         link.bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         topic.deliver(
             &link.uri,
-            SerializedMessage {
-                bytes,
-                wire_type: wire_type.clone(),
-                publisher: publisher.clone(),
-                latching,
-            },
+            SerializedMessage { bytes, wire_type: wire_type.clone(), publisher: publisher.clone(), latching },
         );
     }
 }
@@ -208,10 +181,7 @@ pub(super) async fn connect(
     let (stream, answer) = match timeout(HANDSHAKE, shake).await {
         Ok(shaken) => shaken.map_err(|error| from_tcpros_error(&what(), error))?,
         Err(_) => {
-            return Err(BusError::Timeout {
-                what: what(),
-                after: HANDSHAKE,
-            });
+            return Err(BusError::Timeout { what: what(), after: HANDSHAKE });
         }
     };
     let wire_type = wire_type_from_header(&answer);
@@ -232,32 +202,21 @@ pub(super) async fn connect(
 }
 
 /// Returns host and port at which the node at `uri` serves the topic.
-async fn request_topic(
-    bus: &Ros1BusState,
-    topic: &str,
-    uri: &str,
-) -> Result<(String, u16), BusError> {
+async fn request_topic(bus: &Ros1BusState, topic: &str, uri: &str) -> Result<(String, u16), BusError> {
     let client = bus.client(uri)?;
     let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
     let args = [bus.node.as_str().into(), topic.into(), protocols];
     let answer = client.call("requestTopic", &args, HANDSHAKE).await;
-    let refused = |reason: String| BusError::Protocol {
-        what: format!("requestTopic of {uri}"),
-        reason,
-    };
+    let refused = |reason: String| BusError::Protocol { what: format!("requestTopic of {uri}"), reason };
     let reply = ApiReply::from_value(answer.map_err(to_bus_error)?)
         .ok_or_else(|| refused("its answer is not [code, message, value]".to_owned()))?;
     if reply.code != 1 {
         return Err(refused(format!("it declined: {}", reply.message)));
     }
     let place = match reply.value.as_array() {
-        Some(
-            [
-                Value::String(protocol),
-                Value::String(host),
-                Value::Int(port),
-            ],
-        ) if protocol == "TCPROS" => u16::try_from(*port).ok().map(|port| (host.clone(), port)),
+        Some([Value::String(protocol), Value::String(host), Value::Int(port)]) if protocol == "TCPROS" => {
+            u16::try_from(*port).ok().map(|port| (host.clone(), port))
+        }
         _ => None,
     };
     place.ok_or_else(|| refused("it offers no TCPROS address".to_owned()))
@@ -268,9 +227,6 @@ pub(super) fn from_tcpros_error(what: &str, error: tcpros::Error) -> BusError {
     let what = what.to_owned();
     match error {
         tcpros::Error::Io(source) => BusError::Io { what, source },
-        other => BusError::Protocol {
-            what,
-            reason: other.to_string(),
-        },
+        other => BusError::Protocol { what, reason: other.to_string() },
     }
 }

@@ -43,15 +43,8 @@ impl MasterClient {
         budget: &Budget,
     ) -> Result<Self, BusError> {
         let uri = format!("http://{address}/");
-        let client = XmlRpcClient::new(sockets, &uri)
-            .map_err(to_bus_error)?
-            .with_budget(budget);
-        Ok(Self {
-            client,
-            uri,
-            node: node.to_owned(),
-            turns: CallLimiter::new(),
-        })
+        let client = XmlRpcClient::new(sockets, &uri).map_err(to_bus_error)?.with_budget(budget);
+        Ok(Self { client, uri, node: node.to_owned(), turns: CallLimiter::new() })
     }
 
     /// Returns the Master's address.
@@ -62,18 +55,11 @@ impl MasterClient {
     /// Calls a method and returns its value; any answer but success is an error.
     pub(super) async fn call(&self, method: &str, args: Vec<Value>) -> Result<Value, BusError> {
         let answer = self.ask(method, args).await?;
-        answer.map_err(|reason| BusError::Master {
-            call: method.to_owned(),
-            reason: reason.into_string(),
-        })
+        answer.map_err(|reason| BusError::Master { call: method.to_owned(), reason: reason.into_string() })
     }
 
     /// Calls a method and returns its value, or the message with which the Master declined.
-    pub(super) async fn ask(
-        &self,
-        method: &str,
-        args: Vec<Value>,
-    ) -> Result<Result<Value, FailureReason>, BusError> {
+    pub(super) async fn ask(&self, method: &str, args: Vec<Value>) -> Result<Result<Value, FailureReason>, BusError> {
         self.ask_in_name_of(&self.node, method, args).await
     }
 
@@ -85,19 +71,12 @@ impl MasterClient {
         args: Vec<Value>,
     ) -> Result<Result<Value, FailureReason>, BusError> {
         let Some(_turn) = self.turns.acquire().await else {
-            return Err(BusError::Timeout {
-                what: format!("{method} of {}", self.uri),
-                after: ANSWER,
-            });
+            return Err(BusError::Timeout { what: format!("{method} of {}", self.uri), after: ANSWER });
         };
         let answer = self.call_raw(caller, method, args, ANSWER).await;
         let reply = answer.map_err(to_bus_error)?;
         self.turns.record_answer();
-        Ok(if reply.code == 1 {
-            Ok(reply.value)
-        } else {
-            Err(FailureReason::new(reply.message))
-        })
+        Ok(if reply.code == 1 { Ok(reply.value) } else { Err(FailureReason::new(reply.message)) })
     }
 
     /// Calls a method with its own time limit; returns XML-RPC errors as such.
@@ -119,10 +98,7 @@ impl MasterClient {
 
 impl CallLimiter {
     pub(super) fn new() -> Self {
-        Self {
-            free: Semaphore::new(AT_A_TIME),
-            answered: Mutex::new(Instant::now()),
-        }
+        Self { free: Semaphore::new(AT_A_TIME), answered: Mutex::new(Instant::now()) }
     }
 
     pub(super) fn record_answer(&self) {
@@ -149,22 +125,13 @@ impl CallLimiter {
 pub(super) fn to_bus_error(error: xmlrpc::Error) -> BusError {
     match error {
         xmlrpc::Error::Io { peer, source } => BusError::Io { what: peer, source },
-        xmlrpc::Error::Timeout {
-            peer,
-            method,
-            after,
-        } => BusError::Timeout {
-            what: format!("{method} of {peer}"),
-            after,
-        },
-        xmlrpc::Error::Fault { method, fault, .. } => BusError::Master {
-            call: method,
-            reason: fault.text,
-        },
+        xmlrpc::Error::Timeout { peer, method, after } => {
+            BusError::Timeout { what: format!("{method} of {peer}"), after }
+        }
+        xmlrpc::Error::Fault { method, fault, .. } => BusError::Master { call: method, reason: fault.text },
         xmlrpc::Error::Http { peer, reason } => BusError::Protocol { what: peer, reason },
-        xmlrpc::Error::Malformed { .. } | xmlrpc::Error::BadUri(_) => BusError::Protocol {
-            what: "XML-RPC peer".to_owned(),
-            reason: error.to_string(),
-        },
+        xmlrpc::Error::Malformed { .. } | xmlrpc::Error::BadUri(_) => {
+            BusError::Protocol { what: "XML-RPC peer".to_owned(), reason: error.to_string() }
+        }
     }
 }

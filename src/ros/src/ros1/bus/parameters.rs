@@ -3,9 +3,7 @@
 use async_trait::async_trait;
 
 use super::Ros1Bus;
-use crate::bus::{
-    BusError, GlobalParameters, ParamChangeReceiver, ParamValue, param_change_channel,
-};
+use crate::bus::{BusError, GlobalParameters, ParamChangeReceiver, ParamValue, param_change_channel};
 use crate::ros1::names;
 use crate::ros1::xmlrpc::Value;
 
@@ -19,10 +17,8 @@ impl GlobalParameters for Ros1Bus {
     }
 
     async fn set(&self, key: &str, value: ParamValue) -> Result<(), BusError> {
-        let value = Value::try_from(value).map_err(|error| BusError::BadParam {
-            key: key.to_owned(),
-            reason: error.to_string(),
-        })?;
+        let value = Value::try_from(value)
+            .map_err(|error| BusError::BadParam { key: key.to_owned(), reason: error.to_string() })?;
         let set = self.inner.master.call("setParam", vec![key.into(), value]);
         set.await.map(drop)
     }

@@ -11,9 +11,7 @@ use super::registrar::Kind;
 use super::state::Ros1BusState;
 use super::subscriptions;
 use super::topic_out::{LocalPublisher, State, Subscriber, TopicOut};
-use crate::bus::{
-    BusError, MatchedPeers, PeerId, Publisher, QosProfile, SerializedMessage, TopicPeer, WireType,
-};
+use crate::bus::{BusError, MatchedPeers, PeerId, Publisher, QosProfile, SerializedMessage, TopicPeer, WireType};
 use crate::ring::DropTally;
 use crate::ros1::tcpros::SendQueue;
 
@@ -30,8 +28,7 @@ pub(in crate::ros1) async fn advertise(
         let mut topics = bus.publications.lock();
         let topic = topics.entry(name.to_owned()).or_default();
         topic.add(name, id, &of, (qos, end))?;
-        bus.registrar
-            .set_wanted(Kind::Publisher, name, Some(&of.name));
+        bus.registrar.set_wanted(Kind::Publisher, name, Some(&of.name));
         topic.clone()
     };
     bus.publishing.notify_waiters();
@@ -44,9 +41,7 @@ pub(in crate::ros1) async fn advertise(
         of: Arc::new(of),
         latching: qos.is_latching(),
     };
-    handle
-        .topic
-        .set_action_listeners(subscriptions::action_peers(bus, name));
+    handle.topic.set_action_listeners(subscriptions::action_peers(bus, name));
     bus.registrar.sync(Kind::Publisher, name, false).await?;
     Ok(Box::new(handle))
 }
@@ -60,17 +55,11 @@ pub(super) fn ask_subscribers(bus: &Arc<Ros1BusState>, name: &str) -> Subscriber
         let mut state = topic.state.lock();
         state.askers.push((bus.next_id(), sender));
         let type_name = state.advert.as_ref().map_or("*", |advert| &advert.name);
-        bus.registrar
-            .set_wanted(Kind::Publisher, name, Some(type_name));
+        bus.registrar.set_wanted(Kind::Publisher, name, Some(type_name));
         topic.clone()
     };
     bus.publishing.notify_waiters();
-    SubscriberQuery {
-        bus: bus.clone(),
-        name: name.to_owned(),
-        topic,
-        answers,
-    }
+    SubscriberQuery { bus: bus.clone(), name: name.to_owned(), topic, answers }
 }
 
 /// A pending query for the types that subscribers request; ends when dropped.
@@ -110,11 +99,7 @@ impl TopicOut {
             Some(_) => {}
             None => state.advert = Some(ours.clone()),
         }
-        let local = LocalPublisher {
-            end,
-            qos,
-            last: None,
-        };
+        let local = LocalPublisher { end, qos, last: None };
         state.locals.insert(id, local);
         Ok(())
     }
@@ -128,11 +113,7 @@ impl TopicOut {
 
     /// Forwards the type requested by a subscriber to the queries with a number above `told`; returns the number of the
     /// last one.
-    pub(super) fn forward_requested_type(
-        &self,
-        asked: &WireType,
-        told: Option<i32>,
-    ) -> Option<i32> {
+    pub(super) fn forward_requested_type(&self, asked: &WireType, told: Option<i32>) -> Option<i32> {
         let state = self.state.lock();
         let mut last = None;
         for (number, asker) in &state.askers {
@@ -171,9 +152,7 @@ impl TopicOut {
 
     pub(super) fn detach(&self, subscriber: &Arc<Subscriber>) {
         let mut state = self.state.lock();
-        state
-            .subscribers
-            .retain(|other| !Arc::ptr_eq(other, subscriber));
+        state.subscribers.retain(|other| !Arc::ptr_eq(other, subscriber));
         self.matched.send_replace(state.matched_peers());
     }
 
@@ -187,11 +166,7 @@ impl TopicOut {
     }
 
     /// Returns the latched messages for a new subscription of this node.
-    pub(super) fn latched_messages(
-        &self,
-        node: &str,
-        end: EndpointOwner,
-    ) -> Vec<SerializedMessage> {
+    pub(super) fn latched_messages(&self, node: &str, end: EndpointOwner) -> Vec<SerializedMessage> {
         let state = self.state.lock();
         let Some(advert) = state.advert.clone().map(Arc::new) else {
             return Vec::new();
@@ -236,9 +211,7 @@ impl TopicOut {
     /// Waits until all subscribers are gone.
     pub(super) async fn wait_until_no_subscribers(&self) {
         let mut matched = self.matched.subscribe();
-        let _ = matched
-            .wait_for(|matched| matched.connected_count() == 0)
-            .await;
+        let _ = matched.wait_for(|matched| matched.connected_count() == 0).await;
     }
 
     /// Returns the connected subscribers.
@@ -250,15 +223,9 @@ impl TopicOut {
 impl State {
     fn matched_peers(&self) -> MatchedPeers {
         let subscribers = self.subscribers.iter().map(|subscriber| &subscriber.peer);
-        let peers = subscribers.chain(&self.actions).map(|id| TopicPeer {
-            id: id.clone(),
-            connected: true,
-            offer: None,
-        });
-        MatchedPeers {
-            peers: peers.collect(),
-            refused: Vec::new(),
-        }
+        let peers =
+            subscribers.chain(&self.actions).map(|id| TopicPeer { id: id.clone(), connected: true, offer: None });
+        MatchedPeers { peers: peers.collect(), refused: Vec::new() }
     }
 }
 
@@ -273,12 +240,7 @@ fn retire(state: &mut State) {
 }
 
 /// Applies `by` to remove something from a topic, and unregisters the topic once nothing is left of it.
-fn release(
-    bus: &Arc<Ros1BusState>,
-    name: &str,
-    topic: &Arc<TopicOut>,
-    by: impl FnOnce(&mut State),
-) {
+fn release(bus: &Arc<Ros1BusState>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(&mut State)) {
     {
         let mut topics = bus.publications.lock();
         let mut state = topic.state.lock();

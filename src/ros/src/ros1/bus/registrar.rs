@@ -51,13 +51,7 @@ pub(super) struct Registrar {
 
 impl Registrar {
     pub(super) fn new(master: Arc<MasterClient>, slave_uri: String, service_uri: String) -> Self {
-        Self {
-            master,
-            slave_uri,
-            service_uri,
-            slots: Mutex::default(),
-            contests: Mutex::default(),
-        }
+        Self { master, slave_uri, service_uri, slots: Mutex::default(), contests: Mutex::default() }
     }
 
     pub(super) fn slave_uri(&self) -> &str {
@@ -84,12 +78,7 @@ impl Registrar {
 
     /// Brings the Master's registration of one name up to date; with `again`, even if it is believed to be. Returns the
     /// Master's answer if anything was registered.
-    pub(super) async fn sync(
-        &self,
-        kind: Kind,
-        name: &str,
-        again: bool,
-    ) -> Result<Option<Value>, BusError> {
+    pub(super) async fn sync(&self, kind: Kind, name: &str, again: bool) -> Result<Option<Value>, BusError> {
         let key = (kind, name.to_owned());
         let Some(slot) = self.slots.lock().get(&key).cloned() else {
             return Ok(None);
@@ -150,10 +139,7 @@ impl Registrar {
     /// Returns the differences to what the Master shows of node `node`: registrations that are missing and those that
     /// are surplus.
     pub(super) fn differences(&self, node: &str, graph: &Graph) -> Vec<(Kind, String)> {
-        let ours = graph
-            .nodes
-            .get(node)
-            .is_none_or(|uri| *uri == self.slave_uri);
+        let ours = graph.nodes.get(node).is_none_or(|uri| *uri == self.slave_uri);
         let has = |kind: Kind, name: &str| {
             let topic = graph.topics.get(name);
             let among = |nodes: &[String]| nodes.iter().any(|other| other == node);
@@ -168,23 +154,17 @@ impl Registrar {
             .iter()
             .filter(|(_, slot)| {
                 // Not those with a call in progress.
-                slot.told.try_lock().is_ok_and(|told| told.is_some())
-                    && slot.wanted.lock().is_some()
+                slot.told.try_lock().is_ok_and(|told| told.is_some()) && slot.wanted.lock().is_some()
             })
             .filter(|((kind, name), _)| !ours || !has(*kind, name))
             .filter(|((kind, name), _)| match graph.services.get(name) {
-                Some(other) if *kind == Kind::Service && other != node => {
-                    self.should_reregister(name, other)
-                }
+                Some(other) if *kind == Kind::Service && other != node => self.should_reregister(name, other),
                 _ => true,
             })
             .map(|(key, _)| key.clone())
             .collect();
         if ours {
-            let topics = graph
-                .topics
-                .keys()
-                .flat_map(|name| [(Kind::Publisher, name), (Kind::Subscriber, name)]);
+            let topics = graph.topics.keys().flat_map(|name| [(Kind::Publisher, name), (Kind::Subscriber, name)]);
             let services = graph.services.keys().map(|name| (Kind::Service, name));
             let surplus = topics
                 .chain(services)
@@ -222,10 +202,7 @@ impl Registrar {
 
     /// Removes a registration that the Master shows and this node does not want.
     pub(super) async fn withdraw_surplus(&self, kind: Kind, name: &str) {
-        self.slots
-            .lock()
-            .entry((kind, name.to_owned()))
-            .or_default();
+        self.slots.lock().entry((kind, name.to_owned())).or_default();
         let _ = self.sync(kind, name, true).await;
     }
 

@@ -93,12 +93,7 @@ async fn serve_subscriber(
 ) -> Result<(), Error> {
     let asked = &wire_type_from_header(header);
     let caller = header.get("callerid").unwrap_or("unknown");
-    let mut waiting = PendingSubscriber {
-        bus,
-        name,
-        asked,
-        told: None,
-    };
+    let mut waiting = PendingSubscriber { bus, name, asked, told: None };
     let Some((topic, advert, latching)) = waiting.wait_until_advertised().await else {
         if waiting.told.is_some() {
             // It was only queried for its type: close without a reason, or it would log an error.
@@ -119,10 +114,7 @@ async fn serve_subscriber(
     let Some(subscriber) = topic.attach(bus.next_id(), caller) else {
         return Ok(());
     };
-    let attached = AttachedSubscriber {
-        topic: &topic,
-        subscriber,
-    };
+    let attached = AttachedSubscriber { topic: &topic, subscriber };
     let answer = Header::new([
         ("callerid", bus.node.as_str()),
         ("topic", name),

@@ -35,11 +35,7 @@ pub(super) async fn serve(
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
     let (ending, ended) = watch::channel(false);
-    let served = Arc::new(ServiceEntry {
-        service_type,
-        handler,
-        ended,
-    });
+    let served = Arc::new(ServiceEntry { service_type, handler, ended });
     {
         let mut services = bus.services.lock();
         if services.contains_key(name) {
@@ -47,15 +43,9 @@ pub(super) async fn serve(
         }
         services.insert(name.to_owned(), served.clone());
         let type_name = served.service_type.name.as_str();
-        bus.registrar
-            .set_wanted(Kind::Service, name, Some(type_name));
+        bus.registrar.set_wanted(Kind::Service, name, Some(type_name));
     }
-    let guard = ServiceGuard {
-        bus: bus.clone(),
-        name: name.to_owned(),
-        served,
-        ending,
-    };
+    let guard = ServiceGuard { bus: bus.clone(), name: name.to_owned(), served, ending };
     bus.registrar.sync(Kind::Service, name, false).await?;
     Ok(Box::new(guard))
 }
@@ -77,9 +67,7 @@ impl Drop for ServiceGuard {
                 return;
             }
             services.remove(&self.name);
-            self.bus
-                .registrar
-                .set_wanted(Kind::Service, &self.name, None);
+            self.bus.registrar.set_wanted(Kind::Service, &self.name, None);
         }
         let (bus, name) = (self.bus.clone(), self.name.clone());
         self.bus.spawn(async move {

@@ -72,11 +72,7 @@ impl Slave {
         let name = args.text("topic")?;
         let protocols = args.value("protocols")?;
         let bus = &self.bus;
-        let open = bus
-            .publications
-            .lock()
-            .get(&name)
-            .is_some_and(|t| t.is_open());
+        let open = bus.publications.lock().get(&name).is_some_and(|t| t.is_open());
         if !open {
             let message = format!("{} does not publish {name}", bus.node);
             return Ok(ApiReply::failure(message, Value::Array(Vec::new())));
@@ -89,11 +85,7 @@ impl Slave {
             let message = "only TCPROS is spoken here";
             return Ok(ApiReply::failure(message, Value::Array(Vec::new())));
         }
-        let place = vec![
-            "TCPROS".into(),
-            bus.host.as_str().into(),
-            i32::from(bus.port).into(),
-        ];
+        let place = vec!["TCPROS".into(), bus.host.as_str().into(), i32::from(bus.port).into()];
         let message = format!("ready on {}:{}", bus.host, bus.port);
         Ok(ApiReply::success(message, Value::Array(place)))
     }

@@ -13,8 +13,7 @@ use super::registrar::Kind;
 use super::state::Ros1BusState;
 use super::topic_in::{LocalSubscriber, LocalSubscribers, PublisherLink, PublisherLinks, TopicIn};
 use crate::bus::{
-    BusError, MatchedPeers, PeerId, QosProfile, SerializedMessage, Subscription, TopicPeer,
-    WireType, message_queue,
+    BusError, MatchedPeers, PeerId, QosProfile, SerializedMessage, Subscription, TopicPeer, WireType, message_queue,
 };
 use crate::ros1::tcpros;
 
@@ -48,21 +47,11 @@ pub(in crate::ros1) async fn subscribe(
                 matched: watch::Sender::default(),
             })
         });
-        topic.add(LocalSubscriber {
-            id,
-            end,
-            sender,
-            wanted,
-        });
-        bus.registrar
-            .set_wanted(Kind::Subscriber, name, Some(&topic.type_name()));
+        topic.add(LocalSubscriber { id, end, sender, wanted });
+        bus.registrar.set_wanted(Kind::Subscriber, name, Some(&topic.type_name()));
         (topic.clone(), first)
     };
-    let guard = SubscriptionGuard {
-        bus: bus.clone(),
-        topic: topic.clone(),
-        id,
-    };
+    let guard = SubscriptionGuard { bus: bus.clone(), topic: topic.clone(), id };
     topic.deliver_own_latched(bus, id);
     // A new set of connections must learn the publishers, even if an earlier registration still stands.
     let answer = bus.registrar.sync(Kind::Subscriber, name, first).await?;
@@ -85,12 +74,7 @@ pub(super) fn action_peers(bus: &Ros1BusState, name: &str) -> Vec<PeerId> {
 
 /// Delivers a message published by this node through an endpoint of owner `by` to the local subscriptions that are to
 /// receive it.
-pub(super) fn deliver_locally(
-    bus: &Ros1BusState,
-    name: &str,
-    by: EndpointOwner,
-    message: &SerializedMessage,
-) {
+pub(super) fn deliver_locally(bus: &Ros1BusState, name: &str, by: EndpointOwner, message: &SerializedMessage) {
     let topic = bus.subscriptions.lock().get(name).cloned();
     let Some(topic) = topic else { return };
     for local in &topic.locals.lock().list {
@@ -103,10 +87,7 @@ pub(super) fn deliver_locally(
 impl TopicIn {
     fn action_peers(&self, node: &str) -> Vec<PeerId> {
         let locals = self.locals.lock();
-        let actions = locals
-            .list
-            .iter()
-            .filter(|local| local.end == EndpointOwner::Action);
+        let actions = locals.list.iter().filter(|local| local.end == EndpointOwner::Action);
         let ids = actions.map(|local| PeerId::new(node, local.id.unsigned_abs().into()));
         ids.collect()
     }
@@ -138,9 +119,7 @@ impl TopicIn {
         let locals = self.locals.lock();
         let mut types = locals.list.iter().map(|local| &local.wanted);
         match types.next() {
-            Some(first) if types.all(|o| (&o.name, &o.digest) == (&first.name, &first.digest)) => {
-                first.clone()
-            }
+            Some(first) if types.all(|o| (&o.name, &o.digest) == (&first.name, &first.digest)) => first.clone(),
             _ => WireType::any(),
         }
     }
@@ -159,10 +138,7 @@ impl TopicIn {
         if message.latching {
             // Kept for long: it must not keep the receive buffer alive that it shares with other messages.
             let kept = if message.bytes.len() < tcpros::BIG {
-                SerializedMessage {
-                    bytes: Bytes::copy_from_slice(&message.bytes),
-                    ..message.clone()
-                }
+                SerializedMessage { bytes: Bytes::copy_from_slice(&message.bytes), ..message.clone() }
             } else {
                 message.clone()
             };
@@ -247,10 +223,7 @@ impl TopicIn {
                 offer: link.offer(),
             })
         });
-        let now = MatchedPeers {
-            peers: peers.collect(),
-            refused: Vec::new(),
-        };
+        let now = MatchedPeers { peers: peers.collect(), refused: Vec::new() };
         self.matched.send_if_modified(|before| {
             let news = *before != now;
             if news {
@@ -294,9 +267,7 @@ impl Drop for SubscriptionGuard {
                 locals.list.retain(|local| local.id != self.id);
                 locals.list.is_empty()
             };
-            let current = topics
-                .get(name)
-                .is_some_and(|t| Arc::ptr_eq(t, &self.topic));
+            let current = topics.get(name).is_some_and(|t| Arc::ptr_eq(t, &self.topic));
             let gone = empty && current;
             if gone {
                 topics.remove(name);

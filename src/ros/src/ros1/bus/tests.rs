@@ -14,9 +14,7 @@ use crate::ros1::testing::{LONG, TestMaster};
 
 pub(super) async fn join(master: &TestMaster, name: &str) -> Arc<Ros1Bus> {
     let sockets = Arc::new(HostSockets);
-    Ros1Bus::connect(sockets, master.address, name)
-        .await
-        .unwrap()
+    Ros1Bus::connect(sockets, master.address, name).await.unwrap()
 }
 
 pub(super) fn text_type(md5: &str) -> WireType {
@@ -43,9 +41,7 @@ pub(super) async fn wait_for_subscribers(publisher: &dyn Publisher, count: usize
 /// Returns the next message, with a time limit.
 pub(super) async fn next(messages: &mut MessageReceiver) -> SerializedMessage {
     let message = tokio::time::timeout(LONG, messages.recv()).await;
-    message
-        .expect("a message should come")
-        .expect("not the end")
+    message.expect("a message should come").expect("not the end")
 }
 
 pub(super) async fn next_text(messages: &mut MessageReceiver) -> String {

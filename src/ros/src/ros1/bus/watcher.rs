@@ -71,12 +71,7 @@ pub(super) struct Watcher {
 
 /// Creates the watcher and gets the graph for the first time.
 pub(super) async fn start(bus: Arc<Ros1BusState>) -> Result<Watcher, BusError> {
-    let mut watcher = Watcher {
-        bus,
-        waits: true,
-        known: -1,
-        run_id: String::new(),
-    };
+    let mut watcher = Watcher { bus, waits: true, known: -1, run_id: String::new() };
     watcher.refresh().await.map_err(to_bus_error)?;
     Ok(watcher)
 }
@@ -198,25 +193,15 @@ impl Ros1BusState {
     }
 }
 
-async fn wait_graph(
-    bus: &Ros1BusState,
-    known: i32,
-    seconds: i32,
-) -> Result<(Graph, String), xmlrpc::Error> {
+async fn wait_graph(bus: &Ros1BusState, known: i32, seconds: i32) -> Result<(Graph, String), xmlrpc::Error> {
     let args = vec![known.into(), seconds.into()];
     let time = Duration::from_secs(u64::from(seconds.unsigned_abs())) + GRACE;
-    let reply = bus
-        .master
-        .call_raw(&bus.node, WAIT_GRAPH, args, time)
-        .await?;
+    let reply = bus.master.call_raw(&bus.node, WAIT_GRAPH, args, time).await?;
     from_value(&reply.value).ok_or_else(|| unreadable(WAIT_GRAPH))
 }
 
 fn unreadable(method: &str) -> xmlrpc::Error {
-    xmlrpc::Error::Http {
-        peer: "the ROS Master".to_owned(),
-        reason: format!("its answer to {method} cannot be read"),
-    }
+    xmlrpc::Error::Http { peer: "the ROS Master".to_owned(), reason: format!("its answer to {method} cannot be read") }
 }
 
 /// Gets the graph with the methods that every Master has; these do not include the use of parameters.
@@ -230,19 +215,15 @@ async fn poll_graph(bus: &Ros1BusState) -> Result<Graph, xmlrpc::Error> {
     let Some([publishers, subscribers, services]) = state.as_array() else {
         return Err(unreadable("getSystemState"));
     };
-    let types: BTreeMap<String, String> = pairs(&types)
-        .filter_map(|(topic, name)| Some((topic.to_owned(), name.as_str()?.to_owned())))
-        .collect();
+    let types: BTreeMap<String, String> =
+        pairs(&types).filter_map(|(topic, name)| Some((topic.to_owned(), name.as_str()?.to_owned()))).collect();
     let mut graph = Graph::default();
     for (list, publishing) in [(publishers, true), (subscribers, false)] {
         for (name, nodes) in pairs(list) {
-            let topic = graph
-                .topics
-                .entry(name.to_owned())
-                .or_insert_with(|| TopicNodes {
-                    type_name: types.get(name).map_or("*", String::as_str).to_owned(),
-                    ..TopicNodes::default()
-                });
+            let topic = graph.topics.entry(name.to_owned()).or_insert_with(|| TopicNodes {
+                type_name: types.get(name).map_or("*", String::as_str).to_owned(),
+                ..TopicNodes::default()
+            });
             if publishing {
                 topic.publishers = nodes.to_strings();
             } else {
@@ -255,10 +236,7 @@ async fn poll_graph(bus: &Ros1BusState) -> Result<Graph, xmlrpc::Error> {
             graph.services.insert(name.to_owned(), node);
         }
     }
-    let in_topics = graph
-        .topics
-        .values()
-        .flat_map(|topic| topic.publishers.iter().chain(&topic.subscribers));
+    let in_topics = graph.topics.values().flat_map(|topic| topic.publishers.iter().chain(&topic.subscribers));
     let mut names: Vec<String> = in_topics.chain(graph.services.values()).cloned().collect();
     names.sort();
     names.dedup();

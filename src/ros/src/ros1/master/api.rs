@@ -120,20 +120,14 @@ impl Api {
             return Err(Fault::new("system.multicall takes an array of calls"));
         };
         if calls.len() > MAX_MULTICALL {
-            return Err(Fault::new(format!(
-                "more than {MAX_MULTICALL} calls in one"
-            )));
+            return Err(Fault::new(format!("more than {MAX_MULTICALL} calls in one")));
         }
         let answers = calls.into_iter().map(|call| {
             let answer = match call {
-                Value::Struct(mut members) => {
-                    match (members.remove("methodName"), members.remove("params")) {
-                        (Some(Value::String(method)), Some(Value::Array(params))) => {
-                            self.dispatch(&method, params)
-                        }
-                        _ => Err(Fault::new("a call needs methodName and params")),
-                    }
-                }
+                Value::Struct(mut members) => match (members.remove("methodName"), members.remove("params")) {
+                    (Some(Value::String(method)), Some(Value::Array(params))) => self.dispatch(&method, params),
+                    _ => Err(Fault::new("a call needs methodName and params")),
+                },
                 _ => Err(Fault::new("a call is a struct of methodName and params")),
             };
             match answer {
@@ -158,10 +152,7 @@ impl Api {
         // In either case: the answer always contains the whole state.
         let _ = tokio::time::timeout(time.min(MAX_WAIT), news).await;
         let graph = self.master.graph();
-        Ok(ApiReply::success(
-            "",
-            graph::to_value(&graph, &self.master.run_id),
-        ))
+        Ok(ApiReply::success("", graph::to_value(&graph, &self.master.run_id)))
     }
 
     fn registration(&self, method: &str, args: &mut Args) -> Option<Result<ApiReply, ApiReply>> {
@@ -194,10 +185,7 @@ impl Api {
             Kind::Publisher => format!("Registered [{node}] as publisher of [{topic}]"),
             _ => format!("Subscribed to [{topic}]"),
         };
-        Ok(ApiReply::success(
-            message,
-            Value::strings(others.map_err(refusal_reply)?),
-        ))
+        Ok(ApiReply::success(message, Value::strings(others.map_err(refusal_reply)?)))
     }
 
     fn register_service(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
@@ -212,10 +200,7 @@ impl Api {
             registry.register(Kind::Service, &service, "", by, &service_api, notices)
         });
         registered.map_err(refusal_reply)?;
-        Ok(ApiReply::success(
-            format!("Registered [{node}] as provider of [{service}]"),
-            1,
-        ))
+        Ok(ApiReply::success(format!("Registered [{node}] as provider of [{service}]"), 1))
     }
 
     fn unregister(&self, kind: Kind, args: &mut Args) -> Result<ApiReply, ApiReply> {
@@ -248,10 +233,7 @@ impl Api {
             "getSystemState" => args.text("caller_id").map(|_| self.system_state()),
             "getUri" => Ok(ApiReply::success("", self.master.uri.as_str())),
             "getPid" => Ok(ApiReply::success("", pid())),
-            "shutdown" => Ok(ApiReply::error(
-                "this Master runs as long as its servant; nodes cannot shut it down",
-                0,
-            )),
+            "shutdown" => Ok(ApiReply::error("this Master runs as long as its servant; nodes cannot shut it down", 0)),
             _ => return None,
         })
     }
@@ -304,12 +286,7 @@ impl Api {
         let node = args.text("caller_id")?;
         let api = args.uri("caller_api", "http")?;
         args.finish()?;
-        let lent = self.master.lending.set_lender(
-            &node,
-            &api,
-            self.master.sockets(),
-            &self.master.limits.budget,
-        );
+        let lent = self.master.lending.set_lender(&node, &api, self.master.sockets(), &self.master.limits.budget);
         lent.map_err(|error| ApiReply::error(error.to_string(), 0))?;
         Ok(ApiReply::success(format!("[{node}] lends services"), 1))
     }
@@ -324,14 +301,12 @@ impl Api {
             _ => String::new(),
         };
         let state = self.master.state.lock();
-        let published = state.registry.topics().filter(|(name, topic)| {
-            !topic.publishers.is_empty() && name.starts_with(below.as_str())
-        });
+        let published = state
+            .registry
+            .topics()
+            .filter(|(name, topic)| !topic.publishers.is_empty() && name.starts_with(below.as_str()));
         let list = published.map(|(name, topic)| pair((name, &topic.type_name)));
-        Ok(ApiReply::success(
-            "current topics",
-            Value::Array(list.collect()),
-        ))
+        Ok(ApiReply::success("current topics", Value::Array(list.collect())))
     }
 
     fn system_state(&self) -> ApiReply {
@@ -339,18 +314,14 @@ impl Api {
         let mut publishers = Vec::new();
         let mut subscribers = Vec::new();
         for (name, topic) in state.registry.topics() {
-            for (nodes, list) in [
-                (topic.publishers, &mut publishers),
-                (topic.subscribers, &mut subscribers),
-            ] {
+            for (nodes, list) in [(topic.publishers, &mut publishers), (topic.subscribers, &mut subscribers)] {
                 if !nodes.is_empty() {
                     list.push(Value::Array(vec![name.into(), Value::strings(nodes)]));
                 }
             }
         }
         let services = state.registry.services();
-        let services =
-            services.map(|(name, node)| Value::Array(vec![name.into(), Value::strings([node])]));
+        let services = services.map(|(name, node)| Value::Array(vec![name.into(), Value::strings([node])]));
         let lists = [publishers, subscribers, services.collect()].map(Value::Array);
         ApiReply::success("current system state", Value::Array(lists.into()))
     }

@@ -29,10 +29,7 @@ pub(super) fn to_value(graph: &Graph, run_id: &str) -> Value {
         (name.clone(), Value::Array(ends))
     });
     let parameters = graph.parameters.iter().map(|(key, used)| {
-        let nodes = vec![
-            Value::strings(used.read_by.iter().cloned()),
-            Value::strings(used.written_by.iter().cloned()),
-        ];
+        let nodes = vec![Value::strings(used.read_by.iter().cloned()), Value::strings(used.written_by.iter().cloned())];
         (key.clone(), Value::Array(nodes))
     });
     let sought = graph.sought.iter().map(|(service, nodes)| {
@@ -48,20 +45,11 @@ pub(super) fn to_value(graph: &Graph, run_id: &str) -> Value {
         ("parameters", Value::Struct(parameters.collect())),
         ("sought", Value::Struct(sought.collect())),
     ];
-    Value::Struct(
-        members
-            .into_iter()
-            .map(|(name, value)| (name.to_owned(), value))
-            .collect(),
-    )
+    Value::Struct(members.into_iter().map(|(name, value)| (name.to_owned(), value)).collect())
 }
 
 fn text_map(map: &BTreeMap<String, String>) -> Value {
-    Value::Struct(
-        map.iter()
-            .map(|(key, text)| (key.clone(), Value::from(text.as_str())))
-            .collect(),
-    )
+    Value::Struct(map.iter().map(|(key, text)| (key.clone(), Value::from(text.as_str()))).collect())
 }
 
 /// Reads the output of [`to_value`]: the graph and the Master's run id.
@@ -87,10 +75,7 @@ pub(crate) fn from_value(value: &Value) -> Option<(Graph, String)> {
         let [read_by, written_by] = nodes.as_array()? else {
             return None;
         };
-        let used = ParameterUse {
-            read_by: read_by.to_strings(),
-            written_by: written_by.to_strings(),
-        };
+        let used = ParameterUse { read_by: read_by.to_strings(), written_by: written_by.to_strings() };
         graph.parameters.insert(key.clone(), used);
     }
     // A shim of an earlier version does not send it.
@@ -102,11 +87,7 @@ pub(crate) fn from_value(value: &Value) -> Option<(Graph, String)> {
 }
 
 fn read_texts(value: &Value) -> Option<BTreeMap<String, String>> {
-    value
-        .as_struct()?
-        .iter()
-        .map(|(key, text)| Some((key.clone(), text.as_str()?.to_owned())))
-        .collect()
+    value.as_struct()?.iter().map(|(key, text)| Some((key.clone(), text.as_str()?.to_owned()))).collect()
 }
 
 #[cfg(test)]
@@ -128,14 +109,7 @@ mod tests {
             .into(),
             services: [("/s".to_owned(), "/a".to_owned())].into(),
             nodes: [("/a".to_owned(), "http://h:1/".to_owned())].into(),
-            parameters: [(
-                "/k".to_owned(),
-                ParameterUse {
-                    read_by: vec!["/a".into()],
-                    written_by: vec![],
-                },
-            )]
-            .into(),
+            parameters: [("/k".to_owned(), ParameterUse { read_by: vec!["/a".into()], written_by: vec![] })].into(),
             actions: BTreeMap::new(),
             sought: [("/map".to_owned(), vec!["/b".to_owned()])].into(),
             ends: BTreeMap::new(),

@@ -45,10 +45,7 @@ struct RegisteredLender {
 
 impl Default for LenderSlot {
     fn default() -> Self {
-        Self {
-            lender: Mutex::default(),
-            room: Semaphore::new(AT_A_TIME),
-        }
+        Self { lender: Mutex::default(), room: Semaphore::new(AT_A_TIME) }
     }
 }
 
@@ -62,10 +59,8 @@ impl LenderSlot {
         budget: &Budget,
     ) -> Result<(), xmlrpc::Error> {
         let client = XmlRpcClient::new(sockets, api)?;
-        *self.lender.lock() = Some(RegisteredLender {
-            node: node.to_owned(),
-            client: Arc::new(client.with_budget(budget)),
-        });
+        *self.lender.lock() =
+            Some(RegisteredLender { node: node.to_owned(), client: Arc::new(client.with_budget(budget)) });
         Ok(())
     }
 
@@ -80,11 +75,7 @@ impl LenderSlot {
         let args: [Value; 3] = [CALLER.into(), service.into(), node.into()];
         match lender.client.call(LEND_SERVICE, &args, PATIENCE).await {
             Ok(answer) => match ApiReply::from_value(answer)? {
-                ApiReply {
-                    code: 1,
-                    value: Value::String(api),
-                    ..
-                } if !api.is_empty() => Some(api),
+                ApiReply { code: 1, value: Value::String(api), .. } if !api.is_empty() => Some(api),
                 _ => None,
             },
             Err(error) => {

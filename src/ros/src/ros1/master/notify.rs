@@ -63,11 +63,7 @@ impl Notice {
         Self {
             api: api.to_owned(),
             subject: Subject::Publishers(topic.to_owned()),
-            params: vec![
-                CALLER.into(),
-                topic.into(),
-                Value::strings(publishers.iter().cloned()),
-            ],
+            params: vec![CALLER.into(), topic.into(), Value::strings(publishers.iter().cloned())],
             size: 0,
         }
     }
@@ -82,12 +78,7 @@ impl Notice {
     }
 
     pub(super) fn shutdown(api: &str, reason: &str) -> Self {
-        Self {
-            api: api.to_owned(),
-            subject: Subject::Shutdown,
-            params: vec![CALLER.into(), reason.into()],
-            size: 0,
-        }
+        Self { api: api.to_owned(), subject: Subject::Shutdown, params: vec![CALLER.into(), reason.into()], size: 0 }
     }
 }
 
@@ -107,9 +98,7 @@ impl NoticeQueue {
     fn push(&mut self, notice: Notice) {
         self.notices.retain(|older| older.subject != notice.subject);
         let is_value = |notice: &Notice| matches!(notice.subject, Subject::Parameter(_));
-        while is_value(&notice)
-            && notice.size + self.notices.iter().map(|n| n.size).sum::<usize>() > WAITING
-        {
+        while is_value(&notice) && notice.size + self.notices.iter().map(|n| n.size).sum::<usize>() > WAITING {
             let Some(oldest) = self.notices.iter().position(is_value) else {
                 break;
             };
@@ -140,10 +129,7 @@ impl Notifier {
     /// Returns the number of notices that the node's task has not taken yet.
     #[cfg(test)]
     pub(super) fn waiting(&self, api: &str) -> usize {
-        self.queues
-            .lock()
-            .get(api)
-            .map_or(0, |queue| queue.notices.len())
+        self.queues.lock().get(api).map_or(0, |queue| queue.notices.len())
     }
 
     fn next(&self, api: &str) -> Option<Notice> {
@@ -214,8 +200,7 @@ async fn deliver_notices(master: Arc<MasterCore>, api: String, more: Arc<Notify>
                 }
             }
             Err(Error::Io { source, .. })
-                if notice.subject == Subject::Shutdown
-                    && source.kind() == ErrorKind::ConnectionRefused =>
+                if notice.subject == Subject::Shutdown && source.kind() == ErrorKind::ConnectionRefused =>
             {
                 // No process is left that could register again: a successor may be given the same port.
                 master.state.lock().registry.forget_replaced_address(&api);

@@ -19,10 +19,7 @@ pub(super) struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self {
-            root: Value::Struct(BTreeMap::new()),
-            size: 0,
-        }
+        Self { root: Value::Struct(BTreeMap::new()), size: 0 }
     }
 }
 
@@ -65,9 +62,7 @@ impl Params {
             let Value::Struct(members) = place else {
                 return Err(ParamError::Root);
             };
-            place = members
-                .entry(part.to_owned())
-                .or_insert_with(|| Value::Struct(BTreeMap::new()));
+            place = members.entry(part.to_owned()).or_insert_with(|| Value::Struct(BTreeMap::new()));
         }
         *place = value;
         self.size = size;
@@ -178,11 +173,7 @@ pub(super) fn updates(
 }
 
 fn with_slash(key: &str) -> String {
-    if key.ends_with('/') {
-        key.to_owned()
-    } else {
-        format!("{key}/")
-    }
+    if key.ends_with('/') { key.to_owned() } else { format!("{key}/") }
 }
 
 #[cfg(test)]
@@ -200,10 +191,7 @@ mod tests {
     #[test]
     fn namespaces_are_structs() {
         let mut params = sample();
-        assert_eq!(
-            params.get("/a/c").unwrap().get("d"),
-            Some(&Value::from("x"))
-        );
+        assert_eq!(params.get("/a/c").unwrap().get("d"), Some(&Value::from("x")));
         assert_eq!(params.names(), ["/a/b", "/a/c/d", "/top"]);
         params.set("/top/below", Value::Int(2)).unwrap();
         assert_eq!(params.get("/top/below"), Some(&Value::Int(2)));
@@ -232,10 +220,7 @@ mod tests {
         let params = sample();
         assert_eq!(params.search("/a/n", "b").as_deref(), Some("/a/b"));
         assert_eq!(params.search("/a/c/n", "top").as_deref(), Some("/top"));
-        assert_eq!(
-            params.search("/a/n", "c/none").as_deref(),
-            Some("/a/c/none")
-        );
+        assert_eq!(params.search("/a/n", "c/none").as_deref(), Some("/a/c/none"));
         assert_eq!(params.search("/a", "nope"), None);
         assert_eq!(params.search("/a", "/top").as_deref(), Some("/top"));
     }
@@ -253,40 +238,19 @@ mod tests {
 
     #[test]
     fn watchers_hear_of_what_concerns_them() {
-        let watchers: BTreeMap<_, _> = ["/a/", "/a/b", "/other"]
-            .map(|key| (key.to_owned(), vec![format!("api of {key}")]))
-            .into();
+        let watchers: BTreeMap<_, _> =
+            ["/a/", "/a/b", "/other"].map(|key| (key.to_owned(), vec![format!("api of {key}")])).into();
         let told = |key: &str, value: Value| -> Vec<(String, Value)> {
             let all = updates(&watchers, key, &value);
-            all.into_iter()
-                .map(|(_, key, value)| (key, value))
-                .collect()
+            all.into_iter().map(|(_, key, value)| (key, value)).collect()
         };
         let one = Value::Int(1);
-        assert_eq!(
-            told("/a/b", one.clone()),
-            [
-                ("/a/b/".to_owned(), one.clone()),
-                ("/a/b/".to_owned(), one.clone())
-            ]
-        );
-        assert_eq!(
-            told("/a/x/y", one.clone()),
-            [("/a/x/y/".to_owned(), one.clone())]
-        );
+        assert_eq!(told("/a/b", one.clone()), [("/a/b/".to_owned(), one.clone()), ("/a/b/".to_owned(), one.clone())]);
+        assert_eq!(told("/a/x/y", one.clone()), [("/a/x/y/".to_owned(), one.clone())]);
         let tree = Value::Struct([("b".to_owned(), one.clone())].into());
-        assert_eq!(
-            told("/a", tree.clone()),
-            [("/a/".to_owned(), tree), ("/a/b/".to_owned(), one)]
-        );
+        assert_eq!(told("/a", tree.clone()), [("/a/".to_owned(), tree), ("/a/b/".to_owned(), one)]);
         let empty = Value::Struct(BTreeMap::new());
-        assert_eq!(
-            told("/a", empty.clone()),
-            [
-                ("/a/".to_owned(), empty.clone()),
-                ("/a/b/".to_owned(), empty.clone())
-            ]
-        );
+        assert_eq!(told("/a", empty.clone()), [("/a/".to_owned(), empty.clone()), ("/a/b/".to_owned(), empty.clone())]);
         assert_eq!(told("/aa", empty), []);
     }
 }

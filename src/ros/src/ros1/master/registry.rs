@@ -55,10 +55,7 @@ impl RegisteredNode {
     }
 
     fn is_idle(&self) -> bool {
-        self.publishes.is_empty()
-            && self.subscribes.is_empty()
-            && self.serves.is_empty()
-            && self.watches.is_empty()
+        self.publishes.is_empty() && self.subscribes.is_empty() && self.serves.is_empty() && self.watches.is_empty()
     }
 }
 
@@ -125,10 +122,7 @@ impl Registry {
             notices.push(Notice::shutdown(&before.api, reason));
             self.drop_node(node, notices);
         }
-        let entry = self
-            .nodes
-            .entry(node.to_owned())
-            .or_insert_with(|| RegisteredNode::new(api));
+        let entry = self.nodes.entry(node.to_owned()).or_insert_with(|| RegisteredNode::new(api));
         if !replaced.is_empty() {
             entry.replaced = replaced;
         }
@@ -137,14 +131,11 @@ impl Registry {
         self.version += u64::from(new);
         match kind {
             Kind::Publisher | Kind::Subscriber => {
-                let topic =
-                    self.topics
-                        .entry(name.to_owned())
-                        .or_insert_with(|| TopicRegistration {
-                            type_name: ANY_TYPE.to_owned(),
-                            publishers: Vec::new(),
-                            subscribers: Vec::new(),
-                        });
+                let topic = self.topics.entry(name.to_owned()).or_insert_with(|| TopicRegistration {
+                    type_name: ANY_TYPE.to_owned(),
+                    publishers: Vec::new(),
+                    subscribers: Vec::new(),
+                });
                 // As in rosmaster: a publisher's type takes effect, a subscriber's only fills the gap.
                 let counts = kind == Kind::Publisher || topic.type_name == ANY_TYPE;
                 if counts && type_name != ANY_TYPE && type_name != topic.type_name {
@@ -163,10 +154,7 @@ impl Registry {
                 }
             }
             Kind::Service => {
-                let service = RegisteredService {
-                    node: node.to_owned(),
-                    api: service_api.to_owned(),
-                };
+                let service = RegisteredService { node: node.to_owned(), api: service_api.to_owned() };
                 let before = self.services.insert(name.to_owned(), service);
                 if let Some(other) = before.filter(|before| before.node != node) {
                     self.release(&other.node, Kind::Service, name);
@@ -187,11 +175,9 @@ impl Registry {
         notices: &mut Vec<Notice>,
     ) -> bool {
         let held_at = match kind {
-            Kind::Service => self
-                .services
-                .get(name)
-                .filter(|service| service.node == node)
-                .map(|service| service.api.as_str()),
+            Kind::Service => {
+                self.services.get(name).filter(|service| service.node == node).map(|service| service.api.as_str())
+            }
             _ => self.nodes.get(node).map(|found| found.api.as_str()),
         };
         if held_at != Some(api) || !self.holds(kind, name, node) {
@@ -320,38 +306,31 @@ impl Registry {
 
     /// Iterates over all nodes with their addresses.
     pub(super) fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.nodes
-            .iter()
-            .map(|(name, node)| (name.as_str(), node.api.as_str()))
+        self.nodes.iter().map(|(name, node)| (name.as_str(), node.api.as_str()))
     }
 
     /// Iterates over all services with the nodes that serve them.
     pub(super) fn services(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.services
-            .iter()
-            .map(|(name, service)| (name.as_str(), service.node.as_str()))
+        self.services.iter().map(|(name, service)| (name.as_str(), service.node.as_str()))
     }
 
     /// Iterates over all topics whose type was ever declared.
     pub(super) fn types(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.topics
-            .iter()
-            .map(|(name, topic)| (name.as_str(), topic.type_name.as_str()))
+        self.topics.iter().map(|(name, topic)| (name.as_str(), topic.type_name.as_str()))
     }
 
     /// Iterates over the topics that have publishers or subscribers now.
     pub(super) fn topics(&self) -> impl Iterator<Item = (&str, TopicNodes)> {
-        self.topics
-            .iter()
-            .filter(|(_, topic)| !topic.publishers.is_empty() || !topic.subscribers.is_empty())
-            .map(|(name, topic)| {
+        self.topics.iter().filter(|(_, topic)| !topic.publishers.is_empty() || !topic.subscribers.is_empty()).map(
+            |(name, topic)| {
                 let ends = TopicNodes {
                     type_name: topic.type_name.clone(),
                     publishers: topic.publishers.clone(),
                     subscribers: topic.subscribers.clone(),
                 };
                 (name.as_str(), ends)
-            })
+            },
+        )
     }
 
     /// Returns the addresses of parameter subscribers, by the key they subscribed to.
@@ -359,10 +338,7 @@ impl Registry {
         let mut watchers: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for node in self.nodes.values() {
             for key in &node.watches {
-                watchers
-                    .entry(key.clone())
-                    .or_default()
-                    .push(node.api.clone());
+                watchers.entry(key.clone()).or_default().push(node.api.clone());
             }
         }
         watchers

@@ -40,11 +40,7 @@ pub struct FrameBounds {
 impl From<usize> for FrameBounds {
     /// Limits messages to `max` bytes, with an unlimited budget.
     fn from(max: usize) -> Self {
-        Self {
-            max,
-            budget: Budget::without_limit(),
-            unfinished: super::UNFINISHED,
-        }
+        Self { max, budget: Budget::without_limit(), unfinished: super::UNFINISHED }
     }
 }
 
@@ -64,20 +60,11 @@ impl FrameReader {
     /// Creates a reader that begins with what was already read and takes messages within `bounds`.
     pub fn new(buffer: BytesMut, bounds: impl Into<FrameBounds>) -> Self {
         let bounds = bounds.into();
-        Self {
-            buffer,
-            chunk: FEW,
-            big: None,
-            permit: bounds.budget.permit(),
-            bounds,
-        }
+        Self { buffer, chunk: FEW, big: None, permit: bounds.budget.permit(), bounds }
     }
 
     /// Returns the next message, or `None` when the stream ends between messages.
-    pub async fn next(
-        &mut self,
-        stream: &mut (impl AsyncRead + Unpin),
-    ) -> Result<Option<Bytes>, Error> {
+    pub async fn next(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<Option<Bytes>, Error> {
         loop {
             if let Some(size) = self.peek_size()? {
                 if self.buffer.len() >= 4 + size {
@@ -93,20 +80,13 @@ impl FrameReader {
                 }
             }
             if !self.fill(stream).await? {
-                return if self.buffer.is_empty() {
-                    Ok(None)
-                } else {
-                    Err(ended_inside())
-                };
+                return if self.buffer.is_empty() { Ok(None) } else { Err(ended_inside()) };
             }
         }
     }
 
     /// Reads one byte before the messages that follow it (the success flag of a service response).
-    pub(super) async fn byte(
-        &mut self,
-        stream: &mut (impl AsyncRead + Unpin),
-    ) -> Result<Option<u8>, Error> {
+    pub(super) async fn byte(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<Option<u8>, Error> {
         if self.buffer.is_empty() && !self.fill(stream).await? {
             return Ok(None);
         }
@@ -168,11 +148,7 @@ impl FrameReader {
         Ok(())
     }
 
-    async fn read_big(
-        &mut self,
-        stream: &mut (impl AsyncRead + Unpin),
-        size: usize,
-    ) -> Result<Bytes, Error> {
+    async fn read_big(&mut self, stream: &mut (impl AsyncRead + Unpin), size: usize) -> Result<Bytes, Error> {
         let mut big = self.big.take().unwrap_or_default();
         let first = self.buffer.len().min(size);
         self.make_room(&mut big, size, first)?;
@@ -191,11 +167,7 @@ impl FrameReader {
         match timeout(patience, reading).await {
             Ok(read) => read?,
             Err(_) => {
-                return Err(Error::Unfinished {
-                    size,
-                    read: big.len(),
-                    after: patience,
-                });
+                return Err(Error::Unfinished { size, read: big.len(), after: patience });
             }
         }
         let message = big.split().freeze();
@@ -207,10 +179,7 @@ impl FrameReader {
 }
 
 fn ended_inside() -> Error {
-    Error::Io(io::Error::new(
-        io::ErrorKind::UnexpectedEof,
-        "the connection ended inside a message",
-    ))
+    Error::Io(io::Error::new(io::ErrorKind::UnexpectedEof, "the connection ended inside a message"))
 }
 
 #[cfg(test)]
@@ -256,11 +225,7 @@ mod tests {
     async fn unfinished_messages_take_no_more_than_their_budget() {
         use tokio::io::AsyncWriteExt as _;
         let budget = Budget::new("servant x", 4 << 20);
-        let bounds = FrameBounds {
-            max: 250 << 20,
-            budget: budget.clone(),
-            unfinished: Duration::from_secs(3600),
-        };
+        let bounds = FrameBounds { max: 250 << 20, budget: budget.clone(), unfinished: Duration::from_secs(3600) };
         // Eight connections each promise 250 MB and send the first 3 of it.
         let mut reading = tokio::task::JoinSet::new();
         for _ in 0..8 {
@@ -284,10 +249,7 @@ mod tests {
             let refused = timeout(Duration::from_secs(60), reading.join_next()).await;
             let refused = refused.expect("it is refused").unwrap().unwrap();
             let refused = refused.unwrap_err();
-            assert!(
-                refused.to_string().contains("the memory for servant x"),
-                "{refused}"
-            );
+            assert!(refused.to_string().contains("the memory for servant x"), "{refused}");
             assert!(budget.used_bytes() <= 4 << 20);
         }
         reading.shutdown().await;
@@ -297,10 +259,7 @@ mod tests {
     #[tokio::test]
     async fn a_whole_message_counts_no_longer() {
         let budget = Budget::new("servant x", 4 << 20);
-        let bounds = FrameBounds {
-            budget: budget.clone(),
-            ..FrameBounds::from(8 << 20)
-        };
+        let bounds = FrameBounds { budget: budget.clone(), ..FrameBounds::from(8 << 20) };
         let bytes = frame_messages(&vec![vec![1; 3 << 20]; 3]);
         let mut stream = bytes.as_slice();
         let mut frames = FrameReader::new(BytesMut::new(), bounds);
@@ -316,34 +275,19 @@ mod tests {
     async fn a_message_that_stays_unfinished_ends_its_connection() {
         use tokio::io::AsyncWriteExt as _;
         let (mut sender, mut receiver) = tokio::io::duplex(64 << 10);
-        let bounds = FrameBounds {
-            unfinished: Duration::from_millis(20),
-            ..FrameBounds::from(250 << 20)
-        };
+        let bounds = FrameBounds { unfinished: Duration::from_millis(20), ..FrameBounds::from(250 << 20) };
         let bytes = &frame_messages(&[vec![7; 100_000]])[..50_000];
         sender.write_all(bytes).await.unwrap();
         let mut frames = FrameReader::new(BytesMut::new(), bounds);
         let given_up = timeout(Duration::from_secs(60), frames.next(&mut receiver)).await;
         let error = given_up.expect("it is given up").unwrap_err();
-        assert!(
-            matches!(error, Error::Unfinished { size: 100_000, .. }),
-            "{error}"
-        );
+        assert!(matches!(error, Error::Unfinished { size: 100_000, .. }), "{error}");
     }
 
     #[tokio::test]
     async fn a_lying_prefix_is_refused() {
         let error = all([0xff; 4].as_slice()).await.unwrap_err();
-        assert!(
-            matches!(
-                error,
-                Error::TooLarge {
-                    size: 0xffff_ffff,
-                    ..
-                }
-            ),
-            "{error}"
-        );
+        assert!(matches!(error, Error::TooLarge { size: 0xffff_ffff, .. }), "{error}");
     }
 
     #[tokio::test]

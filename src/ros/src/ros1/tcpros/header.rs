@@ -22,9 +22,7 @@ impl Header {
     /// Creates a header with these fields.
     pub fn new<const N: usize>(fields: [(&str, &str); N]) -> Self {
         let owned = |(name, value): (&str, &str)| (name.to_owned(), value.to_owned());
-        Self {
-            fields: fields.into_iter().map(owned).collect(),
-        }
+        Self { fields: fields.into_iter().map(owned).collect() }
     }
 
     /// Creates a header that refuses the connection.
@@ -85,8 +83,7 @@ impl Header {
             }
             let (field, rest) = bytes.split_at(length);
             bytes = rest;
-            let equals =
-                memchr::memchr(b'=', field).ok_or_else(|| bad("a field has no equals sign"))?;
+            let equals = memchr::memchr(b'=', field).ok_or_else(|| bad("a field has no equals sign"))?;
             let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
             fields.insert(text(&field[..equals]), text(&field[equals + 1..]));
         }
@@ -94,16 +91,11 @@ impl Header {
     }
 
     /// Reads a header; what was read beyond it stays in `buffer`.
-    pub async fn read(
-        stream: &mut (impl AsyncRead + Unpin),
-        buffer: &mut BytesMut,
-    ) -> Result<Self, Error> {
+    pub async fn read(stream: &mut (impl AsyncRead + Unpin), buffer: &mut BytesMut) -> Result<Self, Error> {
         fill_to(stream, buffer, 4).await?;
         let length = buffer.get_u32_le() as usize;
         if length > MAX_HEADER {
-            return Err(Error::Header(format!(
-                "{length} bytes announced; the limit is {MAX_HEADER}"
-            )));
+            return Err(Error::Header(format!("{length} bytes announced; the limit is {MAX_HEADER}")));
         }
         fill_to(stream, buffer, length).await?;
         Self::decode(&buffer.split_to(length))
@@ -160,10 +152,7 @@ mod tests {
         bytes.extend_from_slice(b"rest");
         let mut stream = bytes.as_slice();
         let mut buffer = BytesMut::new();
-        assert_eq!(
-            Header::read(&mut stream, &mut buffer).await.unwrap(),
-            header
-        );
+        assert_eq!(Header::read(&mut stream, &mut buffer).await.unwrap(), header);
         assert_eq!(&buffer[..], b"rest");
     }
 

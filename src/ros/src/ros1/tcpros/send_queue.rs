@@ -93,14 +93,8 @@ impl SendQueue {
 }
 
 /// Writes messages, each with its length in front, without copying them.
-pub async fn write_messages(
-    stream: &mut (impl AsyncWrite + Unpin),
-    messages: &[Bytes],
-) -> io::Result<()> {
-    let prefixes: Vec<[u8; 4]> = messages
-        .iter()
-        .map(|message| (message.len() as u32).to_le_bytes())
-        .collect();
+pub async fn write_messages(stream: &mut (impl AsyncWrite + Unpin), messages: &[Bytes]) -> io::Result<()> {
+    let prefixes: Vec<[u8; 4]> = messages.iter().map(|message| (message.len() as u32).to_le_bytes()).collect();
     let mut slices: Vec<IoSlice<'_>> = Vec::with_capacity(2 * messages.len());
     for (prefix, message) in prefixes.iter().zip(messages) {
         slices.push(IoSlice::new(prefix));
@@ -154,10 +148,7 @@ mod tests {
             lost += send_queue.push(message(n, 10));
         }
         assert_eq!(lost.messages, 3);
-        assert_eq!(
-            drain_messages(&send_queue).await,
-            [message(3, 10), message(4, 10)]
-        );
+        assert_eq!(drain_messages(&send_queue).await, [message(3, 10), message(4, 10)]);
     }
 
     #[tokio::test]
@@ -167,10 +158,7 @@ mod tests {
         for one in all.iter().chain(&all) {
             assert_eq!(send_queue.push(one.clone()).messages, 0);
         }
-        assert_eq!(
-            drain_messages(&send_queue).await,
-            [all.clone(), all].concat()
-        );
+        assert_eq!(drain_messages(&send_queue).await, [all.clone(), all].concat());
     }
 
     #[tokio::test]

@@ -49,11 +49,7 @@ impl ServiceConnection {
         net::enable_keepalive(&stream);
         let mut buffer = BytesMut::new();
         let header = header.exchange(&mut stream, &mut buffer).await?;
-        Ok(Self {
-            stream,
-            frames: FrameReader::new(buffer, bounds),
-            header,
-        })
+        Ok(Self { stream, frames: FrameReader::new(buffer, bounds), header })
     }
 
     /// Returns the server's header.
@@ -71,16 +67,9 @@ impl ServiceConnection {
 
     /// Makes one call; returns the answer, or the server's reason for failing. After an error, or when the call is
     /// dropped half-way, the connection must be dropped too.
-    pub async fn call(
-        &mut self,
-        request: Bytes,
-    ) -> Result<Result<Bytes, FailureReason>, CallError> {
+    pub async fn call(&mut self, request: Bytes) -> Result<Result<Bytes, FailureReason>, CallError> {
         if let Err(error) = write_messages(&mut self.stream, &[request]).await {
-            return Err(if was_reset(&error) {
-                CallError::NotTaken
-            } else {
-                CallError::Broken(error.into())
-            });
+            return Err(if was_reset(&error) { CallError::NotTaken } else { CallError::Broken(error.into()) });
         }
         let done = match self.frames.byte(&mut self.stream).await {
             Ok(Some(byte)) => byte,
@@ -110,10 +99,7 @@ impl ServiceConnection {
 }
 
 fn was_reset(error: &io::Error) -> bool {
-    matches!(
-        error.kind(),
-        io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe
-    )
+    matches!(error.kind(), io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe)
 }
 
 /// Serves the calls of one connection after the exchange of headers, until `ended` is set between two calls.

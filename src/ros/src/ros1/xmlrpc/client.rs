@@ -46,36 +46,19 @@ impl XmlRpcClient {
     /// Creates a client of the server at `uri` (`http://host:port/`); connects with the first call.
     pub fn new(sockets: Arc<dyn Sockets>, uri: &str) -> Result<Self, Error> {
         let uri = PeerUri::parse(uri, "http").ok_or_else(|| Error::BadUri(uri.to_owned()))?;
-        Ok(Self {
-            sockets,
-            uri,
-            idle: Mutex::new(Vec::new()),
-            budget: Budget::without_limit(),
-        })
+        Ok(Self { sockets, uri, idle: Mutex::new(Vec::new()), budget: Budget::without_limit() })
     }
 
     /// Charges responses to this budget while they are read; one that does not fit fails its call.
     pub fn with_budget(self, budget: &Budget) -> Self {
-        Self {
-            budget: budget.clone(),
-            ..self
-        }
+        Self { budget: budget.clone(), ..self }
     }
 
     /// Calls `method`; the time limit covers everything.
-    pub async fn call(
-        &self,
-        method: &str,
-        params: &[Value],
-        time: Duration,
-    ) -> Result<Value, Error> {
+    pub async fn call(&self, method: &str, params: &[Value], time: Duration) -> Result<Value, Error> {
         match timeout(time, self.exchange(method, params)).await {
             Ok(result) => result,
-            Err(_) => Err(Error::Timeout {
-                peer: self.peer(),
-                method: method.to_owned(),
-                after: time,
-            }),
+            Err(_) => Err(Error::Timeout { peer: self.peer(), method: method.to_owned(), after: time }),
         }
     }
 
@@ -114,10 +97,7 @@ impl XmlRpcClient {
                 }
                 Err(Failure::Unanswered(error) | Failure::Io(error)) => return Err(self.io(error)),
                 Err(Failure::Http(reason)) => {
-                    return Err(Error::Http {
-                        peer: self.peer(),
-                        reason,
-                    });
+                    return Err(Error::Http { peer: self.peer(), reason });
                 }
             };
             let (response, _held) = response;
@@ -130,37 +110,21 @@ impl XmlRpcClient {
     }
 
     fn io(&self, source: io::Error) -> Error {
-        Error::Io {
-            peer: self.peer(),
-            source,
-        }
+        Error::Io { peer: self.peer(), source }
     }
 
     async fn connect(&self) -> io::Result<ClientConnection> {
         let address = self.sockets.resolve(&self.uri.host, self.uri.port).await?;
         let stream = self.sockets.connect(address).await?;
         net::enable_keepalive(&stream);
-        Ok(ClientConnection {
-            stream,
-            reader: HttpReader::new(),
-        })
+        Ok(ClientConnection { stream, reader: HttpReader::new() })
     }
 
     /// Sends one request and returns its response, with the permit for the parsed response; keeps the connection if
     /// both sides allow.
-    async fn send_request(
-        &self,
-        connection: ClientConnection,
-        request: &str,
-    ) -> Result<(Vec<u8>, Permit), Failure> {
-        let ClientConnection {
-            mut stream,
-            mut reader,
-        } = connection;
-        stream
-            .write_all(request.as_bytes())
-            .await
-            .map_err(Failure::Unanswered)?;
+    async fn send_request(&self, connection: ClientConnection, request: &str) -> Result<(Vec<u8>, Permit), Failure> {
+        let ClientConnection { mut stream, mut reader } = connection;
+        stream.write_all(request.as_bytes()).await.map_err(Failure::Unanswered)?;
         match reader.fill(&mut stream).await {
             Ok(true) => {}
             Ok(false) => {
@@ -178,9 +142,7 @@ impl XmlRpcClient {
                 return Err(HttpError::Bad(0, format!("it answered {start:?}")));
             }
             let mut permit = self.budget.permit();
-            let body = reader
-                .read_body(&mut stream, &head, MAX_BODY, true, &mut permit)
-                .await?;
+            let body = reader.read_body(&mut stream, &head, MAX_BODY, true, &mut permit).await?;
             let weight = weight(&body);
             if weight > SMALL {
                 let counted = permit.grow_to(weight);
@@ -206,10 +168,7 @@ impl XmlRpcClient {
 
 impl fmt::Debug for XmlRpcClient {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        formatter
-            .debug_struct("Client")
-            .field("uri", &self.uri)
-            .finish_non_exhaustive()
+        formatter.debug_struct("Client").field("uri", &self.uri).finish_non_exhaustive()
     }
 }
 

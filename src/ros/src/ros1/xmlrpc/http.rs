@@ -41,10 +41,7 @@ pub(super) struct HttpHead {
 
 impl HttpHead {
     pub(super) fn field(&self, name: &str) -> Option<&str> {
-        self.fields
-            .iter()
-            .find(|(found, _)| found == name)
-            .map(|(_, value)| value.as_str())
+        self.fields.iter().find(|(found, _)| found == name).map(|(_, value)| value.as_str())
     }
 
     /// Returns true if the connection may carry another message after this one.
@@ -58,23 +55,18 @@ impl HttpHead {
 
     /// Returns true if the peer waits for `100 Continue` before it sends the body.
     pub(super) fn expects_continue(&self) -> bool {
-        self.field("expect")
-            .is_some_and(|value| value.eq_ignore_ascii_case("100-continue"))
+        self.field("expect").is_some_and(|value| value.eq_ignore_ascii_case("100-continue"))
     }
 
     /// Returns the announced length, if there is one.
     pub(super) fn content_length(&self) -> Result<Option<usize>, HttpError> {
         self.field("content-length")
-            .map(|text| {
-                text.parse()
-                    .map_err(|_| bad(400, format!("Content-Length {text:?} is not a number")))
-            })
+            .map(|text| text.parse().map_err(|_| bad(400, format!("Content-Length {text:?} is not a number"))))
             .transpose()
     }
 
     fn is_chunked(&self) -> bool {
-        self.field("transfer-encoding")
-            .is_some_and(|value| value.to_ascii_lowercase().contains("chunked"))
+        self.field("transfer-encoding").is_some_and(|value| value.to_ascii_lowercase().contains("chunked"))
     }
 }
 
@@ -85,9 +77,7 @@ pub(super) struct HttpReader {
 
 impl HttpReader {
     pub(super) fn new() -> Self {
-        Self {
-            buffer: BytesMut::new(),
-        }
+        Self { buffer: BytesMut::new() }
     }
 
     /// Returns true if nothing of a next message has arrived yet.
@@ -117,11 +107,7 @@ impl HttpReader {
     }
 
     async fn read_more(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<(), HttpError> {
-        if self.fill(stream).await? {
-            Ok(())
-        } else {
-            Err(io::Error::from(io::ErrorKind::UnexpectedEof).into())
-        }
+        if self.fill(stream).await? { Ok(()) } else { Err(io::Error::from(io::ErrorKind::UnexpectedEof).into()) }
     }
 
     /// Reads one line without its line end.
@@ -148,10 +134,7 @@ impl HttpReader {
     }
 
     /// Reads start line and fields; skips blank lines before them.
-    pub(super) async fn read_head(
-        &mut self,
-        stream: &mut (impl AsyncRead + Unpin),
-    ) -> Result<HttpHead, HttpError> {
+    pub(super) async fn read_head(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<HttpHead, HttpError> {
         let mut budget = MAX_HEAD;
         let mut start = String::new();
         while start.is_empty() {
@@ -166,9 +149,7 @@ impl HttpReader {
             if fields.len() == MAX_FIELDS {
                 return Err(bad(431, format!("more than {MAX_FIELDS} header fields")));
             }
-            let (name, value) = line
-                .split_once(':')
-                .ok_or_else(|| bad(400, "a header field has no colon"))?;
+            let (name, value) = line.split_once(':').ok_or_else(|| bad(400, "a header field has no colon"))?;
             fields.push((name.trim().to_ascii_lowercase(), value.trim().to_owned()));
         }
     }

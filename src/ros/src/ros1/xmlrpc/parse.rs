@@ -23,10 +23,7 @@ pub fn weight(document: &[u8]) -> usize {
     // Invalid UTF-8 is copied and grows by that; base64 is collected and decoded.
     let is_text = std::str::from_utf8(document).is_ok();
     let texts = if is_text { 2 } else { 5 } + usize::from(count("<base64") > 0);
-    texts * document.len()
-        + VALUE * count("<value")
-        + STRUCT * count("<struct")
-        + MEMBER * count("<member")
+    texts * document.len() + VALUE * count("<value") + STRUCT * count("<struct") + MEMBER * count("<member")
 }
 
 /// A method call.
@@ -121,20 +118,11 @@ struct Parser<'a> {
 
 impl<'a> Parser<'a> {
     fn new(text: &'a str) -> Self {
-        Self {
-            text: text.strip_prefix('\u{feff}').unwrap_or(text),
-            at: 0,
-            closing: None,
-            depth: 0,
-            elements: 0,
-        }
+        Self { text: text.strip_prefix('\u{feff}').unwrap_or(text), at: 0, closing: None, depth: 0, elements: 0 }
     }
 
     fn error(&self, reason: impl Into<String>) -> Error {
-        Error::Malformed {
-            at: self.at,
-            reason: reason.into(),
-        }
+        Error::Malformed { at: self.at, reason: reason.into() }
     }
 
     fn unexpected_error(&self, found: &XmlToken<'_>, wanted: &str) -> Error {
@@ -175,9 +163,7 @@ impl<'a> Parser<'a> {
             if rest.starts_with("<!--") {
                 self.skip_past("-->", 4)?;
             } else if let Some(data) = rest.strip_prefix("<![CDATA[") {
-                let end = data
-                    .find("]]>")
-                    .ok_or_else(|| self.error("a CDATA section never ends"))?;
+                let end = data.find("]]>").ok_or_else(|| self.error("a CDATA section never ends"))?;
                 self.at += "<![CDATA[".len() + end + "]]>".len();
                 return Ok(XmlToken::Text(Cow::Borrowed(&data[..end])));
             } else if rest.starts_with("<?") {
@@ -192,9 +178,7 @@ impl<'a> Parser<'a> {
 
     fn skip_past(&mut self, end: &str, from: usize) -> Result<(), Error> {
         let rest = &self.text[self.at + from..];
-        let found = rest
-            .find(end)
-            .ok_or_else(|| self.error(format!("{end} is missing")))?;
+        let found = rest.find(end).ok_or_else(|| self.error(format!("{end} is missing")))?;
         self.at += from + found + end.len();
         Ok(())
     }
@@ -227,10 +211,7 @@ impl<'a> Parser<'a> {
             Some(name) if !closing => (true, name),
             _ => (false, inside),
         };
-        let name = inside
-            .split(|character: char| character.is_whitespace())
-            .next()
-            .unwrap_or_default();
+        let name = inside.split(|character: char| character.is_whitespace()).next().unwrap_or_default();
         if name.is_empty() {
             return Err(self.error("a tag has no name"));
         }
@@ -368,24 +349,19 @@ impl<'a> Parser<'a> {
 
     fn scalar(&self, name: &str, text: &str) -> Result<Value, Error> {
         match name {
-            "int" | "i4" | "i1" | "i2" | "i8" => text
-                .parse()
-                .map(Value::Int)
-                .map_err(|_| self.error(format!("{} is not a 32-bit integer", quote(text)))),
+            "int" | "i4" | "i1" | "i2" | "i8" => {
+                text.parse().map(Value::Int).map_err(|_| self.error(format!("{} is not a 32-bit integer", quote(text))))
+            }
             "boolean" => match text {
                 "1" | "true" => Ok(Value::Bool(true)),
                 "0" | "false" => Ok(Value::Bool(false)),
                 _ => Err(self.error(format!("{} is neither 0 nor 1", quote(text)))),
             },
-            "double" | "float" => text
-                .parse()
-                .map(Value::Double)
-                .map_err(|_| self.error(format!("{} is not a number", quote(text)))),
+            "double" | "float" => {
+                text.parse().map(Value::Double).map_err(|_| self.error(format!("{} is not a number", quote(text))))
+            }
             "base64" => {
-                let dense: Vec<u8> = text
-                    .bytes()
-                    .filter(|byte| !byte.is_ascii_whitespace())
-                    .collect();
+                let dense: Vec<u8> = text.bytes().filter(|byte| !byte.is_ascii_whitespace()).collect();
                 base64_simd::STANDARD
                     .decode_to_vec(dense)
                     .map(Value::Base64)
@@ -416,10 +392,7 @@ fn unescape(text: &str) -> Cow<'_, str> {
     while let Some(start) = rest.find('&') {
         out.push_str(&rest[..start]);
         rest = &rest[start..];
-        let name = rest[1..]
-            .find(';')
-            .filter(|end| *end <= 8)
-            .map(|end| &rest[1..=end]);
+        let name = rest[1..].find(';').filter(|end| *end <= 8).map(|end| &rest[1..=end]);
         match name.and_then(reference) {
             Some(character) => {
                 out.push(character);

@@ -63,11 +63,7 @@ fn print_value(out: &mut String, value: &Value) {
             out.push_str("</int>");
         }
         Value::Bool(truth) => {
-            out.push_str(if *truth {
-                "<boolean>1</boolean>"
-            } else {
-                "<boolean>0</boolean>"
-            });
+            out.push_str(if *truth { "<boolean>1</boolean>" } else { "<boolean>0</boolean>" });
         }
         Value::String(text) => {
             out.push_str("<string>");

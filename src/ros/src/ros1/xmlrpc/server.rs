@@ -106,8 +106,7 @@ impl XmlRpcServer {
                     () = wait_until_closed(&mut reader, &mut stream) => return Ok(()),
                 }
             };
-            self.respond(&mut stream, 200, "text/xml", &body, keep)
-                .await?;
+            self.respond(&mut stream, 200, "text/xml", &body, keep).await?;
             if !keep {
                 return stream.shutdown().await;
             }
@@ -145,9 +144,7 @@ impl XmlRpcServer {
             stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
         }
         let body = self.read_body(reader, stream, &head, &mut permit);
-        let body = timeout(self.limits.transfer, body)
-            .await
-            .map_err(stalled)??;
+        let body = timeout(self.limits.transfer, body).await.map_err(stalled)??;
         if body.len() > SMALL {
             // The size of a body without a length, or of one with many small values, was not known in advance.
             let counted = permit.grow_to(weight(&body).max(body.len() * FORMS));
@@ -194,12 +191,7 @@ impl XmlRpcServer {
     }
 
     /// Waits until there is room for the answer.
-    async fn reserve(
-        &self,
-        method: &str,
-        params: &[Value],
-        permit: &mut Permit,
-    ) -> Result<(), budget::Exceeded> {
+    async fn reserve(&self, method: &str, params: &[Value], permit: &mut Permit) -> Result<(), budget::Exceeded> {
         loop {
             let weight = self.handler.weight(method, params).saturating_mul(FORMS);
             if weight <= permit.bytes().max(SMALL) {
@@ -211,8 +203,7 @@ impl XmlRpcServer {
     }
 
     async fn refuse(&self, stream: &mut TcpStream, status: u16, reason: &str) -> io::Result<()> {
-        self.respond(stream, status, "text/plain", reason, false)
-            .await?;
+        self.respond(stream, status, "text/plain", reason, false).await?;
         stream.shutdown().await
     }
 

@@ -67,21 +67,12 @@ impl Value {
 
     /// Creates an array of strings.
     pub fn strings<I: IntoIterator<Item: Into<String>>>(texts: I) -> Value {
-        Value::Array(
-            texts
-                .into_iter()
-                .map(|text| Value::String(text.into()))
-                .collect(),
-        )
+        Value::Array(texts.into_iter().map(|text| Value::String(text.into())).collect())
     }
 
     /// Returns the strings in an array; elements of other types are skipped.
     pub fn to_strings(&self) -> Vec<String> {
-        self.as_array()
-            .unwrap_or_default()
-            .iter()
-            .filter_map(|value| value.as_str().map(str::to_owned))
-            .collect()
+        self.as_array().unwrap_or_default().iter().filter_map(|value| value.as_str().map(str::to_owned)).collect()
     }
 
     /// Returns the name of the type for error messages.
@@ -115,10 +106,9 @@ impl Value {
                 Value::String(text) | Value::DateTime(text) => text.len(),
                 Value::Base64(bytes) => bytes.len(),
                 Value::Array(elements) => elements.iter().map(Value::size).sum(),
-                Value::Struct(members) => members
-                    .iter()
-                    .map(|(name, value)| size_of::<String>() + name.len() + value.size())
-                    .sum(),
+                Value::Struct(members) => {
+                    members.iter().map(|(name, value)| size_of::<String>() + name.len() + value.size()).sum()
+                }
                 Value::Int(_) | Value::Bool(_) | Value::Double(_) | Value::Nil => 0,
             }
     }
@@ -163,15 +153,10 @@ impl From<Value> for ParamValue {
             Value::String(text) | Value::DateTime(text) => ParamValue::String(text),
             Value::Double(number) => ParamValue::Double(number),
             Value::Base64(bytes) => ParamValue::Binary(bytes),
-            Value::Array(elements) => {
-                ParamValue::List(elements.into_iter().map(ParamValue::from).collect())
+            Value::Array(elements) => ParamValue::List(elements.into_iter().map(ParamValue::from).collect()),
+            Value::Struct(members) => {
+                ParamValue::Map(members.into_iter().map(|(name, value)| (name, value.into())).collect())
             }
-            Value::Struct(members) => ParamValue::Map(
-                members
-                    .into_iter()
-                    .map(|(name, value)| (name, value.into()))
-                    .collect(),
-            ),
             Value::Nil => ParamValue::Nil,
         }
     }
@@ -210,12 +195,9 @@ impl TryFrom<ParamValue> for Value {
             ParamValue::String(text) => Value::String(text),
             ParamValue::Binary(bytes) => Value::Base64(bytes),
             ParamValue::Nil => return Err(UnsendableValue::Nil),
-            ParamValue::List(elements) => Value::Array(
-                elements
-                    .into_iter()
-                    .map(Value::try_from)
-                    .collect::<Result<_, _>>()?,
-            ),
+            ParamValue::List(elements) => {
+                Value::Array(elements.into_iter().map(Value::try_from).collect::<Result<_, _>>()?)
+            }
             ParamValue::Map(members) => Value::Struct(
                 members
                     .into_iter()

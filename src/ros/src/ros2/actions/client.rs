@@ -15,8 +15,8 @@ use tokio::time::{sleep, timeout};
 use super::messages::{self, ActionGoalStatus, GoalInfo};
 use super::{ActionInterfaces, GoalId, QUEUE};
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, MessageReceiver,
-    MessageSender, PeerId, SerializedMessage, ServiceType, WireType, message_queue,
+    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, MessageReceiver, MessageSender,
+    PeerId, SerializedMessage, ServiceType, WireType, message_queue,
 };
 use crate::codec::{Time, default_message};
 use crate::ros2::client::ServiceClient;
@@ -88,26 +88,15 @@ impl ActiveGoals {
 
 impl Ros2ActionClient {
     /// Opens the action's services and topics; servers are discovered in the background.
-    pub(in crate::ros2) fn open(
-        bus: &Arc<Ros2BusState>,
-        name: &str,
-        of: &Arc<ActionDef>,
-    ) -> Result<Self, BusError> {
+    pub(in crate::ros2) fn open(bus: &Arc<Ros2BusState>, name: &str, of: &Arc<ActionDef>) -> Result<Self, BusError> {
         bus.check_open()?;
         let parts = ActionInterfaces::for_action(name, of)?;
         let client = |(service, of): (String, ServiceType)| calls::client_for(bus, &service, &of);
         let (queue, feedback) = message_queue(QUEUE as usize);
         let (topic, wire_type) = parts.feedback;
         let topic = names::topic(&topic, &wire_type)?;
-        let ear = Arc::new(FeedbackSink {
-            queue,
-            wire_type: Arc::new(wire_type),
-            publisher: PeerId::from(name),
-        });
-        let qos = EndpointQos {
-            history: HistoryKind::KeepLast(QUEUE),
-            ..EndpointQos::default()
-        };
+        let ear = Arc::new(FeedbackSink { queue, wire_type: Arc::new(wire_type), publisher: PeerId::from(name) });
+        let qos = EndpointQos { history: HistoryKind::KeepLast(QUEUE), ..EndpointQos::default() };
         let (sender, ended) = mpsc::unbounded_channel();
         let shared = Arc::new(ActionClientState {
             bus: bus.clone(),
@@ -120,11 +109,7 @@ impl Ros2ActionClient {
             goals: Mutex::default(),
             ended: sender,
         });
-        let task = bus.spawn(report_events(
-            EndGoalsOnDrop(shared.clone()),
-            feedback,
-            ended,
-        ));
+        let task = bus.spawn(report_events(EndGoalsOnDrop(shared.clone()), feedback, ended));
         Ok(Self { shared, task })
     }
 }
@@ -153,13 +138,10 @@ impl ActionClient for Ros2ActionClient {
             Ok(())
         };
         match timeout(patience, ready).await {
-            Ok(Err(BusError::Timeout { .. })) | Err(_) => Err(BusError::Timeout {
-                what: format!("action {}", shared.name),
-                after: patience,
-            }),
-            Ok(Err(of_part @ BusError::TypeMismatch { .. })) => {
-                Err(shared.type_mismatch().unwrap_or(of_part))
+            Ok(Err(BusError::Timeout { .. })) | Err(_) => {
+                Err(BusError::Timeout { what: format!("action {}", shared.name), after: patience })
             }
+            Ok(Err(of_part @ BusError::TypeMismatch { .. })) => Err(shared.type_mismatch().unwrap_or(of_part)),
             Ok(ready) => ready,
         }
     }
@@ -172,11 +154,7 @@ impl ActionClient for Ros2ActionClient {
             return events.on_ended(Err(GoalError::NotAGoal(goal_type)));
         };
         let (wish, wished) = watch::channel(GoalIntent::GoOn);
-        let known = ActiveGoal {
-            name: id.to_owned(),
-            events: events.clone(),
-            wish,
-        };
+        let known = ActiveGoal { name: id.to_owned(), events: events.clone(), wish };
         {
             let mut goals = shared.goals.lock();
             if goals.named.contains_key(id) || goals.under_way.contains_key(&uuid) {
@@ -223,20 +201,11 @@ impl ActionClientState {
     /// `Fibonacci_SendGoal`.
     fn type_mismatch(&self) -> Option<BusError> {
         let services = self.of.services.as_ref()?;
-        let parts = [
-            (&self.send_goal, &services.send_goal),
-            (&self.get_result, &services.get_result),
-        ];
+        let parts = [(&self.send_goal, &services.send_goal), (&self.get_result, &services.get_result)];
         parts.into_iter().find_map(|(part, ours)| {
             let of_action = |of: ServiceType| {
-                let name = of
-                    .name
-                    .rsplit_once('_')
-                    .map(|(action, _)| action.to_owned());
-                ServiceType {
-                    name: name.unwrap_or_default(),
-                    ..of
-                }
+                let name = of.name.rsplit_once('_').map(|(action, _)| action.to_owned());
+                ServiceType { name: name.unwrap_or_default(), ..of }
             };
             let theirs = of_action(part.mismatched_type()?);
             let what = format!("action {}", self.name);
@@ -275,10 +244,7 @@ impl ActionClientState {
         }
         let answer = part.call(request, FOREVER).await;
         answer.map_err(|error| match error {
-            BusError::CallFailed {
-                fate: CallFate::Unknown,
-                ..
-            } => GoalError::ServerGone(self.name.clone()),
+            BusError::CallFailed { fate: CallFate::Unknown, .. } => GoalError::ServerGone(self.name.clone()),
             other => other.into(),
         })
     }
@@ -321,11 +287,7 @@ impl ActionClientState {
     }
 
     fn rejected_end(&self) -> GoalEnd {
-        GoalEnd {
-            outcome: GoalOutcome::Rejected,
-            text: String::new(),
-            result: default_message(&self.of.result).into(),
-        }
+        GoalEnd { outcome: GoalOutcome::Rejected, text: String::new(), result: default_message(&self.of.result).into() }
     }
 
     fn parse_result(&self, answer: &[u8]) -> Result<GoalEnd, GoalError> {
@@ -339,11 +301,7 @@ impl ActionClientState {
             Some(ActionGoalStatus::Unknown) => return Err(GoalError::Forgotten),
             _ => GoalOutcome::Unknown,
         };
-        Ok(GoalEnd {
-            outcome,
-            text: String::new(),
-            result,
-        })
+        Ok(GoalEnd { outcome, text: String::new(), result })
     }
 
     fn goal_events(&self, id: GoalId) -> Option<Arc<dyn GoalEvents>> {

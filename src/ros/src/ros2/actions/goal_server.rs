@@ -172,10 +172,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
     pub fn parse_cancel(&self, request: &[u8]) -> Option<CancelRequest> {
         let wanted = messages::read_cancel(request)?;
         let goals = self.goals.lock();
-        Some(CancelRequest {
-            goals: goals.matching_goals(wanted),
-            otherwise: goals.no_match_code(wanted),
-        })
+        Some(CancelRequest { goals: goals.matching_goals(wanted), otherwise: goals.no_match_code(wanted) })
     }
 
     /// Cancels those goals for which `ends` returns true, in addition to those that were asked before.
@@ -196,10 +193,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
             (true, false) => CancelCode::Rejected,
             (true, true) => wanted.otherwise,
         };
-        CancelOutcome {
-            answer: messages::write_cancelled(code, &ending),
-            newly,
-        }
+        CancelOutcome { answer: messages::write_cancelled(code, &ending), newly }
     }
 
     /// Returns true if there is a goal with this id that has not ended.
@@ -240,9 +234,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
         let mut status = match outcome {
             GoalOutcome::Succeeded => ActionGoalStatus::Succeeded,
             GoalOutcome::Canceled => ActionGoalStatus::Canceled,
-            GoalOutcome::Aborted | GoalOutcome::Rejected | GoalOutcome::Unknown => {
-                ActionGoalStatus::Aborted
-            }
+            GoalOutcome::Aborted | GoalOutcome::Rejected | GoalOutcome::Unknown => ActionGoalStatus::Aborted,
         };
         let answer = messages::write_result(status, of, result).unwrap_or_else(|| {
             if status == ActionGoalStatus::Succeeded {
@@ -308,8 +300,7 @@ impl<T: GoalServerTopics> GoalServer<T> {
     fn publish_statuses(&self) {
         let _telling = self.telling.lock();
         let statuses = self.goals.lock().statuses();
-        self.topics
-            .publish_status(messages::write_statuses(&statuses));
+        self.topics.publish_status(messages::write_statuses(&statuses));
     }
 }
 

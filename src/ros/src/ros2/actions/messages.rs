@@ -101,23 +101,13 @@ pub(super) fn write_accepted(accepted: bool, stamp: Time) -> Bytes {
 }
 
 /// Reads the final status of a goal and its result; the status is `None` if it is not a defined one.
-pub(super) fn read_result(
-    of: &MessageType,
-    bytes: &[u8],
-) -> Option<(Option<ActionGoalStatus>, Bytes)> {
+pub(super) fn read_result(of: &MessageType, bytes: &[u8]) -> Option<(Option<ActionGoalStatus>, Bytes)> {
     let [status] = MessageCursor::new(RosVersion::Two, bytes)?.number()?;
-    Some((
-        ActionGoalStatus::from_number(status),
-        extract_embedded(of, bytes, STATUS, &[])?,
-    ))
+    Some((ActionGoalStatus::from_number(status), extract_embedded(of, bytes, STATUS, &[])?))
 }
 
 /// Writes the final status of a goal and its result.
-pub(super) fn write_result(
-    status: ActionGoalStatus,
-    of: &MessageType,
-    result: &[u8],
-) -> Option<Bytes> {
+pub(super) fn write_result(status: ActionGoalStatus, of: &MessageType, result: &[u8]) -> Option<Bytes> {
     extract_embedded(of, result, 0, &[status as u8])
 }
 

@@ -15,8 +15,7 @@ use self::retired::{RetiredGuard, release_retired};
 use super::ActionInterfaces;
 use super::goal_server::{self, GoalServer, GoalServerTopics};
 use crate::bus::{
-    ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, QosProfile, ServiceHandler,
-    ServiceType, WireType,
+    ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, QosProfile, ServiceHandler, ServiceType, WireType,
 };
 use crate::ros2::raw::{self, RawWriter};
 use crate::ros2::state::{BoxedGuard, Ros2BusState};
@@ -93,12 +92,7 @@ impl Ros2ActionServer {
         ];
         let goals = shared.goals.clone();
         let task = bus.spawn(async move { goals.expire_results().await });
-        Ok(Self {
-            shared,
-            task,
-            _services: services,
-            get_result: Some(get_result),
-        })
+        Ok(Self { shared, task, _services: services, get_result: Some(get_result) })
     }
 }
 
@@ -135,12 +129,7 @@ struct SendGoal(Arc<ActionServerState>);
 #[async_trait]
 impl ServiceHandler for SendGoal {
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, FailureReason> {
-        let ActionServerState {
-            goals,
-            handler,
-            name: action,
-            ..
-        } = &*self.0;
+        let ActionServerState { goals, handler, name: action, .. } = &*self.0;
         let refused = |reason: String| {
             tracing::debug!(action, caller, reason, "a goal is refused");
         };

@@ -10,20 +10,11 @@ fn kinds(line: &str) -> Vec<Kind> {
 }
 
 fn remap_rule(node: Option<&str>, of: RemapTarget, [from, to]: [&str; 2]) -> Kind {
-    Kind::Rule(RemapRule {
-        node: node.map(str::to_owned),
-        of,
-        from: from.to_owned(),
-        to: to.to_owned(),
-    })
+    Kind::Rule(RemapRule { node: node.map(str::to_owned), of, from: from.to_owned(), to: to.to_owned() })
 }
 
 fn set(node: Option<&str>, name: &str, value: &str) -> Kind {
-    Kind::Parameter(Parameter {
-        node: node.map(str::to_owned),
-        name: name.to_owned(),
-        value: value.to_owned(),
-    })
+    Kind::Parameter(Parameter { node: node.map(str::to_owned), name: name.to_owned(), value: value.to_owned() })
 }
 
 #[test]
@@ -67,9 +58,7 @@ fn rules_may_be_of_one_node_or_of_one_kind_and_need_no_flag() {
         ]
     );
     assert_eq!(
-        kinds(
-            "--ros-args -r usual:__name:=bar -r rostopic://a:=b -r x:rosservice://a:=b -r /x/*:=/y/\\1 --ros-args"
-        ),
+        kinds("--ros-args -r usual:__name:=bar -r rostopic://a:=b -r x:rosservice://a:=b -r /x/*:=/y/\\1 --ros-args"),
         [
             Kind::Mark,
             remap_rule(Some("usual"), RemapTarget::Node, ["__name", "bar"]),
@@ -94,10 +83,7 @@ fn what_rcl_refuses_is_refused_by_name() {
         ("--ros-args --params-file", "give --params-file FILE"),
         ("--ros-args --log-level", "nothing follows --log-level"),
         ("--ros-args -r foo", "-r foo: it has no :="),
-        (
-            "--ros-args -r foo:=",
-            "-r foo:=: \"\" behind := is not a name",
-        ),
+        ("--ros-args -r foo:=", "-r foo:=: \"\" behind := is not a name"),
         ("--ros-args -r __ns:=q", "\"q\" is not a namespace"),
         ("--ros-args -r __ns:=/q/", "\"/q/\" is not a namespace"),
         ("--ros-args -r __node:=q/r", "\"q/r\" is not a node name"),
@@ -121,11 +107,7 @@ fn what_rcl_refuses_is_refused_by_name() {
 fn rules_for_one_node_say_nothing_to_the_others() {
     for (line, name, namespace) in [
         ("x --ros-args -r a:=b", false, false),
-        (
-            "--ros-args -r ears:__node:=x -r ears:__ns:=/y",
-            false,
-            false,
-        ),
+        ("--ros-args -r ears:__node:=x -r ears:__ns:=/y", false, false),
         ("--ros-args -r ears:__node:=x -r __ns:=/y", false, true),
         ("__node:=x", true, false),
     ] {

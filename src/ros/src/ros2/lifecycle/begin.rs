@@ -36,10 +36,7 @@ impl LifecycleNode {
     /// Returns the nodes that have a lifecycle.
     pub fn all(graph: &Graph) -> Vec<String> {
         let nodes = graph.nodes.keys();
-        nodes
-            .filter(|node| Self::has_lifecycle(graph, node))
-            .cloned()
-            .collect()
+        nodes.filter(|node| Self::has_lifecycle(graph, node)).cloned().collect()
     }
 
     /// Returns a node other than those of `ours` that may change the state of this one, if there is any: a lifecycle
@@ -47,9 +44,7 @@ impl LifecycleNode {
     fn find_driver(graph: &Graph, node: &str, ours: &dyn Fn(&str) -> bool) -> Option<String> {
         let service = format!("{node}/change_state");
         let mut others = graph.ends.iter();
-        let driver = others.find(|(other, ends)| {
-            *other != node && !ours(other) && ends.clients.contains_key(&service)
-        });
+        let driver = others.find(|(other, ends)| *other != node && !ours(other) && ends.clients.contains_key(&service));
         driver.map(|(other, _)| other.clone())
     }
 
@@ -101,10 +96,7 @@ impl LifecycleNode {
 ///
 /// # Errors
 /// The error of the first node that fails.
-pub async fn begin_all(
-    bus: &Arc<dyn Bus>,
-    patience: Duration,
-) -> Result<Vec<(String, BeginOutcome)>, BeginError> {
+pub async fn begin_all(bus: &Arc<dyn Bus>, patience: Duration) -> Result<Vec<(String, BeginOutcome)>, BeginError> {
     let graph = Arc::clone(&bus.graph().borrow());
     let mut all = Vec::new();
     for node in LifecycleNode::all(&graph) {
@@ -153,10 +145,7 @@ mod tests {
             reason: "/drive did not activate, and is inactive now".to_owned(),
         };
         let words = refused.to_string();
-        assert!(
-            words.starts_with("the lifecycle node /drive does not activate: /drive did not"),
-            "{words}"
-        );
+        assert!(words.starts_with("the lifecycle node /drive does not activate: /drive did not"), "{words}");
         assert!(words.contains("see its log"), "{words}");
     }
 }

@@ -20,10 +20,7 @@ impl<'a> ParameterReader<'a> {
     /// Creates a reader at the beginning of the message; `None` if it is too long.
     pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
         let cursor = MessageCursor::new(RosVersion::Two, bytes)?;
-        (bytes.len() <= MAX_BYTES).then_some(Self {
-            cursor,
-            elements: MAX_ELEMENTS,
-        })
+        (bytes.len() <= MAX_BYTES).then_some(Self { cursor, elements: MAX_ELEMENTS })
     }
 
     pub(super) fn byte(&mut self) -> Option<u8> {

@@ -45,10 +45,7 @@ impl ParameterKind {
 
 /// Returns true if the value's type may have to be adapted to the parameter's, or is not determined by the value.
 pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
-    !matches!(
-        value,
-        ParamValue::Bool(_) | ParamValue::Binary(_) | ParamValue::Nil
-    )
+    !matches!(value, ParamValue::Bool(_) | ParamValue::Binary(_) | ParamValue::Nil)
 }
 
 /// The reason why no ROS 2 parameter can have a value.
@@ -65,19 +62,13 @@ pub(super) enum CoerceError {
 /// Converts the value to the parameter's type where that is lossless; otherwise leaves it for the node to judge.
 pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, CoerceError> {
     let natural = match (value, kind) {
-        (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => {
-            TypedValue::Double(value as f64)
-        }
-        (ParamValue::Double(value), ParameterKind::Integer) if is_integer(value) => {
-            TypedValue::Integer(value as i64)
-        }
+        (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => TypedValue::Double(value as f64),
+        (ParamValue::Double(value), ParameterKind::Integer) if is_integer(value) => TypedValue::Integer(value as i64),
         // JSON has no bytes: they are given as base64, or as numbers.
-        (ParamValue::String(text), ParameterKind::Bytes) => {
-            match BASE64.decode_to_vec(text.as_bytes()) {
-                Ok(bytes) => TypedValue::Bytes(bytes),
-                Err(_) => TypedValue::String(text),
-            }
-        }
+        (ParamValue::String(text), ParameterKind::Bytes) => match BASE64.decode_to_vec(text.as_bytes()) {
+            Ok(bytes) => TypedValue::Bytes(bytes),
+            Err(_) => TypedValue::String(text),
+        },
         (ParamValue::List(items), kind) => coerce_list(items, kind)?,
         (ParamValue::Nil, _) => TypedValue::NotSet,
         (ParamValue::Bool(value), _) => TypedValue::Bool(value),
@@ -182,17 +173,9 @@ pub(super) fn write(value: &TypedValue, put: &mut CdrWriter) {
     };
     put.byte(number);
     put.byte(u8::from(*value == Bool(true)));
-    let integer = if let Integer(value) = value {
-        *value
-    } else {
-        0
-    };
+    let integer = if let Integer(value) = value { *value } else { 0 };
     put.number(integer.to_le_bytes());
-    let double = if let Double(value) = value {
-        *value
-    } else {
-        0.0
-    };
+    let double = if let Double(value) = value { *value } else { 0.0 };
     put.number(double.to_le_bytes());
     put.text(if let String(text) = value { text } else { "" });
     let bytes: &[u8] = if let Bytes(bytes) = value { bytes } else { &[] };
@@ -203,9 +186,7 @@ pub(super) fn write(value: &TypedValue, put: &mut CdrWriter) {
     bools.iter().for_each(|one| put.byte(u8::from(*one)));
     let integers: &[i64] = if let Integers(all) = value { all } else { &[] };
     put.length(integers.len());
-    integers
-        .iter()
-        .for_each(|one| put.number(one.to_le_bytes()));
+    integers.iter().for_each(|one| put.number(one.to_le_bytes()));
     let doubles: &[f64] = if let Doubles(all) = value { all } else { &[] };
     put.length(doubles.len());
     doubles.iter().for_each(|one| put.number(one.to_le_bytes()));

@@ -79,10 +79,7 @@ impl Readers {
     }
 
     async fn ends_changed(&mut self) {
-        let changes = self
-            .open
-            .values_mut()
-            .map(|open| Box::pin(open.ends.changed()));
+        let changes = self.open.values_mut().map(|open| Box::pin(open.ends.changed()));
         let changes: Vec<_> = changes.collect();
         if changes.is_empty() || select_all(changes).await.0.is_err() {
             pending::<()>().await;
@@ -99,9 +96,7 @@ impl Readers {
             if let Some(source) = sources.get(&writer.guid) {
                 let key = (source.type_name.clone(), source.quality);
                 let ours = announced.clone().filter(|_| self.type_name.is_some());
-                needed
-                    .entry(key)
-                    .or_insert_with(|| ours.unwrap_or_else(|| writer.user_data.clone()));
+                needed.entry(key).or_insert_with(|| ours.unwrap_or_else(|| writer.user_data.clone()));
             }
         }
         // While there is no writer, a reader of the preferred quality shows that somebody listens. A writer that offers
@@ -122,9 +117,7 @@ impl Readers {
         let discovered = Arc::clone(&self.topic.discovered.borrow());
         let mut locals = self.topic.locals.lock();
         // A publisher's last message is dropped together with the publisher.
-        locals
-            .latched
-            .retain(|writer, _| discovered.writers.contains_key(writer));
+        locals.latched.retain(|writer, _| discovered.writers.contains_key(writer));
         drop(locals);
         let now = self.matched_peers(seen, &sources);
         show::log_incompatible(&mut self.told, &self.topic.key.topic, &now);
@@ -149,9 +142,8 @@ impl Readers {
             }
             let before = known.get(&writer.guid);
             let node = seen.node(writer.guid);
-            let same = |before: &&Arc<KnownWriter>| {
-                before.peer.node() == &*node && before.named == seen.is_named(writer.guid)
-            };
+            let same =
+                |before: &&Arc<KnownWriter>| before.peer.node() == &*node && before.named == seen.is_named(writer.guid);
             let source = match before.filter(same) {
                 Some(before) => Arc::clone(before),
                 None => Arc::new(KnownWriter::new(writer, self.topic.key.wish, seen)),
@@ -162,30 +154,15 @@ impl Readers {
     }
 
     fn open_one(&self, (type_name, quality): &(String, Quality), user_data: Bytes) -> OpenReader {
-        let topic = TopicDescription {
-            name: self.name.clone(),
-            type_name: type_name.clone(),
-            user_data,
-        };
+        let topic = TopicDescription { name: self.name.clone(), type_name: type_name.clone(), user_data };
         let qos = quality::reader_qos(*quality, self.topic.depth);
-        let ear = ReaderSink {
-            topic: Arc::clone(&self.topic),
-            quality: *quality,
-        };
+        let ear = ReaderSink { topic: Arc::clone(&self.topic), quality: *quality };
         let reader = ReaderEnd::open(&self.bus, &topic, qos, Arc::new(ear));
-        OpenReader {
-            ends: reader.ends(),
-            qos,
-            _reader: reader,
-        }
+        OpenReader { ends: reader.ends(), qos, _reader: reader }
     }
 
     /// Returns the current matched peers.
-    fn matched_peers(
-        &mut self,
-        seen: &DiscoverySnapshot,
-        sources: &HashMap<Guid, Arc<KnownWriter>>,
-    ) -> MatchedPeers {
+    fn matched_peers(&mut self, seen: &DiscoverySnapshot, sources: &HashMap<Guid, Arc<KnownWriter>>) -> MatchedPeers {
         let ends = self.open.iter_mut().map(|(key, open)| {
             let ends = Arc::clone(&open.ends.borrow_and_update());
             (key, (open.qos, ends))
@@ -198,16 +175,9 @@ impl Readers {
             if !sources.contains_key(&writer.guid) {
                 let theirs = seen::wire_type(writer);
                 if self.type_name.is_some() {
-                    let ours = self
-                        .topic
-                        .check_wanted(&theirs)
-                        .err()
-                        .or_else(|| self.topic.announced_type());
+                    let ours = self.topic.check_wanted(&theirs).err().or_else(|| self.topic.announced_type());
                     let why = ours.map(|ours| show::type_mismatch_text(&theirs, &ours));
-                    now.refused.push(IncompatiblePeer {
-                        peer: seen.peer(writer.guid),
-                        why: why.unwrap_or_default(),
-                    });
+                    now.refused.push(IncompatiblePeer { peer: seen.peer(writer.guid), why: why.unwrap_or_default() });
                 }
             } else if !self.order.contains(&writer.guid) {
                 self.order.push(writer.guid);

@@ -47,20 +47,10 @@ async fn a_bus_that_stands_for_several_nodes_is_seen_as_these() {
     let (one, two) = (join(53, "/ears").await, join(53, "/other").await);
     let qos = QosProfile::keep_last(1);
     let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
-    let mouth = NodeNames {
-        publishes: names(&["/said", "/log"]),
-        ..NodeNames::default()
-    };
-    let ears = NodeNames {
-        publishes: names(&["/log"]),
-        ..NodeNames::default()
-    };
+    let mouth = NodeNames { publishes: names(&["/said", "/log"]), ..NodeNames::default() };
+    let ears = NodeNames { publishes: names(&["/log"]), ..NodeNames::default() };
     let both = |mouth: &NodeNames| {
-        [
-            ("/ears".to_owned(), ears.clone()),
-            ("/mouth".to_owned(), mouth.clone()),
-            ("no name".to_owned(), ears.clone()),
-        ]
+        [("/ears".to_owned(), ears.clone()), ("/mouth".to_owned(), mouth.clone()), ("no name".to_owned(), ears.clone())]
     };
     one.set_represented_nodes(both(&mouth).into());
     let _said = one.advertise("/said", string(), qos).await.unwrap();
@@ -95,8 +85,6 @@ async fn names_and_domains_that_are_none_are_refused() {
         let subscribed = bus.subscribe(bad, string(), qos).await;
         assert!(matches!(subscribed, Err(BusError::BadName(_))), "{bad}");
     }
-    let typed = bus
-        .subscribe("/a", WireType::with_name("std_msgs/ String"), qos)
-        .await;
+    let typed = bus.subscribe("/a", WireType::with_name("std_msgs/ String"), qos).await;
     assert!(matches!(typed, Err(BusError::BadName(_))));
 }

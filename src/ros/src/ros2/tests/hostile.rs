@@ -5,8 +5,8 @@ use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use budget::Budget;
 use rtps::wire::{Data, DataFrag, DatagramWriter, Heartbeat, InlineQos};
 use rtps::{
-    Config, EndpointData, EndpointQos, EntityId, Guid, GuidPrefix, HistoryKind, Participant,
-    ParticipantData, SequenceNumber, TopicDescription, VendorId,
+    Config, EndpointData, EndpointQos, EntityId, Guid, GuidPrefix, HistoryKind, Participant, ParticipantData,
+    SequenceNumber, TopicDescription, VendorId,
 };
 
 use super::*;
@@ -22,11 +22,7 @@ const WRITER: EntityId = EntityId([0, 0, 1, 3]);
 const LIMIT: usize = 1 << 20;
 
 fn topic_named(name: &str, type_name: &str) -> TopicDescription {
-    TopicDescription {
-        name: name.to_owned(),
-        type_name: type_name.to_owned(),
-        user_data: Bytes::new(),
-    }
+    TopicDescription { name: name.to_owned(), type_name: type_name.to_owned(), user_data: Bytes::new() }
 }
 
 /// A hand-made participant, which receives and answers nothing.
@@ -70,10 +66,7 @@ impl Forger {
             guid: Guid::new(forger.prefix, WRITER),
             topic: "rt/chat".to_owned(),
             type_name: "std_msgs::msg::dds_::String_".to_owned(),
-            qos: EndpointQos {
-                history: HistoryKind::KeepLast(10),
-                ..EndpointQos::default()
-            },
+            qos: EndpointQos { history: HistoryKind::KeepLast(10), ..EndpointQos::default() },
             user_data: Bytes::new(),
             unicast: Vec::new(),
             expects_inline_qos: false,
@@ -84,9 +77,7 @@ impl Forger {
     }
 
     fn send(&self, to: SocketAddr, datagram: DatagramWriter) {
-        self.socket
-            .send_to(&datagram.finish(), to)
-            .expect("sending");
+        self.socket.send_to(&datagram.finish(), to).expect("sending");
     }
 
     fn data(&self, to: SocketAddr, writer: EntityId, number: i64, payload: Bytes) {
@@ -139,10 +130,7 @@ impl Forger {
 #[tokio::test]
 async fn what_waits_for_what_never_comes_costs_no_more_than_the_budget() {
     let budget = Budget::new("samples", LIMIT);
-    let options = JoinOptions {
-        budget: budget.clone(),
-        ..JoinOptions::in_domain(domain(90), "/one")
-    };
+    let options = JoinOptions { budget: budget.clone(), ..JoinOptions::in_domain(domain(90), "/one") };
     let joined = Ros2Bus::connect(Arc::new(HostSockets), options).await;
     let (one, two) = (joined.expect("a bus"), join(90, "/two").await);
     let qos = QosProfile::keep_last(10);
@@ -163,10 +151,7 @@ async fn what_waits_for_what_never_comes_costs_no_more_than_the_budget() {
         pause().await;
     }
     assert!(budget.refusal_count() > 100, "{budget:?}");
-    assert!(
-        (LIMIT / 2..=LIMIT).contains(&budget.used_bytes()),
-        "{budget:?}"
-    );
+    assert!((LIMIT / 2..=LIMIT).contains(&budget.used_bytes()), "{budget:?}");
     good.publish(numbered_message(7));
     assert_eq!(next(&mut heard).await.bytes, numbered_message(7));
     // The forger's samples are dropped with the forger.
@@ -183,23 +168,14 @@ async fn nodes_that_tell_nonsense_of_themselves_harm_nobody() {
     let liar = Participant::join(place, Config::new(domain(91), "liar")).await;
     let liar = liar.expect("a participant");
     let tells = liar.writer(entities::topic(), entities::qos());
-    let chats = liar.writer(
-        topic_named("rt/chat", "std_msgs::msg::dds_::String_"),
-        EndpointQos::default(),
-    );
-    let asks = liar.writer(
-        topic_named("rq/echoRequest", "tests::srv::dds_::Echo_Request_"),
-        EndpointQos::default(),
-    );
+    let chats = liar.writer(topic_named("rt/chat", "std_msgs::msg::dds_::String_"), EndpointQos::default());
+    let asks = liar.writer(topic_named("rq/echoRequest", "tests::srv::dds_::Echo_Request_"), EndpointQos::default());
     let registry = Registry::for_version(RosVersion::Two);
     let text = "string data\n---\nstring data\n";
     registry.insert("tests/srv/Echo", text).unwrap();
     let of = ServiceType::from_service(&registry.service("tests/srv/Echo").unwrap());
     let _serving = one.serve("/echo", of, Arc::new(Echo)).await.unwrap();
-    let mut heard = one
-        .subscribe("/chat", string(), QosProfile::keep_last(100))
-        .await
-        .unwrap();
+    let mut heard = one.subscribe("/chat", string(), QosProfile::keep_last(100)).await.unwrap();
     expect_connected(heard.matched.clone(), 1).await;
     let nonsense = [
         Bytes::new(),
@@ -224,9 +200,7 @@ async fn nodes_that_tell_nonsense_of_themselves_harm_nobody() {
     let mut graph = two.graph();
     let served = graph.wait_for(|graph| graph.services.contains_key("/echo"));
     timeout(LONG, served).await.expect("in time").expect("open");
-    let answer = two
-        .call_typed("/echo", &Digest::any(), numbered_message(8), LONG)
-        .await;
+    let answer = two.call_typed("/echo", &Digest::any(), numbered_message(8), LONG).await;
     assert_eq!(answer.unwrap(), numbered_message(8));
 }
 

@@ -14,9 +14,7 @@ const SOON: Duration = Duration::from_millis(500);
 
 fn definition(text: &str) -> Arc<ServiceDef> {
     let registry = Registry::for_version(RosVersion::Two);
-    registry
-        .insert("tests/srv/Echo", text)
-        .expect("a definition");
+    registry.insert("tests/srv/Echo", text).expect("a definition");
     registry.service("tests/srv/Echo").expect("a service")
 }
 
@@ -70,33 +68,21 @@ async fn pair(number: u16) -> (Arc<Ros2Bus>, Arc<Ros2Bus>) {
 async fn wait_until_served(bus: &Ros2Bus, service: &str) {
     let mut graph = bus.graph();
     let found = graph.wait_for(|graph| graph.services.contains_key(service));
-    timeout(LONG, found)
-        .await
-        .expect("in time")
-        .expect("the bus is open");
+    timeout(LONG, found).await.expect("in time").expect("the bus is open");
 }
 
 #[tokio::test]
 async fn calls_are_answered_one_after_the_other_and_many_at_once() {
     let (server, client) = pair(53).await;
-    let _guard = server
-        .serve("/echo", echo(), Arc::new(Echo::default()))
-        .await
-        .unwrap();
+    let _guard = server.serve("/echo", echo(), Arc::new(Echo::default())).await.unwrap();
     wait_until_served(&client, "/echo").await;
-    let answer = client
-        .call("/echo", numbered_message(7), LONG)
-        .await
-        .unwrap();
+    let answer = client.call("/echo", numbered_message(7), LONG).await.unwrap();
     assert_eq!(answer, numbered_message(7));
     let mut calls = JoinSet::new();
     for number in 0..200 {
         let client = Arc::clone(&client);
         calls.spawn(async move {
-            let answer = client
-                .call("/echo", numbered_message(number), LONG)
-                .await
-                .unwrap();
+            let answer = client.call("/echo", numbered_message(number), LONG).await.unwrap();
             assert_eq!(answer, numbered_message(number));
         });
     }
@@ -107,26 +93,18 @@ async fn calls_are_answered_one_after_the_other_and_many_at_once() {
 #[tokio::test]
 async fn the_type_of_a_service_is_what_its_server_says() {
     let (server, client) = pair(54).await;
-    let _guard = server
-        .serve("/echo", echo(), Arc::new(Echo::default()))
-        .await
-        .unwrap();
+    let _guard = server.serve("/echo", echo(), Arc::new(Echo::default())).await.unwrap();
     wait_until_served(&client, "/echo").await;
     let told = client.service_type("/echo").await.unwrap();
     let ours = echo();
-    assert_eq!(
-        (&told.name, &told.request, &told.response),
-        (&ours.name, &ours.request, &ours.response)
-    );
+    assert_eq!((&told.name, &told.request, &told.response), (&ours.name, &ours.request, &ours.response));
     assert!(told.digest.is_any() && told.is_compatible_with(&ours));
     let other = ServiceType::from_service(&definition("int32 data\n---\nstring data\n"));
     assert!(!told.is_compatible_with(&other));
     assert_eq!(server.service_type("/echo").await.unwrap(), ours);
     // A server on this bus knows the digest of the whole service.
     let wrong = Digest::from("RIHS01_00");
-    let refused = server
-        .call_typed("/echo", &wrong, numbered_message(1), LONG)
-        .await;
+    let refused = server.call_typed("/echo", &wrong, numbered_message(1), LONG).await;
     assert!(matches!(refused, Err(BusError::TypeMismatch { .. })));
 }
 
@@ -134,20 +112,11 @@ async fn the_type_of_a_service_is_what_its_server_says() {
 async fn what_this_bus_serves_it_can_call() {
     let server = join(55, "/server").await;
     let handler = Arc::new(Echo::default());
-    let guard = server
-        .serve("/echo", echo(), handler.clone())
-        .await
-        .unwrap();
+    let guard = server.serve("/echo", echo(), handler.clone()).await.unwrap();
     let again = server.serve("/echo", echo(), handler.clone()).await;
     assert!(matches!(again, Err(BusError::AlreadyServed(_))));
-    let answer = server
-        .call("/echo", numbered_message(3), LONG)
-        .await
-        .unwrap();
-    assert_eq!(
-        (answer, handler.calls.load(Ordering::Relaxed)),
-        (numbered_message(3), 1)
-    );
+    let answer = server.call("/echo", numbered_message(3), LONG).await.unwrap();
+    assert_eq!((answer, handler.calls.load(Ordering::Relaxed)), (numbered_message(3), 1));
     drop(guard);
     let gone = server.call("/echo", numbered_message(3), LONG).await;
     assert!(matches!(gone, Err(BusError::NoService(_))), "{gone:?}");
@@ -161,34 +130,19 @@ async fn nobody_serves_and_nobody_answers() {
     let nobody = client.call("/none", numbered_message(1), LONG).await;
     assert!(matches!(nobody, Err(BusError::NoService(_))), "{nobody:?}");
     assert!(begun.elapsed() < LONG / 2);
-    let _guard = server
-        .serve("/refuses", echo(), Arc::new(Refuses))
-        .await
-        .unwrap();
+    let _guard = server.serve("/refuses", echo(), Arc::new(Refuses)).await.unwrap();
     wait_until_served(&client, "/refuses").await;
     let unanswered = client.call("/refuses", numbered_message(1), SOON).await;
-    assert!(
-        matches!(unanswered, Err(BusError::Timeout { .. })),
-        "{unanswered:?}"
-    );
+    assert!(matches!(unanswered, Err(BusError::Timeout { .. })), "{unanswered:?}");
     let own = server.call("/refuses", numbered_message(1), SOON).await;
-    assert!(matches!(
-        own,
-        Err(BusError::CallFailed {
-            fate: CallFate::Answered,
-            ..
-        })
-    ));
+    assert!(matches!(own, Err(BusError::CallFailed { fate: CallFate::Answered, .. })));
 }
 
 #[tokio::test]
 async fn a_server_that_goes_is_noticed_at_once() {
     let (server, client) = pair(57).await;
     let (asked, mut asks) = mpsc::unbounded_channel();
-    let slow = Slow {
-        asked,
-        answer: Arc::default(),
-    };
+    let slow = Slow { asked, answer: Arc::default() };
     let _guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
     wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);
@@ -197,16 +151,7 @@ async fn a_server_that_goes_is_noticed_at_once() {
     let begun = Instant::now();
     server.close().await;
     let failed = call.await.unwrap();
-    assert!(
-        matches!(
-            failed,
-            Err(BusError::CallFailed {
-                fate: CallFate::Unknown,
-                ..
-            })
-        ),
-        "{failed:?}"
-    );
+    assert!(matches!(failed, Err(BusError::CallFailed { fate: CallFate::Unknown, .. })), "{failed:?}");
     assert!(begun.elapsed() < LONG / 2);
 }
 
@@ -215,10 +160,7 @@ async fn what_was_asked_before_a_service_ended_is_answered() {
     let (server, client) = pair(58).await;
     let (asked, mut asks) = mpsc::unbounded_channel();
     let answer = Arc::new(Notify::new());
-    let slow = Slow {
-        asked,
-        answer: Arc::clone(&answer),
-    };
+    let slow = Slow { asked, answer: Arc::clone(&answer) };
     let guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
     wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);
@@ -234,10 +176,7 @@ async fn what_was_asked_before_a_service_ended_is_answered() {
 async fn a_bus_that_is_closed_ends_its_calls() {
     let (server, client) = pair(59).await;
     let (asked, mut asks) = mpsc::unbounded_channel();
-    let slow = Slow {
-        asked,
-        answer: Arc::default(),
-    };
+    let slow = Slow { asked, answer: Arc::default() };
     let _guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
     wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);

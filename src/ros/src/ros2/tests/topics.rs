@@ -1,7 +1,4 @@
-use rtps::{
-    Config, DataReader, DataWriter, EndpointQos, Participant, ReceivedSample, Sink,
-    TopicDescription,
-};
+use rtps::{Config, DataReader, DataWriter, EndpointQos, Participant, ReceivedSample, Sink, TopicDescription};
 
 use super::*;
 use crate::bus::{BusError, Publisher, QosDurability, QosProfile, QosReliability};
@@ -13,10 +10,7 @@ use crate::ros2::{entities, names, type_hash};
 const DEPTH: usize = 10;
 
 fn best_effort() -> QosProfile {
-    QosProfile {
-        reliability: QosReliability::BestEffort,
-        ..QosProfile::keep_last(DEPTH)
-    }
+    QosProfile { reliability: QosReliability::BestEffort, ..QosProfile::keep_last(DEPTH) }
 }
 
 fn latching() -> QosProfile {
@@ -46,10 +40,7 @@ async fn messages_pass_and_nobody_hears_himself() {
     let qos = QosProfile::keep_last(DEPTH);
     let mut own = one.subscribe("/chatter", string(), qos).await.unwrap();
     let mut other = two.subscribe("/chatter", string(), qos).await.unwrap();
-    let mut same = two
-        .subscribe("/chatter", WireType::any(), qos)
-        .await
-        .unwrap();
+    let mut same = two.subscribe("/chatter", WireType::any(), qos).await.unwrap();
     let publisher = one.advertise("/chatter", string(), qos).await.unwrap();
     let back = two.advertise("/chatter", string(), qos).await.unwrap();
     expect_connected(publisher.matched_subscribers(), 2).await;
@@ -62,13 +53,7 @@ async fn messages_pass_and_nobody_hears_himself() {
     for subscription in [&mut other, &mut same] {
         let first = next(subscription).await;
         assert_eq!(first.bytes, numbered_message(0));
-        assert_eq!(
-            *first.wire_type,
-            WireType {
-                definition: String::new(),
-                ..string()
-            }
-        );
+        assert_eq!(*first.wire_type, WireType { definition: String::new(), ..string() });
         assert_eq!((first.publisher.node(), first.latching), ("/one", false));
         assert_eq!(numbers(subscription, 2).await, [1, 2]);
     }
@@ -93,10 +78,7 @@ async fn whoever_leaves_is_no_longer_matched() {
     expect_connected(again.matched.clone(), 1).await;
     one.close().await;
     wait_for_matched(again.matched.clone(), |matched| matched.peers.is_empty()).await;
-    assert!(matches!(
-        one.subscribe("/chatter", string(), qos).await,
-        Err(BusError::Closed)
-    ));
+    assert!(matches!(one.subscribe("/chatter", string(), qos).await, Err(BusError::Closed)));
 }
 
 #[tokio::test]
@@ -105,10 +87,7 @@ async fn what_was_published_last_is_heard_by_those_who_come_later() {
     let publisher = one.advertise("/map", string(), latching()).await.unwrap();
     publisher.publish(numbered_message(1));
     publisher.publish(numbered_message(2));
-    let wish = QosProfile {
-        depth: 1,
-        ..latching()
-    };
+    let wish = QosProfile { depth: 1, ..latching() };
     let mut first = two.subscribe("/map", string(), wish).await.unwrap();
     let message = loop {
         let message = next(&mut first).await;
@@ -120,10 +99,7 @@ async fn what_was_published_last_is_heard_by_those_who_come_later() {
     let mut second = two.subscribe("/map", string(), wish).await.unwrap();
     assert_eq!(numbers(&mut second, 1).await, [2]);
     // A subscription that does not request it is not given it.
-    let mut volatile = two
-        .subscribe("/map", string(), QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let mut volatile = two.subscribe("/map", string(), QosProfile::keep_last(1)).await.unwrap();
     expect_connected(volatile.matched.clone(), 1).await;
     expect_connected(publisher.matched_subscribers(), 2).await;
     publisher.publish(numbered_message(3));
@@ -144,10 +120,7 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
         latching(),
         QosProfile::keep_last(DEPTH),
         best_effort(),
-        QosProfile {
-            durability: QosDurability::TransientLocal,
-            ..best_effort()
-        },
+        QosProfile { durability: QosDurability::TransientLocal, ..best_effort() },
     ];
     let mut publishers: Vec<Box<dyn Publisher>> = Vec::new();
     for qos in offers {
@@ -155,19 +128,12 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     }
     expect_connected(subscription.matched.clone(), publishers.len()).await;
     let told = subscription.matched.borrow().clone();
-    let latches: Vec<bool> = told
-        .peers
-        .iter()
-        .filter_map(|peer| Some(peer.offer.as_ref()?.latching))
-        .collect();
+    let latches: Vec<bool> = told.peers.iter().filter_map(|peer| Some(peer.offer.as_ref()?.latching)).collect();
     assert_eq!(latches.iter().filter(|latching| **latching).count(), 2);
     assert_eq!(told.refused, []);
     for publisher in &publishers {
         // Several readers of this subscription receive it; each message counts once.
-        wait_for_matched(publisher.matched_subscribers(), |matched| {
-            matched.connected_count() > 0
-        })
-        .await;
+        wait_for_matched(publisher.matched_subscribers(), |matched| matched.connected_count() > 0).await;
     }
     let mut sent = Vec::new();
     for (number, publisher) in (0..).zip(&publishers) {
@@ -200,10 +166,7 @@ async fn whoever_offers_less_than_is_wished_is_not_told_that_it_does() {
     assert_eq!(less.matched_subscribers().borrow().refused, []);
     // A publisher that offers it later is matched with the preferred quality.
     let three = join(61, "/three").await;
-    let latched = three
-        .advertise("/scan", string(), latching())
-        .await
-        .unwrap();
+    let latched = three.advertise("/scan", string(), latching()).await.unwrap();
     latched.publish(numbered_message(2));
     assert_eq!(numbers(&mut subscription, 1).await, [2]);
 }
@@ -212,30 +175,18 @@ async fn whoever_offers_less_than_is_wished_is_not_told_that_it_does() {
 async fn until_known(bus: &Ros2Bus, topic: &str) {
     let mut graph = bus.graph();
     let known = graph.wait_for(|graph| graph.topics.contains_key(topic));
-    timeout(LONG, known)
-        .await
-        .expect("in time")
-        .expect("the bus is open");
+    timeout(LONG, known).await.expect("in time").expect("the bus is open");
 }
 
 #[tokio::test]
 async fn a_reader_that_asks_for_more_is_said_with_both_profiles() {
     let bus = join(44, "/one").await;
-    let publisher = bus
-        .advertise("/scan", string(), best_effort())
-        .await
-        .unwrap();
+    let publisher = bus.advertise("/scan", string(), best_effort()).await.unwrap();
     let stranger = stranger(44).await;
     let topic = names::topic("/scan", &string()).unwrap();
-    let asked = EndpointQos {
-        deadline: Some(Duration::from_millis(500)),
-        ..EndpointQos::default()
-    };
+    let asked = EndpointQos { deadline: Some(Duration::from_millis(500)), ..EndpointQos::default() };
     let _reader = read(&stranger, topic, asked);
-    let matched = wait_for_matched(publisher.matched_subscribers(), |matched| {
-        !matched.refused.is_empty()
-    })
-    .await;
+    let matched = wait_for_matched(publisher.matched_subscribers(), |matched| !matched.refused.is_empty()).await;
     assert_eq!(matched.peers, []);
     assert_eq!(matched.refused[0].peer.node(), stranger.guid().to_string());
     assert_eq!(
@@ -254,28 +205,17 @@ async fn ends_of_other_types_are_said_and_not_heard() {
     let number = WireType::from_message(&message_type("std_msgs/msg/UInt8", "uint8 data"));
     let mut subscription = two.subscribe("/chatter", string(), qos).await.unwrap();
     let wrong = one.advertise("/chatter", other.clone(), qos).await.unwrap();
-    let told = wait_for_matched(subscription.matched.clone(), |matched| {
-        !matched.refused.is_empty()
-    })
-    .await;
+    let told = wait_for_matched(subscription.matched.clone(), |matched| !matched.refused.is_empty()).await;
     assert_eq!(told.peers, []);
     let (theirs, ours) = (other.digest, string().digest);
     assert_eq!(
         told.refused[0].why,
-        format!(
-            "its type is std_msgs/msg/String {theirs} there and std_msgs/msg/String {ours} here"
-        )
+        format!("its type is std_msgs/msg/String {theirs} there and std_msgs/msg/String {ours} here")
     );
-    let told = wait_for_matched(wrong.matched_subscribers(), |matched| {
-        !matched.refused.is_empty()
-    })
-    .await;
+    let told = wait_for_matched(wrong.matched_subscribers(), |matched| !matched.refused.is_empty()).await;
     assert_eq!((told.peers.len(), told.refused.len()), (0, 1));
     wrong.publish(numbered_message(1));
-    assert!(matches!(
-        one.advertise("/chatter", number.clone(), qos).await,
-        Err(BusError::TypeMismatch { .. })
-    ));
+    assert!(matches!(one.advertise("/chatter", number.clone(), qos).await, Err(BusError::TypeMismatch { .. })));
     drop(wrong);
 
     // With another name, it is not even matched.
@@ -285,10 +225,7 @@ async fn ends_of_other_types_are_said_and_not_heard() {
         refused.any(|refusal| refusal.why.contains("UInt8"))
     };
     wait_for_matched(subscription.matched.clone(), is_named).await;
-    wait_for_matched(named.matched_subscribers(), |matched| {
-        !matched.refused.is_empty()
-    })
-    .await;
+    wait_for_matched(named.matched_subscribers(), |matched| !matched.refused.is_empty()).await;
     drop(named);
     let right = one.advertise("/chatter", string(), qos).await.unwrap();
     expect_connected(right.matched_subscribers(), 1).await;
@@ -301,29 +238,18 @@ async fn ends_of_other_types_are_said_and_not_heard() {
 async fn the_type_of_a_topic_is_what_its_ends_say() {
     let (one, two) = (join(46, "/one").await, join(46, "/two").await);
     let qos = QosProfile::keep_last(DEPTH);
-    assert!(matches!(
-        two.topic_type("/none").await,
-        Err(BusError::NoTopic(_))
-    ));
+    assert!(matches!(two.topic_type("/none").await, Err(BusError::NoTopic(_))));
     let _wanted = one.subscribe("/wanted", string(), qos).await.unwrap();
     let _offered = one.advertise("/offered", string(), qos).await.unwrap();
     let mut graph = two.graph();
-    let both = graph.wait_for(|graph| {
-        graph.topics.contains_key("/wanted") && graph.topics.contains_key("/offered")
-    });
-    timeout(LONG, both)
-        .await
-        .expect("in time")
-        .expect("the bus is open");
+    let both = graph.wait_for(|graph| graph.topics.contains_key("/wanted") && graph.topics.contains_key("/offered"));
+    timeout(LONG, both).await.expect("in time").expect("the bus is open");
     for topic in ["/wanted", "/offered"] {
         let found = two.topic_type(topic).await.unwrap();
         assert_eq!((found.name, found.digest), (string().name, string().digest));
     }
     // An unspecified type means that of the others.
-    let publisher = two
-        .advertise("/wanted", WireType::any(), qos)
-        .await
-        .unwrap();
+    let publisher = two.advertise("/wanted", WireType::any(), qos).await.unwrap();
     expect_connected(publisher.matched_subscribers(), 1).await;
     assert!(two.advertise("/none", WireType::any(), qos).await.is_err());
 }
@@ -331,15 +257,9 @@ async fn the_type_of_a_topic_is_what_its_ends_say() {
 #[tokio::test]
 async fn an_end_without_a_hash_is_known_by_the_name_of_its_type() {
     let bus = join(47, "/one").await;
-    let publisher = bus
-        .advertise("/chatter", string(), QosProfile::keep_last(DEPTH))
-        .await
-        .unwrap();
+    let publisher = bus.advertise("/chatter", string(), QosProfile::keep_last(DEPTH)).await.unwrap();
     let stranger = stranger(47).await;
-    let topic = TopicDescription {
-        user_data: Bytes::new(),
-        ..names::topic("/chatter", &string()).unwrap()
-    };
+    let topic = TopicDescription { user_data: Bytes::new(), ..names::topic("/chatter", &string()).unwrap() };
     assert!(type_hash::message_hash(&topic.user_data).is_any());
     let _reader = read(&stranger, topic, EndpointQos::default());
     expect_connected(publisher.matched_subscribers(), 1).await;
@@ -347,10 +267,7 @@ async fn an_end_without_a_hash_is_known_by_the_name_of_its_type() {
 
 /// A ROS participant without nodes yet, with a writer of `/chatter`.
 async fn newcomer(number: u16) -> (Participant, DataWriter) {
-    let config = Config {
-        user_data: Bytes::from_static(b"enclave=/;"),
-        ..Config::new(domain(number), "newcomer")
-    };
+    let config = Config { user_data: Bytes::from_static(b"enclave=/;"), ..Config::new(domain(number), "newcomer") };
     let joined = Participant::join(Arc::new(BusSockets(Arc::new(HostSockets))), config).await;
     let participant = joined.expect("a domain can be joined");
     let topic = names::topic("/chatter", &string()).unwrap();
@@ -361,11 +278,7 @@ async fn newcomer(number: u16) -> (Participant, DataWriter) {
 /// Announces a node with this writer.
 fn introduce(participant: &Participant, name: &str, writer: &DataWriter) -> DataWriter {
     let teller = participant.writer(entities::topic(), entities::qos());
-    let node = entities::DiscoveredNode {
-        name: name.into(),
-        readers: Vec::new(),
-        writers: vec![writer.guid()],
-    };
+    let node = entities::DiscoveredNode { name: name.into(), readers: Vec::new(), writers: vec![writer.guid()] };
     let told = entities::encode(participant.guid(), &[node], Default::default());
     teller.write(told);
     teller
@@ -390,15 +303,10 @@ async fn messages_wait_for_the_name_of_their_node() {
     writer.write(numbered_message(2));
     let _teller = introduce(&participant, "/late", &writer);
     let first = next(&mut subscription).await;
-    assert_eq!(
-        (first.bytes, first.publisher.node()),
-        (numbered_message(1), "/late")
-    );
+    assert_eq!((first.bytes, first.publisher.node()), (numbered_message(1), "/late"));
     writer.write(numbered_message(3));
     assert_eq!(numbers(&mut subscription, 2).await, [2, 3]);
-    let told = wait_for_matched(subscription.matched.clone(), |matched| {
-        matched.has_node("/late")
-    });
+    let told = wait_for_matched(subscription.matched.clone(), |matched| matched.has_node("/late"));
     assert_eq!(told.await.peers[0].id, first.publisher);
 }
 
@@ -413,19 +321,12 @@ async fn a_node_that_never_tells_its_name_is_known_by_its_participant() {
     writer.write(numbered_message(1));
     let first = next(&mut subscription).await;
     let guid = participant.guid().to_string();
-    assert_eq!(
-        (first.bytes, first.publisher.node()),
-        (numbered_message(1), &*guid)
-    );
-    let before = wait_for_matched(subscription.matched.clone(), |matched| {
-        matched.has_node(&guid)
-    });
+    assert_eq!((first.bytes, first.publisher.node()), (numbered_message(1), &*guid));
+    let before = wait_for_matched(subscription.matched.clone(), |matched| matched.has_node(&guid));
     let before = before.await;
     // Its id stays the same if it announces its node after all.
     let _teller = introduce(&participant, "/late", &writer);
-    let after = wait_for_matched(subscription.matched.clone(), |matched| {
-        matched.has_node("/late")
-    });
+    let after = wait_for_matched(subscription.matched.clone(), |matched| matched.has_node("/late"));
     assert_eq!(before.peers[0].id, after.await.peers[0].id);
 }
 
@@ -433,18 +334,9 @@ async fn a_node_that_never_tells_its_name_is_known_by_its_participant() {
 #[tokio::test]
 async fn a_slow_receiver_loses_what_is_oldest_and_it_is_counted() {
     let (one, two) = (join(49, "/one").await, join(49, "/two").await);
-    let mut slow = two
-        .subscribe("/fast", string(), QosProfile::keep_last(2))
-        .await
-        .unwrap();
-    let mut quick = two
-        .subscribe("/fast", string(), QosProfile::keep_last(50))
-        .await
-        .unwrap();
-    let publisher = one
-        .advertise("/fast", string(), QosProfile::keep_last(50))
-        .await
-        .unwrap();
+    let mut slow = two.subscribe("/fast", string(), QosProfile::keep_last(2)).await.unwrap();
+    let mut quick = two.subscribe("/fast", string(), QosProfile::keep_last(50)).await.unwrap();
+    let publisher = one.advertise("/fast", string(), QosProfile::keep_last(50)).await.unwrap();
     expect_connected(publisher.matched_subscribers(), 1).await;
     expect_connected(quick.matched.clone(), 1).await;
     for number in 0..20 {

@@ -52,16 +52,9 @@ struct Hash {
 }
 
 pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> {
-    let fail = |line, reason: SyntaxError| SchemaError::Syntax {
-        name: key.to_owned(),
-        line,
-        reason: Box::new(reason),
-    };
+    let fail = |line, reason: SyntaxError| SchemaError::Syntax { name: key.to_owned(), line, reason: Box::new(reason) };
     if json.len() > MAX_TEXT_BYTES {
-        return Err(SchemaError::TooLarge {
-            name: key.to_owned(),
-            reason: ExceededLimit::DescriptionBytes,
-        });
+        return Err(SchemaError::TooLarge { name: key.to_owned(), reason: ExceededLimit::DescriptionBytes });
     }
     let file: File = serde_json::from_str(json).map_err(|error| {
         let reason = SyntaxError::NotADescription(error.to_string());
@@ -72,25 +65,17 @@ pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> 
     let types = description.referenced_type_descriptions.into_iter();
     for described in types.chain([description.type_description]) {
         let text = definition_text(&described).map_err(|reason| {
-            let in_type = SyntaxError::InType {
-                type_name: described.type_name.clone(),
-                reason: Box::new(reason),
-            };
+            let in_type = SyntaxError::InType { type_name: described.type_name.clone(), reason: Box::new(reason) };
             fail(1, in_type)
         })?;
         texts.insert(described.type_name, text);
     }
     let own = assemble(key, &texts)?;
-    let mut definitions: BTreeMap<String, String> = texts
-        .into_iter()
-        .filter(|(name, _)| name.split('/').nth(1) == Some("msg"))
-        .collect();
+    let mut definitions: BTreeMap<String, String> =
+        texts.into_iter().filter(|(name, _)| name.split('/').nth(1) == Some("msg")).collect();
     definitions.insert(key.to_owned(), own);
     let hashes = file.type_hashes.into_iter();
-    Ok(InterfaceFile {
-        definitions,
-        hashes: hashes.map(|it| (it.type_name, it.hash_string)).collect(),
-    })
+    Ok(InterfaceFile { definitions, hashes: hashes.map(|it| (it.type_name, it.hash_string)).collect() })
 }
 
 fn definition_text(described: &Type) -> Result<String, SyntaxError> {
@@ -105,12 +90,7 @@ fn definition_text(described: &Type) -> Result<String, SyntaxError> {
 
 /// Converts a field; numbers are those of `type_description_interfaces/msg/FieldType`.
 fn field_line(field: &Field) -> Result<FieldLine, SyntaxError> {
-    let FieldType {
-        type_id,
-        capacity,
-        string_capacity,
-        ..
-    } = field.r#type;
+    let FieldType { type_id, capacity, string_capacity, .. } = field.r#type;
     let (form, one) = ((type_id.max(1) - 1) / 48, (type_id.max(1) - 1) % 48 + 1);
     let is_text = matches!(one, 17 | 18 | 21 | 22);
     let name = match one {
@@ -132,10 +112,7 @@ fn field_line(field: &Field) -> Result<FieldLine, SyntaxError> {
         21 => format!("string<={string_capacity}"),
         22 => format!("wstring<={string_capacity}"),
         _ => {
-            return Err(SyntaxError::BadTypeId {
-                field: field.name.clone(),
-                type_id,
-            });
+            return Err(SyntaxError::BadTypeId { field: field.name.clone(), type_id });
         }
     };
     let brackets = match form {
@@ -150,12 +127,7 @@ fn field_line(field: &Field) -> Result<FieldLine, SyntaxError> {
         (value, 0) => value.to_owned(),
         (list, _) => tuple_to_list(list),
     };
-    Ok(FieldLine {
-        one: name,
-        brackets,
-        name: field.name.clone(),
-        value,
-    })
+    Ok(FieldLine { one: name, brackets, name: field.name.clone(), value })
 }
 
 /// Converts a Python tuple to a `.msg` list.

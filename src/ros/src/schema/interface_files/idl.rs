@@ -15,10 +15,7 @@ pub use self::error::IdlError;
 
 pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
     if idl.len() > MAX_TEXT_BYTES {
-        return Err(SchemaError::TooLarge {
-            name: key.to_owned(),
-            reason: ExceededLimit::IdlBytes,
-        });
+        return Err(SchemaError::TooLarge { name: key.to_owned(), reason: ExceededLimit::IdlBytes });
     }
     let mut reader = IdlReader {
         tokens: Tokens::new(idl),
@@ -42,15 +39,10 @@ pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
         }
     }
     let own = assemble(key, &texts)?;
-    let mut definitions: BTreeMap<String, String> = texts
-        .into_iter()
-        .filter(|(name, _)| name.split('/').nth(1) == Some("msg"))
-        .collect();
+    let mut definitions: BTreeMap<String, String> =
+        texts.into_iter().filter(|(name, _)| name.split('/').nth(1) == Some("msg")).collect();
     definitions.insert(key.to_owned(), own);
-    Ok(InterfaceFile {
-        definitions,
-        hashes: BTreeMap::new(),
-    })
+    Ok(InterfaceFile { definitions, hashes: BTreeMap::new() })
 }
 
 struct IdlReader<'a> {
@@ -212,9 +204,7 @@ impl IdlReader<'_> {
                 "long" => self.long("uint")?,
                 other => return Err(IdlError::NotUnsigned(other.to_owned()).into()),
             },
-            "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64" | "uint64" => {
-                first
-            }
+            "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64" | "uint64" => first,
             // `char` in `.msg` is uint8, which has another hash.
             "char" | "wchar" | "fixed" | "any" | "enum" | "union" | "map" => {
                 return Err(IdlError::NotInMessages(first).into());
@@ -239,10 +229,7 @@ impl IdlReader<'_> {
                 }
             }
         };
-        Ok(FieldLine {
-            one,
-            ..FieldLine::default()
-        })
+        Ok(FieldLine { one, ..FieldLine::default() })
     }
 
     fn sequence(&mut self, depth: usize) -> Result<FieldLine, SyntaxError> {
@@ -254,22 +241,14 @@ impl IdlReader<'_> {
         if !line.brackets.is_empty() {
             return Err(IdlError::NotInMessages("sequences of arrays".to_owned()).into());
         }
-        line.brackets = if self.tokens.skip(',')? {
-            format!("[<={}]", self.name()?)
-        } else {
-            "[]".to_owned()
-        };
+        line.brackets = if self.tokens.skip(',')? { format!("[<={}]", self.name()?) } else { "[]".to_owned() };
         self.tokens.expect('>')?;
         Ok(line)
     }
 
     /// Parses the rest of a type that began with `long`: 64 bits if another `long` follows, otherwise 32.
     fn long(&mut self, kind: &str) -> Result<String, SyntaxError> {
-        let bits = if self.tokens.skip_word("long")? {
-            64
-        } else {
-            32
-        };
+        let bits = if self.tokens.skip_word("long")? { 64 } else { 32 };
         Ok(format!("{kind}{bits}"))
     }
 
@@ -318,11 +297,7 @@ impl Literal {
     fn to_msg_text(&self, field: &FieldLine) -> String {
         match self {
             Literal::Text(list) if !field.brackets.is_empty() => tuple_to_list(list),
-            Literal::Text(text)
-                if matches!(field.one.split("<=").next(), Some("string" | "wstring")) =>
-            {
-                quote(text)
-            }
+            Literal::Text(text) if matches!(field.one.split("<=").next(), Some("string" | "wstring")) => quote(text),
             Literal::Text(text) => text.clone(),
             Literal::Word(word) => word.clone(),
         }

@@ -9,11 +9,7 @@ use crate::schema::types::{Arity, Constant, FieldBounds};
 use crate::schema::{MAX_MESSAGE_BYTES, SyntaxError};
 
 /// Parses a line and adds it to `parsed`. References are relative to `package`.
-pub(super) fn parse_line(
-    package: &str,
-    line: &str,
-    parsed: &mut Parsed,
-) -> Result<(), SyntaxError> {
+pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), SyntaxError> {
     let line = line.trim();
     if line.is_empty() || line.starts_with('#') {
         return Ok(());
@@ -75,19 +71,10 @@ fn constant(written: &str, name: &str, value: &str) -> Result<Constant, SyntaxEr
         InitialItem::Text(text) => text.into(),
         InitialItem::Scalar(_) => value.to_owned(),
     };
-    Ok(Constant {
-        name: name.to_owned(),
-        type_name: written.to_owned(),
-        value,
-    })
+    Ok(Constant { name: name.to_owned(), type_name: written.to_owned(), value })
 }
 
-fn field(
-    package: &str,
-    written: &str,
-    name: &str,
-    value: &str,
-) -> Result<ParsedField, SyntaxError> {
+fn field(package: &str, written: &str, name: &str, value: &str) -> Result<ParsedField, SyntaxError> {
     let (bare, brackets) = written.split_at(written.find('[').unwrap_or(written.len()));
     let (bare, text_bound) = match bare.split_once("<=") {
         Some((text, bound)) if matches!(text, "string" | "wstring") => (text, Some(size(bound)?)),
@@ -95,18 +82,12 @@ fn field(
         None => (bare, None),
     };
     let (arity, most) = parse_brackets(brackets)?;
-    let bounds = FieldBounds {
-        text: text_bound,
-        elements: most,
-    };
+    let bounds = FieldBounds { text: text_bound, elements: most };
     let primitive = Primitive::from_versioned_name(RosVersion::Two, bare);
     let initial = match primitive {
         _ if value.is_empty() => None,
         None => {
-            return Err(SyntaxError::NoValueAllowed {
-                type_name: bare.to_owned(),
-                value: value.to_owned(),
-            });
+            return Err(SyntaxError::NoValueAllowed { type_name: bare.to_owned(), value: value.to_owned() });
         }
         Some(primitive) => {
             let initial = Initial::parse(primitive, arity != Arity::One, value)?;
@@ -130,9 +111,7 @@ fn parse_brackets(brackets: &str) -> Result<(Arity, Option<u32>), SyntaxError> {
     let Some(inside) = brackets.strip_prefix('[') else {
         return Ok((Arity::One, None));
     };
-    let inside = inside
-        .strip_suffix(']')
-        .ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
+    let inside = inside.strip_suffix(']').ok_or_else(|| SyntaxError::BadArraySuffix(brackets.to_owned()))?;
     Ok(match inside.strip_prefix("<=") {
         Some(most) => (Arity::Variable, Some(size(most)?)),
         None if inside.is_empty() => (Arity::Variable, None),
@@ -152,10 +131,7 @@ fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result
     let found = initial.0.len();
     match (arity, bounds.elements) {
         (Arity::Fixed(count), _) if found != count as usize => {
-            return Err(SyntaxError::WrongValueCount {
-                expected: count,
-                found,
-            });
+            return Err(SyntaxError::WrongValueCount { expected: count, found });
         }
         (Arity::Variable, Some(most)) if found > most as usize => {
             return Err(SyntaxError::TooManyValues { most, found });

@@ -32,10 +32,7 @@ fn a_description_is_read_as_definitions() {
              string[<=3] few ['a', 'b, c']\n",
         ),
         ("b/msg/Nothing", ""),
-        (
-            "std_msgs/msg/Header",
-            "builtin_interfaces/msg/Time stamp\nstring frame_id\n",
-        ),
+        ("std_msgs/msg/Header", "builtin_interfaces/msg/Time stamp\nstring frame_id\n"),
     ];
     let expected = expected.map(|(key, text)| (key.to_owned(), text.to_owned()));
     assert_eq!(file.definitions, expected.into());
@@ -114,10 +111,7 @@ fn services_and_actions_are_put_together_of_their_parts() {
     let action = "module a { module action { struct F_Goal { long order; }; struct F_Result { }; struct F_Feedback { \
                   sequence<long> so_far; }; }; };";
     let file = InterfaceFile::read_idl("a/action/F", action).unwrap();
-    assert_eq!(
-        file.definitions["a/action/F"],
-        "int32 order\n---\n---\nint32[] so_far\n"
-    );
+    assert_eq!(file.definitions["a/action/F"], "int32 order\n---\n---\nint32[] so_far\n");
     file.registry().unwrap().action("a/F").unwrap();
     let missing = InterfaceFile::read_idl("a/action/G", action).unwrap_err();
     assert!(matches!(missing, SchemaError::Missing { name, .. } if name == "a/action/G_Goal"));
@@ -125,41 +119,19 @@ fn services_and_actions_are_put_together_of_their_parts() {
 
 #[test]
 fn files_that_are_no_interfaces_are_refused_with_the_line() {
-    let inside =
-        |members: &str| format!("module a {{ module msg {{\nstruct A {{\n{members} }}; }}; }};");
+    let inside = |members: &str| format!("module a {{ module msg {{\nstruct A {{\n{members} }}; }}; }};");
     for (idl, error) in [
-        (
-            inside("long double x;"),
-            "line 3: messages have no long double",
-        ),
+        (inside("long double x;"), "line 3: messages have no long double"),
         (inside("char x;"), "line 3: messages have no char"),
-        (
-            inside("sequence<sequence<long>> x;"),
-            "line 3: messages have no sequences of sequences",
-        ),
+        (inside("sequence<sequence<long>> x;"), "line 3: messages have no sequences of sequences"),
         (inside("long x"), "line 3: expected ;, got }"),
         (inside("long 😀;"), "line 3: expected a name, got 😀"),
-        (
-            inside("@default (value=\"a\nb"),
-            "line 3: a text without a closing quote",
-        ),
-        (
-            inside("@default (value=\"a\\nb\") string x;"),
-            "line 3: the value of x goes over a line",
-        ),
-        (
-            "module a {".to_owned(),
-            "line 1: the text ends inside a module",
-        ),
+        (inside("@default (value=\"a\nb"), "line 3: a text without a closing quote"),
+        (inside("@default (value=\"a\\nb\") string x;"), "line 3: the value of x goes over a line"),
+        ("module a {".to_owned(), "line 1: the text ends inside a module"),
         ("/* a".to_owned(), "line 1: a comment without an end"),
-        (
-            "interface a {".to_owned(),
-            "line 1: interface does not begin a definition that messages can have",
-        ),
-        (
-            "module a { ".repeat(9),
-            "line 1: modules nest deeper than 3",
-        ),
+        ("interface a {".to_owned(), "line 1: interface does not begin a definition that messages can have"),
+        ("module a { ".repeat(9), "line 1: modules nest deeper than 3"),
     ] {
         let found = InterfaceFile::read_idl("a/msg/A", &idl).unwrap_err();
         assert_eq!(found.to_string(), format!("a/msg/A {error}"), "{idl}");
@@ -167,19 +139,11 @@ fn files_that_are_no_interfaces_are_refused_with_the_line() {
     // A short alias for a long name, used very often.
     let long = "x".repeat(200);
     let many = "T a;".repeat(9000);
-    let idl = format!(
-        "module a {{ module msg {{ typedef b::{long}::{long} T;\nstruct A {{ {many} }}; }}; }};"
-    );
+    let idl = format!("module a {{ module msg {{ typedef b::{long}::{long} T;\nstruct A {{ {many} }}; }}; }};");
     let found = InterfaceFile::read_idl("a/msg/A", &idl).unwrap_err();
-    assert_eq!(
-        found.to_string(),
-        "a/msg/A line 2: it defines more than 1048576 bytes"
-    );
+    assert_eq!(found.to_string(), "a/msg/A line 2: it defines more than 1048576 bytes");
     for (json, error) in [
-        (
-            "{}",
-            "a/msg/A line 1: not a description of a type: missing field `type_description_msg` at line 1 column 2",
-        ),
+        ("{}", "a/msg/A line 1: not a description of a type: missing field `type_description_msg` at line 1 column 2"),
         (
             &IMAGE.replace("\"type_id\": 21", "\"type_id\": 13"),
             "a/msg/A line 1: a/msg/A: field text is of type 13, which messages do not have",

@@ -58,14 +58,7 @@ fn engine(now: Instant) -> Engine {
 }
 
 /// Delivers a sample of a built-in writer.
-fn deliver_announcement(
-    engine: &mut Engine,
-    now: Instant,
-    whose: u16,
-    writer: EntityId,
-    number: i64,
-    payload: Bytes,
-) {
+fn deliver_announcement(engine: &mut Engine, now: Instant, whose: u16, writer: EntityId, number: i64, payload: Bytes) {
     let mut datagram = DatagramWriter::new(participant(whose).prefix);
     datagram.data(&Data {
         reader: EntityId::UNKNOWN,
@@ -93,9 +86,7 @@ fn one_participant_too_many_is_not_heard_until_another_goes() {
     let there = |engine: &Engine| engine.watch_discovered().borrow().participants.len();
     let hears = |engine: &Engine, whose: u16| {
         let discovered = engine.watch_discovered().borrow().clone();
-        discovered
-            .participants
-            .contains_key(&participant(whose).prefix)
+        discovered.participants.contains_key(&participant(whose).prefix)
     };
     assert_eq!(MOST_PARTICIPANTS, 256);
     assert_eq!(there(&engine), 256);
@@ -164,10 +155,7 @@ fn one_end_too_many_is_not_heard_and_those_that_are_can_change() {
 fn an_end_with_a_name_or_user_data_without_end_is_not_heard() {
     let mut told = endpoint(1, 1, b"");
     told.topic = "x".repeat(1024);
-    assert_eq!(
-        EndpointData::from_payload(&told.to_bytes()),
-        Ok(told.clone())
-    );
+    assert_eq!(EndpointData::from_payload(&told.to_bytes()), Ok(told.clone()));
     told.topic.push('x');
     assert!(EndpointData::from_payload(&told.to_bytes()).is_err());
     let told = endpoint(1, 1, &[0; 1025]);

@@ -46,15 +46,9 @@ struct ClientWorld {
 impl ClientWorld {
     fn with_servers(servers: &[DiscoveryServer]) -> Self {
         let now = Instant::now();
-        let own = ParticipantData {
-            vendor: VendorId::OURS,
-            ..participant(GuidPrefix([1; 12]), 7410)
-        };
-        let bounds = ReaderLimits {
-            max_sample: 1 << 20,
-            budget: budget::Budget::without_limit(),
-            unfinished: 30 * SECOND,
-        };
+        let own = ParticipantData { vendor: VendorId::OURS, ..participant(GuidPrefix([1; 12]), 7410) };
+        let bounds =
+            ReaderLimits { max_sample: 1 << 20, budget: budget::Budget::without_limit(), unfinished: 30 * SECOND };
         let settings = Settings {
             own,
             ports: Ports::for_domain(0).expect("a domain"),
@@ -120,11 +114,7 @@ struct FakeServer {
 
 impl FakeServer {
     fn new(place: u8) -> Self {
-        Self {
-            prefix: discovery_server(place).prefix(),
-            port: discovery_server(place).at.port(),
-            counts: 0,
-        }
+        Self { prefix: discovery_server(place).prefix(), port: discovery_server(place).at.port(), counts: 0 }
     }
 
     /// Sends a sample as the only one of a built-in writer so far.
@@ -143,14 +133,7 @@ impl FakeServer {
         self.counts += 1;
         let number = SequenceNumber(number);
         let key_only = inline.status != 0;
-        let data = wire::Data {
-            reader: EntityId::UNKNOWN,
-            writer,
-            number,
-            inline,
-            payload: Some(payload),
-            key_only,
-        };
+        let data = wire::Data { reader: EntityId::UNKNOWN, writer, number, inline, payload: Some(payload), key_only };
         let beat = wire::Heartbeat {
             reader: EntityId::UNKNOWN,
             writer,
@@ -177,23 +160,13 @@ impl FakeServer {
 
     fn withdraw(&mut self, world: &mut ClientWorld, number: i64, gone: GuidPrefix) {
         let guid = Guid::new(gone, EntityId::PARTICIPANT);
-        let inline = InlineQos {
-            status: DISPOSED,
-            key_hash: Some(guid.bytes()),
-            ..InlineQos::default()
-        };
+        let inline = InlineQos { status: DISPOSED, key_hash: Some(guid.bytes()), ..InlineQos::default() };
         let key = discovery::key_payload(guid);
         self.send_with_status(world, EntityId::SPDP_WRITER, number, inline, key);
     }
 
     /// Acknowledges all samples of a built-in writer before this number.
-    fn acknowledge(
-        &mut self,
-        world: &mut ClientWorld,
-        writer: EntityId,
-        reader: EntityId,
-        next: i64,
-    ) {
+    fn acknowledge(&mut self, world: &mut ClientWorld, writer: EntityId, reader: EntityId, next: i64) {
         self.counts += 1;
         let acknack = wire::AckNack {
             reader,
@@ -209,10 +182,7 @@ impl FakeServer {
 }
 
 fn discovery_server(place: u8) -> DiscoveryServer {
-    DiscoveryServer {
-        place,
-        at: local_address(11811 + u16::from(place)),
-    }
+    DiscoveryServer { place, at: local_address(11811 + u16::from(place)) }
 }
 
 fn topic() -> TopicDescription {
@@ -237,9 +207,7 @@ fn reader(prefix: GuidPrefix) -> EndpointData {
 }
 
 /// Returns the samples of built-in writers: entity, number and destination.
-fn collect_announcements(
-    said: &[(SocketAddr, ReceivedSubmessage)],
-) -> Vec<(EntityId, i64, SocketAddr)> {
+fn collect_announcements(said: &[(SocketAddr, ReceivedSubmessage)]) -> Vec<(EntityId, i64, SocketAddr)> {
     let data = said.iter().filter_map(|(to, it)| match &it.submessage {
         Submessage::Data(data) => Some((data.writer, data.number.0, *to)),
         _ => None,
@@ -264,10 +232,9 @@ fn servers_alone_are_told_and_again_until_they_are_there() {
         assert!((15..=25).contains(&times), "{times} times in 9 s");
     }
     assert!(
-        told.iter()
-            .all(|(writer, number, to)| *writer == EntityId::SPDP_WRITER
-                && *number == 1
-                && [11811, 11814].contains(&to.port())),
+        told.iter().all(|(writer, number, to)| *writer == EntityId::SPDP_WRITER
+            && *number == 1
+            && [11811, 11814].contains(&to.port())),
         "{told:?}"
     );
     let (_, first) = &said[0];
@@ -295,9 +262,7 @@ fn servers_alone_are_told_and_again_until_they_are_there() {
 #[test]
 fn others_are_known_by_the_server_and_spoken_with_directly() {
     let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
-    let (_, ends) = world
-        .client
-        .add_writer(world.now, &topic(), EndpointQos::default());
+    let (_, ends) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
     let mut server = FakeServer::new(0);
     server.announce_itself(&mut world);
     let said = collect_announcements(&world.advance(SECOND));
@@ -315,20 +280,13 @@ fn others_are_known_by_the_server_and_spoken_with_directly() {
     assert!(!user_ports.is_empty() && user_ports.iter().all(|port| *port == 7413));
     server.withdraw(&mut world, 3, OTHER);
     assert!(!world.knows(OTHER));
-    assert_eq!(
-        (ends.borrow().matched.len(), world.endpoint_count()),
-        (0, 0)
-    );
+    assert_eq!((ends.borrow().matched.len(), world.endpoint_count()), (0, 0));
 }
 
 #[test]
 fn participants_that_are_no_servers_are_ignored() {
     let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
-    let mut stranger = FakeServer {
-        prefix: OTHER,
-        port: 7412,
-        counts: 0,
-    };
+    let mut stranger = FakeServer { prefix: OTHER, port: 7412, counts: 0 };
     stranger.announce_itself(&mut world);
     // Neither is what it says about others or their endpoints.
     stranger.send_participant(&mut world, 2, &participant(GuidPrefix([8; 12]), 7414));
@@ -337,11 +295,7 @@ fn participants_that_are_no_servers_are_ignored() {
     assert!(!world.knows(OTHER) && !world.knows(GuidPrefix([8; 12])));
     assert_eq!(world.endpoint_count(), 0);
     // A server with another prefix is recognized by its address.
-    let mut server = FakeServer {
-        prefix: GuidPrefix([7; 12]),
-        port: 11811,
-        counts: 0,
-    };
+    let mut server = FakeServer { prefix: GuidPrefix([7; 12]), port: 11811, counts: 0 };
     server.announce_itself(&mut world);
     assert!(world.knows(server.prefix));
     // Its endpoints are ignored while the participant is unknown.
@@ -357,9 +311,7 @@ fn a_restarted_server_is_sent_everything_again() {
     let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
     let mut server = FakeServer::new(0);
     server.announce_itself(&mut world);
-    let (_, ends) = world
-        .client
-        .add_writer(world.now, &topic(), EndpointQos::default());
+    let (_, ends) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
     server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     let end = reader(OTHER).to_bytes();
     server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
@@ -406,19 +358,12 @@ fn a_server_that_is_gone_takes_nobody_with_it() {
 #[test]
 fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
     let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
-    let (ours, _) = world
-        .client
-        .add_writer(world.now, &topic(), EndpointQos::default());
+    let (ours, _) = world.client.add_writer(world.now, &topic(), EndpointQos::default());
     let mut server = FakeServer::new(0);
     server.announce_itself(&mut world);
     server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     let theirs = reader(OTHER);
-    server.send(
-        &mut world,
-        EntityId::SUBSCRIPTIONS_WRITER,
-        1,
-        theirs.to_bytes(),
-    );
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, theirs.to_bytes());
     let mut count = 0;
     let mut answer = |world: &mut ClientWorld| {
         count += 1;
@@ -453,10 +398,7 @@ fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
     assert!(times >= 10, "{times} times in 80 s");
     assert!(world.knows(OTHER) && !world.knows(server.prefix));
     world.advance(20 * SECOND);
-    assert!(
-        world.knows(OTHER),
-        "a server would have said so first: its lease is 20 s"
-    );
+    assert!(world.knows(OTHER), "a server would have said so first: its lease is 20 s");
     world.advance(20 * SECOND);
     assert!(!world.knows(OTHER));
 }
@@ -473,10 +415,7 @@ fn leaving_is_said_to_servers() {
         _ => None,
     });
     let (to, data) = last.expect("a last word");
-    assert_eq!(
-        (*to, data.writer),
-        (local_address(11811), EntityId::SPDP_WRITER)
-    );
+    assert_eq!((*to, data.writer), (local_address(11811), EntityId::SPDP_WRITER));
     let own = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
     assert_eq!(discovery::guid_of_key(data), Some(own));
     assert!(data.inline.related.is_some());

@@ -15,14 +15,7 @@ fn participants_find_each_other_and_samples_arrive_in_order() {
     world.advance(SECOND / 5);
     assert_eq!(writer_ends.borrow().confirmed, [reader]);
     assert_eq!(reader_ends.borrow().confirmed, [writer]);
-    for (mark, length) in [
-        (1, 8),
-        (2, 100_000),
-        (3, 8),
-        (4, 15_872),
-        (5, 15_873),
-        (6, 3_000_001),
-    ] {
+    for (mark, length) in [(1, 8), (2, 100_000), (3, 8), (4, 15_872), (5, 15_873), (6, 3_000_001)] {
         world.write(writer, mark, length);
     }
     world.advance(SECOND / 10);
@@ -30,10 +23,7 @@ fn participants_find_each_other_and_samples_arrive_in_order() {
     assert_eq!(read.lengths(), [8, 100_000, 8, 15_872, 15_873, 3_000_001]);
     let discovered = world.engines[0].watch_discovered().borrow().clone();
     assert_eq!(discovered.participants.len(), 1);
-    assert_eq!(
-        discovered.readers.keys().copied().collect::<Vec<_>>(),
-        [reader]
-    );
+    assert_eq!(discovered.readers.keys().copied().collect::<Vec<_>>(), [reader]);
 }
 
 #[test]
@@ -69,15 +59,8 @@ fn best_effort_samples_are_whole_or_lost_and_never_out_of_order() {
             world.advance(Duration::from_millis(10));
         }
         let marks = read.marks();
-        assert!(
-            marks.is_sorted_by(|before, after| before < after),
-            "seed {seed}: {marks:?}"
-        );
-        assert!(
-            (50..100).contains(&marks.len()),
-            "seed {seed}: {} of 100",
-            marks.len()
-        );
+        assert!(marks.is_sorted_by(|before, after| before < after), "seed {seed}: {marks:?}");
+        assert!((50..100).contains(&marks.len()), "seed {seed}: {} of 100", marks.len());
         for (mark, length) in marks.iter().zip(read.lengths()) {
             assert_eq!(length, 8 + usize::from(mark % 3) * 40_000);
         }
@@ -126,10 +109,7 @@ fn requests_and_replies_keep_their_identity() {
     let (writer, _) = world.writer(0, keep_last_qos(10));
     let (_, _, read) = world.reader(1, keep_last_qos(10));
     world.advance(SECOND);
-    let related = SampleIdentity {
-        writer,
-        number: SequenceNumber(7),
-    };
+    let related = SampleIdentity { writer, number: SequenceNumber(7) };
     let now = world.now;
     for length in [8, 50_000] {
         world.engines[0].write(now, writer.entity, vec![0; length].into(), Some(related));
@@ -149,13 +129,7 @@ fn datagrams_of_nonsense_change_nothing() {
     for mark in 0..4 {
         world.write(writer, mark, 40_000);
         while let Some(datagram) = world.engines[0].transmit(&mut |_, _, _| true) {
-            kept.push(
-                datagram
-                    .parts()
-                    .iter()
-                    .flat_map(|part| part.to_vec())
-                    .collect(),
-            );
+            kept.push(datagram.parts().iter().flat_map(|part| part.to_vec()).collect());
         }
     }
     let mut random = pseudo_random(7);

@@ -6,9 +6,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 
-use super::world::{
-    HERE, NetworkWorld, SECOND, best_effort_qos, keep_last_qos, transient_local_qos,
-};
+use super::world::{HERE, NetworkWorld, SECOND, best_effort_qos, keep_last_qos, transient_local_qos};
 use crate::qos::{EndpointQos, HistoryKind};
 use crate::sequence::SequenceSet;
 use crate::wire::{self, DatagramWriter};
@@ -182,13 +180,7 @@ fn matched_reader(world: &NetworkWorld, writer: Guid) -> EntityId {
 #[test]
 fn a_slow_receiver_gets_whole_samples_though_newer_ones_replace_them() {
     let mut world = NetworkWorld::with_participants(2);
-    let (writer, _) = world.writer(
-        0,
-        EndpointQos {
-            history: HistoryKind::KeepLast(1),
-            ..best_effort_qos()
-        },
-    );
+    let (writer, _) = world.writer(0, EndpointQos { history: HistoryKind::KeepLast(1), ..best_effort_qos() });
     let (_, _, read) = world.reader(1, best_effort_qos());
     world.advance(SECOND);
     // Two fragments are sent between two samples of seven.

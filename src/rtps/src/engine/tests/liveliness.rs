@@ -16,13 +16,7 @@ fn who_falls_silent_is_gone_when_the_lease_is_over() {
     assert_eq!(ends.borrow().matched.len(), 1);
     world.advance(SECOND * 8);
     assert_eq!(ends.borrow().matched.len(), 0);
-    assert!(
-        world.engines[0]
-            .watch_discovered()
-            .borrow()
-            .participants
-            .is_empty()
-    );
+    assert!(world.engines[0].watch_discovered().borrow().participants.is_empty());
 }
 
 #[test]
@@ -32,16 +26,10 @@ fn who_says_anything_is_there() {
     world.reader(1, keep_last_qos(10));
     world.advance(SECOND);
     // Only its announcements are lost; it still acknowledges.
-    world.loses = Box::new(|_, bytes| {
-        bytes[8] == 2 && bytes.windows(4).any(|ids| ids == EntityId::SPDP_WRITER.0)
-    });
+    world.loses = Box::new(|_, bytes| bytes[8] == 2 && bytes.windows(4).any(|ids| ids == EntityId::SPDP_WRITER.0));
     let writer = ends.borrow().matched[0].guid;
     assert_eq!(writer.prefix, GuidPrefix([2; 12]));
-    let ours = *world.engines[0]
-        .writers
-        .keys()
-        .find(|entity| !entity.is_builtin())
-        .expect("a writer");
+    let ours = *world.engines[0].writers.keys().find(|entity| !entity.is_builtin()).expect("a writer");
     for mark in 0..20 {
         world.write(Guid::new(GuidPrefix([1; 12]), ours), mark, 8);
         world.advance(SECOND);
@@ -154,16 +142,10 @@ fn a_predecessors_good_bye_comes_from_its_own_writer_with_the_highest_number() {
         other => panic!("{other:?}"),
     });
     assert_eq!((said[0].from, said[1].from), (killed, GuidPrefix([2; 12])));
-    assert_eq!(
-        (gone.writer, gone.reader),
-        (EntityId::SPDP_WRITER, EntityId::SPDP_READER)
-    );
+    assert_eq!((gone.writer, gone.reader), (EntityId::SPDP_WRITER, EntityId::SPDP_READER));
     let key = Guid::new(killed, EntityId::PARTICIPANT).bytes();
     let disposed = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
-    assert_eq!(
-        (gone.key_only, gone.inline.status, gone.inline.key_hash),
-        (true, disposed, Some(key))
-    );
+    assert_eq!((gone.key_only, gone.inline.status, gone.inline.key_hash), (true, disposed, Some(key)));
     assert!(gone.number.0 > 1 << 31);
     assert_eq!((comes.inline.status, comes.key_only), (0, false));
 }

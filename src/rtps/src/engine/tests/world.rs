@@ -30,20 +30,12 @@ impl Sink for SampleRecorder {
 
 impl SampleRecorder {
     pub(super) fn lengths(&self) -> Vec<usize> {
-        self.0
-            .lock()
-            .iter()
-            .map(|sample| sample.payload.len())
-            .collect()
+        self.0.lock().iter().map(|sample| sample.payload.len()).collect()
     }
 
     /// Returns the first byte after the header of each sample.
     pub(super) fn marks(&self) -> Vec<u8> {
-        self.0
-            .lock()
-            .iter()
-            .map(|sample| sample.payload[4])
-            .collect()
+        self.0.lock().iter().map(|sample| sample.payload[4]).collect()
     }
 }
 
@@ -111,14 +103,9 @@ impl NetworkWorld {
             builtin: BUILTIN,
             lease: Some(Duration::from_secs(10)),
         };
-        let bounds = ReaderLimits {
-            max_sample: 16 << 20,
-            budget: self.budget.clone(),
-            unfinished: Duration::from_secs(30),
-        };
-        let announce_to = (0..4)
-            .map(|other| SocketAddr::from(([127, 0, 0, 1], discovery_port(other))))
-            .collect();
+        let bounds =
+            ReaderLimits { max_sample: 16 << 20, budget: self.budget.clone(), unfinished: Duration::from_secs(30) };
+        let announce_to = (0..4).map(|other| SocketAddr::from(([127, 0, 0, 1], discovery_port(other)))).collect();
         let ports = Ports::for_domain(0).expect("a domain");
         self.engines.push(Engine::new(
             self.now,
@@ -153,11 +140,7 @@ impl NetworkWorld {
                 continue;
             }
             for datagram in out {
-                let bytes: Bytes = datagram
-                    .parts()
-                    .iter()
-                    .flat_map(|part| part.to_vec())
-                    .collect();
+                let bytes: Bytes = datagram.parts().iter().flat_map(|part| part.to_vec()).collect();
                 self.sent += 1;
                 if (self.loses)(self.sent, &bytes) {
                     continue;
@@ -184,12 +167,7 @@ impl NetworkWorld {
             if self.carry() {
                 continue;
             }
-            let next = self
-                .engines
-                .iter()
-                .map(Engine::tick_at)
-                .min()
-                .unwrap_or(until);
+            let next = self.engines.iter().map(Engine::tick_at).min().unwrap_or(until);
             if next > until {
                 break;
             }
@@ -203,11 +181,7 @@ impl NetworkWorld {
         self.now = until;
     }
 
-    pub(super) fn writer(
-        &mut self,
-        engine: usize,
-        qos: EndpointQos,
-    ) -> (Guid, watch::Receiver<Arc<EndpointMatches>>) {
+    pub(super) fn writer(&mut self, engine: usize, qos: EndpointQos) -> (Guid, watch::Receiver<Arc<EndpointMatches>>) {
         let now = self.now;
         self.engines[engine].add_writer(now, &topic(), qos)
     }
@@ -216,11 +190,7 @@ impl NetworkWorld {
         &mut self,
         engine: usize,
         qos: EndpointQos,
-    ) -> (
-        Guid,
-        watch::Receiver<Arc<EndpointMatches>>,
-        Arc<SampleRecorder>,
-    ) {
+    ) -> (Guid, watch::Receiver<Arc<EndpointMatches>>, Arc<SampleRecorder>) {
         let now = self.now;
         let read = Arc::new(SampleRecorder::default());
         let (guid, ends) = self.engines[engine].add_reader(now, &topic(), qos, read.clone());
@@ -245,24 +215,15 @@ pub(super) fn topic() -> TopicDescription {
 }
 
 pub(super) fn keep_last_qos(depth: u32) -> EndpointQos {
-    EndpointQos {
-        history: HistoryKind::KeepLast(depth),
-        ..EndpointQos::default()
-    }
+    EndpointQos { history: HistoryKind::KeepLast(depth), ..EndpointQos::default() }
 }
 
 pub(super) fn best_effort_qos() -> EndpointQos {
-    EndpointQos {
-        reliability: ReliabilityKind::BestEffort,
-        ..keep_last_qos(10)
-    }
+    EndpointQos { reliability: ReliabilityKind::BestEffort, ..keep_last_qos(10) }
 }
 
 pub(super) fn transient_local_qos(depth: u32) -> EndpointQos {
-    EndpointQos {
-        durability: DurabilityKind::TransientLocal,
-        ..keep_last_qos(depth)
-    }
+    EndpointQos { durability: DurabilityKind::TransientLocal, ..keep_last_qos(depth) }
 }
 
 pub(super) const SECOND: Duration = Duration::from_secs(1);
@@ -271,9 +232,7 @@ pub(super) const SECOND: Duration = Duration::from_secs(1);
 pub(super) fn pseudo_random(seed: u64) -> impl FnMut() -> u64 {
     let mut state = seed;
     move || {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         state >> 33
     }
 }

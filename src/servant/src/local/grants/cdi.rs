@@ -69,51 +69,27 @@ struct Bind {
 }
 
 /// Adds the mounts and variables that the device `name` needs.
-pub(super) fn add_device(
-    name: &str,
-    directories: &[PathBuf],
-    granted: &mut ResolvedGrants,
-) -> Result<(), GrantError> {
+pub(super) fn add_device(name: &str, directories: &[PathBuf], granted: &mut ResolvedGrants) -> Result<(), GrantError> {
     let mut devices = BTreeMap::new();
     for path in specification_files(directories) {
         let specification = read_specification(&path)?;
         for device in &specification.devices {
             let full = format!("{}={}", specification.kind, device.name);
-            let edits = (
-                path.clone(),
-                [&specification.container_edits, &device.container_edits].map(resolve_edits),
-            );
+            let edits = (path.clone(), [&specification.container_edits, &device.container_edits].map(resolve_edits));
             devices.insert(full, edits);
         }
     }
     let known = devices.keys().cloned().collect::<Vec<_>>().join(", ");
-    let (path, edits) = devices
-        .remove(name)
-        .ok_or_else(|| GrantError::UnknownDevice {
-            name: name.to_owned(),
-            directories: directories
-                .iter()
-                .map(|one| one.display().to_string())
-                .collect::<Vec<_>>()
-                .join(" and "),
-            known: if known.is_empty() {
-                "none".to_owned()
-            } else {
-                known
-            },
-        })?;
+    let (path, edits) = devices.remove(name).ok_or_else(|| GrantError::UnknownDevice {
+        name: name.to_owned(),
+        directories: directories.iter().map(|one| one.display().to_string()).collect::<Vec<_>>().join(" and "),
+        known: if known.is_empty() { "none".to_owned() } else { known },
+    })?;
     for edit in edits {
-        let edit = edit.map_err(|reason| GrantError::Specification {
-            path: path.clone(),
-            reason,
-        })?;
+        let edit = edit.map_err(|reason| GrantError::Specification { path: path.clone(), reason })?;
         for mount in edit.mounts {
             // Devices of one vendor may share files.
-            if !granted
-                .mounts
-                .iter()
-                .any(|there| there.target == mount.target)
-            {
+            if !granted.mounts.iter().any(|there| there.target == mount.target) {
                 granted.mounts.push(mount);
             }
         }
@@ -144,12 +120,8 @@ fn specification_files(directories: &[PathBuf]) -> Vec<PathBuf> {
 }
 
 fn read_specification(path: &Path) -> Result<Specification, GrantError> {
-    let broken = |reason: CdiError| GrantError::Specification {
-        path: path.to_owned(),
-        reason,
-    };
-    let text =
-        std::fs::read_to_string(path).map_err(|error| broken(CdiError::Unreadable(error)))?;
+    let broken = |reason: CdiError| GrantError::Specification { path: path.to_owned(), reason };
+    let text = std::fs::read_to_string(path).map_err(|error| broken(CdiError::Unreadable(error)))?;
     // Every JSON text is valid YAML.
     serde_norway::from_str(&text).map_err(|error| broken(CdiError::Malformed(error)))
 }
@@ -157,34 +129,21 @@ fn read_specification(path: &Path) -> Result<Specification, GrantError> {
 fn resolve_edits(edits: &Edits) -> Result<ResolvedGrants, CdiError> {
     let mut granted = ResolvedGrants::default();
     for variable in &edits.env {
-        let (name, value) = variable
-            .split_once('=')
-            .ok_or_else(|| CdiError::Variable(variable.clone()))?;
-        granted
-            .environment
-            .insert(name.to_owned(), value.to_owned());
+        let (name, value) = variable.split_once('=').ok_or_else(|| CdiError::Variable(variable.clone()))?;
+        granted.environment.insert(name.to_owned(), value.to_owned());
     }
     for node in &edits.device_nodes {
         let source = node.host_path.clone().unwrap_or_else(|| node.path.clone());
         let kind = match std::fs::metadata(&source) {
             Ok(metadata) => metadata.file_type(),
             Err(error) => {
-                return Err(CdiError::Device {
-                    path: source,
-                    error,
-                });
+                return Err(CdiError::Device { path: source, error });
             }
         };
         if !kind.is_char_device() && !kind.is_block_device() {
             return Err(CdiError::NotADevice(source));
         }
-        granted.mounts.push(Mount {
-            source,
-            target: node.path.clone(),
-            writable: false,
-            device: true,
-            opened: None,
-        });
+        granted.mounts.push(Mount { source, target: node.path.clone(), writable: false, device: true, opened: None });
     }
     for bind in &edits.mounts {
         granted.mounts.push(Mount {
@@ -244,34 +203,20 @@ devices:
         let mut granted = ResolvedGrants::default();
         add_device("vendor.com/harmless=zero", &directories, &mut granted).expect("known");
         assert_eq!(granted.environment["VENDOR"], "here");
-        let targets: Vec<_> = granted
-            .mounts
-            .iter()
-            .map(|mount| (mount.target.to_str().expect("UTF-8"), mount.device))
-            .collect();
-        assert_eq!(
-            targets,
-            [("/dev/vendor0", true), ("/usr/share/vendor", false)]
-        );
+        let targets: Vec<_> =
+            granted.mounts.iter().map(|mount| (mount.target.to_str().expect("UTF-8"), mount.device)).collect();
+        assert_eq!(targets, [("/dev/vendor0", true), ("/usr/share/vendor", false)]);
         assert_eq!(
             granted.unfulfilled,
-            [
-                "device vendor.com/harmless=zero: its hook createContainer (/usr/bin/vendor-hook update-ldcache) is \
-                    not run; the device may work without it"
-            ]
+            ["device vendor.com/harmless=zero: its hook createContainer (/usr/bin/vendor-hook update-ldcache) is \
+                    not run; the device may work without it"]
         );
-        let mut refused = |name| {
-            add_device(name, &directories, &mut granted)
-                .expect_err(name)
-                .to_string()
-        };
+        let mut refused = |name| add_device(name, &directories, &mut granted).expect_err(name).to_string();
         assert!(
             refused("vendor.com/harmless=one")
                 .contains("there are: vendor.com/harmless=broken, vendor.com/harmless=zero")
         );
-        assert!(
-            refused("vendor.com/harmless=broken").contains("/etc/hostname is not a device node")
-        );
+        assert!(refused("vendor.com/harmless=broken").contains("/etc/hostname is not a device node"));
     }
 
     #[test]

@@ -17,10 +17,7 @@ const AGAIN: u32 = 100;
 
 /// Opens a volume if it lies in one of the allowed directories.
 pub(super) fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, GrantError> {
-    let broken = |source| GrantError::Volume {
-        path: volume.source.clone(),
-        source,
-    };
+    let broken = |source| GrantError::Volume { path: volume.source.clone(), source };
     // Resolves links first, since a link must not lead out of what is allowed. From here on no link is followed.
     let source = Path::new(&volume.source).canonicalize().map_err(broken)?;
     for place in allowed {
@@ -30,9 +27,7 @@ pub(super) fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, G
         let Ok(below) = source.strip_prefix(&root) else {
             continue;
         };
-        let opened = open_place(&root)
-            .and_then(|root| open_beneath(root.as_fd(), below))
-            .map_err(broken)?;
+        let opened = open_place(&root).and_then(|root| open_beneath(root.as_fd(), below)).map_err(broken)?;
         return Ok(Mount {
             source,
             target: PathBuf::from(&volume.target),
@@ -52,18 +47,10 @@ fn open_place(path: &Path) -> std::io::Result<OwnedFd> {
 }
 
 fn open_beneath(directory: BorrowedFd<'_>, path: &Path) -> std::io::Result<OwnedFd> {
-    let path = if path.as_os_str().is_empty() {
-        Path::new(".")
-    } else {
-        path
-    };
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     let how = OpenHow::new()
         .flags(OFlag::O_PATH | OFlag::O_CLOEXEC)
-        .resolve(
-            ResolveFlag::RESOLVE_BENEATH
-                | ResolveFlag::RESOLVE_NO_SYMLINKS
-                | ResolveFlag::RESOLVE_NO_MAGICLINKS,
-        );
+        .resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS | ResolveFlag::RESOLVE_NO_MAGICLINKS);
     for _ in 0..AGAIN {
         match openat2(directory, path, how) {
             // Something was renamed meanwhile.
@@ -82,10 +69,7 @@ mod tests {
     use super::*;
 
     fn asks(source: PathBuf, allowed: &Path) -> Result<Mount, GrantError> {
-        let volume = api::Volume {
-            source: source.display().to_string(),
-            target: "/models".into(),
-        };
+        let volume = api::Volume { source: source.display().to_string(), target: "/models".into() };
         open(&volume, std::slice::from_ref(&allowed.to_owned()))
     }
 
@@ -116,19 +100,11 @@ mod tests {
         assert!(!whole.writable);
         assert_eq!(read(&whole, "/net/weights"), "models");
         let linked = asks(models.join("latest"), &models).expect("leads to what is allowed");
-        assert_eq!(
-            linked.source,
-            models.join("net").canonicalize().expect("there")
-        );
-        let refused = asks(models.join("sly"), &models)
-            .expect_err("leads out")
-            .to_string();
+        assert_eq!(linked.source, models.join("net").canonicalize().expect("there"));
+        let refused = asks(models.join("sly"), &models).expect_err("leads out").to_string();
         assert!(refused.contains("[allow]"), "{refused}");
         assert!(asks(models.join("../secret"), &models).is_err());
-        assert!(matches!(
-            asks(models.join("none"), &models),
-            Err(GrantError::Volume { .. })
-        ));
+        assert!(matches!(asks(models.join("none"), &models), Err(GrantError::Volume { .. })));
     }
 
     #[test]

@@ -101,12 +101,7 @@ impl Driver {
         let mut text = Vec::new();
         let read = async {
             // An error may be followed by others until the end of the report; success is reported once.
-            while !Creator::has_succeeded(&text)
-                && report
-                    .read_buf(&mut text)
-                    .await
-                    .is_ok_and(|length| length > 0)
-            {}
+            while !Creator::has_succeeded(&text) && report.read_buf(&mut text).await.is_ok_and(|length| length > 0) {}
         };
         let in_time = tokio::time::timeout(CREATION, read).await.is_ok();
         match Creator::outcome(&String::from_utf8_lossy(&text)) {

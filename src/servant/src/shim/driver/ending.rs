@@ -26,14 +26,9 @@ impl Driver {
         if self.stopping.is_some() || self.init.is_none() {
             return;
         }
-        self.verdict.get_or_insert_with(|| ContainerState::Stopped {
-            reason: reason.into(),
-        });
-        let first = if self.nodes.running_and_starting() == (vec![], 0) {
-            StopStage::Kill
-        } else {
-            StopStage::Interrupt
-        };
+        self.verdict.get_or_insert_with(|| ContainerState::Stopped { reason: reason.into() });
+        let first =
+            if self.nodes.running_and_starting() == (vec![], 0) { StopStage::Kill } else { StopStage::Interrupt };
         self.enter_stage(first).await;
     }
 
@@ -47,10 +42,7 @@ impl Driver {
     }
 
     pub(super) async fn enter_stage(&mut self, stage: StopStage) {
-        if self
-            .stopping
-            .is_some_and(|now| now >= stage && now != StopStage::KillAgain)
-        {
+        if self.stopping.is_some_and(|now| now >= stage && now != StopStage::KillAgain) {
             return;
         }
         self.stopping = Some(stage);
@@ -91,12 +83,7 @@ impl Driver {
         let out_of_memory = !asked && self.was_out_of_memory(status);
         let exit = nodes::parse_wait_status(status, out_of_memory);
         for (_, pid) in self.nodes.running_and_starting().0 {
-            let exit = NodeExit {
-                code: None,
-                signal: Some(libc::SIGKILL),
-                out_of_memory,
-                exec_error: None,
-            };
+            let exit = NodeExit { code: None, signal: Some(libc::SIGKILL), out_of_memory, exec_error: None };
             if let Some((event, _)) = self.nodes.on_exited(pid, exit) {
                 self.report_node(event);
             }
@@ -111,19 +98,11 @@ impl Driver {
         let limit = self.memory_limit();
         self.verdict.get_or_insert_with(|| {
             let how = match exit {
-                NodeExit {
-                    out_of_memory: true,
-                    ..
-                } => format!("was killed: {limit}"),
-                NodeExit {
-                    signal: Some(signal),
-                    ..
-                } => format!("was killed by signal {signal}"),
+                NodeExit { out_of_memory: true, .. } => format!("was killed: {limit}"),
+                NodeExit { signal: Some(signal), .. } => format!("was killed by signal {signal}"),
                 NodeExit { code, .. } => format!("exited with status {}", code.unwrap_or(0)),
             };
-            ContainerState::Failed {
-                reason: format!("its init {how}"),
-            }
+            ContainerState::Failed { reason: format!("its init {how}") }
         });
         self.init = None;
     }
@@ -133,19 +112,12 @@ impl Driver {
         // When the namespace is gone nobody holds the other ends of the pipes, unless they were sent out of it.
         let _ = tokio::time::timeout(DRAIN, self.streams.wait_drained()).await;
         let removed = self.begun.cgroup.destroy(PATIENCE);
-        let fallback = ContainerState::Stopped {
-            reason: "stopped".into(),
-        };
+        let fallback = ContainerState::Stopped { reason: "stopped".into() };
         let mut state = self.verdict.take().unwrap_or(fallback);
         if let Err(error) = &removed {
-            state = ContainerState::Failed {
-                reason: error.to_string(),
-            };
+            state = ContainerState::Failed { reason: error.to_string() };
         }
-        let exit = ExitRecord {
-            state: state.clone(),
-            nodes: self.nodes.statuses(),
-        };
+        let exit = ExitRecord { state: state.clone(), nodes: self.nodes.statuses() };
         let written = launch::write_record(&self.begun.directory.join(launch::EXIT), &exit);
         // A daemon that has just connected is notified, too.
         while let Ok(input) = self.queue.try_recv() {

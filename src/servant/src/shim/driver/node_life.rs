@@ -32,25 +32,14 @@ impl Driver {
         }
     }
 
-    pub(super) async fn send_start_request(
-        &mut self,
-        number: u32,
-        spec: &NodeSpec,
-    ) -> Result<(), StartError> {
+    pub(super) async fn send_start_request(&mut self, number: u32, spec: &NodeSpec) -> Result<(), StartError> {
         let open = |stream| self.streams.open(&spec.name, stream);
         let (out, err) = (open("stdout")?, open("stderr")?);
         let mut environment = self.begun.launch.spec.environment.clone();
         environment.extend(spec.environment.clone());
-        let environment: Vec<String> = environment
-            .iter()
-            .map(|(name, value)| format!("{name}={value}"))
-            .collect();
-        let request = StartRequest {
-            id: number,
-            directory: &spec.directory,
-            argv: &spec.argv,
-            environment: &environment,
-        };
+        let environment: Vec<String> = environment.iter().map(|(name, value)| format!("{name}={value}")).collect();
+        let request =
+            StartRequest { id: number, directory: &spec.directory, argv: &spec.argv, environment: &environment };
         let streams = [out.as_raw_fd(), err.as_raw_fd()];
         Ok(self.link.start(&request, streams).await?)
     }
@@ -78,16 +67,14 @@ impl Driver {
                 }
             }
             InitReply::Failed { id, errno, stage } => {
-                self.on_start_failed(id, StartError::from_init(errno, stage))
-                    .await
+                self.on_start_failed(id, StartError::from_init(errno, stage)).await
             }
             InitReply::Exited { pid, status } => {
                 self.resident.process_exited(pid);
                 let exit = nodes::parse_wait_status(status, self.was_out_of_memory(status));
                 if let Some((event, consequence)) = self.nodes.on_exited(pid, exit.clone()) {
                     self.report_node(event.clone());
-                    self.apply_consequence(event.node(), consequence, &exit)
-                        .await;
+                    self.apply_consequence(event.node(), consequence, &exit).await;
                 }
             }
         }
@@ -100,9 +87,7 @@ impl Driver {
     }
 
     pub(super) async fn deliver_early_signals(&mut self, started: &str) {
-        let (now, later) = std::mem::take(&mut self.early_signals)
-            .into_iter()
-            .partition(|(node, _)| node == started);
+        let (now, later) = std::mem::take(&mut self.early_signals).into_iter().partition(|(node, _)| node == started);
         self.early_signals = later;
         let now: Vec<(String, i32)> = now;
         for (node, signal) in now {
@@ -131,23 +116,12 @@ impl Driver {
             self.report_node(event.clone());
             self.answer_start(number, Err(error.into()));
             self.early_signals.retain(|(node, _)| node != event.node());
-            let exit = NodeExit {
-                code: None,
-                signal: None,
-                out_of_memory: false,
-                exec_error: Some(reason),
-            };
-            self.apply_consequence(event.node(), consequence, &exit)
-                .await;
+            let exit = NodeExit { code: None, signal: None, out_of_memory: false, exec_error: Some(reason) };
+            self.apply_consequence(event.node(), consequence, &exit).await;
         }
     }
 
-    pub(super) async fn apply_consequence(
-        &mut self,
-        node: &str,
-        consequence: Consequence,
-        exit: &NodeExit,
-    ) {
+    pub(super) async fn apply_consequence(&mut self, node: &str, consequence: Consequence, exit: &NodeExit) {
         if self.stopping.is_some() {
             // The last one has ended: there is nothing to wait for.
             if self.nodes.running_and_starting() == (vec![], 0) {
@@ -175,32 +149,19 @@ impl Driver {
 
     pub(super) fn end_state_for(&self, node: &str, exit: &NodeExit) -> ContainerState {
         let how = match exit {
-            NodeExit {
-                exec_error: Some(reason),
-                ..
-            } => {
+            NodeExit { exec_error: Some(reason), .. } => {
                 return ContainerState::Failed {
                     reason: format!("required node {node} could not be started: {reason}"),
                 };
             }
-            NodeExit {
-                out_of_memory: true,
-                ..
-            } => {
+            NodeExit { out_of_memory: true, .. } => {
                 let limit = self.memory_limit();
-                return ContainerState::Failed {
-                    reason: format!("required node {node} was killed: {limit}"),
-                };
+                return ContainerState::Failed { reason: format!("required node {node} was killed: {limit}") };
             }
-            NodeExit {
-                signal: Some(signal),
-                ..
-            } => format!("was killed by signal {signal}"),
+            NodeExit { signal: Some(signal), .. } => format!("was killed by signal {signal}"),
             NodeExit { code, .. } => format!("exited with status {}", code.unwrap_or(0)),
         };
-        ContainerState::Stopped {
-            reason: format!("required node {node} {how}"),
-        }
+        ContainerState::Stopped { reason: format!("required node {node} {how}") }
     }
 
     pub(super) fn memory_limit(&self) -> String {

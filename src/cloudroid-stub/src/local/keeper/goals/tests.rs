@@ -28,11 +28,7 @@ impl Cloud for RecordingCloud {
     fn call_unmeasured(&self, service: &str, request: Bytes) -> PendingAnswer {
         let (answer, answered) = oneshot::channel();
         let part = service.strip_prefix("/count/_action/").unwrap().to_owned();
-        let asked = CloudCall {
-            part,
-            request,
-            answer,
-        };
+        let asked = CloudCall { part, request, answer };
         let _ = self.0.send(asked);
         Box::pin(async move {
             let gone = || Failure::Unreachable("the test has ended".to_owned());
@@ -71,11 +67,7 @@ impl Scene {
         let cloud = Arc::new(RecordingCloud(sender));
         let keeper = Keeper::start(sla, vec![], original, cloud, Arc::new(IgnoringApplication));
         keeper.link_up(false);
-        Self {
-            keeper,
-            asked,
-            action: "/count".into(),
-        }
+        Self { keeper, asked, action: "/count".into() }
     }
 
     /// Returns the next call to the cloud, which must be of this part.
@@ -92,25 +84,19 @@ impl Scene {
 
     fn send_goal(&self, request: Bytes) -> ApplicationCall {
         let (keeper, action) = (self.keeper.clone(), self.action.clone());
-        ApplicationCall(tokio::spawn(async move {
-            keeper.send_goal(&action, request).await
-        }))
+        ApplicationCall(tokio::spawn(async move { keeper.send_goal(&action, request).await }))
     }
 
     fn request_result(&self, id: &GoalId) -> ApplicationCall {
         let (keeper, action) = (self.keeper.clone(), self.action.clone());
         let request = messages::result_request(id);
-        ApplicationCall(tokio::spawn(async move {
-            keeper.get_result(&action, request).await
-        }))
+        ApplicationCall(tokio::spawn(async move { keeper.get_result(&action, request).await }))
     }
 
     fn cancel_goal(&self, id: &GoalId) -> ApplicationCall {
         let (keeper, action) = (self.keeper.clone(), self.action.clone());
         let request = messages::cancel_request(id);
-        ApplicationCall(tokio::spawn(async move {
-            keeper.cancel_goal(&action, request).await
-        }))
+        ApplicationCall(tokio::spawn(async move { keeper.cancel_goal(&action, request).await }))
     }
 }
 
@@ -124,9 +110,7 @@ impl ApplicationCall {
 }
 
 fn goal(id: &GoalId, number: i32) -> Bytes {
-    [&messages::result_request(id)[..], &number.to_le_bytes()]
-        .concat()
-        .into()
+    [&messages::result_request(id)[..], &number.to_le_bytes()].concat().into()
 }
 
 fn acceptance() -> Bytes {
@@ -168,9 +152,7 @@ async fn a_goal_is_one_request_from_when_it_is_sent_to_its_result() {
     assert_eq!((counts.requests, counts.from_cloud), (1, 1));
     // A refused goal is answered, too.
     let refused = scene.send_goal(goal(&[2; 16], 7));
-    scene
-        .answer_next("send_goal", messages::goal_response(false, 1))
-        .await;
+    scene.answer_next("send_goal", messages::goal_response(false, 1)).await;
     assert!(!messages::is_accepted(&refused.answer().await));
     let counts = scene.keeper.report().counts;
     assert_eq!((counts.requests, counts.from_cloud), (2, 2));

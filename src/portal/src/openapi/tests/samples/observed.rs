@@ -26,10 +26,7 @@ pub(super) fn samples() -> Vec<(&'static str, Value)> {
         bandwidth: 1.5,
         latency,
     };
-    let topics = PublishedTopics {
-        seconds: 1.0,
-        topics: vec![topic(None), topic(Some(0.5))],
-    };
+    let topics = PublishedTopics { seconds: 1.0, topics: vec![topic(None), topic(Some(0.5))] };
     let goal = |ended, state, text: &str| Goal {
         action: "/x".into(),
         id: "x".into(),

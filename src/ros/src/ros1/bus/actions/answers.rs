@@ -38,10 +38,7 @@ impl KnownResponders {
     pub(super) async fn wait_until_connected(&self, bus: &Arc<Ros1BusState>, action: &str) {
         for part in PARTS {
             let topic = format!("{action}/{part}");
-            if timeout(GIVES_UP, self.wait_for_publishers(bus, &topic))
-                .await
-                .is_err()
-            {
+            if timeout(GIVES_UP, self.wait_for_publishers(bus, &topic)).await.is_err() {
                 let silent = self.unknown_publishers(bus, &topic);
                 let nodes: Vec<_> = silent.iter().map(|publisher| &publisher.node).collect();
                 tracing::debug!(topic, ?nodes, "they do not say that they send to us");
@@ -61,8 +58,7 @@ impl KnownResponders {
             let Ok(connections) = heard::connections(bus, topic).await else {
                 return;
             };
-            let sends =
-                |by: &ActionPublisher| connections.iter().any(|peer| peer.node() == by.node);
+            let sends = |by: &ActionPublisher| connections.iter().any(|peer| peer.node() == by.node);
             let (arrived, missing): (Vec<_>, Vec<_>) = unknown.into_iter().partition(sends);
             self.known.lock().extend(arrived);
             if missing.is_empty() {
@@ -83,11 +79,7 @@ impl KnownResponders {
         let others = others.filter(|node| **node != bus.node);
         let others = others.filter_map(|node| {
             let uri = graph.nodes.get(node)?;
-            Some(ActionPublisher {
-                topic: topic.to_owned(),
-                node: node.clone(),
-                uri: uri.clone(),
-            })
+            Some(ActionPublisher { topic: topic.to_owned(), node: node.clone(), uri: uri.clone() })
         });
         others.filter(|by| !known.contains(by)).collect()
     }

@@ -12,8 +12,8 @@ use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph,
-    MatchedPeers, Publisher, Subscription,
+    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, MatchedPeers, Publisher,
+    Subscription,
 };
 use crate::codec::Time;
 use crate::ros1::actions::messages::{self, ActionlibStatus, GoalId};
@@ -74,11 +74,7 @@ struct TrackedGoal {
 
 impl TrackedGoal {
     fn new(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
-        Self {
-            seen: now,
-            patience: NEVER_TAKEN,
-            events,
-        }
+        Self { seen: now, patience: NEVER_TAKEN, events }
     }
 
     fn mark_seen(&mut self, now: Instant) {
@@ -153,10 +149,7 @@ impl ActionClient for Ros1ActionClient {
                 });
             }
             shared.wait_for_goal_subscribers().await;
-            shared
-                .answers
-                .wait_until_connected(&shared.bus, &shared.name)
-                .await;
+            shared.answers.wait_until_connected(&shared.bus, &shared.name).await;
             Ok(())
         };
         let ready = async {
@@ -170,10 +163,7 @@ impl ActionClient for Ros1ActionClient {
             Ok(ready) => ready,
             // The server may accept goals all the same and only not have published its status.
             Err(_) if shared.is_connected() => Ok(()),
-            Err(_) => Err(BusError::Timeout {
-                what: format!("action {}", shared.name),
-                after: patience,
-            }),
+            Err(_) => Err(BusError::Timeout { what: format!("action {}", shared.name), after: patience }),
         }
     }
 
@@ -184,10 +174,7 @@ impl ActionClient for Ros1ActionClient {
         let known = TrackedGoal::new(Instant::now(), events);
         self.shared.goals.lock().insert(id.to_owned(), known);
         let stamp = Time::now();
-        let id = GoalId {
-            stamp,
-            id: id.to_owned(),
-        };
+        let id = GoalId { stamp, id: id.to_owned() };
         ends.goal.publish(messages::write_goal(stamp, &id, &goal));
     }
 
@@ -217,10 +204,7 @@ impl ActionClient for Ros1ActionClient {
 }
 
 fn cancel_message(id: &str) -> Bytes {
-    messages::write_cancel(&GoalId {
-        stamp: Time::default(),
-        id: id.to_owned(),
-    })
+    messages::write_cancel(&GoalId { stamp: Time::default(), id: id.to_owned() })
 }
 
 impl ActionlibClientState {
@@ -267,17 +251,14 @@ impl ActionlibClientState {
     }
 
     fn is_connected(&self) -> bool {
-        self.goal_subscribers()
-            .is_some_and(|matched| self.has_server(&matched.borrow(), &self.bus.graph.borrow()))
+        self.goal_subscribers().is_some_and(|matched| self.has_server(&matched.borrow(), &self.bus.graph.borrow()))
     }
 
     /// Returns the error once the servers turn out to have another type.
     async fn wait_for_type_mismatch(&self) -> BusError {
         let mut graph = self.bus.graph.subscribe();
         loop {
-            let other = graph
-                .borrow_and_update()
-                .action_type_mismatch(&self.name, &self.type_name);
+            let other = graph.borrow_and_update().action_type_mismatch(&self.name, &self.type_name);
             if let Some(other) = other {
                 return other;
             }
@@ -300,9 +281,7 @@ impl ActionlibClientState {
                 let servers = graph.topics.get(&topic).map(|nodes| &nodes.subscribers);
                 let mut others = servers.into_iter().flatten();
                 let others = others.all(|node| *node == self.bus.node || matched.has_node(node));
-                let has_other_type = graph
-                    .action_type_mismatch(&self.name, &self.type_name)
-                    .is_some();
+                let has_other_type = graph.action_type_mismatch(&self.name, &self.type_name).is_some();
                 others && !has_other_type && self.has_server(&matched, &graph)
             };
             if complete {
@@ -343,11 +322,7 @@ impl ActionlibClientState {
             ActionlibStatus::Rejected => GoalOutcome::Rejected,
             _ => GoalOutcome::Unknown,
         };
-        goal.events.on_ended(Ok(GoalEnd {
-            outcome,
-            text: state.text,
-            result: body,
-        }));
+        goal.events.on_ended(Ok(GoalEnd { outcome, text: state.text, result: body }));
     }
 
     fn on_status(&self, bytes: &Bytes) {

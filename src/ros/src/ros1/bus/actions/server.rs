@@ -8,9 +8,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::task::AbortHandle;
 
-use crate::bus::{
-    ActionHandler, ActionServer, BusError, GoalEnd, GoalOutcome, Publisher, Subscription,
-};
+use crate::bus::{ActionHandler, ActionServer, BusError, GoalEnd, GoalOutcome, Publisher, Subscription};
 use crate::codec::Time;
 use crate::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
 use crate::ros1::bus::Ros1BusState;
@@ -172,11 +170,7 @@ impl ActionlibServerState {
             goal.id = format!("{}-{}", self.name, self.bus.next_id());
         }
         let id = goal.id.clone();
-        let mut state = GoalState {
-            goal,
-            status: ActionlibStatus::Active,
-            text: String::new(),
-        };
+        let mut state = GoalState { goal, status: ActionlibStatus::Active, text: String::new() };
         {
             let cancelled_up_to = *self.cancelled_up_to.lock();
             let mut goals = self.goals.lock();
@@ -223,9 +217,7 @@ impl ActionlibServerState {
         };
         let zero = wanted.stamp == Time::default();
         let matches = |goal: &GoalId| {
-            goal.id == wanted.id
-                || (wanted.id.is_empty() && zero)
-                || (!zero && goal.stamp <= wanted.stamp)
+            goal.id == wanted.id || (wanted.id.is_empty() && zero) || (!zero && goal.stamp <= wanted.stamp)
         };
         {
             let mut up_to = self.cancelled_up_to.lock();
@@ -234,11 +226,7 @@ impl ActionlibServerState {
         let mut cancelled = Vec::new();
         let mut goals = self.goals.lock();
         if !wanted.id.is_empty() && !goals.contains_key(&wanted.id) && goals.len() < MAX_GOALS {
-            let state = GoalState {
-                goal: wanted.clone(),
-                status: ActionlibStatus::Recalling,
-                text: String::new(),
-            };
+            let state = GoalState { goal: wanted.clone(), status: ActionlibStatus::Recalling, text: String::new() };
             let ended = Some(Instant::now());
             goals.insert(wanted.id.clone(), ServedGoal { state, ended });
         }
@@ -285,11 +273,7 @@ impl ActionlibServerState {
 
     fn publish_status(&self) {
         let mut goals = self.goals.lock();
-        goals.retain(|_, served| {
-            served
-                .ended
-                .is_none_or(|ended| ended.elapsed() < STATUS_KEPT)
-        });
+        goals.retain(|_, served| served.ended.is_none_or(|ended| ended.elapsed() < STATUS_KEPT));
         let states: Vec<_> = goals.values().map(|served| served.state.clone()).collect();
         drop(goals);
         if let Some(ends) = self.ends.get() {

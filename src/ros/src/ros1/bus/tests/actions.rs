@@ -47,12 +47,7 @@ async fn wait_until_asked(node: &mut TestNode) {
 }
 
 async fn both_there(bus: &Ros1Bus) {
-    let of = |graph: &Graph| {
-        graph
-            .topics
-            .get("/dig/result")
-            .map(|of| of.publishers.len())
-    };
+    let of = |graph: &Graph| graph.topics.get("/dig/result").map(|of| of.publishers.len());
     wait_for_graph(bus, |graph| of(graph) == Some(2)).await;
 }
 
@@ -79,14 +74,7 @@ async fn a_server_that_sends_its_results_here_is_asked_once() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let _server = serve_dig(&two);
-    let row = [
-        Value::Int(1),
-        "/one".into(),
-        "o".into(),
-        "TCPROS".into(),
-        "/dig/result".into(),
-        true.into(),
-    ];
+    let row = [Value::Int(1), "/one".into(), "o".into(), "TCPROS".into(), "/dig/result".into(), true.into()];
     let rows = Value::Array(vec![Value::Array(row.to_vec())]);
     let mut other = node_reporting(&master, rows).await;
     both_there(&one).await;
@@ -109,10 +97,7 @@ async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
     let client = one.action_client("/dig", &dig()).unwrap();
     client.wait_for_server(LONG).await.unwrap();
     while other.calls.try_recv().is_ok() {}
-    client
-        .wait_for_server(Duration::from_secs(1))
-        .await
-        .unwrap();
+    client.wait_for_server(Duration::from_secs(1)).await.unwrap();
     while let Ok((method, _)) = other.calls.try_recv() {
         assert_ne!(method, "getBusInfo");
     }

@@ -87,10 +87,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let qos = QosProfile::keep_last(2);
-    let publisher = one
-        .advertise("/chat", text_type("992c"), qos)
-        .await
-        .unwrap();
+    let publisher = one.advertise("/chat", text_type("992c"), qos).await.unwrap();
     let address: SocketAddr = ([127, 0, 0, 1], one.inner.port).into();
     let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
     let header = Header::new([("topic", "/chat"), ("md5sum", "*"), ("callerid", "/lazy")]);
@@ -103,11 +100,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
         next(&mut subscription.messages).await;
     }
     // Messages it does not take are dropped and counted, not kept.
-    assert!(
-        publisher.dropped_count() > 50,
-        "{}",
-        publisher.dropped_count()
-    );
+    assert!(publisher.dropped_count() > 50, "{}", publisher.dropped_count());
     drop(publisher);
     // If it reads at last, it gets what is still queued, and is then disconnected.
     let mut rest = Vec::new();
@@ -126,9 +119,7 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
 #[tokio::test]
 async fn a_master_that_refuses_is_quoted() {
     let refusing = TestNode::start_answering(Value::Int(0)).await;
-    let address: SocketAddr = refusing.uri["http://".len()..refusing.uri.len() - 1]
-        .parse()
-        .unwrap();
+    let address: SocketAddr = refusing.uri["http://".len()..refusing.uri.len() - 1].parse().unwrap();
     // Its answers are not a graph.
     let sockets = Arc::new(HostSockets);
     let error = Ros1Bus::connect(sockets.clone(), address, "/one").await;
@@ -150,24 +141,14 @@ async fn a_failed_registration_leaves_nothing_behind() {
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     let address = master.stop().await;
-    assert!(
-        bus.subscribe("/chat", WireType::any(), QosProfile::keep_last(100))
-            .await
-            .is_err()
-    );
-    assert!(
-        bus.advertise("/chat", text_type("992c"), QosProfile::keep_last(100))
-            .await
-            .is_err()
-    );
+    assert!(bus.subscribe("/chat", WireType::any(), QosProfile::keep_last(100)).await.is_err());
+    assert!(bus.advertise("/chat", text_type("992c"), QosProfile::keep_last(100)).await.is_err());
     assert_eq!(bus.inner.subscriptions.lock().len(), 0);
     assert_eq!(bus.inner.publications.lock().len(), 0);
     let fresh = crate::ros1::master::Master::new(Default::default());
     let master = TestMaster::start_at(fresh, Some(address)).await;
     let _subscription = subscribe_text(&bus, "/chat").await;
-    master
-        .wait_until(|graph| graph.topics.contains_key("/chat"))
-        .await;
+    master.wait_until(|graph| graph.topics.contains_key("/chat")).await;
 }
 
 #[tokio::test]
@@ -194,11 +175,7 @@ async fn the_slave_api_answers_what_tools_ask() {
     let master_uri = ask("getMasterUri", &caller).await;
     assert_eq!(master_uri[2], format!("http://{}/", master.address).into());
     let udp = Value::Array(vec![Value::strings(["UDPROS"])]);
-    let declined = ask(
-        "requestTopic",
-        &["/tool".into(), "/chat".into(), udp.clone()],
-    )
-    .await;
+    let declined = ask("requestTopic", &["/tool".into(), "/chat".into(), udp.clone()]).await;
     assert_eq!(declined[0], 0.into());
     let unknown = ask("requestTopic", &["/tool".into(), "/none".into(), udp]).await;
     assert!(unknown[1].as_str().unwrap().contains("does not publish"));
@@ -231,14 +208,9 @@ async fn a_graph_that_grows_without_end_is_read_seldom() {
     for number in 0..REGISTRATIONS {
         let topic = format!("/topic{number}");
         let list = ["/greedy", &topic, "std_msgs/String", "http://127.0.0.1:9/"];
-        master
-            .call("registerPublisher", &list.map(Value::from))
-            .await;
+        master.call("registerPublisher", &list.map(Value::from)).await;
     }
     // If it were read after each change, that would be a thousand parts each time on average.
     let read = reading.await.unwrap() / REGISTRATIONS;
-    assert!(
-        read < REGISTRATIONS / 10,
-        "{read} topics for each registration"
-    );
+    assert!(read < REGISTRATIONS / 10, "{read} topics for each registration");
 }

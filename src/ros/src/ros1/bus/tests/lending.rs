@@ -31,11 +31,7 @@ impl Lender for Counters {
         let asked = (service.to_owned(), node.to_owned());
         self.0.asked.lock().push(asked);
         let (md5, gone) = self.0.on_offer.lock().clone()?;
-        Some(LentService {
-            service_type: ServiceType::new("pkg/Add", md5),
-            handler: Arc::new(Counter),
-            gone,
-        })
+        Some(LentService { service_type: ServiceType::new("pkg/Add", md5), handler: Arc::new(Counter), gone })
     }
 }
 

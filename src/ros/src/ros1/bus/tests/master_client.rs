@@ -29,11 +29,7 @@ impl XmlRpcHandler for Busy {
 
 #[tokio::test]
 async fn many_calls_at_once_do_not_flood_the_master() {
-    let busy = Arc::new(Busy {
-        now: AtomicUsize::new(0),
-        most: AtomicUsize::new(0),
-        answers: Semaphore::new(0),
-    });
+    let busy = Arc::new(Busy { now: AtomicUsize::new(0), most: AtomicUsize::new(0), answers: Semaphore::new(0) });
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let serving = tokio::spawn(serve(listener, busy.clone(), ServerLimits::default()));

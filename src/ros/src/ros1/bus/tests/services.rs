@@ -35,9 +35,7 @@ fn add_type() -> ServiceType {
 }
 
 async fn serve(bus: &Ros1Bus) -> Box<dyn Send + Sync> {
-    let handler = Arc::new(Echo {
-        meeting: Barrier::new(2),
-    });
+    let handler = Arc::new(Echo { meeting: Barrier::new(2) });
     bus.serve("/echo", add_type(), handler).await.unwrap()
 }
 
@@ -57,17 +55,8 @@ async fn calls_are_answered_or_failed_with_the_servers_words() {
     assert!(failed.to_string().contains("not for /two"), "{failed}");
     // The connection is still good for the next call.
     assert_eq!(two.call("/echo", "ok".into(), LONG).await.unwrap(), "ok");
-    assert_eq!(
-        one.call("/echo", "self".into(), LONG).await.unwrap(),
-        "self"
-    );
-    let taken = one.serve(
-        "/echo",
-        add_type(),
-        Arc::new(Echo {
-            meeting: Barrier::new(1),
-        }),
-    );
+    assert_eq!(one.call("/echo", "self".into(), LONG).await.unwrap(), "self");
+    let taken = one.serve("/echo", add_type(), Arc::new(Echo { meeting: Barrier::new(1) }));
     assert!(matches!(taken.await, Err(BusError::AlreadyServed(_))));
     drop(guard);
     master.wait_until(|graph| graph.services.is_empty()).await;
@@ -75,10 +64,7 @@ async fn calls_are_answered_or_failed_with_the_servers_words() {
     assert!(matches!(gone, BusError::NoService(_)), "{gone}");
     // And served again.
     let _guard = serve(&one).await;
-    assert_eq!(
-        two.call("/echo", "back".into(), LONG).await.unwrap(),
-        "back"
-    );
+    assert_eq!(two.call("/echo", "back".into(), LONG).await.unwrap(), "back");
 }
 
 #[tokio::test]
@@ -93,17 +79,11 @@ async fn calls_run_at_the_same_time_and_end_in_time() {
     let late = two.call("/echo", "wait".into(), short).await.unwrap_err();
     assert!(matches!(late, BusError::Timeout { .. }), "{late}");
     // A late answer is not mistaken for the next call's.
-    assert_eq!(
-        two.call("/echo", "next".into(), LONG).await.unwrap(),
-        "next"
-    );
+    assert_eq!(two.call("/echo", "next".into(), LONG).await.unwrap(), "next");
 }
 
 /// A hand-made server: each connection is answered by the next of `scripts`.
-async fn scripted_server(
-    master: &TestMaster,
-    scripts: Vec<Script>,
-) -> (TestNode, Arc<AtomicUsize>) {
+async fn scripted_server(master: &TestMaster, scripts: Vec<Script>) -> (TestNode, Arc<AtomicUsize>) {
     let node = TestNode::start().await;
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let uri = format!("rosrpc://{}", listener.local_addr().unwrap());
@@ -203,13 +183,7 @@ async fn servers_that_misbehave_are_told_apart() {
         assert!(error.to_string().contains(wanted), "{wanted}: {error}");
     }
     // A server that is registered but not running.
-    let list = [
-        "/server",
-        "/gone",
-        "rosrpc://127.0.0.1:1",
-        "http://127.0.0.1:1/",
-    ]
-    .map(Value::from);
+    let list = ["/server", "/gone", "rosrpc://127.0.0.1:1", "http://127.0.0.1:1/"].map(Value::from);
     master.call("registerService", &list).await;
     let error = one.call("/gone", "x".into(), LONG).await.unwrap_err();
     assert!(error.to_string().contains("refused"), "{error}");
@@ -222,39 +196,23 @@ async fn callers_that_misbehave_are_refused_and_harm_nobody() {
     let _guard = serve(&one).await;
     let address: SocketAddr = ([127, 0, 0, 1], one.inner.port).into();
     for (fields, wanted) in [
-        (
-            Header::new([("service", "/echo"), ("md5sum", "0000")]),
-            "0000",
-        ),
-        (
-            Header::new([("service", "/none"), ("md5sum", "*")]),
-            "does not serve",
-        ),
-        (
-            Header::new([("topic", "/none"), ("md5sum", "*")]),
-            "does not publish",
-        ),
+        (Header::new([("service", "/echo"), ("md5sum", "0000")]), "0000"),
+        (Header::new([("service", "/none"), ("md5sum", "*")]), "does not serve"),
+        (Header::new([("topic", "/none"), ("md5sum", "*")]), "does not publish"),
         (Header::new([("callerid", "/x")]), "neither"),
     ] {
         let opened = tcpros::ServiceConnection::open(&HostSockets, address, &fields, 1000).await;
         let error = opened.unwrap_err().to_string();
         assert!(error.contains(wanted), "{wanted}: {error}");
     }
-    for garbage in [
-        &b"GET / HTTP/1.1\r\n\r\n"[..],
-        &[0xff; 64],
-        &[3, 0, 0, 0, 9, 9, 9],
-    ] {
+    for garbage in [&b"GET / HTTP/1.1\r\n\r\n"[..], &[0xff; 64], &[3, 0, 0, 0, 9, 9, 9]] {
         let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
         let _ = stream.write_all(garbage).await;
         let mut answer = Vec::new();
         let _ = tokio::io::AsyncReadExt::read_to_end(&mut stream, &mut answer).await;
         assert_eq!(answer, b"");
     }
-    assert_eq!(
-        two.call("/echo", "fine".into(), LONG).await.unwrap(),
-        "fine"
-    );
+    assert_eq!(two.call("/echo", "fine".into(), LONG).await.unwrap(), "fine");
 }
 
 #[tokio::test]
@@ -279,8 +237,5 @@ async fn two_that_serve_one_service_do_not_fight_for_it_for_ever() {
         _ => (second, "/one"),
     };
     drop(gone);
-    wait_for_graph(&three, |graph| {
-        graph.services.get("/echo").is_some_and(|node| node == left)
-    })
-    .await;
+    wait_for_graph(&three, |graph| graph.services.get("/echo").is_some_and(|node| node == left)).await;
 }

@@ -20,24 +20,14 @@ async fn messages_go_from_bus_to_bus_with_their_type() {
     publisher.publish(Bytes::from(vec![b'x'; 1_000_000]));
     publisher.publish("".into());
     let message = next(&mut subscription.messages).await;
-    assert_eq!(
-        (&message.bytes[..], message.publisher.node()),
-        (&b"a"[..], "/one")
-    );
+    assert_eq!((&message.bytes[..], message.publisher.node()), (&b"a"[..], "/one"));
     assert_eq!(*message.wire_type, text_type("992c"));
-    assert_eq!(
-        next(&mut subscription.messages).await.bytes.len(),
-        1_000_000
-    );
+    assert_eq!(next(&mut subscription.messages).await.bytes.len(), 1_000_000);
     assert_eq!(next(&mut subscription.messages).await.bytes.len(), 0);
     drop(publisher);
-    master
-        .wait_until(|graph| graph.topics["/chat"].publishers.is_empty())
-        .await;
+    master.wait_until(|graph| graph.topics["/chat"].publishers.is_empty()).await;
     drop(subscription);
-    master
-        .wait_until(|graph| graph.topics.is_empty() && graph.nodes.is_empty())
-        .await;
+    master.wait_until(|graph| graph.topics.is_empty() && graph.nodes.is_empty()).await;
 }
 
 #[tokio::test]
@@ -100,19 +90,13 @@ async fn every_latching_publisher_is_replayed_to_every_newcomer() {
     assert_eq!(heard, ["first", "second", "third"]);
     // A later local subscription shares the connections; the last message of each publisher is kept for it.
     let mut later = subscribe_text(&three, "/tf_static").await;
-    let mut again = [
-        next(&mut later.messages).await,
-        next(&mut later.messages).await,
-    ];
+    let mut again = [next(&mut later.messages).await, next(&mut later.messages).await];
     again.sort_by(|a, b| a.publisher.cmp(&b.publisher));
     assert_eq!(again[0].publisher.node(), "/one");
     assert_eq!(again[1].bytes, "third");
     // A publisher's latched message is dropped with the publisher.
     drop(third);
-    wait_for_graph(&three, |graph| {
-        graph.topics["/tf_static"].publishers == ["/one"]
-    })
-    .await;
+    wait_for_graph(&three, |graph| graph.topics["/tf_static"].publishers == ["/one"]).await;
     let released = async {
         while three.inner.subscriptions.lock()["/tf_static"].links().len() > 1 {
             tokio::task::yield_now().await;
@@ -134,19 +118,13 @@ async fn a_publisher_says_whom_it_sends_to() {
     let first = subscribe_text(&two, "/chat").await;
     wait_for_subscribers(&*publisher, 1).await;
     let before = two.reported_connections("/chat").await.unwrap();
-    assert_eq!(
-        before.iter().map(PeerId::node).collect::<Vec<_>>(),
-        ["/one"]
-    );
+    assert_eq!(before.iter().map(PeerId::node).collect::<Vec<_>>(), ["/one"]);
     drop(first);
     wait_for_subscribers(&*publisher, 0).await;
     let _second = subscribe_text(&two, "/chat").await;
     wait_for_subscribers(&*publisher, 1).await;
     let after = two.reported_connections("/chat").await.unwrap();
-    assert!(
-        after.len() == 1 && after != before,
-        "another connection: {after:?}"
-    );
+    assert!(after.len() == 1 && after != before, "another connection: {after:?}");
 }
 
 /// Proxies a node's XML-RPC server and counts the connections to it.
@@ -196,10 +174,7 @@ async fn local_subscriptions_share_one_connection() {
     publisher.publish("both".into());
     assert_eq!(next_text(&mut first.messages).await, "both");
     assert_eq!(next_text(&mut second.messages).await, "both");
-    assert_eq!(
-        publisher.matched_subscribers().borrow().connected_count(),
-        1
-    );
+    assert_eq!(publisher.matched_subscribers().borrow().connected_count(), 1);
     drop(first);
     publisher.publish("one".into());
     assert_eq!(next_text(&mut second.messages).await, "one");
@@ -236,16 +211,10 @@ async fn different_definitions_do_not_meet() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let publisher = advertise_text(&one, "/chat", false).await;
-    let mut wrong = two
-        .subscribe("/chat", text_type("0000"), QosProfile::keep_last(10))
-        .await
-        .unwrap();
+    let mut wrong = two.subscribe("/chat", text_type("0000"), QosProfile::keep_last(10)).await.unwrap();
     let direct = link::connect(&two.inner, "/chat", one.uri(), &text_type("0000")).await;
     let refusal = direct.err().unwrap().to_string();
-    assert!(
-        refusal.contains("992c") && refusal.contains("0000"),
-        "{refusal}"
-    );
+    assert!(refusal.contains("992c") && refusal.contains("0000"), "{refusal}");
     // Next to a subscription to any type, it still gets nothing of the other type.
     let mut right = subscribe_text(&two, "/chat").await;
     wait_for_subscribers(&*publisher, 1).await;
@@ -264,19 +233,11 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
     let error = two.topic_type("/chat").await.unwrap_err();
     assert!(matches!(error, BusError::NoTopic(_)), "{error}");
-    let subscription = one
-        .subscribe("/chat", text_type("992c"), QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let subscription = one.subscribe("/chat", text_type("992c"), QosProfile::keep_last(1)).await.unwrap();
     let asked = two.topic_type("/chat").await.unwrap();
-    assert_eq!(
-        (asked.name.as_str(), asked.digest.as_str()),
-        ("std_msgs/String", "992c")
-    );
+    assert_eq!((asked.name.as_str(), asked.digest.as_str()), ("std_msgs/String", "992c"));
     // Nothing of the query remains.
-    master
-        .wait_until(|graph| graph.topics["/chat"].publishers.is_empty())
-        .await;
+    master.wait_until(|graph| graph.topics["/chat"].publishers.is_empty()).await;
     drop(subscription);
     let publisher = advertise_text(&one, "/chat", false).await;
     assert_eq!(two.topic_type("/chat").await.unwrap(), text_type("992c"));
@@ -292,25 +253,12 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
 async fn whoever_was_asked_for_its_type_stays_for_what_is_advertised_next() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let _subscription = two
-        .subscribe("/chat", text_type("992c"), QosProfile::keep_last(1))
-        .await
-        .unwrap();
+    let _subscription = two.subscribe("/chat", text_type("992c"), QosProfile::keep_last(1)).await.unwrap();
     let mut asking = publications::ask_subscribers(&one.inner, "/chat");
-    let mut asked = tokio::net::TcpStream::connect(("127.0.0.1", one.inner.port))
-        .await
-        .unwrap();
-    let header = [
-        ("topic", "/chat"),
-        ("type", "std_msgs/String"),
-        ("md5sum", "992c"),
-        ("callerid", "/asked"),
-    ];
+    let mut asked = tokio::net::TcpStream::connect(("127.0.0.1", one.inner.port)).await.unwrap();
+    let header = [("topic", "/chat"), ("type", "std_msgs/String"), ("md5sum", "992c"), ("callerid", "/asked")];
     Header::new(header).write(&mut asked).await.unwrap();
-    assert_eq!(
-        asking.answers.recv().await.expect("asked").digest.as_str(),
-        "992c"
-    );
+    assert_eq!(asking.answers.recv().await.expect("asked").digest.as_str(), "992c");
     drop(asking);
     // Queried again, it answers again.
     let mut asking = publications::ask_subscribers(&one.inner, "/chat");
@@ -338,10 +286,7 @@ async fn a_master_that_forgot_is_told_again() {
     let master = TestMaster::start_at(Master::new(MasterOptions::default()), Some(address)).await;
     master
         .wait_until(|graph| {
-            graph
-                .topics
-                .get("/chat")
-                .is_some_and(|topic| topic.publishers == ["/one"] && topic.subscribers == ["/two"])
+            graph.topics.get("/chat").is_some_and(|topic| topic.publishers == ["/one"] && topic.subscribers == ["/two"])
         })
         .await;
     publisher.publish("still here".into());
@@ -360,9 +305,7 @@ async fn what_the_master_has_too_much_is_taken_back() {
     let one = join(&master, "/one").await;
     let list = ["/one", "/ghost", "a/B", one.uri()].map(Value::from);
     master.call("registerPublisher", &list).await;
-    master
-        .wait_until(|graph| !graph.topics.contains_key("/ghost"))
-        .await;
+    master.wait_until(|graph| !graph.topics.contains_key("/ghost")).await;
 }
 
 #[tokio::test]
@@ -382,9 +325,7 @@ async fn the_graph_follows_and_close_takes_everything_back() {
     wait_for_graph(&two, |graph| !graph.nodes.contains_key("/one")).await;
     assert!(own.messages.recv().await.is_none());
     publisher.publish("into the void".into());
-    let late = one
-        .subscribe("/chat", WireType::any(), QosProfile::keep_last(100))
-        .await;
+    let late = one.subscribe("/chat", WireType::any(), QosProfile::keep_last(100)).await;
     assert!(matches!(late, Err(BusError::Closed)));
 }
 
@@ -393,14 +334,8 @@ async fn parameters_are_read_and_written() {
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     let map = ParamValue::Map(
-        [
-            ("a".to_owned(), ParamValue::Double(0.5)),
-            (
-                "b".to_owned(),
-                ParamValue::List(vec![ParamValue::Bool(true)]),
-            ),
-        ]
-        .into(),
+        [("a".to_owned(), ParamValue::Double(0.5)), ("b".to_owned(), ParamValue::List(vec![ParamValue::Bool(true)]))]
+            .into(),
     );
     bus.set("/ns", map.clone()).await.unwrap();
     assert_eq!(bus.get("/ns").await.unwrap(), map);
@@ -423,11 +358,7 @@ async fn only_absolute_names_are_taken() {
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     for name in ["", "relative", "/a b", "~private", "/a//b"] {
-        let error = bus
-            .subscribe(name, WireType::any(), QosProfile::keep_last(100))
-            .await
-            .err()
-            .unwrap();
+        let error = bus.subscribe(name, WireType::any(), QosProfile::keep_last(100)).await.err().unwrap();
         assert!(matches!(error, BusError::BadName(_)), "{name}: {error}");
     }
     let sockets = Arc::new(HostSockets);

@@ -11,11 +11,7 @@ use crate::ros1::xmlrpc::Value;
 type Locked<'a> = parking_lot::MutexGuard<'a, crate::ros1::master::State>;
 
 impl Api {
-    pub(super) fn parameter(
-        &self,
-        method: &str,
-        args: &mut Args,
-    ) -> Option<Result<ApiReply, ApiReply>> {
+    pub(super) fn parameter(&self, method: &str, args: &mut Args) -> Option<Result<ApiReply, ApiReply>> {
         Some(match method {
             "setParam" => self.set_param(args),
             "getParam" => self.get_param(args),
@@ -111,10 +107,7 @@ impl Api {
         self.master.record_use(&mut state, &used, &node, false);
         Ok(match found {
             Some(found) => ApiReply::success(format!("Found [{found}]"), found),
-            None => ApiReply::error(
-                format!("Cannot find parameter [{key}] in an upwards search"),
-                "",
-            ),
+            None => ApiReply::error(format!("Cannot find parameter [{key}] in an upwards search"), ""),
         })
     }
 
@@ -125,9 +118,7 @@ impl Api {
         let master = &self.master;
         let value = master.update(|state, notices| {
             let by = (node.as_str(), api.as_str());
-            state
-                .registry
-                .register(Kind::Parameter, &key, "", by, "", notices)?;
+            state.registry.register(Kind::Parameter, &key, "", by, "", notices)?;
             master.record_use(state, &key, &node, false);
             Ok(state.params.get(&key).cloned())
         });
@@ -146,17 +137,10 @@ impl Api {
             let registry = &mut state.registry;
             registry.unregister(Kind::Parameter, &key, &node, &api, notices)
         });
-        Ok(ApiReply::success(
-            format!("Unsubscribe to parameter [{key}]"),
-            i32::from(held),
-        ))
+        Ok(ApiReply::success(format!("Unsubscribe to parameter [{key}]"), i32::from(held)))
     }
 }
 
 fn report(updates: Vec<(String, String, Value)>, notices: &mut Vec<Notice>) {
-    notices.extend(
-        updates
-            .into_iter()
-            .map(|(api, key, value)| Notice::parameter(api, key, value)),
-    );
+    notices.extend(updates.into_iter().map(|(api, key, value)| Notice::parameter(api, key, value)));
 }

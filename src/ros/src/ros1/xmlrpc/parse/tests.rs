@@ -2,8 +2,7 @@ use super::*;
 use crate::ros1::xmlrpc::{print_call, print_fault, print_response};
 
 fn value(xml: &str) -> Result<Value, Error> {
-    let document =
-        format!("<methodResponse><params><param>{xml}</param></params></methodResponse>");
+    let document = format!("<methodResponse><params><param>{xml}</param></params></methodResponse>");
     parse_response(document.as_bytes()).map(Result::unwrap)
 }
 
@@ -21,23 +20,14 @@ fn everything_printed_is_read_back() {
         ("double".to_owned(), Value::Double(1e-300)),
         ("infinite".to_owned(), Value::Double(f64::NEG_INFINITY)),
         ("bytes".to_owned(), Value::Base64(vec![0, 255, 7])),
-        (
-            "when".to_owned(),
-            Value::DateTime("20240101T00:00:00".into()),
-        ),
+        ("when".to_owned(), Value::DateTime("20240101T00:00:00".into())),
         ("nothing".to_owned(), Value::Nil),
         ("none".to_owned(), Value::Array(vec![])),
-        (
-            "list".to_owned(),
-            Value::Array(vec![Value::Struct(BTreeMap::new()), Value::Int(1)]),
-        ),
+        ("list".to_owned(), Value::Array(vec![Value::Struct(BTreeMap::new()), Value::Int(1)])),
         ("odd <name>".to_owned(), Value::Int(i32::MIN)),
     ]));
     let response = print_response(&all);
-    assert_eq!(
-        parse_response(response.as_bytes()).unwrap(),
-        Ok(all.clone())
-    );
+    assert_eq!(parse_response(response.as_bytes()).unwrap(), Ok(all.clone()));
     let call = print_call("a.b", &[all.clone(), Value::Int(1)]);
     let call = parse_call(call.as_bytes()).unwrap();
     assert_eq!((call.method.as_str(), &call.params[0]), ("a.b", &all));
@@ -59,8 +49,7 @@ fn what_no_xml_can_hold_spoils_nothing() {
 #[test]
 fn roscpp_is_understood() {
     // XmlRpcpp omits the type of strings and has its own line breaks.
-    let call =
-        b"<?xml version=\"1.0\"?>\r\n<methodCall><methodName>registerPublisher</methodName>\r\n\
+    let call = b"<?xml version=\"1.0\"?>\r\n<methodCall><methodName>registerPublisher</methodName>\r\n\
         <params><param><value>/node</value></param><param><value></value></param>\
         <param><value>a &lt;b&gt; &amp;&quot;&apos;</value></param>\
         <param><value><i4>7</i4></value></param></params></methodCall>\r\n";
@@ -82,10 +71,7 @@ fn python_is_understood() {
         </struct></value>\n</param>\n<param>\n<value><base64>\nAAEC\n</base64></value>\n</param>\n\
         <param>\n<value><nil/></value></param></params>\n</methodCall>\n";
     let params = parse_call(call).unwrap().params;
-    assert_eq!(
-        params[1],
-        Value::Array(vec![Value::Int(1), Value::Double(2.5)])
-    );
+    assert_eq!(params[1], Value::Array(vec![Value::Int(1), Value::Double(2.5)]));
     assert_eq!(params[2].get("k"), Some(&Value::Bool(true)));
     assert_eq!(params[3], Value::Base64(vec![0, 1, 2]));
     assert_eq!(params[4], Value::Nil);
@@ -100,15 +86,10 @@ fn odd_but_sound_xml_is_read() {
     assert_eq!(value("<value><string/></value>").unwrap(), Value::from(""));
     let empty = value("<value><array/></value>").unwrap();
     assert_eq!(empty, Value::Array(vec![]));
-    let commented =
-        "<value a='>'><!-- <int> --><string><![CDATA[<&]]>&#65;&#x42;&bad;</string ></value >";
+    let commented = "<value a='>'><!-- <int> --><string><![CDATA[<&]]>&#65;&#x42;&bad;</string ></value >";
     assert_eq!(value(commented).unwrap(), Value::from("<&AB&bad;"));
-    let latin =
-        b"<methodResponse><params><param><value>\xe4</value></param></params></methodResponse>";
-    assert_eq!(
-        parse_response(latin).unwrap().unwrap(),
-        Value::from("\u{fffd}")
-    );
+    let latin = b"<methodResponse><params><param><value>\xe4</value></param></params></methodResponse>";
+    assert_eq!(parse_response(latin).unwrap().unwrap(), Value::from("\u{fffd}"));
 }
 
 #[test]
@@ -124,14 +105,8 @@ fn broken_documents_are_refused_by_name() {
         ("<value>a<int>1</int></value>", "<int> where </value>"),
         ("<value><int>1</int>", "</param> where </value>"),
         ("<value><string>a</int></value>", "</int> where </string>"),
-        (
-            "<value><struct><member><value/></member></struct></value>",
-            "<name>",
-        ),
-        (
-            "<value><array><data><int>1</int></data></array></value>",
-            "<value>",
-        ),
+        ("<value><struct><member><value/></member></struct></value>", "<name>"),
+        ("<value><array><data><int>1</int></data></array></value>", "<value>"),
         ("<nothing/>", "<value>"),
         ("<value><string>", "</param>"),
         ("<value 'x", "tag"),
@@ -146,15 +121,9 @@ fn broken_documents_are_refused_by_name() {
         ("", "end of the document"),
         ("hello", "text where"),
         ("<html></html>", "<html>"),
-        (
-            "<methodCall><methodName> </methodName></methodCall>",
-            "empty",
-        ),
+        ("<methodCall><methodName> </methodName></methodCall>", "empty"),
         ("<methodCall><params/></methodCall>", "<methodName>"),
-        (
-            "<!DOCTYPE a [<!ENTITY b \"c\">]><methodCall/>",
-            "document type",
-        ),
+        ("<!DOCTYPE a [<!ENTITY b \"c\">]><methodCall/>", "document type"),
     ] {
         let reason = reason(parse_call(document.as_bytes()));
         assert!(reason.contains(wanted), "{document}: {reason}");
@@ -172,8 +141,6 @@ fn depth_and_number_are_limited() {
     assert!(reason(nested(MAX_DEPTH + 1)).contains("deep"));
     assert!(reason(nested(100_000)).contains("deep"));
     let many = "<value/>".repeat(MAX_ELEMENTS);
-    let many = value(&format!(
-        "<value><array><data>{many}</data></array></value>"
-    ));
+    let many = value(&format!("<value><array><data>{many}</data></array></value>"));
     assert!(reason(many).contains("values"));
 }

@@ -41,11 +41,7 @@ async fn start(limits: ServerLimits) -> Running {
 }
 
 fn small() -> ServerLimits {
-    ServerLimits {
-        body: 10_000,
-        transfer: LONG,
-        ..ServerLimits::default()
-    }
+    ServerLimits { body: 10_000, transfer: LONG, ..ServerLimits::default() }
 }
 
 fn client(address: SocketAddr) -> XmlRpcClient {
@@ -95,10 +91,7 @@ async fn a_long_call_does_not_hold_up_others() {
 async fn several_requests_of_one_connection_are_answered_in_order() {
     let server = start(ServerLimits::default()).await;
     let first = request("", &print_call("echo", &["first".into()]));
-    let last = request(
-        "Connection: close\r\n",
-        &print_call("echo", &["last".into()]),
-    );
+    let last = request("Connection: close\r\n", &print_call("echo", &["last".into()]));
     let answers = raw(&server, format!("{first}\r\n{last}").as_bytes()).await;
     let place = |text: &str| answers.find(text).expect(text);
     assert!(place("first") < place("last"));
@@ -109,10 +102,7 @@ async fn several_requests_of_one_connection_are_answered_in_order() {
 async fn clients_of_all_kinds_are_served() {
     let server = start(ServerLimits::default()).await;
     let body = print_call("echo", &["hello".into()]);
-    let old = format!(
-        "POST /RPC2 HTTP/1.0\r\ncontent-length:{}\r\n\r\n{body}",
-        body.len()
-    );
+    let old = format!("POST /RPC2 HTTP/1.0\r\ncontent-length:{}\r\n\r\n{body}", body.len());
     let expecting = request("Expect: 100-continue\r\nConnection: close\r\n", &body);
     let (start, end) = body.split_at(20);
     let chunked = format!(
@@ -132,11 +122,7 @@ async fn clients_of_all_kinds_are_served() {
 #[tokio::test]
 async fn bad_requests_are_refused_with_a_reason() {
     let server = start(small()).await;
-    let hasty = start(ServerLimits {
-        transfer: Duration::from_millis(50),
-        ..small()
-    })
-    .await;
+    let hasty = start(ServerLimits { transfer: Duration::from_millis(50), ..small() }).await;
     let many = "a: b\r\n".repeat(200);
     let post = "POST / HTTP/1.1\r\n";
     for (request, wanted) in [
@@ -146,14 +132,8 @@ async fn bad_requests_are_refused_with_a_reason() {
         (format!("{post}\r\n"), "411"),
         (format!("{post}Content-Length: -1\r\n\r\n"), "400"),
         (format!("{post}Content-Length: 10001\r\n\r\n"), "413"),
-        (
-            format!("{post}Transfer-Encoding: chunked\r\n\r\nffffffff\r\n"),
-            "413",
-        ),
-        (
-            format!("{post}Transfer-Encoding: chunked\r\n\r\nzz\r\n"),
-            "400",
-        ),
+        (format!("{post}Transfer-Encoding: chunked\r\n\r\nffffffff\r\n"), "413"),
+        (format!("{post}Transfer-Encoding: chunked\r\n\r\nzz\r\n"), "400"),
         (format!("{post}{many}\r\n"), "431"),
         (format!("POST /{}", "x".repeat(16_400)), "431"),
         // Slow: the rest never arrives.
@@ -175,28 +155,19 @@ async fn bad_requests_are_refused_with_a_reason() {
 async fn what_is_no_xml_rpc_is_answered_with_a_fault() {
     let server = start(small()).await;
     let answer = raw(&server, request("Connection: close\r\n", "{}").as_bytes()).await;
-    assert!(
-        answer.contains("<fault>") && answer.contains("malformed"),
-        "{answer}"
-    );
+    assert!(answer.contains("<fault>") && answer.contains("malformed"), "{answer}");
 }
 
 #[tokio::test]
 async fn an_idle_connection_is_closed_in_the_end() {
-    let limits = ServerLimits {
-        idle: Duration::from_millis(50),
-        ..small()
-    };
+    let limits = ServerLimits { idle: Duration::from_millis(50), ..small() };
     let server = start(limits).await;
     assert_eq!(raw(&server, b"").await, "");
 }
 
 #[tokio::test]
 async fn connections_beyond_the_limit_wait_their_turn() {
-    let limits = ServerLimits {
-        connections: 1,
-        ..ServerLimits::default()
-    };
+    let limits = ServerLimits { connections: 1, ..ServerLimits::default() };
     let server = start(limits).await;
     let first = client(server.address);
     first.call("echo", &[], LONG).await.unwrap();
@@ -214,10 +185,7 @@ async fn the_client_survives_a_connection_closed_between_calls() {
     let address = listener.local_addr().unwrap();
     let task = tokio::spawn(async move {
         let body = print_response(&Value::Int(1));
-        let answer = format!(
-            "HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}",
-            body.len()
-        );
+        let answer = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len());
         while let Ok((mut stream, _)) = listener.accept().await {
             let _ = stream.read(&mut [0; 4096]).await;
             let _ = stream.write_all(answer.as_bytes()).await;
@@ -250,18 +218,9 @@ async fn the_client_names_what_the_server_does_wrong() {
         ("", "end of file"),
         ("HTTP/1.1 404 Not Found\r\n\r\n", "404"),
         ("SSH-2.0-x\r\n\r\n", "SSH"),
-        (
-            "HTTP/1.1 200 OK\r\nContent-Length: 999999999999\r\n\r\n",
-            "over",
-        ),
-        (
-            "HTTP/1.1 200 OK\r\nContent-Length: 10\r\n\r\n<a",
-            "end of file",
-        ),
-        (
-            "HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>",
-            "malformed",
-        ),
+        ("HTTP/1.1 200 OK\r\nContent-Length: 999999999999\r\n\r\n", "over"),
+        ("HTTP/1.1 200 OK\r\nContent-Length: 10\r\n\r\n<a", "end of file"),
+        ("HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>", "malformed"),
     ] {
         let address = fixed_server(answer).await;
         let error = client(address).call("echo", &[], LONG).await.unwrap_err();
@@ -312,26 +271,15 @@ async fn a_server_that_hangs_costs_no_more_than_the_time_out() {
 
 #[tokio::test]
 async fn who_waits_for_memory_in_vain_is_told_so() {
-    let limits = ServerLimits {
-        body: 1 << 20,
-        budget: Budget::new("XML-RPC", 1 << 20),
-        ..small()
-    };
+    let limits = ServerLimits { body: 1 << 20, budget: Budget::new("XML-RPC", 1 << 20), ..small() };
     let held = limits.budget.take(1 << 20).unwrap();
-    let hasty = ServerLimits {
-        transfer: Duration::from_millis(200),
-        ..limits.clone()
-    };
+    let hasty = ServerLimits { transfer: Duration::from_millis(200), ..limits.clone() };
     let (server, hasty) = (start(limits).await, start(hasty).await);
     let answer = raw(&hasty, request("", &"x".repeat(200_000)).as_bytes()).await;
     let status = answer.split_whitespace().nth(1);
     assert_eq!(status, Some("503"), "{answer}");
     assert!(answer.contains("the memory for XML-RPC"), "{answer}");
     drop(held);
-    let answer = raw(
-        &server,
-        request("Connection: close\r\n", &"x".repeat(200_000)).as_bytes(),
-    )
-    .await;
+    let answer = raw(&server, request("Connection: close\r\n", &"x".repeat(200_000)).as_bytes()).await;
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
 }

@@ -68,14 +68,7 @@ struct GoalEntry {
 
 impl GoalTable {
     pub(super) fn new(budget: Budget) -> Self {
-        Self {
-            known: HashMap::new(),
-            ended: VecDeque::new(),
-            kept_bytes: 0,
-            budget,
-            begun: 0,
-            closed: false,
-        }
+        Self { known: HashMap::new(), ended: VecDeque::new(), kept_bytes: 0, budget, begun: 0, closed: false }
     }
 
     /// Adds a goal, unless there is no room for it.
@@ -112,12 +105,8 @@ impl GoalTable {
     /// Marks a goal as executing. It may have ended already.
     pub(super) fn set_executing(&mut self, id: GoalId) {
         let known = self.known.get_mut(&id);
-        let waits = |known: &&mut GoalEntry| {
-            matches!(
-                known.status,
-                ActionGoalStatus::Unknown | ActionGoalStatus::Accepted
-            )
-        };
+        let waits =
+            |known: &&mut GoalEntry| matches!(known.status, ActionGoalStatus::Unknown | ActionGoalStatus::Accepted);
         if let Some(known) = known.filter(waits) {
             known.status = ActionGoalStatus::Executing;
         }
@@ -148,21 +137,13 @@ impl GoalTable {
     }
 
     /// Ends a goal; returns false if no goal with this id is active.
-    pub(super) fn end(
-        &mut self,
-        id: GoalId,
-        status: ActionGoalStatus,
-        answer: Bytes,
-        now: Instant,
-    ) -> bool {
+    pub(super) fn end(&mut self, id: GoalId, status: ActionGoalStatus, answer: Bytes, now: Instant) -> bool {
         if !self.is_under_way(id) {
             return false;
         }
         let size = answer.len();
         self.kept_bytes += size;
-        while self.ended.len() >= MAX_KEPT
-            || (self.kept_bytes > MAX_KEPT_BYTES && !self.ended.is_empty())
-        {
+        while self.ended.len() >= MAX_KEPT || (self.kept_bytes > MAX_KEPT_BYTES && !self.ended.is_empty()) {
             self.remove_oldest();
         }
         let mut permit = self.budget.take(size);
@@ -226,16 +207,10 @@ impl GoalTable {
     /// Marks a goal as cancelling; returns false if it has ended or was asked before.
     pub(super) fn set_canceling(&mut self, id: GoalId) -> bool {
         let known = self.known.get_mut(&id);
-        let goes_on = |known: &&mut GoalEntry| {
-            matches!(
-                known.status,
-                ActionGoalStatus::Accepted | ActionGoalStatus::Executing
-            )
-        };
+        let goes_on =
+            |known: &&mut GoalEntry| matches!(known.status, ActionGoalStatus::Accepted | ActionGoalStatus::Executing);
         let known = known.filter(goes_on);
-        known
-            .map(|known| known.status = ActionGoalStatus::Canceling)
-            .is_some()
+        known.map(|known| known.status = ActionGoalStatus::Canceling).is_some()
     }
 
     /// Returns the statuses of all accepted goals, the oldest first.
@@ -277,10 +252,7 @@ impl GoalTable {
 
 impl GoalEntry {
     fn info(&self, id: GoalId) -> GoalInfo {
-        GoalInfo {
-            id,
-            stamp: self.accepted,
-        }
+        GoalInfo { id, stamp: self.accepted }
     }
 }
 
@@ -311,19 +283,12 @@ mod tests {
     }
 
     fn end(goals: &mut GoalTable, number: u8, now: Instant) -> bool {
-        goals.end(
-            id(number),
-            ActionGoalStatus::Succeeded,
-            Bytes::from_static(b"result"),
-            now,
-        )
+        goals.end(id(number), ActionGoalStatus::Succeeded, Bytes::from_static(b"result"), now)
     }
 
     fn status_list(goals: &GoalTable) -> Vec<(u8, ActionGoalStatus)> {
         let statuses = goals.statuses().into_iter();
-        statuses
-            .map(|(info, status)| (info.id.0[0], status))
-            .collect()
+        statuses.map(|(info, status)| (info.id.0[0], status)).collect()
     }
 
     #[track_caller]
@@ -334,9 +299,7 @@ mod tests {
         let wanted = GoalInfo { id, stamp };
         let concerned = |goals: &GoalTable| -> Vec<(u8, bool)> {
             let concerned = goals.matching_goals(wanted).into_iter();
-            concerned
-                .map(|(info, before)| (info.id.0[0], before))
-                .collect()
+            concerned.map(|(info, before)| (info.id.0[0], before)).collect()
         };
         let all = |before| expected.iter().map(|number| (*number, before)).collect();
         let first: Vec<(u8, bool)> = all(false);
@@ -379,21 +342,12 @@ mod tests {
         assert_eq!(early.borrow().as_deref(), Some(&b"result"[..]));
         let late = goals.subscribe_result(id(1)).unwrap();
         assert_eq!(late.borrow().as_deref(), Some(&b"result"[..]));
-        assert_eq!(
-            status_list(&goals),
-            [
-                (1, ActionGoalStatus::Succeeded),
-                (2, ActionGoalStatus::Executing)
-            ]
-        );
+        assert_eq!(status_list(&goals), [(1, ActionGoalStatus::Succeeded), (2, ActionGoalStatus::Executing)]);
         assert_eq!(goals.next_expiry(), Some(now + KEPT));
         assert!(!goals.expire(now));
         assert!(goals.expire(now + KEPT));
         assert!(goals.subscribe_result(id(1)).is_none());
-        assert_eq!(
-            (status_list(&goals), goals.next_expiry()),
-            (vec![(2, ActionGoalStatus::Executing)], None)
-        );
+        assert_eq!((status_list(&goals), goals.next_expiry()), (vec![(2, ActionGoalStatus::Executing)], None));
         assert_eq!(goals.under_way(), [id(2)]);
     }
 
@@ -402,10 +356,7 @@ mod tests {
         let (mut goals, now) = (executing_goals(3), Instant::now());
         let large = Bytes::from(vec![0; MAX_KEPT_BYTES]);
         assert!(goals.end(id(1), ActionGoalStatus::Aborted, large.clone(), now));
-        assert!(
-            goals.subscribe_result(id(1)).is_some(),
-            "the last one is kept"
-        );
+        assert!(goals.subscribe_result(id(1)).is_some(), "the last one is kept");
         assert!(goals.end(id(2), ActionGoalStatus::Aborted, large, now));
         assert!(goals.subscribe_result(id(1)).is_none());
         assert!(end(&mut goals, 3, now));
@@ -415,12 +366,7 @@ mod tests {
             let mut bytes = [7; 16];
             bytes[..8].copy_from_slice(&number.to_le_bytes());
             goals.begin(GoalId(bytes), time_at(1)).unwrap();
-            assert!(goals.end(
-                GoalId(bytes),
-                ActionGoalStatus::Succeeded,
-                Bytes::new(),
-                now
-            ));
+            assert!(goals.end(GoalId(bytes), ActionGoalStatus::Succeeded, Bytes::new(), now));
         }
         assert_eq!(goals.known.len(), MAX_KEPT);
     }
@@ -461,23 +407,11 @@ mod tests {
         goals.begin(id(2), time_at(2)).unwrap();
         goals.set_accepted(id(2));
         goals.set_accepted(id(1));
-        let statuses = [
-            (1, ActionGoalStatus::Executing),
-            (2, ActionGoalStatus::Accepted),
-        ];
+        let statuses = [(1, ActionGoalStatus::Executing), (2, ActionGoalStatus::Accepted)];
         assert_eq!(status_list(&goals), statuses);
-        assert!(
-            !goals.remove_rejected(id(2)),
-            "its sender was told otherwise"
-        );
+        assert!(!goals.remove_rejected(id(2)), "its sender was told otherwise");
         goals.set_executing(id(2));
-        assert_eq!(
-            status_list(&goals),
-            [
-                (1, ActionGoalStatus::Executing),
-                (2, ActionGoalStatus::Executing)
-            ]
-        );
+        assert_eq!(status_list(&goals), [(1, ActionGoalStatus::Executing), (2, ActionGoalStatus::Executing)]);
     }
 
     #[test]

@@ -22,11 +22,7 @@ impl RetiredGuard {
         drop(actions);
         // Dropping it takes locks of its own.
         drop(before);
-        Self {
-            bus: bus.clone(),
-            action: action.to_owned(),
-            number,
-        }
+        Self { bus: bus.clone(), action: action.to_owned(), number }
     }
 }
 

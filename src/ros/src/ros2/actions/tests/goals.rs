@@ -20,9 +20,7 @@ const UUID: &str = "00112233-4455-6677-8899-aabbccddeeff";
 
 async fn next<T>(events: &mut UnboundedReceiver<T>) -> T {
     let event = timeout(LONG, events.recv()).await;
-    event
-        .expect("something happens in time")
-        .expect("its sender is there")
+    event.expect("something happens in time").expect("its sender is there")
 }
 
 fn goal() -> Bytes {
@@ -34,11 +32,7 @@ fn sequence(json: &str) -> Bytes {
 }
 
 fn end(outcome: GoalOutcome, result: Bytes) -> GoalEnd {
-    GoalEnd {
-        outcome,
-        text: String::new(),
-        result,
-    }
+    GoalEnd { outcome, text: String::new(), result }
 }
 
 async fn client(bus: &Ros2Bus) -> Box<dyn ActionClient> {
@@ -49,10 +43,7 @@ async fn client(bus: &Ros2Bus) -> Box<dyn ActionClient> {
 
 fn serve(bus: &Ros2Bus, takes: bool) -> (Box<dyn ActionServer>, UnboundedReceiver<Heard>) {
     let (handler, heard) = Handler::new(takes);
-    (
-        bus.serve_action("/fib", &fibonacci(), handler).unwrap(),
-        heard,
-    )
+    (bus.serve_action("/fib", &fibonacci(), handler).unwrap(), heard)
 }
 
 fn send(client: &dyn ActionClient, id: &str) -> UnboundedReceiver<Told> {
@@ -102,10 +93,7 @@ async fn goals_pass(using: &Ros2Bus, serving: &Ros2Bus) {
     let mut told = send(&*client, "third");
     let id = next_goal_id(&mut heard).await;
     let mut twice = send(&*client, "third");
-    assert!(
-        matches!(next(&mut twice).await, Told::Ended(Err(_))),
-        "it is under way"
-    );
+    assert!(matches!(next(&mut twice).await, Told::Ended(Err(_))), "it is under way");
     // No result at all, and one of the wrong type.
     assert!(server.end_goal(&id, end(GoalOutcome::Aborted, Bytes::new())));
     let nothing = Bytes::from(default_message(&fibonacci().result));
@@ -146,10 +134,7 @@ async fn a_goal_that_is_not_taken_was_rejected() {
         client.send_goal("goal", Bytes::from_static(&[0, 1, 0, 0]), events);
         told
     };
-    assert!(
-        matches!(next(&mut told).await, Told::Ended(Err(_))),
-        "it is no goal"
-    );
+    assert!(matches!(next(&mut told).await, Told::Ended(Err(_))), "it is no goal");
 }
 
 #[tokio::test]
@@ -228,11 +213,7 @@ async fn another_server_takes_over_from_one_whose_results_nobody_has_asked_for()
     let (_server, mut heard) = serve(&two, true);
     client.wait_for_server(LONG).await.unwrap();
     let _told = send(&*client, UUID);
-    assert_eq!(
-        next_goal_id(&mut heard).await,
-        UUID,
-        "it knows nothing of the first one"
-    );
+    assert_eq!(next_goal_id(&mut heard).await, UUID, "it knows nothing of the first one");
 }
 
 #[tokio::test]
@@ -267,11 +248,7 @@ async fn goals_end_with_the_bus_that_has_sent_them() {
 
 #[tokio::test]
 async fn several_clients_hear_of_their_own_goals_only() {
-    let (one, two, three) = (
-        join(78, "/one").await,
-        join(78, "/two").await,
-        join(78, "/three").await,
-    );
+    let (one, two, three) = (join(78, "/one").await, join(78, "/two").await, join(78, "/three").await);
     let (server, mut heard) = serve(&three, true);
     let (first, second) = (client(&one).await, client(&two).await);
     let mut of_first = send(&*first, "same");
@@ -301,10 +278,7 @@ async fn a_result_is_there_for_who_asks_late_and_statuses_for_who_comes_late() {
     let of = fibonacci();
     let result = async |id: &str| {
         let request = messages::write_id(GoalId::parse(id).unwrap());
-        let answer = one
-            .call("/fib/_action/get_result", request, LONG)
-            .await
-            .unwrap();
+        let answer = one.call("/fib/_action/get_result", request, LONG).await.unwrap();
         messages::read_result(&of.result, &answer).unwrap()
     };
     let succeeded = Some(messages::ActionGoalStatus::Succeeded);
@@ -315,17 +289,11 @@ async fn a_result_is_there_for_who_asks_late_and_statuses_for_who_comes_late() {
     let list = interfaces::message("action_msgs/msg/GoalStatusArray").unwrap();
     let qos = QosProfile::keep_last(1).latching(true);
     let status = "/fib/_action/status";
-    let mut late = one
-        .subscribe(status, WireType::from_message(&list), qos)
-        .await
-        .unwrap();
+    let mut late = one.subscribe(status, WireType::from_message(&list), qos).await.unwrap();
     let message = timeout(LONG, late.messages.recv()).await.unwrap().unwrap();
     let mut json = Vec::new();
     to_json(&list, &message.bytes, &mut json, &JsonOptions::default()).unwrap();
     let json = String::from_utf8(json).unwrap();
-    assert!(
-        json.contains(r#""uuid":"ABEiM0RVZneImaq7zN3u/w==""#),
-        "{json}"
-    );
+    assert!(json.contains(r#""uuid":"ABEiM0RVZneImaq7zN3u/w==""#), "{json}");
     assert!(json.ends_with(r#""status":4}]}"#), "{json}");
 }

@@ -9,10 +9,7 @@ use crate::schema::{MessageType, Registry};
 
 const ID: GoalId = GoalId([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]);
 const ID_JSON: &str = r#""goal_id":{"uuid":"AQIDBAUGBwgJCgsMDQ4PEA=="}"#;
-const INFO: GoalInfo = GoalInfo {
-    id: ID,
-    stamp: Time { secs: 7, nsecs: 8 },
-};
+const INFO: GoalInfo = GoalInfo { id: ID, stamp: Time { secs: 7, nsecs: 8 } };
 
 fn info_json() -> String {
     format!(r#"{{{ID_JSON},"stamp":{{"sec":7,"nanosec":8}}}}"#)
@@ -52,10 +49,7 @@ fn goals_and_feedback_stand_behind_their_id() {
 fn results_stand_behind_a_status_however_they_are_aligned() {
     for (text, json) in [
         ("float64 wide\nbool b", r#"{"wide":0.5,"b":true}"#),
-        (
-            "int32 order\nfloat64 wide\nstring name\nint64[] all",
-            r#"{"order":5,"wide":0.5,"name":"abc","all":[1,2]}"#,
-        ),
+        ("int32 order\nfloat64 wide\nstring name\nint64[] all", r#"{"order":5,"wide":0.5,"name":"abc","all":[1,2]}"#),
         (
             "bool b\nint16 c\nfloat64[2] d\nbuiltin_interfaces/Time[] times\nint64 last",
             r#"{"b":true,"c":3,"d":[1.0,2.0],"times":[{"sec":1,"nanosec":2}],"last":-1}"#,
@@ -106,32 +100,18 @@ fn answers_to_goals_and_to_who_cancels_are_read_as_they_are_written() {
     let refused = write_accepted(false, Time::default());
     assert_eq!(read_accepted(&refused), Some(false));
     assert_eq!(read_accepted(&refused[..4]), None);
-    assert_encoded(
-        &services.get_result.request,
-        &write_id(ID),
-        &format!("{{{ID_JSON}}}"),
-    );
+    assert_encoded(&services.get_result.request, &write_id(ID), &format!("{{{ID_JSON}}}"));
 
     let known = Registry::for_version(RosVersion::Two);
     let cancel = known.service("action_msgs/CancelGoal").unwrap();
     let asked = write_cancel(INFO);
-    assert_encoded(
-        &cancel.request,
-        &asked,
-        &format!(r#"{{"goal_info":{}}}"#, info_json()),
-    );
+    assert_encoded(&cancel.request, &asked, &format!(r#"{{"goal_info":{}}}"#, info_json()));
     assert_eq!(read_cancel(&asked), Some(INFO));
     assert_eq!(read_cancel(&asked[..27]), None);
-    let other = GoalInfo {
-        id: GoalId([3; 16]),
-        ..INFO
-    };
+    let other = GoalInfo { id: GoalId([3; 16]), ..INFO };
     let answer = write_cancelled(CancelCode::None, &[other, INFO]);
     let other = info_json().replace("AQIDBAUGBwgJCgsMDQ4PEA==", "AwMDAwMDAwMDAwMDAwMDAw==");
-    let json = format!(
-        r#"{{"return_code":0,"goals_canceling":[{other},{}]}}"#,
-        info_json()
-    );
+    let json = format!(r#"{{"return_code":0,"goals_canceling":[{other},{}]}}"#, info_json());
     assert_encoded(&cancel.response, &answer, &json);
     assert_eq!(read_cancelled(&answer, ID), Some(Ok(())));
     assert_eq!(read_cancelled(&answer, GoalId([4; 16])), Some(Err(0)));

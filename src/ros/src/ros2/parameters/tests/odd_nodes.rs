@@ -36,9 +36,7 @@ async fn odd(
     let of = interfaces::service(&format!("rcl_interfaces/srv/{of}")).unwrap();
     let answer = Box::new(answer);
     let handler = Arc::new(Says { answer, request });
-    bus.serve(&format!("/odd/{part}"), of, handler)
-        .await
-        .unwrap()
+    bus.serve(&format!("/odd/{part}"), of, handler).await.unwrap()
 }
 
 fn response(of: &str, json: &str) -> Bytes {
@@ -84,12 +82,9 @@ async fn answers_that_are_torn_or_too_few_are_the_nodes_fault() {
             response("SetParameters", r#"{"results":[{"successful":true}]}"#)
         })
         .await,
-        odd(
-            &bus,
-            "set_parameters_atomically",
-            "SetParametersAtomically",
-            |_| response("SetParametersAtomically", "{}"),
-        )
+        odd(&bus, "set_parameters_atomically", "SetParametersAtomically", |_| {
+            response("SetParametersAtomically", "{}")
+        })
         .await,
     );
     let some = names(&["a"]);
@@ -107,39 +102,22 @@ async fn answers_that_are_torn_or_too_few_are_the_nodes_fault() {
     let both = vec![change("a"), change("b")];
     broken(bus.set("/odd", both).await.unwrap_err());
     assert_eq!(bus.set("/odd", vec![change("a")]).await.unwrap(), [Ok(())]);
-    let refused = bus
-        .set_atomically("/odd", vec![change("a")])
-        .await
-        .unwrap_err();
-    assert_eq!(
-        refused.to_string(),
-        "service /odd/set_parameters_atomically failed: the node does not say why"
-    );
+    let refused = bus.set_atomically("/odd", vec![change("a")]).await.unwrap_err();
+    assert_eq!(refused.to_string(), "service /odd/set_parameters_atomically failed: the node does not say why");
 }
 
 #[tokio::test]
 async fn what_cannot_be_sent_is_not_and_the_rest_is() {
     let bus = join(83, "/asker").await;
     let _node = (
-        odd(
-            &bus,
-            "get_parameter_types",
-            "GetParameterTypes",
-            |request| {
-                assert_eq!(request, r#"{"names":["list","rate"]}"#);
-                response("GetParameterTypes", r#"{"types":[0,3]}"#)
-            },
-        )
+        odd(&bus, "get_parameter_types", "GetParameterTypes", |request| {
+            assert_eq!(request, r#"{"names":["list","rate"]}"#);
+            response("GetParameterTypes", r#"{"types":[0,3]}"#)
+        })
         .await,
         odd(&bus, "set_parameters", "SetParameters", |request| {
-            assert!(
-                request.contains(r#""name":"rate","value":{"type":3,"#),
-                "{request}"
-            );
-            assert!(
-                request.contains(r#""name":"gone","value":{"type":0,"#),
-                "{request}"
-            );
+            assert!(request.contains(r#""name":"rate","value":{"type":3,"#), "{request}");
+            assert!(request.contains(r#""name":"gone","value":{"type":0,"#), "{request}");
             assert!(!request.contains("list"), "{request}");
             let json = r#"{"results":[{"reason":"no"},{"successful":true}]}"#;
             response("SetParameters", json)

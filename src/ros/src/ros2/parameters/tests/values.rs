@@ -41,46 +41,20 @@ fn each_kind_is_written_and_read_as_its_definition_has_it() {
         (int(large), "integer_value", "9223372036854775806"),
         (ParamValue::Double(-0.5), "double_value", "-0.5"),
         (text("gütig"), "string_value", "\"gütig\""),
-        (
-            ParamValue::Binary(vec![1, 2, 255]),
-            "byte_array_value",
-            "\"AQL/\"",
-        ),
-        (
-            list([ParamValue::Bool(true), ParamValue::Bool(false)]),
-            "bool_array_value",
-            "[true,false]",
-        ),
-        (
-            list([int(-1), int(large)]),
-            "integer_array_value",
-            "[-1,9223372036854775806]",
-        ),
-        (
-            list([ParamValue::Double(0.25), ParamValue::Double(2.0)]),
-            "double_array_value",
-            "[0.25,2.0]",
-        ),
-        (
-            list([text(""), text("abc")]),
-            "string_array_value",
-            r#"["","abc"]"#,
-        ),
+        (ParamValue::Binary(vec![1, 2, 255]), "byte_array_value", "\"AQL/\""),
+        (list([ParamValue::Bool(true), ParamValue::Bool(false)]), "bool_array_value", "[true,false]"),
+        (list([int(-1), int(large)]), "integer_array_value", "[-1,9223372036854775806]"),
+        (list([ParamValue::Double(0.25), ParamValue::Double(2.0)]), "double_array_value", "[0.25,2.0]"),
+        (list([text(""), text("abc")]), "string_array_value", r#"["","abc"]"#),
     ] {
         let mut put = CdrWriter::new();
-        write(
-            &coerce(value.clone(), ParameterKind::NotSet).unwrap(),
-            &mut put,
-        );
+        write(&coerce(value.clone(), ParameterKind::NotSet).unwrap(), &mut put);
         let written = put.finish();
         let of = value_type();
         let mut printed = Vec::new();
         to_json(&of, &written, &mut printed, &JsonOptions::default()).unwrap();
         let printed = String::from_utf8(printed).unwrap();
-        assert!(
-            printed.contains(&format!("\"{field}\":{json}")),
-            "{printed}"
-        );
+        assert!(printed.contains(&format!("\"{field}\":{json}")), "{printed}");
         assert_eq!(written, cdr(&of, &printed), "{field}");
         assert_eq!(read_value(&written), Some(Some(value)), "{field}");
         for end in 0..written.len() {
@@ -117,69 +91,24 @@ fn a_value_becomes_one_of_the_parameters_kind_where_nothing_is_lost() {
         (int(exact), Kind::Double, TypedValue::Double(exact as f64)),
         (int(exact + 1), Kind::Double, TypedValue::Integer(exact + 1)),
         (int(1), Kind::NotSet, TypedValue::Integer(1)),
-        (
-            ParamValue::Double(2.0),
-            Kind::Integer,
-            TypedValue::Integer(2),
-        ),
-        (
-            ParamValue::Double(2.5),
-            Kind::Integer,
-            TypedValue::Double(2.5),
-        ),
+        (ParamValue::Double(2.0), Kind::Integer, TypedValue::Integer(2)),
+        (ParamValue::Double(2.5), Kind::Integer, TypedValue::Double(2.5)),
         (text("AQI="), Kind::Bytes, TypedValue::Bytes(vec![1, 2])),
         (text("A"), Kind::Bytes, TypedValue::String("A".to_owned())),
-        (
-            text("AQI="),
-            Kind::String,
-            TypedValue::String("AQI=".to_owned()),
-        ),
-        (
-            list([int(1), int(2)]),
-            Kind::Doubles,
-            TypedValue::Doubles(vec![1.0, 2.0]),
-        ),
-        (
-            list([int(1), int(2)]),
-            Kind::Bytes,
-            TypedValue::Bytes(vec![1, 2]),
-        ),
-        (
-            list([int(1), int(256)]),
-            Kind::Bytes,
-            TypedValue::Integers(vec![1, 256]),
-        ),
-        (
-            list([int(1), ParamValue::Double(2.0)]),
-            Kind::Integers,
-            TypedValue::Integers(vec![1, 2]),
-        ),
-        (
-            list([int(1), ParamValue::Double(2.0)]),
-            Kind::NotSet,
-            TypedValue::Doubles(vec![1.0, 2.0]),
-        ),
+        (text("AQI="), Kind::String, TypedValue::String("AQI=".to_owned())),
+        (list([int(1), int(2)]), Kind::Doubles, TypedValue::Doubles(vec![1.0, 2.0])),
+        (list([int(1), int(2)]), Kind::Bytes, TypedValue::Bytes(vec![1, 2])),
+        (list([int(1), int(256)]), Kind::Bytes, TypedValue::Integers(vec![1, 256])),
+        (list([int(1), ParamValue::Double(2.0)]), Kind::Integers, TypedValue::Integers(vec![1, 2])),
+        (list([int(1), ParamValue::Double(2.0)]), Kind::NotSet, TypedValue::Doubles(vec![1.0, 2.0])),
         (list([]), Kind::Strings, TypedValue::Strings(vec![])),
         (list([]), Kind::Bools, TypedValue::Bools(vec![])),
-        (
-            list([text("a")]),
-            Kind::Bools,
-            TypedValue::Strings(vec!["a".to_owned()]),
-        ),
+        (list([text("a")]), Kind::Bools, TypedValue::Strings(vec!["a".to_owned()])),
         (ParamValue::Nil, Kind::Bool, TypedValue::NotSet),
     ] {
-        assert_eq!(
-            coerce(value.clone(), kind),
-            Ok(expected),
-            "{value:?} {kind:?}"
-        );
+        assert_eq!(coerce(value.clone(), kind), Ok(expected), "{value:?} {kind:?}");
     }
-    for value in [
-        list([]),
-        list([int(1), text("a")]),
-        list([list([])]),
-        ParamValue::Map(Default::default()),
-    ] {
+    for value in [list([]), list([int(1), text("a")]), list([list([])]), ParamValue::Map(Default::default())] {
         assert!(coerce(value.clone(), Kind::NotSet).is_err(), "{value:?}");
     }
     assert!(coerce(list([]), Kind::Double).is_err());
@@ -197,10 +126,7 @@ fn what_a_stranger_sends_is_bounded() {
         bytes.resize(bytes.len() + count + 64, 0);
         read_value(&bytes)
     };
-    assert_eq!(
-        many(3),
-        Some(Some(list([false, false, false].map(ParamValue::Bool))))
-    );
+    assert_eq!(many(3), Some(Some(list([false, false, false].map(ParamValue::Bool)))));
     assert!(many(1 << 20).is_some());
     assert!(many((1 << 20) + 1).is_none());
     assert!(ParameterReader::new(&vec![0; (16 << 20) + 1]).is_none());

@@ -63,9 +63,7 @@ impl<'a> Tokens<'a> {
             byte.is_ascii_alphanumeric()
                 || byte == '_'
                 || (is_number && byte == '.')
-                || (is_number
-                    && matches!(byte, '-' | '+')
-                    && matches!(before, None | Some('e' | 'E')))
+                || (is_number && matches!(byte, '-' | '+') && matches!(before, None | Some('e' | 'E')))
         };
         let end = rest.char_indices().find(|it| !in_word(*it));
         let end = end.map_or(rest.len(), |(at, _)| at);
@@ -87,23 +85,18 @@ impl<'a> Tokens<'a> {
     pub(super) fn expect(&mut self, mark: char) -> Result<(), IdlError> {
         match self.next()? {
             Some(IdlToken::Mark(found)) if found == mark => Ok(()),
-            other => Err(IdlError::MissingMark {
-                expected: mark,
-                found: IdlToken::describe(other),
-            }),
+            other => Err(IdlError::MissingMark { expected: mark, found: IdlToken::describe(other) }),
         }
     }
 
     /// Skips the mark if it follows.
     pub(super) fn skip(&mut self, mark: char) -> Result<bool, IdlError> {
-        self.skip_if(|token| *token == IdlToken::Mark(mark))
-            .map(|skipped| skipped.is_some())
+        self.skip_if(|token| *token == IdlToken::Mark(mark)).map(|skipped| skipped.is_some())
     }
 
     /// Skips the word if it follows.
     pub(super) fn skip_word(&mut self, word: &str) -> Result<bool, IdlError> {
-        self.skip_if(|token| *token == IdlToken::Word(word))
-            .map(|skipped| skipped.is_some())
+        self.skip_if(|token| *token == IdlToken::Word(word)).map(|skipped| skipped.is_some())
     }
 
     /// Skips and returns a text if one follows.
@@ -115,10 +108,7 @@ impl<'a> Tokens<'a> {
         })
     }
 
-    fn skip_if(
-        &mut self,
-        is: impl Fn(&IdlToken<'_>) -> bool,
-    ) -> Result<Option<IdlToken<'a>>, IdlError> {
+    fn skip_if(&mut self, is: impl Fn(&IdlToken<'_>) -> bool) -> Result<Option<IdlToken<'a>>, IdlError> {
         let before = self.at;
         match self.next()? {
             Some(token) if is(&token) => Ok(Some(token)),
