@@ -7,6 +7,7 @@ use std::process::ExitCode;
 
 use anyhow::{Result, ensure};
 use clap::{Parser, Subcommand};
+use support::claim;
 use support::daemon::DaemonSetup;
 
 use eval::cells::RunCache;
@@ -214,7 +215,7 @@ fn evaluate(arguments: &EvalArguments) -> Result<bool> {
         eprintln!("left by an evaluation before: {line}");
     }
     let place = tempfile::Builder::new().prefix(sweep::PREFIX).tempdir()?;
-    sweep::claim(place.path())?;
+    claim::claim(place.path())?;
     let daemon = DaemonSetup::new(&place.path().join("home")).start()?;
     let workshop = EvalFixtures::new(&daemon, place.path());
     let sections = match &arguments.verb {

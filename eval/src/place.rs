@@ -15,12 +15,12 @@ use serde::{Deserialize, Serialize};
 use servant::cgroup::{Cgroup, CgroupParent};
 use servant::container::{ContainerSpec, Profile};
 use servant::spec::{Limits, Size};
-use support::cable::Cable;
+use support::cable::{self, Cable};
 
+use crate::deadline;
 pub use crate::network::NetworkProfile;
 use crate::robot::RobotPlan;
 use crate::trace::Trace;
-use crate::{deadline, sweep};
 
 /// Maximum time for the kernel to end the processes of a sandbox.
 const END: Duration = Duration::from_secs(20);
@@ -217,32 +217,16 @@ pub fn remove_abandoned() -> Vec<String> {
     let Ok(parent) = CgroupParent::find() else {
         return Vec::new();
     };
-    let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
-    let names = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
     let mut told = Vec::new();
-    for name in names {
-        let Some((pid, number)) = parse_owner(&name) else {
-            continue;
-        };
-        if Path::new(&format!("/proc/{pid}")).exists() {
-            continue;
-        }
+    for name in cable::find_abandoned() {
         let cgroup = Cgroup::for_servant(&parent, &spec(&name, &Limits::default()));
-        if let Err(error) = cgroup.destroy(END) {
-            told.push(format!("the robot's place {name} is left: {error}"));
-            continue;
-        }
-        sweep::run_ip(&["link", "del", &format!("cr{pid}-{number}")]);
-        sweep::run_ip(&["netns", "del", &name]);
-        told.push(format!("the robot's place {name}: taken away"));
+        let removed = cgroup.destroy(END).map_err(anyhow::Error::from);
+        told.push(match removed.and_then(|()| cable::remove_namespace(&name)) {
+            Ok(()) => format!("the robot's place {name}: taken away"),
+            Err(error) => format!("the robot's place {name} is left: {error:#}"),
+        });
     }
     told
-}
-
-/// Parses the owner's pid and a number from the name of a namespace.
-fn parse_owner(name: &str) -> Option<(u32, u32)> {
-    let (pid, number) = name.strip_prefix("cloudroid-cable-")?.split_once('-')?;
-    Some((pid.parse().ok()?, number.parse().ok()?))
 }
 
 fn wait_for_robot(child: &mut Child, patience: Duration) -> Result<()> {
@@ -294,13 +278,6 @@ mod tests {
         child.kill().expect("it is ours");
         let error = wait_for_robot(&mut child, END).expect_err("it was killed");
         assert!(error.to_string().contains("signal 9"), "{error}");
-    }
-
-    #[test]
-    fn a_place_is_of_the_process_in_its_name() {
-        assert_eq!(parse_owner("cloudroid-cable-12-3"), Some((12, 3)));
-        assert_eq!(parse_owner("cloudroid-cable-12"), None);
-        assert_eq!(parse_owner("somebody's-12-3"), None);
     }
 
     #[test]

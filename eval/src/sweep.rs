@@ -2,35 +2,25 @@
 //! that still runs are left alone.
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use support::daemon::DaemonSetup;
-use support::procfs;
+use support::{claim, procfs};
 
 use crate::place;
 
 /// Prefix of the working directories of evaluations, below the directory for temporary files.
 pub const PREFIX: &str = "cloudroid-eval-";
-/// File with the owner of such a directory.
-const OWNER: &str = "owner";
 /// Maximum time for a daemon to stop together with its servants.
 const END: Duration = Duration::from_secs(60);
 
-/// Records this process as the owner of a directory.
-pub fn claim(directory: &Path) -> Result<()> {
-    let own = std::process::id();
-    let text = format!("{own} {}", start_time(own as i32).unwrap_or_default());
-    Ok(fs::write(directory.join(OWNER), text)?)
-}
-
 /// Removes the leftovers of evaluations that are over; returns a line for each, also for what cannot be removed.
 pub fn remove_all() -> Vec<String> {
-    let mut told: Vec<String> = abandoned_directories(&std::env::temp_dir())
+    let mut told: Vec<String> = claim::find_abandoned(&std::env::temp_dir(), PREFIX)
         .iter()
         .map(|directory| match remove_home(directory) {
             Ok(()) => format!("{}: taken away", directory.display()),
@@ -39,30 +29,6 @@ pub fn remove_all() -> Vec<String> {
         .collect();
     told.extend(place::remove_abandoned());
     told
-}
-
-/// Returns the directories of evaluations whose process no longer exists.
-fn abandoned_directories(temporary: &Path) -> Vec<PathBuf> {
-    let entries = fs::read_dir(temporary).into_iter().flatten().flatten();
-    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX));
-    let over = |directory: &PathBuf| {
-        let text = fs::read_to_string(directory.join(OWNER)).ok();
-        text.is_some_and(|text| !is_running(&text))
-    };
-    named.map(|entry| entry.path()).filter(over).collect()
-}
-
-/// Returns whether the process that wrote this note still exists.
-fn is_running(owner: &str) -> bool {
-    let (pid, since) = owner.split_once(' ').unwrap_or((owner, ""));
-    pid.parse().is_ok_and(|pid| start_time(pid).is_some_and(|now| now == since))
-}
-
-/// Returns the start time of a process in ticks since boot, because pids are reused (proc(5): field 22 of `stat`).
-fn start_time(pid: i32) -> Option<String> {
-    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    let rest = stat.rsplit_once(") ")?.1;
-    rest.split(' ').nth(19).map(str::to_owned)
 }
 
 /// Stops the daemon of an evaluation with its servants, and removes the directory.
@@ -99,11 +65,6 @@ fn stop_daemon(pid: i32) -> Result<()> {
     Ok(())
 }
 
-/// Runs `ip`, ignoring failures.
-pub(crate) fn run_ip(words: &[&str]) {
-    let _ = Command::new("ip").args(words).output();
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,14 +77,14 @@ mod tests {
             fs::create_dir(&directory).expect("a directory");
             directory
         };
-        claim(&made("ours")).expect("it is ours");
+        claim::claim(&made("ours")).expect("it is ours");
         made("unknown");
         let ended = made("ended");
-        fs::write(ended.join(OWNER), "999999999 7").expect("a file");
+        fs::write(ended.join(claim::OWNER), "999999999 7").expect("a file");
         // The same pid, but of a process with another start time.
         let again = made("again");
-        fs::write(again.join(OWNER), format!("{} 1", std::process::id())).expect("a file");
-        let mut found = abandoned_directories(temporary.path());
+        fs::write(again.join(claim::OWNER), format!("{} 1", std::process::id())).expect("a file");
+        let mut found = claim::find_abandoned(temporary.path(), PREFIX);
         found.sort();
         assert_eq!(found, [again, ended.clone()]);
         remove_home(&ended).expect("there is no daemon");

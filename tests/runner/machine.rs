@@ -32,8 +32,11 @@ pub(super) fn prepare() -> Result<(), String> {
             Err(error) => println!("{} stays, which a run that was killed had left: {error:#}", place.display()),
         }
     }
-    for name in cable::remove_abandoned() {
-        println!("removed the network {name}, which a run that was killed had left");
+    for name in cable::find_abandoned() {
+        match cable::remove_namespace(&name) {
+            Ok(()) => println!("removed the network {name}, which a run that was killed had left"),
+            Err(error) => println!("the network {name} stays, which a run that was killed had left: {error:#}"),
+        }
     }
     let place = world().place();
     if let Err(error) = disk::mount_on(place, &binaries::cache()) {

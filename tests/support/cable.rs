@@ -29,20 +29,22 @@ static NEXT: AtomicU32 = AtomicU32::new(0);
 /// Begin of the namespaces' names; the pid and start time of the owning process follow.
 const PREFIX: &str = "cloudroid-cable-";
 
-/// Removes the network namespaces of runs that were killed; returns their names.
-pub fn remove_abandoned() -> Vec<String> {
+/// Returns the names of the network namespaces of runs that were killed.
+pub fn find_abandoned() -> Vec<String> {
     let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
     let names = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned());
-    let is_abandoned = |name: &String| {
-        let mut words = name.strip_prefix(PREFIX).unwrap_or_default().split('-');
-        match (words.next(), words.next()) {
-            (Some(pid), Some(start)) => !claim::is_alive(&format!("{pid} {start}")),
-            _ => false,
-        }
-    };
-    let mut removed: Vec<String> = names.filter(is_abandoned).collect();
-    removed.retain(|name| ip(&["netns", "del", name]).is_ok());
-    removed
+    names.filter(|name| parse_owner(name).is_some_and(|owner| !claim::is_alive(&owner))).collect()
+}
+
+/// Parses the note of the owning process (see [`claim::own_note`]) from the name of a namespace.
+fn parse_owner(name: &str) -> Option<String> {
+    let mut words = name.strip_prefix(PREFIX)?.split('-');
+    Some(format!("{} {}", words.next()?, words.next()?))
+}
+
+/// Removes a network namespace with its devices.
+pub fn remove_namespace(name: &str) -> anyhow::Result<()> {
+    ip(&["netns", "del", name])
 }
 
 /// Impairment of a network, in each direction.
@@ -237,7 +239,7 @@ impl Drop for Cable {
         let _ = self.restore();
         let _ = TcpStream::connect_timeout(&self.server, scale(Duration::from_secs(5)));
         let _ = ip(&["link", "del", &self.ends[0]]);
-        let _ = ip(&["netns", "del", &self.name]);
+        let _ = remove_namespace(&self.name);
     }
 }
 

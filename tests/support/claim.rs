@@ -12,7 +12,7 @@ use nix::unistd::Pid;
 use crate::{leftovers, procfs};
 
 /// File in each directory that names its owner: a pid and the start time of that process.
-const OWNER: &str = "owner";
+pub const OWNER: &str = "owner";
 /// Maximum time for killed processes to disappear.
 const END: Duration = Duration::from_secs(60);
 

@@ -21,22 +21,26 @@
 
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "daemon")]
 mod daemon;
 mod machine;
 mod parts;
 mod process;
 mod psnr;
+#[cfg(feature = "daemon")]
 mod push;
 mod race;
 mod space;
 mod statistics;
 mod table;
 
+#[cfg(feature = "daemon")]
 pub use daemon::{BenchDaemon, create_directory};
 pub use machine::MachineDescription;
 pub use parts::{Part, is_full_run, run_parts};
 pub use process::{Process, children_processor_time, first_child};
 pub use psnr::Psnr;
+#[cfg(feature = "daemon")]
 pub use push::TimedPush;
 pub use race::{Race, Times, thread_processor_time};
 pub use space::write_install_space;

@@ -25,6 +25,7 @@ fn run_parts(parts: &[&str]) -> Output {
         .args(parts)
         .env("CARGO_TARGET_DIR", place.path().join("built/cargo"))
         .env_remove("MAKEFLAGS")
+        .env_remove("MAKELEVEL")
         .output()
         .expect("a result")
 }

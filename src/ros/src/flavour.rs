@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+pub use crate::bus::{Naming, NodeIdentity, NodeRename};
 use crate::bus::{ParamValue, RosVersion};
-pub use crate::identity::{Naming, NodeIdentity, NodeRename};
 use crate::{ros1, ros2};
 
 /// The base that an image is built upon, and its ROS.

@@ -1,30 +1,31 @@
-//! The ROS side of Cloudroid, without anything about containers: message schemas, codecs between serialized messages
-//! and JSON or CBOR, and the buses that carry them.
+//! The ROS side of Cloudroid, without anything about containers: one name for the crates below it, and what is decided
+//! by the ROS version.
 //!
 //! In: definitions (`.msg`, `.srv`, `.action` texts) and sockets from a [`net::Sockets`]. Out: a [`bus::Bus`] on which
 //! serialized messages are published, received and answered.
+//!
+//! ```text
+//!                    ros      connect, flavour, remaps, plumbing, bag
+//!                   ╱   ╲
+//!               ros1     ros2      protocols: Master and TCPROS; DDS by the crate rtps
+//!                   ╲   ╱
+//!                  ros_bus         the interface of a bus, queues, sockets
+//!                     │
+//!                ros_message       definitions, codecs, sizes
+//! ```
 
 pub mod bag;
-pub mod bus;
-mod cbor_head;
-pub mod codec;
 mod connect;
 pub mod flavour;
-mod identity;
-mod join;
-pub mod net;
-mod network;
 pub mod plumbing;
 pub mod remaps;
-pub mod ring;
-pub mod ros1;
-pub mod ros2;
-pub mod schema;
-pub mod sizes;
-mod succession;
-pub mod turns;
 
 pub use connect::connect;
-pub use join::JoinOptions;
-pub use network::{DiscoveryNetwork, DiscoveryServer, InterfaceAddress, InterfaceSelection};
-pub use succession::{ParticipantPrefix, Succession};
+pub use ros_bus as bus;
+pub use ros_bus::{
+    DiscoveryNetwork, DiscoveryServer, InterfaceAddress, InterfaceSelection, JoinOptions, ParticipantPrefix,
+    Succession, net, ring, turns,
+};
+pub use ros_message::{codec, schema, sizes};
+pub use ros1;
+pub use ros2;

@@ -35,7 +35,7 @@ mod writer;
 
 pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
-pub use network::{InterfaceAddress, InterfaceSelection, list_interfaces};
+pub use network::{InterfaceAddress, InterfaceSelection};
 pub use participant::{Config, DataReader, DataWriter, JoinError, NetworkNamespace, Participant};
 pub use qos::{DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind, Representations};
 pub use sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};

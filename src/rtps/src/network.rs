@@ -7,12 +7,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::BTreeSet;
-use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-
-use nix::ifaddrs::getifaddrs;
-use nix::net::if_::InterfaceFlags;
 
 use crate::locator::Locator;
 
@@ -49,25 +44,6 @@ impl InterfaceAddress {
         let mask = u32::MAX.checked_shl(32 - u32::from(self.prefix.min(32))).unwrap_or(0);
         self.prefix != 0 && (self.address.to_bits() ^ other.to_bits()) & mask == 0
     }
-}
-
-/// Returns the IPv4 addresses of the interfaces that are up in the network namespace of the calling thread.
-///
-/// # Errors
-/// The kernel does not answer.
-pub fn list_interfaces() -> io::Result<Vec<InterfaceAddress>> {
-    let mut found = BTreeSet::new();
-    for interface in getifaddrs()? {
-        let address = interface.address.as_ref().and_then(|it| it.as_sockaddr_in());
-        let Some(address) = address.filter(|_| interface.flags.contains(InterfaceFlags::IFF_UP)) else {
-            continue;
-        };
-        let mask = interface.netmask.as_ref().and_then(|it| it.as_sockaddr_in());
-        // A point-to-point link has no network besides its peer.
-        let prefix = mask.map_or(32, |mask| mask.ip().to_bits().leading_ones());
-        found.insert(InterfaceAddress { address: address.ip(), prefix: prefix as u8 });
-    }
-    Ok(found.into_iter().collect())
 }
 
 impl InterfaceSelection {
@@ -222,9 +198,8 @@ mod tests {
     }
 
     #[test]
-    fn this_machine_has_a_loopback_device() {
-        let found = list_interfaces().expect("interfaces");
-        assert!(found.contains(&InterfaceAddress::LOOPBACK), "{found:?}");
+    fn nothing_but_the_loopback_device_is_selected_by_default() {
+        let found = network(&[("127.0.0.1", 8), ("10.0.0.5", 24)]).interfaces;
         let these = InterfaceSelection::default();
         assert_eq!(these.filter(found), [InterfaceAddress::LOOPBACK]);
         assert!(these.is_loopback() && !InterfaceSelection::All.is_loopback());

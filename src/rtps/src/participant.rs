@@ -33,8 +33,7 @@ pub trait NetworkNamespace: Send + Sync + 'static {
     /// Binds a UDP socket to this address as seen from inside; port 0 picks a free one. With `shared`, others may bind
     /// to it as well (`SO_REUSEADDR`), for multicast.
     async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket>;
-    /// Returns the interfaces that are up in the namespace, with their addresses; see
-    /// [`list_interfaces`](crate::list_interfaces).
+    /// Returns the interfaces that are up in the namespace, with their addresses.
     async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
         Ok(vec![InterfaceAddress::LOOPBACK])
     }

@@ -1,0 +1,82 @@
+//! Type of a topic, determined from its endpoints.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros_bus::{BusError, Graph, TopicNodes, WireType};
+use tokio::time::timeout;
+
+use super::registrar::Kind;
+use super::{Ros1BusState, link, publications, watcher};
+
+/// Time for a topic's subscribers to connect to us and declare their type.
+const ANSWER: Duration = Duration::from_secs(3);
+
+/// Returns the type from the first source available: what we advertise, a connection of ours, a publisher's header, the
+/// subscribers' requests. If only a name is known (all endpoints accept any md5), the digest is `*`.
+pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<WireType, BusError> {
+    let ours = bus.publications.lock().get(name).cloned();
+    if let Some((advert, _)) = ours.as_ref().and_then(|topic| topic.advert()) {
+        return Ok(advert);
+    }
+    let subscribed = bus.subscriptions.lock().get(name).cloned();
+    let links = subscribed.map(|topic| topic.links()).unwrap_or_default();
+    if let Some(known) = links.iter().find_map(|link| link.wire_type()) {
+        return Ok(WireType::clone(&known));
+    }
+    // A recent registration may not have reached our own graph yet.
+    let graph = watcher::fetch(bus).await?;
+    let Some(topic) = graph.topics.get(name) else {
+        return Err(BusError::NoTopic(name.to_owned()));
+    };
+    let mut failure = None;
+    let publishers = topic.publishers.iter().filter(|node| **node != bus.node);
+    for uri in publishers.filter_map(|node| graph.nodes.get(node)) {
+        match link::connect(bus, name, uri, &WireType::any()).await {
+            Ok(connection) if !connection.wire_type.digest.is_any() => {
+                return Ok(connection.wire_type);
+            }
+            Ok(_) => {}
+            Err(error) => failure = Some(error),
+        }
+    }
+    if let Some(asked) = subscriber_type(bus, name, topic, &graph).await? {
+        return Ok(asked);
+    }
+    match failure {
+        _ if topic.type_name != "*" => Ok(WireType::with_name(&topic.type_name)),
+        Some(failure) => Err(failure),
+        None => Ok(WireType::any()),
+    }
+}
+
+/// Returns the type requested by the topic's subscribers: the first specific one.
+async fn subscriber_type(
+    bus: &Arc<Ros1BusState>,
+    name: &str,
+    topic: &TopicNodes,
+    graph: &Graph,
+) -> Result<Option<WireType>, BusError> {
+    let others = |node: &&String| **node != bus.node && graph.nodes.contains_key(*node);
+    let mut missing = topic.subscribers.iter().filter(others).count();
+    if missing == 0 {
+        return Ok(None);
+    }
+    let mut asking = publications::ask_subscribers(bus, name);
+    bus.registrar.sync(Kind::Publisher, name, false).await?;
+    let heard = timeout(ANSWER, async {
+        let mut best = None;
+        while missing > 0 {
+            let Some(asked) = asking.answers.recv().await else {
+                break;
+            };
+            if !asked.digest.is_any() {
+                return Some(asked);
+            }
+            missing -= 1;
+            best = best.or(Some(asked).filter(|asked| asked.name != "*"));
+        }
+        best
+    });
+    Ok(heard.await.unwrap_or(None))
+}
