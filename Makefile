@@ -93,8 +93,9 @@ build: ## build the daemon, the command line tool and the servants' init, optimi
 	@install -m 755 "$(CARGO_TARGET_DIR)/init/cloudroid-init" "$(CARGO_TARGET_DIR)/release/cloudroid-init"
 
 # One selection of packages and features for all that is built for tests: Cargo compiles a library once per set of features, and each selection
-# has a set of its own. Built with it are the lints, too (scripts/rustc), and the video codec, which no program of a release has.
-DEV := --locked --workspace --features codec/video
+# has a set of its own. Built with it are the lints, too (scripts/rustc), and the video codec and OpenTelemetry, which no program of a release
+# has.
+DEV := --locked --workspace --features codec/video,cloudroidd/otel
 
 # Those of its programs that are tested, of this checkout alone.
 PROGRAMS := $(CARGO_TARGET_DIR)/checkouts/$(shell pwd -P | sha256sum | cut -c1-12)

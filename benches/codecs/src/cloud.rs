@@ -1,7 +1,7 @@
 //! Laser scans and point clouds: the link's codecs should produce less data than zstd 19, at the speed of zstd 3.
 
-use crate::contest::{CodecComparison, find_result, print_results};
-use crate::{samples, world};
+use crate::contest::{CodecComparison, find_result, print_results, report_columns};
+use crate::{messages, recorded, samples, world};
 use anyhow::Result;
 use bench_report::{BenchReport, Target};
 use codec::{Codec, Schema};
@@ -9,11 +9,12 @@ use codec::{Codec, Schema};
 fn report_figures(report: &mut BenchReport, title: &str, schema: Schema, messages: &[Vec<u8>]) -> Result<()> {
     // Scans are small and clouds are large.
     let rounds = if schema == Schema::LaserScan { 40 } else { 7 };
-    let ours = Codec::for_schema(schema);
-    let outcomes = CodecComparison { schema, messages, rounds }.run(&[ours], &[1, 3, 19])?;
+    let codec = Codec::for_schema(schema);
+    let outcomes = CodecComparison { schema, messages, rounds }.run(&[codec], &[1, 3, 19])?;
     print_results(title, &outcomes);
+    report_columns(report, title, &outcomes, codec.name())?;
     let (ours, fast, best) =
-        (find_result(&outcomes, ours.name())?, find_result(&outcomes, "zstd 3")?, find_result(&outcomes, "zstd 19")?);
+        (find_result(&outcomes, codec.name())?, find_result(&outcomes, "zstd 3")?, find_result(&outcomes, "zstd 19")?);
     report
         .figure(format!("{title}: saved"), "%", ours.saved)
         .relative_to("zstd 19", best.saved)
@@ -45,6 +46,13 @@ pub fn measure_scans(report: &mut BenchReport) -> Result<()> {
     for (title, messages) in &cases {
         report_figures(report, title, Schema::LaserScan, messages)?;
     }
+    if recorded::is_installed("recorded scans", report) {
+        for (title, name) in [("scan of a drive", recorded::DRIVE), ("scan of a hall", recorded::BEACONS)] {
+            let scans = recorded::laser_ranges(name)?;
+            let messages: Vec<_> = scans.iter().map(|ranges| messages::scan(ranges, &[])).collect();
+            report_figures(report, title, Schema::LaserScan, &messages)?;
+        }
+    }
     Ok(())
 }
 
@@ -58,6 +66,17 @@ pub fn measure_clouds(report: &mut BenchReport) -> Result<()> {
     ];
     for (title, messages) in cases.iter().filter(|(_, messages)| !messages.is_empty()) {
         report_figures(report, title, Schema::PointCloud2, messages)?;
+    }
+    if recorded::is_installed("recorded clouds", report) {
+        let (colour, depth) = recorded::kinect_frame()?;
+        for (title, step, organised) in
+            [("Kinect cloud, 32 B", 32, true), ("Kinect cloud without its picture", 16, false)]
+        {
+            let message = world::recorded_camera_cloud(&colour, &depth, step, organised);
+            report_figures(report, title, Schema::PointCloud2, &[message])?;
+        }
+        let message = world::recorded_spinning_cloud(&recorded::velodyne_packets()?);
+        report_figures(report, "VLP-16 cloud", Schema::PointCloud2, &[message])?;
     }
     Ok(())
 }

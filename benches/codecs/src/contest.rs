@@ -1,8 +1,10 @@
 //! The link's codecs and common general-purpose ones on the same messages, in turns, on one core.
 
+use crate::columns::ColumnLayout;
+use crate::peers::{PEERS, Peer};
 use crate::zlib;
-use anyhow::{Result, ensure};
-use bench_report::{Race, Times};
+use anyhow::{Context, Result, ensure};
+use bench_report::{BenchReport, Race, Target, Times};
 use codec::{Codec, Decoder, Encoder, Schema};
 use std::cell::RefCell;
 use std::hint::black_box;
@@ -61,6 +63,9 @@ impl CodecComparison<'_> {
             contestants.push(self.zstd(level, &buffer)?);
         }
         contestants.push(self.zlib(&buffer));
+        for peer in PEERS {
+            contestants.push(self.peer(peer).with_context(|| peer.name())?);
+        }
         let (mut encoding, mut decoding) = (Race::new(self.rounds), Race::new(self.rounds));
         let mut entered = Vec::new();
         for one in contestants {
@@ -174,6 +179,33 @@ impl CodecComparison<'_> {
         Contestant { name: "zlib 6".to_owned(), slow: true, sizes, encode: Box::new(encode), decode: Box::new(decode) }
     }
 
+    fn peer(&self, peer: Peer) -> Result<Contestant<'_>> {
+        let layouts = self.messages.iter().map(|message| ColumnLayout::read(self.schema, message));
+        let layouts = layouts.collect::<Result<Vec<_>>>()?;
+        let (mut packing, mut unpacking) = (zstd::bulk::Compressor::new(3)?, zstd::bulk::Decompressor::new()?);
+        let mut frames = Vec::new();
+        for (layout, message) in layouts.iter().zip(self.messages) {
+            let frame = peer.encode(layout, message, &mut packing)?;
+            ensure!(peer.decode(layout, &frame, &mut unpacking)? == *message, "a message changed");
+            frames.push(frame);
+        }
+        let sizes = frames.iter().map(Vec::len).collect();
+        let schema = self.schema;
+        let encode = move || {
+            for message in self.messages {
+                let frame =
+                    ColumnLayout::read(schema, message).map(|layout| peer.encode(&layout, message, &mut packing));
+                black_box(frame).ok();
+            }
+        };
+        let decode = move || {
+            for (layout, frame) in layouts.iter().zip(&frames) {
+                black_box(peer.decode(layout, frame, &mut unpacking)).ok();
+            }
+        };
+        Ok(Contestant { name: peer.name(), slow: false, sizes, encode: Box::new(encode), decode: Box::new(decode) })
+    }
+
     /// Returns the messages that a codec encodes in its run with this number: slow ones encode none after the second.
     fn messages_of_run(&self, slow: bool, runs: usize) -> &[Vec<u8>] {
         if slow && runs > 2 { &[] } else { self.messages }
@@ -210,12 +242,44 @@ pub fn find_result<'a>(outcomes: &'a [CodecResult], name: &str) -> Result<&'a Co
     found.ok_or_else(|| anyhow::anyhow!("{name} did not take part"))
 }
 
+/// Megabytes per second of a slow link, of 10 Mbit/s.
+const SLOW_LINK: f64 = 1.25;
+
+impl CodecResult {
+    /// Returns the seconds in which a megabyte of messages is encoded, sent over a slow link and decoded.
+    fn link_time(&self) -> f64 {
+        (1.0 - self.saved / 100.0) / SLOW_LINK + 1.0 / self.encode + 1.0 / self.decode
+    }
+}
+
+/// Reports the bytes that `ours` leaves and its time over a slow link, each relative to the best of pco's levels and to
+/// the best filter in front of zstd. More than a tenth is to be won: see docs/adr/123.
+pub fn report_columns(report: &mut BenchReport, title: &str, outcomes: &[CodecResult], ours: &str) -> Result<()> {
+    type Measure = fn(&CodecResult) -> f64;
+    const MEASURES: [(&str, &str, Measure); 2] = [
+        ("bytes left", "%", |result| 100.0 - result.saved),
+        ("at 10 Mbit/s", "ms/MB", |result| 1e3 * result.link_time()),
+    ];
+    let ours = find_result(outcomes, ours)?;
+    for (what, unit, measure) in MEASURES {
+        for kind in ["pco", "+ zstd"] {
+            let peers = outcomes.iter().filter(|outcome| outcome.name.contains(kind));
+            let peer = peers.min_by(|a, b| measure(a).total_cmp(&measure(b))).context("no peer took part")?;
+            let (encode, decode) = (ours.encode / peer.encode, ours.decode / peer.decode);
+            let figure = report.figure(format!("{title}: {what}"), unit, measure(ours));
+            figure.relative_to(&peer.name, measure(peer)).require(Target::RatioAtMost(0.9));
+            figure.note(format!("encoding {encode:.2} times as fast, decoding {decode:.2}"));
+        }
+    }
+    Ok(())
+}
+
 /// Prints all results, for readers who want more than the figures.
 pub fn print_results(title: &str, outcomes: &[CodecResult]) {
     println!("{title}");
     for outcome in outcomes {
         println!(
-            "    {:<12} saved {:6.2}%   encode {:8.1} MB/s   decode {:8.1} MB/s",
+            "    {:<16} saved {:6.2}%   encode {:8.1} MB/s   decode {:8.1} MB/s",
             outcome.name, outcome.saved, outcome.encode, outcome.decode
         );
     }

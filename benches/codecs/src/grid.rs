@@ -1,7 +1,7 @@
 //! Occupancy grids: small ones, large ones, and a sequence of grids while a map is being built.
 
-use crate::contest::{CodecComparison, find_result, print_results};
-use crate::{messages, samples, world};
+use crate::contest::{CodecComparison, find_result, print_results, report_columns};
+use crate::{messages, recorded, samples, world};
 use anyhow::{Result, ensure};
 use bench_report::{BenchReport, Target};
 use codec::{Codec, Decoder, Encoder, Schema};
@@ -14,6 +14,7 @@ pub fn measure_grids(report: &mut BenchReport) -> Result<()> {
     let outcomes = CodecComparison { schema: Schema::OccupancyGrid, messages: &small, rounds: 15 }
         .run(&[Codec::Grid], &[1, 3, 19])?;
     print_results("grid, 566×608", &outcomes);
+    report_columns(report, "grid 566×608", &outcomes, "grid")?;
     let (ours, zstd) = (find_result(&outcomes, "grid")?, find_result(&outcomes, "zstd 19")?);
     report
         .figure("grid 566×608: saved", "%", ours.saved)
@@ -22,8 +23,9 @@ pub fn measure_grids(report: &mut BenchReport) -> Result<()> {
 
     let large = [messages::grid(SIZE, SIZE, &samples::centre_in_grid(&office, SIZE))];
     let outcomes =
-        CodecComparison { schema: Schema::OccupancyGrid, messages: &large, rounds: 15 }.run(&[Codec::Grid], &[1, 3])?;
+        CodecComparison { schema: Schema::OccupancyGrid, messages: &large, rounds: 5 }.run(&[Codec::Grid], &[1, 3])?;
     print_results("grid, 4000×4000", &outcomes);
+    report_columns(report, "grid 4000×4000", &outcomes, "grid")?;
     let (ours, zstd, copy) =
         (find_result(&outcomes, "grid")?, find_result(&outcomes, "zstd 1")?, find_result(&outcomes, "memcpy")?);
     let figure = report.figure("grid 4000×4000: saved", "%", ours.saved).relative_to("zstd 1", zstd.saved);
@@ -31,6 +33,16 @@ pub fn measure_grids(report: &mut BenchReport) -> Result<()> {
     let figure = report.figure("grid 4000×4000: encoding", "MB/s", ours.encode).relative_to("memcpy", copy.encode);
     figure.require(Target::RatioAtLeast(0.3));
     report.figure("grid 4000×4000: decoding", "MB/s", ours.decode).relative_to("memcpy", copy.decode);
+    if recorded::is_installed("recorded maps", report) {
+        for (title, name) in [("grid of a hall", recorded::HALL_MAP), ("grid of a campus", recorded::CAMPUS_MAP)] {
+            let map = recorded::occupancy_map(name)?;
+            let messages = [messages::grid(map.width, map.height, &map.data)];
+            let comparison = CodecComparison { schema: Schema::OccupancyGrid, messages: &messages, rounds: 7 };
+            let outcomes = comparison.run(&[Codec::Grid], &[1, 3])?;
+            print_results(title, &outcomes);
+            report_columns(report, title, &outcomes, "grid")?;
+        }
+    }
     measure_mapping(report, &office)
 }
 

@@ -5,11 +5,14 @@
 //! all parts run.
 
 mod cloud;
+mod columns;
 mod contest;
 mod grid;
 mod messages;
+mod peers;
 mod picture;
 mod published;
+mod recorded;
 mod samples;
 mod video;
 mod world;

@@ -1,14 +1,15 @@
 //! Images: colour, grey, Bayer, depth.
 
-use crate::contest::{CodecComparison, find_result, print_results};
+use crate::contest::{CodecComparison, find_result, print_results, report_columns};
 use crate::messages::image;
+use crate::recorded;
 use crate::samples::{self, Noise, Picture};
 use anyhow::{Result, ensure};
 use bench_report::{BenchReport, Race, Target};
 use codec::{Codec, Decoder, Encoder, Schema};
 use std::hint::black_box;
 
-const ROUNDS: usize = 15;
+const ROUNDS: usize = 9;
 
 fn image_comparison(messages: &[Vec<u8>]) -> CodecComparison<'_> {
     CodecComparison { schema: Schema::Image, messages, rounds: ROUNDS }
@@ -24,6 +25,7 @@ fn images(encoding: &str, pictures: &[Picture], data: impl Fn(&Picture) -> Vec<u
 fn report_lossless(report: &mut BenchReport, title: &str, messages: &[Vec<u8>], saved: Option<f64>) -> Result<f64> {
     let outcomes = image_comparison(messages).run(&[Codec::Image], &[1, 3, 19])?;
     print_results(title, &outcomes);
+    report_columns(report, title, &outcomes, "image")?;
     let (ours, zstd, best) =
         (find_result(&outcomes, "image")?, find_result(&outcomes, "zstd 1")?, find_result(&outcomes, "zstd 19")?);
     let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
@@ -121,8 +123,15 @@ pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
     report_lossless(report, "depth", &whole, Some(83.0))?;
     let holes = images("16UC1", &pictures, with_holes);
     report_lossless(report, "depth with holes", &holes, None)?;
-    let metres = images("32FC1", &pictures, to_metres);
+    let metres = images("32FC1", &pictures, |picture| to_metres(&with_holes(picture)));
     report_lossless(report, "float depth", &metres, None)?;
+    if recorded::is_installed("recorded depth", report) {
+        let depth = recorded::kinect_frame()?.1;
+        let millimetres = image("16UC1", depth.width, depth.height, &depth.data);
+        report_lossless(report, "Kinect depth", &[millimetres], None)?;
+        let metres = image("32FC1", depth.width, depth.height, &to_metres(&depth.data));
+        report_lossless(report, "Kinect float depth", &[metres], None)?;
+    }
     if let Some(disparity) = samples::motorcycle_disparity() {
         let data: Vec<u8> = disparity.values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let message = image("32FC1", disparity.width, disparity.height, &data);
@@ -146,12 +155,12 @@ fn with_holes(picture: &Picture) -> Vec<u8> {
 }
 
 /// Converts depth to metres as `depth_image_proc/convert_metric` does, with NaN where nothing was measured.
-fn to_metres(picture: &Picture) -> Vec<u8> {
+fn to_metres(millimetres: &[u8]) -> Vec<u8> {
     let metres = |pair: &[u8]| match u16::from_le_bytes([pair[0], pair[1]]) {
         0 => f32::NAN,
         depth => f32::from(depth) * 0.001,
     };
-    with_holes(picture).chunks_exact(2).map(metres).flat_map(f32::to_le_bytes).collect()
+    millimetres.chunks_exact(2).map(metres).flat_map(f32::to_le_bytes).collect()
 }
 
 /// Checks synthetic corner cases: each one is decoded to the original, and none grows.

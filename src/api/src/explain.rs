@@ -120,6 +120,10 @@ pub struct Link {
     /// Phase in which late requests spent most of their time; absent if none of them was answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub late_in: Option<Part>,
+    /// Trace id of the latest answered request whose trace is exported, preferably of a late one; absent if the daemon
+    /// exports no traces.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trace: Option<String>,
     /// Number of messages that the robot discarded in the last minute because they were superseded or too old.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]

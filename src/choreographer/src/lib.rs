@@ -44,6 +44,7 @@ mod memory;
 mod options;
 mod request;
 mod shown;
+mod tracer;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -77,6 +78,7 @@ pub use memory::{Memory, MemoryOptions};
 pub use options::{ClassOptions, DEFAULT_CLASS, HungPolicy, Options};
 pub use request::ServantRequest;
 pub use shown::usage;
+pub use tracer::{RequestTracer, TracedServant};
 
 use decide::admission::AdmissionRequest;
 use decide::dictionary::Aux;
@@ -305,6 +307,11 @@ impl Choreographer {
     /// Returns the response times of robots' requests.
     pub fn request_times(&self) -> &RequestTimes {
         &self.inner.request_times
+    }
+
+    /// Returns what makes traces of robots' requests, if anything does.
+    pub fn tracer(&self) -> Option<&dyn RequestTracer> {
+        self.inner.options.tracer.as_deref()
     }
 
     /// Returns the journal of events.

@@ -1,10 +1,12 @@
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use api::{Caps, Limits, Sla};
 use bridge::BridgeOptions;
 
 use crate::memory::MemoryOptions;
+use crate::tracer::RequestTracer;
 
 /// Reaction to nodes that receive inputs and answer none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -55,6 +57,8 @@ pub struct Options {
     pub bridge: BridgeOptions,
     /// Limits on the memory held for clients and servants.
     pub memory: MemoryOptions,
+    /// Makes traces of robots' requests.
+    pub tracer: Option<Arc<dyn RequestTracer>>,
 }
 
 /// Name of the class of robots that name none, if it is configured.

@@ -50,6 +50,7 @@ fn options() -> Options {
         hung_after: 10.0,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions { daemon: memory, client: memory, servant: memory, unfinished: Duration::from_secs(300) },
+        tracer: None,
     }
 }
 

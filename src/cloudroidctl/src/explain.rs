@@ -107,6 +107,9 @@ fn print_link(link: &Link) -> anyhow::Result<()> {
         link.late,
         link.local,
     ))?;
+    if let Some(trace) = &link.trace {
+        output::line(&format!("    trace {trace}"))?;
+    }
     let mut table = Table::new(&["    PART", "P50", "P90", "MAX"]);
     for part in &link.phases {
         table.row([

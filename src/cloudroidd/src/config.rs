@@ -14,6 +14,7 @@ mod people;
 mod portal;
 mod push;
 mod servant;
+mod telemetry;
 mod time;
 mod tls;
 mod words;
@@ -43,6 +44,7 @@ pub use capacity::{CapacityConfig, Controller};
 pub use class::ClassConfig;
 pub use memory::MemoryConfig;
 pub use people::PeopleConfig;
+pub use telemetry::TelemetryConfig;
 pub use time::Time;
 pub use tls::TlsConfig;
 
@@ -100,6 +102,8 @@ pub struct Config {
     pub portal: PortalConfig,
     /// Memory limits outside of servants' containers.
     pub memory: MemoryConfig,
+    /// Traces of robots' requests.
+    pub telemetry: Option<TelemetryConfig>,
     /// Recording of the last seconds of servants, kept for when something goes wrong.
     pub black_box: BlackBoxConfig,
     /// Limits of pushes.
@@ -160,6 +164,7 @@ impl Default for Config {
             oidc: None,
             portal: PortalConfig::default(),
             memory: MemoryConfig::default(),
+            telemetry: None,
             black_box: BlackBoxConfig::default(),
             push: PushConfig::default(),
             allow: Allow::default(),
@@ -219,6 +224,9 @@ impl Config {
         }
         reach::egress::validate(&self.allow.egress).context("egress in [allow] of the configuration")?;
         self.black_box.check(self.memory.servant).context("[black_box] of the configuration")?;
+        if let Some(telemetry) = &self.telemetry {
+            telemetry.check(cfg!(feature = "otel")).context("[telemetry] of the configuration")?;
+        }
         self.push.check().context("[push] of the configuration")?;
         self.archives.check().context("[archives] of the configuration")?;
         self.capacity.check().context("[capacity] of the configuration")?;

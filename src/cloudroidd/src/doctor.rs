@@ -3,21 +3,31 @@
 
 mod cgroups;
 
-use std::net::{SocketAddr, TcpListener};
+use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use api::{Check, CheckStatus, Doctor, Size};
 use portal::MachineChecks;
+
+use crate::config::TelemetryConfig;
 
 /// Oldest supported kernel: overlays of idmapped layers need Linux 5.19.
 const OLDEST_KERNEL: (u32, u32) = (5, 19);
 /// Free disk space required and recommended: a base image and one package with its dependencies.
 const ROOM_NEEDED: u64 = 2 << 30;
 const SPACE_WANTED: u64 = 10 << 30;
+/// Time in which a server must accept a connection.
+const CONNECTED: Duration = Duration::from_secs(2);
 
 /// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are settings
-/// that exceed this machine.
-pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) -> Doctor {
+/// that exceed this machine; `collector` is where traces are sent.
+pub fn examine(
+    home: &Path,
+    listening: Option<SocketAddr>,
+    doubts: &[String],
+    collector: Option<&TelemetryConfig>,
+) -> Doctor {
     let mut checks = vec![root(), kernel(), overlay(), user_namespaces(), idmapped_mounts(home), seccomp(), landlock()];
     checks.push(cgroups::check());
     checks.push(program("mmdebstrap", "mmdebstrap", "makes base images"));
@@ -29,6 +39,7 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
     checks.push(init());
     checks.push(port(listening));
     checks.push(configuration(doubts));
+    checks.extend(collector.map(telemetry));
     Doctor { checks }
 }
 
@@ -242,6 +253,31 @@ fn configuration(doubts: &[String]) -> Check {
     }
 }
 
+/// Checks that the collector of traces accepts connections.
+fn telemetry(collector: &TelemetryConfig) -> Check {
+    const NAME: &str = "telemetry";
+    let fix = "start the OpenTelemetry collector, or correct endpoint of [telemetry] in the configuration";
+    let endpoint = &collector.endpoint;
+    let server = match collector.traces_url() {
+        Ok(url) => outbound::find_server(&url).map_err(anyhow::Error::from),
+        Err(error) => Err(error),
+    };
+    let connected = server.and_then(|(host, port)| {
+        let mut failed = anyhow::anyhow!("{host} has no address");
+        for address in (host.as_str(), port).to_socket_addrs()? {
+            match TcpStream::connect_timeout(&address, CONNECTED) {
+                Ok(_) => return Ok(()),
+                Err(error) => failed = error.into(),
+            }
+        }
+        Err(failed)
+    });
+    match connected {
+        Ok(()) => ok(NAME, format!("the collector at {endpoint} accepts connections")),
+        Err(error) => warning(NAME, format!("the collector at {endpoint} cannot be reached: {error:#}"), fix),
+    }
+}
+
 fn port(listening: Option<SocketAddr>) -> Check {
     const NAME: &str = "port";
     if let Some(address) = listening {
@@ -275,10 +311,23 @@ mod tests {
 
     #[test]
     fn every_need_that_is_not_met_says_how_to_mend_it() {
-        let doctor = examine(Path::new("/nonexistent/home"), None, &[]);
+        let doctor = examine(Path::new("/nonexistent/home"), None, &[], None);
         for check in doctor.checks {
             assert!(check.status == CheckStatus::Ok || check.fix.is_some(), "{check:?}");
         }
+    }
+
+    #[test]
+    fn a_collector_that_does_not_listen_is_named() {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let endpoint = format!("http://{}", listener.local_addr().expect("bound"));
+        let collector = TelemetryConfig { endpoint: endpoint.clone(), sampling_ratio: 1.0, authorities: None };
+        assert_eq!(telemetry(&collector).status, CheckStatus::Ok);
+        drop(listener);
+        let check = telemetry(&collector);
+        assert_eq!(check.status, CheckStatus::Warning);
+        assert!(check.found.contains(&endpoint), "{check:?}");
+        assert!(check.fix.is_some_and(|fix| fix.contains("[telemetry]")));
     }
 
     #[test]

@@ -20,6 +20,8 @@ mod log;
 mod machine;
 mod shim;
 mod supervision;
+#[cfg(feature = "otel")]
+mod telemetry;
 mod wiring;
 
 use std::ffi::OsString;
@@ -136,7 +138,8 @@ fn home_path(arguments: &DaemonArguments) -> anyhow::Result<PathBuf> {
 
 fn examine(arguments: &DaemonArguments, config: &Config, json: bool) -> anyhow::Result<()> {
     let doubts = config.machine_warnings(machine::resources());
-    let doctor = doctor::examine(&home_path(arguments)?, None, &doubts);
+    let collector = config.telemetry.as_ref();
+    let doctor = doctor::examine(&home_path(arguments)?, None, &doubts, collector);
     if json {
         println!("{}", serde_json::to_string_pretty(&doctor)?);
         return Ok(());

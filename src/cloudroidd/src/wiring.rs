@@ -7,7 +7,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use async_trait::async_trait;
 use catalogue::Catalogue;
-use choreographer::{Admission, Amount, Choreographer};
+use choreographer::{Admission, Amount, Choreographer, RequestTracer};
 use portal::{App, Audit, MachineChecks, Passwords, Principals, Tokens};
 use push::Pusher;
 use reach::{LocalOpener, Opener};
@@ -21,6 +21,8 @@ use tokio_util::task::TaskTracker;
 
 use crate::config::{Config, IsolationMode};
 use crate::home::Home;
+#[cfg(feature = "otel")]
+use crate::telemetry;
 use crate::{bases, certificates, doctor, machine};
 
 /// Error of another crate.
@@ -47,7 +49,7 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
     let memory = promised.memory.map_or_else(machine::usable_memory, |size| size.0);
     let capacity = Amount::new(promised.cores() * promised.overcommit, memory);
     let choreographer = Choreographer::new(
-        config.choreographer_options(),
+        choreographer::Options { tracer: start_tracer(config)?, ..config.choreographer_options() },
         Arc::clone(&state),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
@@ -67,6 +69,7 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
     let pusher = Pusher::new(config.push_options(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
     let doubts = config.machine_warnings(machine::resources());
+    let collector = config.telemetry.clone();
     let robots = certificates::open_robot_authority(&config.tls, home, listen)?;
     Ok(Arc::new(App {
         principals,
@@ -91,8 +94,20 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),
         options: config.portal_options(),
-        examine: Box::new(move || doctor::examine(&examined, Some(listen), &doubts)),
+        examine: Box::new(move || doctor::examine(&examined, Some(listen), &doubts, collector.as_ref())),
     }))
+}
+
+/// Starts to export traces of requests, if the configuration has a collector.
+#[cfg(feature = "otel")]
+fn start_tracer(config: &Config) -> anyhow::Result<Option<Arc<dyn RequestTracer>>> {
+    config.telemetry.as_ref().map(telemetry::start).transpose()
+}
+
+/// Returns no tracer: a configuration with a collector is refused before.
+#[cfg(not(feature = "otel"))]
+fn start_tracer(_config: &Config) -> anyhow::Result<Option<Arc<dyn RequestTracer>>> {
+    Ok(None)
 }
 
 /// Resources that the engine of this host requests from the rest of the daemon.

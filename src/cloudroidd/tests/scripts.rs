@@ -21,7 +21,9 @@ fn run_parts(parts: &[&str]) -> Output {
     std::fs::create_dir(place.path().join("scripts")).expect("a directory");
     std::fs::copy(root.join("scripts/parts"), place.path().join("scripts/parts")).expect("a copy");
     std::fs::write(place.path().join("Makefile"), MAKEFILE).expect("a file");
-    Command::new(place.path().join("scripts/parts"))
+    // Not by its own name: it could not be executed while another thread's child still has it open for writing.
+    Command::new("bash")
+        .arg(place.path().join("scripts/parts"))
         .args(parts)
         .env("CARGO_TARGET_DIR", place.path().join("built/cargo"))
         .env_remove("MAKEFLAGS")

@@ -183,6 +183,12 @@ impl ServerAddress {
     }
 }
 
+/// Returns host and port of the server that a request to this URL goes to. Fails if [`OutboundClient::send`] would
+/// refuse the URL.
+pub fn find_server(uri: &Uri) -> Result<(String, u16), Error> {
+    ServerAddress::from_uri(uri).map(|address| (address.host, address.port))
+}
+
 /// Returns true if the host is this machine, so that nobody on the network can intercept.
 pub fn is_loopback_host(host: &str) -> bool {
     host.eq_ignore_ascii_case("localhost") || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
@@ -277,6 +283,19 @@ mod tests {
         drop(listener);
         let refused = client().send(get(&format!("http://{address}/"))).await.expect_err("nobody").to_string();
         assert!(refused.contains(&address.to_string()), "{refused}");
+    }
+
+    #[test]
+    fn the_server_of_an_address_is_found() {
+        for (address, host, port) in [
+            ("http://localhost:4318/v1/traces", "localhost", 4318),
+            ("https://otel.lab.example", "otel.lab.example", 443),
+            ("http://[::1]", "::1", 80),
+        ] {
+            let found = find_server(&Uri::from_static(address)).expect(address);
+            assert_eq!(found, (host.to_owned(), port));
+        }
+        find_server(&Uri::from_static("http://otel.lab.example:4318")).expect_err("plain text");
     }
 
     #[tokio::test]

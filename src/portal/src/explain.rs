@@ -16,7 +16,7 @@ use crate::app::App;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::events::visible_services;
-use choreographer::{Choreographer, Handle};
+use choreographer::{Choreographer, Handle, RequestTracer};
 use store::{EventFilter, EventVisibility};
 
 /// Interval between two samples of a servant's resource usage.
@@ -75,18 +75,18 @@ async fn sample_servant(choreographer: &Choreographer, handle: &Handle) -> Serve
     Served {
         throttled: spent(|usage| usage.throttled_usec).min(1.0),
         cores: spent(|usage| usage.cpu_usec),
-        links: links(handle),
+        links: links(choreographer, handle),
         servant,
     }
 }
 
 /// Returns the links to a servant, if it has any yet.
-pub fn links(handle: &Handle) -> Vec<Link> {
+pub fn links(choreographer: &Choreographer, handle: &Handle) -> Vec<Link> {
     let status = handle.reach().map(|reach| reach.links());
-    status.unwrap_or_default().into_iter().map(to_link).collect()
+    status.unwrap_or_default().into_iter().map(|status| to_link(status, choreographer.tracer())).collect()
 }
 
-fn to_link(status: LinkStatus) -> Link {
+fn to_link(status: LinkStatus, tracer: Option<&dyn RequestTracer>) -> Link {
     let millis = |seconds: f64| seconds * 1000.0;
     let max = status.sla.max.map(millis);
     let unpromised = status.sla.fallback_after.is_some();
@@ -97,6 +97,14 @@ fn to_link(status: LinkStatus) -> Link {
     };
     let requests = &status.requests;
     let late: Vec<&RequestTiming> = requests.iter().filter(is_late).collect();
+    // Requests that were not answered while the link was down have no trace.
+    let trace = late
+        .iter()
+        .copied()
+        .rev()
+        .chain(requests.iter().rev())
+        .filter(|request| request.total.is_some())
+        .find_map(|request| tracer?.trace_id(&status.session, request.id));
     let dropped = status.drops.iter().chain(&status.dropped);
     let here = status.drops.iter().map(|drop| format!("in the cloud {drop}"));
     let there = status.dropped.iter();
@@ -127,6 +135,7 @@ fn to_link(status: LinkStatus) -> Link {
         local: requests.iter().filter(|request| request.local).count(),
         phases: phase_times(requests),
         late_in: dominant(&phase_times(late)).cloned(),
+        trace,
         unsent: status.unsent,
         given: status.given,
         left_out: status.left_out,

@@ -51,7 +51,7 @@ async fn describe_servant(app: &App, handle: &Handle) -> Served {
         servant: app.choreographer.describe(handle).await,
         throttled: 0.0,
         cores: 0.0,
-        links: explain::links(handle),
+        links: explain::links(&app.choreographer, handle),
     }
 }
 

@@ -95,6 +95,15 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
         "How often a client or servant was refused memory.",
         [(String::new(), app.choreographer.memory().refusal_count() as f64)],
     );
+    if let Some(tracer) = app.choreographer.tracer() {
+        write_family(
+            &mut out,
+            "cloudroid_dropped_spans_total",
+            "counter",
+            "Spans that were dropped because the OpenTelemetry collector did not take them in time.",
+            [(String::new(), tracer.dropped_spans() as f64)],
+        );
+    }
     let exists = |name: &str| services.iter().any(|service| service == name);
     app.choreographer.request_times().write_prometheus(&mut out, exists);
     write_usage_metrics(&mut out, &app.choreographer.servants()).await;

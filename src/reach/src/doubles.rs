@@ -3,12 +3,12 @@
 use std::time::SystemTime;
 
 use async_trait::async_trait;
-use link::control::{Exit, NodeLaunch, RequestTiming};
+use link::control::{Exit, NodeLaunch};
 use parking_lot::Mutex;
 use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
-use crate::links::{NodeController, NodeError, RequestUpdate};
+use crate::links::{MeasuredRequest, NodeController, NodeError};
 use crate::{Observer, StubNode};
 
 /// Nodes started by stubs, and nothing else.
@@ -65,5 +65,5 @@ impl Observer for RecordedEvents {
         self.0.lock().push((kind.to_owned(), message.to_owned()));
     }
     fn on_served_locally(&self, _robot: &str, _node: &str, _at: SystemTime, _why: Option<&str>) {}
-    fn on_request_measured(&self, _request: &RequestTiming, _news: RequestUpdate) {}
+    fn on_request_measured(&self, _robot: Option<&str>, _request: &MeasuredRequest<'_>) {}
 }

@@ -61,7 +61,7 @@ use link::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 use crate::FlowCounts;
 use attempts::Attempts;
 pub use nodes::{NodeController, NodeError, StubNode};
-pub use requests::RequestUpdate;
+pub use requests::{MeasuredRequest, RequestUpdate};
 pub use state::{Hub, HubOptions};
 use state::{NodeLink, ParameterMirror, RobotMachine};
 pub use status::LinkStatus;

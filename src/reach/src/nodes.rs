@@ -10,7 +10,7 @@ use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use futures_util::FutureExt;
-use link::control::{Decision, Exit, NodeLaunch, RequestTiming};
+use link::control::{Decision, Exit, NodeLaunch};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use ros::flavour::{Naming, NodeIdentity};
@@ -19,7 +19,7 @@ use servant::engine::{LogStart, NodeExit, ServantHandle};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
-use crate::links::{NodeController, NodeError, RequestUpdate};
+use crate::links::{MeasuredRequest, NodeController, NodeError};
 use crate::{Observer, RecordedRevision, StubNode, Tenant, describe_exit};
 
 use planned::OwnNodes;
@@ -235,8 +235,8 @@ impl NodeController for LinkedNodes {
         self.told.record_decision(node, decision);
     }
 
-    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
-        self.told.observer().on_request_measured(request, news);
+    fn on_request_measured(&self, request: &MeasuredRequest<'_>) {
+        self.told.record_request(request);
     }
 
     fn warn(&self, kind: &str, text: &str) {

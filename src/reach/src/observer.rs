@@ -2,10 +2,9 @@
 
 use std::time::SystemTime;
 
-use link::control::RequestTiming;
 use ros::bus::FailureReason;
 
-use crate::links::RequestUpdate;
+use crate::links::MeasuredRequest;
 
 /// The daemon as seen from one servant's reach.
 pub trait Observer: Send + Sync + 'static {
@@ -16,8 +15,8 @@ pub trait Observer: Send + Sync + 'static {
     /// Records that from `at` on a node of the robot is served by its local original, with the reason; `None`: by the
     /// cloud again.
     fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
-    /// Records an update about a request; an answered one has its response time and phases.
-    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate);
+    /// Records an update about a request of the robot; an answered one has its response time and phases.
+    fn on_request_measured(&self, robot: Option<&str>, request: &MeasuredRequest<'_>);
 }
 
 /// The user of a servant. A warm container has none.

@@ -8,7 +8,7 @@ use async_trait::async_trait;
 use bridge::BridgeOptions;
 use budget::{Budget, Permit};
 use bytes::Bytes;
-use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, NodeLaunch, RequestTiming, Welcome};
+use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, NodeLaunch, Welcome};
 use link::record::Record;
 use link::session::{receive_open, send_open};
 use link::{MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
@@ -16,7 +16,7 @@ use package::interface::Interface;
 use package::inventory::Inventory;
 use reach::group::dispatch::Rules;
 use reach::group::{ServantGroup, open_seat};
-use reach::links::RequestUpdate;
+use reach::links::MeasuredRequest;
 use reach::{Observer, Reach, ReachOptions, RecordedRevision, Tenant};
 use ros::bus::{Bus, FailureReason, ParamValue, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
@@ -83,7 +83,7 @@ impl Observer for NullObserver {
     }
     fn record_event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
     fn on_served_locally(&self, _: &str, _: &str, _: std::time::SystemTime, _: Option<&str>) {}
-    fn on_request_measured(&self, _: &RequestTiming, _: RequestUpdate) {}
+    fn on_request_measured(&self, _: Option<&str>, _: &MeasuredRequest<'_>) {}
 }
 
 impl Tenant for NullObserver {

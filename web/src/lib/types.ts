@@ -393,6 +393,7 @@ export interface Link {
   satisfaction?: number;
   threshold?: number;
   throughput?: number;
+  trace?: string;
   unfed: string[];
   unsent: number;
   unserved: string[];

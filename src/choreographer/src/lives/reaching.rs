@@ -7,7 +7,7 @@ use api::Level;
 use bridge::{BridgeOptions, RequestObserver};
 use catalogue::{Catalogue, RevisionContents};
 use link::control::RequestTiming;
-use reach::links::RequestUpdate;
+use reach::links::{MeasuredRequest, RequestUpdate};
 use reach::{Observer, Reach, ReachOptions, RecordedRevision, RequestTimes};
 use ros::bus::FailureReason;
 use servant::engine::ServantHandle;
@@ -18,6 +18,7 @@ use super::ChoreographerInner;
 use super::recent::RecentRequests;
 use super::rollouts::Rollouts;
 use crate::decide::requests::find_topic_request;
+use crate::tracer::{RequestTracer, TracedServant};
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
@@ -65,6 +66,7 @@ pub(crate) fn reach_options(
         catalogue: Arc::clone(&inner.catalogue),
         journal: inner.journal.clone(),
         measures,
+        tracer: inner.options.tracer.clone(),
     };
     (options, Arc::new(reports))
 }
@@ -145,6 +147,7 @@ struct ServantObserver {
     catalogue: Arc<Catalogue>,
     journal: Journal,
     measures: Arc<RequestRecorder>,
+    tracer: Option<Arc<dyn RequestTracer>>,
 }
 
 impl Observer for ServantObserver {
@@ -168,8 +171,13 @@ impl Observer for ServantObserver {
         self.journal.record_local_period((service, robot, node), at, why);
     }
 
-    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
-        let cloud = request.queue + request.compute;
-        self.measures.record(request, cloud, news);
+    fn on_request_measured(&self, robot: Option<&str>, request: &MeasuredRequest<'_>) {
+        let timing = request.timing;
+        let cloud = timing.queue + timing.compute;
+        self.measures.record(timing, cloud, request.update);
+        if let Some(tracer) = &self.tracer {
+            let servant = TracedServant { service: &self.revision.service, servant: &self.id, robot };
+            tracer.record(servant, request);
+        }
     }
 }

@@ -11,6 +11,7 @@ mod ahead;
 mod hung;
 mod log;
 mod rollouts;
+mod traces;
 
 /// Returns a request of this robot for a servant of `greet`, with this statement.
 pub(super) fn request_stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {

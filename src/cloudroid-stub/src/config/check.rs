@@ -50,9 +50,7 @@ impl Config {
                 return wrong(measure.desired_key, reason);
             }
         }
-        if let (Some(desire), Some(max)) = (self.desire, self.max)
-            && desire > max
-        {
+        if let Some((desire, max)) = self.desire.zip(self.max).filter(|(desire, max)| desire > max) {
             let reason = format!("({desire} s) is greater than max ({max} s); lower it, or raise max");
             return wrong("desire", reason);
         }

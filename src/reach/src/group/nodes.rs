@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use link::control::{Decision, Exit, Hello, NodeLaunch, RequestTiming};
+use link::control::{Decision, Exit, Hello, NodeLaunch};
 use parking_lot::Mutex;
 use ros::bus::{ParamValue, RosVersion};
 use ros::ros1::names;
@@ -16,7 +16,7 @@ use tokio::sync::{mpsc, watch};
 use super::bus::GroupBus;
 use super::names::NameResolver;
 use super::view::{GroupView, NodeAlias};
-use crate::links::{NodeController, NodeError, RequestUpdate};
+use crate::links::{MeasuredRequest, NodeController, NodeError};
 use crate::nodes::{RobotEvents, find_program, nodes_running};
 use crate::{Observer, RecordedRevision, Tenant};
 
@@ -238,8 +238,8 @@ impl NodeController for SharedNodes {
         self.told.record_decision(node, decision);
     }
 
-    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
-        self.told.observer().on_request_measured(request, news);
+    fn on_request_measured(&self, request: &MeasuredRequest<'_>) {
+        self.told.record_request(request);
     }
 
     fn warn(&self, kind: &str, text: &str) {

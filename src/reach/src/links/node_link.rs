@@ -14,7 +14,7 @@ use super::inputs::InputChannels;
 use super::lent::RobotServices;
 use super::node_time;
 use super::outputs::Outputs;
-use super::requests::RequestLog;
+use super::requests::{MeasuredRequest, RequestLog};
 use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine};
 use super::unsent::UnsentCounter;
 use super::{LinkStatus, mirror, seen};
@@ -128,6 +128,7 @@ impl NodeLink {
         let refused = self.refused.lock().clone();
         let requests = self.requests.last();
         LinkStatus {
+            session: self.id.clone(),
             node: self.node.clone(),
             up: self.session.is_up(),
             round_trip: self.session.round_trip().map(milliseconds),
@@ -357,8 +358,14 @@ async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::Un
             FromRobot::Parameters(changes) => hub.parameters.apply_changes(&hub, changes).await,
             FromRobot::Requests(requests) => {
                 let news = link.requests.record(requests, link.sla.max, Instant::now());
-                for (request, new) in news {
-                    hub.nodes.on_request_measured(&request, new);
+                for (request, update) in news {
+                    hub.nodes.on_request_measured(&MeasuredRequest {
+                        session: &link.id,
+                        node: &link.node,
+                        max: link.sla.max.map(|seconds| seconds * 1e3),
+                        timing: &request,
+                        update,
+                    });
                 }
             }
             FromRobot::Unsent { replaced, stale } => {

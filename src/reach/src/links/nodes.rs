@@ -3,11 +3,11 @@
 use std::sync::Weak;
 
 use async_trait::async_trait;
-use link::control::{Decision, Exit, Hello, NodeLaunch, RequestTiming};
+use link::control::{Decision, Exit, Hello, NodeLaunch};
 use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
-use super::requests::RequestUpdate;
+use super::requests::MeasuredRequest;
 use crate::observer::Tenant;
 
 /// A node started by a stub.
@@ -118,7 +118,7 @@ pub trait NodeController: Send + Sync + 'static {
     /// Records a decision of the robot about the local original.
     fn on_decision(&self, _node: &str, _decision: &Decision) {}
     /// Records an update about a request; an answered one has the cloud's response time and phases.
-    fn on_request_measured(&self, _request: &RequestTiming, _news: RequestUpdate) {}
+    fn on_request_measured(&self, _request: &MeasuredRequest<'_>) {}
     /// Reports a problem of this robot to the operator.
     fn warn(&self, kind: &str, text: &str);
     /// Describes settings of this robot for its node that the node answering in its place ignores.

@@ -24,6 +24,28 @@ pub enum RequestUpdate {
     AnsweredLate,
 }
 
+/// A robot's request, of which something became known.
+#[derive(Debug, Clone, Copy)]
+pub struct MeasuredRequest<'a> {
+    /// Id of the link's session.
+    pub session: &'a str,
+    /// Name of the node that was asked.
+    pub node: &'a str,
+    /// Longest response time that the robot accepts (T_max), in milliseconds.
+    pub max: Option<f64>,
+    /// Response time and phases as reported by the stub.
+    pub timing: &'a RequestTiming,
+    /// The update.
+    pub update: RequestUpdate,
+}
+
+impl MeasuredRequest<'_> {
+    /// Returns true if the cloud's answer took longer than the robot accepts, or never came.
+    pub fn is_late(&self) -> bool {
+        self.max.is_some_and(|max| self.timing.total.is_none_or(|total| total > max))
+    }
+}
+
 /// The requests of one link.
 #[derive(Default)]
 pub(super) struct RequestLog(Mutex<State>);

@@ -6,6 +6,8 @@ use link::drops::TopicDropCount;
 /// Status of a link, for explanations.
 #[derive(Debug, Clone)]
 pub struct LinkStatus {
+    /// Session id.
+    pub session: String,
     /// Name of the node.
     pub node: String,
     /// A connection exists and is not silent.

@@ -7,6 +7,7 @@ use api::Level;
 use link::control::Decision;
 use parking_lot::Mutex;
 
+use crate::links::MeasuredRequest;
 use crate::{Observer, Tenant};
 
 /// Maximum number of a robot's decisions recorded as events in this time; further ones are ignored, because a robot can
@@ -98,6 +99,13 @@ impl RobotEvents {
         let at = SystemTime::now().checked_sub(ago);
         let at = at.unwrap_or_else(SystemTime::now);
         self.observer.on_served_locally(robot, node, at, why);
+    }
+
+    /// Records an update about a request of the robot.
+    pub(crate) fn record_request(&self, request: &MeasuredRequest<'_>) {
+        let tenant = self.tenant();
+        let robot = tenant.as_ref().map(|tenant| tenant.robot());
+        self.observer.on_request_measured(robot, request);
     }
 
     /// Reports a problem of this robot to the operator.

@@ -229,7 +229,7 @@ async fn a_shim_that_takes_too_much_ends_its_servant_and_says_why() {
     // The resident allocates memory as soon as a client connects.
     let _ = read_from_port(&servant, 11311).await;
     let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else { panic!("it did not fail") };
-    assert!(reason.contains("its shim was killed") && reason.contains(&(48 << 20).to_string()), "{reason}");
+    assert!(reason.contains("its shim was killed") && reason.contains("its 48M of memory"), "{reason}");
     world.stop(servant).await;
 }
 

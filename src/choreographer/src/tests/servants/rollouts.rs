@@ -1,6 +1,8 @@
 //! Tests of rollouts, with the in-memory engine.
 
 use api::rollout::{RolloutState, RolloutTerms, Share};
+use link::control::RequestTiming;
+use reach::links::{MeasuredRequest, RequestUpdate};
 
 use super::*;
 
@@ -76,15 +78,19 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
 }
 
 /// Returns the observer that receives the reports of the robot's stub.
-fn observer_of(daemon: &Choreographer, lease: &Lease) -> Arc<dyn reach::Observer> {
+pub(super) fn observer_of(daemon: &Choreographer, lease: &Lease) -> Arc<dyn reach::Observer> {
     let handle = lease.handle();
     crate::lives::reaching::reach_options(&daemon.inner, &handle.revision, &handle.id).1
 }
 
+/// Reports an update about a request of the robot.
+fn report(observer: &Arc<dyn reach::Observer>, timing: &RequestTiming, update: RequestUpdate) {
+    let request = MeasuredRequest { session: "run-1", node: "/greet", max: None, timing, update };
+    observer.on_request_measured(Some("r1"), &request);
+}
+
 #[tokio::test(start_paused = true)]
 async fn a_canary_that_answers_nothing_is_not_promoted() {
-    use link::control::RequestTiming;
-    use reach::links::RequestUpdate;
     let world = two_revisions();
     let daemon = daemon_with_rollouts(&world);
     let terms = RolloutTerms { promote_after: Some(0.0), ..canary(Share::Robots(1)) };
@@ -101,9 +107,9 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
     waits("it has had 0 requests of the 5 required").await;
     let late = RequestTiming::default();
     let heard = observer_of(&daemon, &first);
-    (0..4).for_each(|_| heard.on_request_measured(&late, RequestUpdate::Late));
+    (0..4).for_each(|_| report(&heard, &late, RequestUpdate::Late));
     waits("it has had 4 requests of the 5 required").await;
-    heard.on_request_measured(&late, RequestUpdate::Late);
+    report(&heard, &late, RequestUpdate::Late);
     waits("5 of its 5 requests failed").await;
     let told = world.event_messages("rollout-waits");
     assert_eq!(told.len(), 3, "each reason once: {told:?}");
@@ -112,11 +118,11 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
     let answered = RequestTiming { total: Some(5.0), ..late.clone() };
     let stable = observer_of(&daemon, &second);
     for _ in 0..20 {
-        stable.on_request_measured(&answered, RequestUpdate::Answered);
-        heard.on_request_measured(&late, RequestUpdate::Late);
+        report(&stable, &answered, RequestUpdate::Answered);
+        report(&heard, &late, RequestUpdate::Late);
     }
     // Its answers come after all; each request was counted.
-    heard.on_request_measured(&answered, RequestUpdate::AnsweredLate);
+    report(&heard, &answered, RequestUpdate::AnsweredLate);
     wait_for_state(&daemon, RolloutState::RolledBack).await;
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.waits, None);

@@ -1,6 +1,7 @@
 use api::explain::Part;
+use choreographer::{RequestTracer, TracedServant};
 use link::control::RequestTiming;
-use reach::links::LinkStatus;
+use reach::links::{LinkStatus, MeasuredRequest};
 
 use super::*;
 
@@ -180,6 +181,62 @@ fn what_a_hand_over_has_lost_is_named() {
     assert!(lost[0].next.contains("local = \"none\""), "{}", lost[0].next);
 }
 
+/// Names traces by session and request; those of odd requests are not sampled.
+#[derive(Debug)]
+struct EvenTracer;
+
+impl RequestTracer for EvenTracer {
+    fn record(&self, _: TracedServant<'_>, _: &MeasuredRequest<'_>) {}
+    fn trace_id(&self, session: &str, request: u64) -> Option<String> {
+        (request % 2 == 0).then(|| format!("{session}:{request}"))
+    }
+    fn dropped_spans(&self) -> u64 {
+        0
+    }
+}
+
+#[test]
+fn the_trace_of_a_late_request_is_named_first() {
+    let trace = |max: f64, totals: [Option<f64>; 4]| {
+        let requests =
+            totals.iter().zip(2..).map(|(total, id)| RequestTiming { id, total: *total, ..RequestTiming::default() });
+        let status = LinkStatus { requests: requests.collect(), ..link_status(Some(max)) };
+        crate::explain::to_link(status, Some(&EvenTracer)).trace
+    };
+    let all = [Some(50.0), Some(150.0), Some(20.0), Some(20.0)];
+    assert_eq!(trace(0.01, all).as_deref(), Some("run-1:4"));
+    assert_eq!(trace(0.04, all).as_deref(), Some("run-1:2"));
+    assert_eq!(trace(1.0, all).as_deref(), Some("run-1:4"));
+    // What was never answered may have no trace.
+    let none = [None, Some(150.0), None, Some(20.0)];
+    assert_eq!(trace(0.1, none), None);
+    let status = link_status(Some(0.1));
+    assert_eq!(crate::explain::to_link(status, None).trace, None);
+}
+
+/// Returns the status of a link that is up and has no requests; `max` is T_max in seconds.
+fn link_status(max: Option<f64>) -> LinkStatus {
+    LinkStatus {
+        session: "run-1".into(),
+        node: "/detect".into(),
+        up: true,
+        round_trip: Some(2.0),
+        clock: None,
+        throughput: None,
+        drops: vec![],
+        dropped: vec![],
+        sla: link::control::SlaTargets { desire: max.map(|max| max / 2.0), max, ..Default::default() },
+        requests: vec![],
+        unsent: 0,
+        given: 3,
+        left_out: 1,
+        unfed: vec![],
+        unserved: vec![],
+        refused: vec![],
+        duplicates: vec![],
+    }
+}
+
 #[test]
 fn a_links_requests_are_summed_up() {
     use link::drops::{Cause, TopicDropCount};
@@ -191,32 +248,22 @@ fn a_links_requests_are_summed_up() {
         ..RequestTiming::default()
     };
     let dropped = |cause, count| TopicDropCount { topic: "/image".into(), cause, count };
-    let seen = crate::explain::to_link(LinkStatus {
-        node: "/detect".into(),
-        up: true,
-        round_trip: Some(2.0),
-        clock: None,
-        throughput: None,
+    let status = LinkStatus {
         drops: vec![dropped(Cause::Slow, 2)],
         dropped: vec![dropped(Cause::Replaced, 30)],
-        sla: link::control::SlaTargets { desire: Some(0.05), max: Some(0.1), ..Default::default() },
         requests: vec![
             request(Some(50.0), false),
             RequestTiming { up: 90.0, ..request(Some(150.0), true) },
             request(None, true),
         ],
-        unsent: 0,
-        given: 3,
-        left_out: 1,
-        unfed: vec![],
-        unserved: vec![],
         refused: vec![link::control::IncompatibleEndpoint {
             topic: "/seen".into(),
             node: "/view".into(),
             why: "durability".into(),
         }],
-        duplicates: vec![],
-    });
+        ..link_status(Some(0.1))
+    };
+    let seen = crate::explain::to_link(status, None);
     assert_eq!((seen.requests, seen.late, seen.local), (3, 2, 2));
     assert_eq!(seen.dropped, 32);
     assert!(seen.drops[0].starts_with("in the cloud 2 messages of /image were dropped: "));
@@ -239,24 +286,16 @@ fn what_was_never_promised_is_not_late() {
         satisfaction: 8.0,
         ..RequestTiming::default()
     };
-    let seen = crate::explain::to_link(LinkStatus {
-        node: "/detect".into(),
+    let status = LinkStatus {
         up: false,
         round_trip: None,
-        clock: None,
-        throughput: None,
-        drops: vec![],
-        dropped: vec![],
         sla: link::control::SlaTargets { fallback_after: Some(3.0), ..Default::default() },
         requests: vec![request(Some(9000.0)), request(None)],
-        unsent: 0,
         given: 0,
         left_out: 0,
-        unfed: vec![],
-        unserved: vec![],
-        refused: vec![],
-        duplicates: vec![],
-    });
+        ..link_status(None)
+    };
+    let seen = crate::explain::to_link(status, None);
     assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
     let causes = texts(served_with(seen));
     for words in [

@@ -342,6 +342,7 @@ fn explanation() -> Explanation {
         satisfaction: Some(0.5),
         phases: vec![Part::default()],
         late_in: Some(Part::default()),
+        trace: some_text("4bf92f3577b34da6a3ce929d0e0e4736"),
         ..Link::default()
     };
     Explanation {
