@@ -205,7 +205,14 @@ impl AppliedGraph {
 /// Waits for the node of a session to register. It may have just been started and registers one name after the other;
 /// until then, everything registered on the robot before is kept, and its users wait.
 async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
-    tokio::time::sleep(SETTLE).await;
+    loop {
+        tokio::time::sleep(SETTLE).await;
+        let Some(current) = session.upgrade() else { return };
+        // A link that has fallen silent lists nothing more, while the local original needs its inputs.
+        if current.is_up() && current.probe(SETTLE).await {
+            break;
+        }
+    }
     let Some(mirror) = mirror.upgrade() else {
         return;
     };

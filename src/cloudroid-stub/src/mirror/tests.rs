@@ -37,12 +37,14 @@ stories! {
         the_node_is_connected_before_the_first_message_comes,
         newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
         the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back,
+        a_link_that_falls_silent_before_the_node_has_registered_leaves_the_original_its_inputs,
         a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other;
     of_ros_2 = Two:
         who_leaves_the_robot_leaves_the_servant_and_nothing_is_lost_before,
         the_node_is_connected_before_the_first_message_comes,
         newcomers_are_given_the_last_word_of_who_speaks_for_the_node,
         the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back,
+        a_link_that_falls_silent_before_the_node_has_registered_leaves_the_original_its_inputs,
         a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other;
 }
 
@@ -302,39 +304,89 @@ impl ServiceHandler for Says {
     }
 }
 
-async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back(ros: RosVersion) {
-    let scene = Scene::new(ros, "/ns/relay").await;
-    let watcher: Arc<dyn Bus> = scene.robot.node("/ns/relay_cloudroid").await;
-    let diagnostics = Diagnostics::new(&watcher, "/ns/relay", "robot").await;
-    let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
-    let sla = QosSla::parse(sla).unwrap();
-    let relay = relay_setup(&scene.robot, &["patient"]);
-    let promised = scene.mirror.start_promise(sla, relay, Vec::new(), diagnostics.unwrap(), &watcher);
-    promised.await.unwrap();
-    let app = scene.robot.node("/app").await;
-    let (input, mut out) = (advertise(&app, "/ns/in", false).await, subscribe(&app, "/absolute/out").await);
-    let echo = "/ns/relay/echo";
-    wait_for_graph(&app, "its services", |graph| graph.services.contains_key(echo)).await;
-    let echoed = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
-    assert_eq!(decode_string(ros, &echoed), "hello", "the original's own answer");
-    let mut count = input.matched_subscribers();
-    count.wait_for(|now| now.connected_count() > 0).await.unwrap();
-    out.matched.wait_for(|now| now.connected_count() > 0).await.unwrap();
-    input.publish(scene.bytes("scan"));
-    assert!(next_text(&mut out).await.ends_with("scan"));
-    // The cloud is reached for the first time.
-    let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
-    let serving = scene.real.serve(echo, of, Arc::new(Says(scene.bytes("cloud"))));
-    let _serving = serving.await.unwrap();
-    let _link = scene.connect().await;
-    let deadline = tokio::time::Instant::now() + SOON;
-    let keeper = scene.mirror.keeper().unwrap();
-    while keeper.is_local_fed() {
-        assert!(tokio::time::Instant::now() < deadline, "it should hand back");
-        tokio::task::yield_now().await;
+/// An application beside an original that stands in for a cloud that was never reached.
+struct StandIn {
+    scene: Scene,
+    app: Arc<dyn Bus>,
+    input: Box<dyn Publisher>,
+    out: Subscription,
+}
+
+/// Service of the node.
+const ECHO: &str = "/ns/relay/echo";
+
+impl StandIn {
+    async fn start(ros: RosVersion) -> Self {
+        let scene = Scene::new(ros, "/ns/relay").await;
+        let watcher: Arc<dyn Bus> = scene.robot.node("/ns/relay_cloudroid").await;
+        let diagnostics = Diagnostics::new(&watcher, "/ns/relay", "robot").await;
+        let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
+        let sla = QosSla::parse(sla).unwrap();
+        let relay = relay_setup(&scene.robot, &["patient"]);
+        let promised = scene.mirror.start_promise(sla, relay, Vec::new(), diagnostics.unwrap(), &watcher);
+        promised.await.unwrap();
+        let app = scene.robot.node("/app").await;
+        let (input, mut out) = (advertise(&app, "/ns/in", false).await, subscribe(&app, "/absolute/out").await);
+        wait_for_graph(&app, "its services", |graph| graph.services.contains_key(ECHO)).await;
+        let mut count = input.matched_subscribers();
+        count.wait_for(|now| now.connected_count() > 0).await.unwrap();
+        out.matched.wait_for(|now| now.connected_count() > 0).await.unwrap();
+        Self { scene, app, input, out }
     }
-    let answer = app.call(echo, scene.bytes("hello"), SOON).await.unwrap();
-    assert_eq!(decode_string(ros, &answer), "cloud");
+
+    /// Sends an input, which the original answers.
+    async fn expect_answer(&mut self, text: &str) {
+        self.input.publish(self.scene.bytes(text));
+        assert!(next_text(&mut self.out).await.ends_with(text));
+    }
+
+    async fn call_echo(&self) -> String {
+        let answer = self.app.call(ECHO, self.scene.bytes("hello"), SOON).await.unwrap();
+        decode_string(self.scene.ros, &answer)
+    }
+
+    /// Serves the service by the node in the cloud, and connects the link.
+    async fn reach_cloud(
+        &self,
+    ) -> (Box<dyn Send + Sync>, (JoinHandle<DisconnectReason>, JoinHandle<DisconnectReason>)) {
+        let of = ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef");
+        let serving = self.scene.real.serve(ECHO, of, Arc::new(Says(self.scene.bytes("cloud"))));
+        (serving.await.unwrap(), self.scene.connect().await)
+    }
+
+    /// Waits until the original is asked, or no longer.
+    async fn wait_for_local_feed(&self, is_fed: bool) {
+        let keeper = self.scene.mirror.keeper().unwrap();
+        let reached = async {
+            while keeper.is_local_fed() != is_fed {
+                tokio::task::yield_now().await;
+            }
+        };
+        timeout(SOON, reached).await.unwrap_or_else(|_| panic!("local: {is_fed}"));
+    }
+}
+
+async fn the_original_stands_in_for_a_cloud_that_was_never_reached_and_hands_back(ros: RosVersion) {
+    let mut stands_in = StandIn::start(ros).await;
+    assert_eq!(stands_in.call_echo().await, "hello", "the original's own answer");
+    stands_in.expect_answer("scan").await;
+    // The cloud is reached for the first time.
+    let _linked = stands_in.reach_cloud().await;
+    stands_in.wait_for_local_feed(false).await;
+    assert_eq!(stands_in.call_echo().await, "cloud");
+}
+
+async fn a_link_that_falls_silent_before_the_node_has_registered_leaves_the_original_its_inputs(ros: RosVersion) {
+    let mut stands_in = StandIn::start(ros).await;
+    // The cloud's node has registered its service, and not yet its topics.
+    let (_serving, (link, served)) = stands_in.reach_cloud().await;
+    stands_in.wait_for_local_feed(false).await;
+    assert_eq!(stands_in.call_echo().await, "cloud");
+    (link.abort(), served.abort());
+    stands_in.wait_for_local_feed(true).await;
+    // Nothing happens that could be awaited: what the graph did not list must still be there after this time.
+    tokio::time::sleep(SETTLE + Duration::from_millis(500)).await;
+    stands_in.expect_answer("scan").await;
 }
 
 async fn a_stub_that_ends_waits_for_a_cloud_that_gives_signs_and_for_no_other(ros: RosVersion) {
