@@ -24,7 +24,7 @@ use super::{names, node_ends, services, type_hash};
 /// Maximum wait for a server whose endpoints are known but which does not acknowledge ours. One that is there does,
 /// within a few milliseconds, or on a busy machine within a second or two; called before, it would answer to nobody, as
 /// a server of Fast DDS drops the reply to a reader that it has not matched.
-const UNSURE: Duration = Duration::from_secs(5);
+const UNSURE: Duration = Duration::from_secs(20);
 
 /// The servers that a call would reach.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

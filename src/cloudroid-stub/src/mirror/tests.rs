@@ -382,7 +382,8 @@ async fn a_link_that_falls_silent_before_the_node_has_registered_leaves_the_orig
     let (_serving, (link, served)) = stands_in.reach_cloud().await;
     stands_in.wait_for_local_feed(false).await;
     assert_eq!(stands_in.call_echo().await, "cloud");
-    (link.abort(), served.abort());
+    link.abort();
+    served.abort();
     stands_in.wait_for_local_feed(true).await;
     // Nothing happens that could be awaited: what the graph did not list must still be there after this time.
     tokio::time::sleep(SETTLE + Duration::from_millis(500)).await;
