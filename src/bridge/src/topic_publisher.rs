@@ -11,21 +11,16 @@ use ros::ring::{Ring, RingBounds};
 use ros::schema::MessageType;
 use ros::sizes::SizeCounters;
 use tokio::sync::watch;
-use tokio::time::timeout_at;
 
-use crate::INSIDE;
 use crate::counted::CountingPublisher;
 use crate::quality::PublisherOffer;
 use crate::refusals::Refusals;
 use crate::shared::BridgeShared;
+use crate::subscribers::{NodeAddress, WaitDeadlines, find_missing_subscribers, wait_for_subscribers};
 use crate::topic_requests::TopicRequests;
 
 /// Limits of messages kept while the topic is being advertised.
 const WARM: RingBounds = RingBounds { messages: 256, bytes: 16 << 20 };
-
-/// Factor of the waiting time for a registered node while nobody else is connected: on a busy machine rospy takes
-/// seconds.
-const ALONE: u32 = 10;
 
 /// Receives events of an advertised topic.
 pub(crate) trait PublisherEvents: Send + Sync + 'static {
@@ -33,15 +28,6 @@ pub(crate) trait PublisherEvents: Send + Sync + 'static {
     fn on_failed(&self, reason: &str);
     /// Called once for each subscriber that receives nothing because its quality of service is incompatible.
     fn on_refused(&self, reason: &str);
-}
-
-/// Deadlines of waiting for subscribers.
-#[derive(Clone, Copy)]
-struct WaitDeadlines {
-    /// Deadline for missing subscribers while others are connected.
-    some: Instant,
-    /// Deadline for registered subscribers while nobody is connected.
-    none: Instant,
 }
 
 /// Advertisement of one topic by one client.
@@ -62,9 +48,6 @@ pub(crate) struct TopicPublisher {
     given_up: Mutex<BTreeSet<NodeAddress>>,
     state: Mutex<State>,
 }
-
-/// Name and address of a node: another node may come with the same name.
-type NodeAddress = (String, String);
 
 enum State {
     /// Not advertised yet, or a node registered as subscriber is not connected yet: messages wait a moment, since
@@ -136,7 +119,7 @@ impl TopicPublisher {
             if let State::Live { publisher, .. } = std::mem::replace(&mut *state, State::warming(None)) {
                 *state = State::warming(Some(publisher));
             }
-            tokio::spawn(wait_for_subscribers(self.clone(), subscribers, self.wait_deadlines()));
+            tokio::spawn(go_live_once_connected(self.clone(), subscribers, self.wait_deadlines()));
         }
         match &mut *state {
             State::Live { publisher, .. } => {
@@ -194,34 +177,12 @@ impl TopicPublisher {
 
     /// Returns the deadlines of waiting for subscribers, from now on.
     fn wait_deadlines(&self) -> WaitDeadlines {
-        let (warm_up, now) = (self.shared.options.warm_up, Instant::now());
-        WaitDeadlines { some: now + warm_up, none: now + warm_up * ALONE }
+        WaitDeadlines::start(self.shared.options.warm_up)
     }
 
-    /// Returns the nodes registered as subscribers that are not connected. The bridge itself may be registered, but
-    /// never connects; nor do subscribers with incompatible quality of service.
+    /// Returns the subscribers that are not connected.
     fn missing_subscribers(&self, matched: &MatchedPeers) -> BTreeSet<NodeAddress> {
-        let bus = &self.shared.bus;
-        let graph = bus.graph().borrow().clone();
-        let Some(nodes) = graph.topics.get(&self.topic) else {
-            return BTreeSet::new();
-        };
-        nodes
-            .subscribers
-            .iter()
-            .filter(|name| *name != bus.node() && *name != INSIDE)
-            .filter(|name| !matched.has_node(name) && !is_refused(matched, name))
-            .map(|name| {
-                let address = graph.nodes.get(name).cloned();
-                (name.clone(), address.unwrap_or_default())
-            })
-            .collect()
-    }
-
-    /// Returns whether all subscribers that should be connected are, and at least one is. An observing node does not
-    /// count.
-    fn is_complete(&self, matched: &MatchedPeers) -> bool {
-        matched.connected_count_except(INSIDE) > 0 && self.missing_subscribers(matched).is_subset(&self.given_up.lock())
+        find_missing_subscribers(&*self.shared.bus, &self.topic, matched)
     }
 
     /// Sends the queued messages, in order, and from now on all at once.
@@ -247,12 +208,6 @@ impl Drop for TopicPublisher {
     }
 }
 
-/// Returns whether an endpoint of this node does not match.
-fn is_refused(matched: &MatchedPeers, node: &str) -> bool {
-    let mut refused = matched.refused.iter();
-    refused.any(|refusal| refusal.peer.node() == node)
-}
-
 async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: Arc<dyn PublisherEvents>) {
     let shared = topic_publisher.shared.clone();
     let patience = topic_publisher.wait_deadlines();
@@ -269,7 +224,7 @@ async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: A
     if let State::Warming { publisher: held, .. } = &mut *topic_publisher.state.lock() {
         *held = Some(publisher);
     }
-    wait_for_subscribers(topic_publisher, subscribers, patience).await;
+    go_live_once_connected(topic_publisher, subscribers, patience).await;
 }
 
 /// Reports incompatible subscribers for as long as the topic is advertised.
@@ -286,47 +241,22 @@ async fn report_refusals(mut subscribers: watch::Receiver<MatchedPeers>, notifie
     }
 }
 
-/// Waits until all subscribers that should be connected are, and at least one is; those that are too late miss the
-/// queued messages. As long as nobody is connected, nobody waits for messages that a slow node would miss: it has more
-/// time.
-async fn wait_for_subscribers(
+/// Sends the queued messages once the subscribers are connected; those that are too late miss them.
+async fn go_live_once_connected(
     topic_publisher: Arc<TopicPublisher>,
     mut subscribers: watch::Receiver<MatchedPeers>,
     patience: WaitDeadlines,
 ) {
-    let mut in_time = wait_connected(&topic_publisher, &mut subscribers, patience.some).await;
-    let is_slow = {
-        let matched = subscribers.borrow();
-        matched.connected_count_except(INSIDE) == 0 && !topic_publisher.missing_subscribers(&matched).is_empty()
+    let missing = |matched: &MatchedPeers| {
+        let given_up = topic_publisher.given_up.lock();
+        let mut missing = topic_publisher.missing_subscribers(matched);
+        missing.retain(|node| !given_up.contains(node));
+        missing
     };
-    if !in_time && is_slow {
-        in_time = wait_connected(&topic_publisher, &mut subscribers, patience.none).await;
-    }
-    if !in_time {
-        // They are not waited for again while they do not change.
-        *topic_publisher.given_up.lock() = topic_publisher.missing_subscribers(&subscribers.borrow());
-    }
+    let late = wait_for_subscribers(&mut subscribers, patience, missing).await;
+    // They are not waited for again while they do not change.
+    topic_publisher.given_up.lock().extend(late);
     topic_publisher.go_live();
-}
-
-/// Returns whether all subscribers that should be connected are before `until`, or the topic has ended.
-async fn wait_connected(
-    topic_publisher: &TopicPublisher,
-    subscribers: &mut watch::Receiver<MatchedPeers>,
-    until: Instant,
-) -> bool {
-    let connected = async {
-        loop {
-            let matched = subscribers.borrow_and_update().clone();
-            if topic_publisher.is_complete(&matched) {
-                return;
-            }
-            if subscribers.changed().await.is_err() {
-                return;
-            }
-        }
-    };
-    timeout_at(until.into(), connected).await.is_ok()
 }
 
 #[cfg(test)]

@@ -83,11 +83,11 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
     let over = Instant::now();
     let later = Instant::now() + PATIENCE * 10;
     let still = WaitDeadlines { some: over, none: later };
-    let waiting = wait_for_subscribers(topic_publisher.clone(), subscribers.clone(), still);
+    let waiting = go_live_once_connected(topic_publisher.clone(), subscribers.clone(), still);
     let waited = timeout(Duration::from_millis(100), waiting).await;
     assert!(waited.is_err() && !is_live(&topic_publisher), "nobody else waits for it");
     let both = WaitDeadlines { some: over, none: over };
-    wait_for_subscribers(topic_publisher.clone(), subscribers, both).await;
+    go_live_once_connected(topic_publisher.clone(), subscribers, both).await;
     assert!(is_live(&topic_publisher), "it has waited long enough");
 
     // The graph changes, and messages are still sent at once.

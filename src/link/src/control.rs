@@ -182,6 +182,11 @@ pub enum Welcome {
     },
 }
 
+/// Earlier stubs do not say what their subscribers request.
+fn is_latching_by_default() -> bool {
+    true
+}
+
 /// Control messages from the robot to the cloud.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -199,6 +204,9 @@ pub enum FromRobot {
         channel: u32,
         /// Number of subscribing nodes on the robot, not counting other nodes of this servant.
         count: usize,
+        /// True if a subscriber requests what was published before it came.
+        #[serde(default = "is_latching_by_default")]
+        latching: bool,
     },
     /// Changed parameters; those without a value were deleted.
     Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros_bus::{BusError, IncompatiblePeer, MatchedPeers, PeerId, Publisher, QosProfile, TopicPeer, WireType};
+use ros_bus::{BusError, IncompatiblePeer, MatchedPeers, Offer, PeerId, Publisher, QosProfile, TopicPeer, WireType};
 use rtps::{EndpointData, EndpointMatches, EndpointQos};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -108,7 +108,9 @@ impl SubscriberWatcher {
             let peer = seen.peer(reader.guid);
             let theirs = seen::wire_type(reader);
             if theirs.is_compatible_with(&self.of) {
-                now.peers.push(TopicPeer { id: peer, connected: ends.confirmed.contains(&reader.guid), offer: None });
+                let connected = ends.confirmed.contains(&reader.guid);
+                let offer = Offer { wire_type: Arc::new(theirs), latching: quality::is_latching(reader) };
+                now.peers.push(TopicPeer { id: peer, connected, offer: Some(offer) });
             } else {
                 let why = show::type_mismatch_text(&theirs, &self.of);
                 now.refused.push(IncompatiblePeer { peer, why });

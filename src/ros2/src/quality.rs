@@ -103,8 +103,8 @@ fn profile(qos: &EndpointQos) -> String {
 }
 
 /// Returns true if a writer keeps its last messages for late subscribers.
-pub(super) fn is_latching(writer: &EndpointData) -> bool {
-    writer.qos.durability >= DurabilityKind::TransientLocal
+pub(super) fn is_latching(endpoint: &EndpointData) -> bool {
+    endpoint.qos.durability >= DurabilityKind::TransientLocal
 }
 
 #[cfg(test)]

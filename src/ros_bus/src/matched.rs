@@ -77,12 +77,12 @@ impl fmt::Display for PeerId {
     }
 }
 
-/// Properties that a publisher announces for all messages it will send.
+/// Properties that a publisher announces for all messages it will send, or that a subscriber requests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Offer {
     /// Type of the messages.
     pub wire_type: Arc<WireType>,
-    /// True if the publisher keeps its last message for late subscribers.
+    /// True if the publisher keeps its last message for late subscribers, or the subscriber requests that message.
     pub latching: bool,
 }
 
@@ -93,7 +93,8 @@ pub struct TopicPeer {
     pub id: PeerId,
     /// True while messages can pass; false if the peer was connected before and, as far as is known, still exists.
     pub connected: bool,
-    /// Offer of the publisher, once known; `None` for subscribers.
+    /// Offer of the publisher, once known, or request of the subscriber; `None` for subscribers of ROS 1, which are given
+    /// what a publisher latches.
     pub offer: Option<Offer>,
 }
 

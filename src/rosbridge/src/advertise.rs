@@ -2,86 +2,37 @@
 
 use std::borrow::Cow;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Id, Problem, QosRequest, Writer};
+use crate::kinds::{Flag, MESSAGE_TYPE, OptionalCount, OptionalId, OptionalText, Qos, TOPIC, Text};
+use crate::message::message;
+use crate::{Id, QosRequest};
 
-/// Announces that the client will publish on a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Advertise<'a> {
+message! {
+    /// Announces that the client will publish on a topic.
+    Advertise "advertise"
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the topic.
-    pub topic: Cow<'a, str>,
+    topic: Cow<'a, str> = "topic" TOPIC,
     /// Type of the messages: `package/Type`.
-    pub type_name: Cow<'a, str>,
+    type_name: Cow<'a, str> = "type" Text(MESSAGE_TYPE),
     /// Sends the last message to new subscribers.
-    pub latch: bool,
+    latch: bool = "latch" Flag,
     /// Number of messages queued for a slow subscriber.
-    pub queue_size: Option<u64>,
+    queue_size: Option<u64> = "queue_size" OptionalCount("a number of messages"),
     /// Digest of the client's own definition (MD5, or the type hash of ROS 2), for clients that publish ROS bytes
     /// (extension).
-    pub md5sum: Option<Cow<'a, str>>,
+    md5sum: Option<Cow<'a, str>> = "md5sum" OptionalText("the definition's MD5 in hex, or its type hash,"),
     /// Quality of service offered by the client.
-    pub qos: Option<QosRequest>,
+    qos: Option<QosRequest> = "qos" Qos,
 }
 
-impl<'a> Message<'a> for Advertise<'a> {
-    const OP: &'static str = "advertise";
-    const FIELDS: &'static [&'static str] = &["topic", "type", "latch", "queue_size", "md5sum", "qos"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            topic: fields.required_text("topic", "a topic name")?,
-            type_name: fields.required_text("type", "a message type such as \"std_msgs/String\"")?,
-            latch: fields.boolean("latch")?.unwrap_or(false),
-            queue_size: fields.count("queue_size", 0, "a number of messages")?,
-            md5sum: fields.text("md5sum", "the definition's MD5 in hex, or its type hash,")?,
-            qos: QosRequest::read(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("topic", &self.topic);
-        writer.text("type", &self.type_name);
-        if self.latch {
-            writer.boolean("latch", true);
-        }
-        writer.optional_count("queue_size", self.queue_size);
-        writer.optional_text("md5sum", &self.md5sum);
-        QosRequest::write(self.qos, writer);
-    }
-}
-
-/// Announces that the client will no longer publish on a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Unadvertise<'a> {
+message! {
+    /// Announces that the client will no longer publish on a topic.
+    Unadvertise "unadvertise"
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the topic.
-    pub topic: Cow<'a, str>,
-}
-
-impl<'a> Message<'a> for Unadvertise<'a> {
-    const OP: &'static str = "unadvertise";
-    const FIELDS: &'static [&'static str] = &["topic"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self { id, topic: fields.required_text("topic", "a topic name")? })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("topic", &self.topic);
-    }
+    topic: Cow<'a, str> = "topic" TOPIC,
 }
 
 #[cfg(test)]

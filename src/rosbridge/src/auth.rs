@@ -2,62 +2,31 @@
 
 use std::borrow::Cow;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Id, Problem, Writer};
+use crate::Id;
+use crate::kinds::{Integer, OptionalId, Text};
+use crate::message::message;
 
-/// Credentials: a MAC over the other fields, with a secret shared with a third party.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Auth<'a> {
+const SECONDS: Integer = Integer("seconds since 1970");
+
+message! {
+    /// Credentials: a MAC over the other fields, with a secret shared with a third party.
+    Auth "auth"
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// SHA-512 of the secret and the other fields, in hex.
-    pub mac: Cow<'a, str>,
+    mac: Cow<'a, str> = "mac" Text("a hash in hex"),
     /// Address of the client.
-    pub client: Cow<'a, str>,
+    client: Cow<'a, str> = "client" Text("the client's address"),
     /// Address of the server.
-    pub dest: Cow<'a, str>,
+    dest: Cow<'a, str> = "dest" Text("the server's address"),
     /// A random string.
-    pub rand: Cow<'a, str>,
+    rand: Cow<'a, str> = "rand" Text("a random text"),
     /// Time of the request, in seconds since 1970.
-    pub t: i64,
+    t: i64 = "t" SECONDS,
     /// Level of the client.
-    pub level: Cow<'a, str>,
+    level: Cow<'a, str> = "level" Text("a text"),
     /// Expiry, in seconds since 1970.
-    pub end: i64,
-}
-
-impl<'a> Message<'a> for Auth<'a> {
-    const OP: &'static str = "auth";
-    const FIELDS: &'static [&'static str] = &["mac", "client", "dest", "rand", "t", "level", "end"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let seconds = |field| fields.integer(field)?.ok_or(Problem::Missing { field, expected: "seconds since 1970" });
-        Ok(Self {
-            id,
-            mac: fields.required_text("mac", "a hash in hex")?,
-            client: fields.required_text("client", "the client's address")?,
-            dest: fields.required_text("dest", "the server's address")?,
-            rand: fields.required_text("rand", "a random text")?,
-            t: seconds("t")?,
-            level: fields.required_text("level", "a text")?,
-            end: seconds("end")?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("mac", &self.mac);
-        writer.text("client", &self.client);
-        writer.text("dest", &self.dest);
-        writer.text("rand", &self.rand);
-        writer.integer("t", self.t);
-        writer.text("level", &self.level);
-        writer.integer("end", self.end);
-    }
+    end: i64 = "end" SECONDS,
 }
 
 #[cfg(test)]

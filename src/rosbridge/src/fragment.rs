@@ -4,48 +4,21 @@ use std::borrow::Cow;
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Id, Problem, Writer};
+use crate::Id;
+use crate::kinds::{Count, Data, RequiredId};
+use crate::message::message;
 
-/// One fragment of a message.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Fragment<'a> {
+message! {
+    /// One fragment of a message.
+    Fragment "fragment"
     /// Id of the message it belongs to.
-    pub id: Id<'a>,
+    id: Id<'a> = RequiredId("the id common to all fragments of the message"),
     /// A piece of that message's JSON text.
-    pub data: Cow<'a, str>,
+    data: Cow<'a, str> = "data" Data("a piece of the message's text"),
     /// Index of the fragment, from 0.
-    pub num: u64,
+    num: u64 = "num" Count((0, "the fragment's index, from 0,")),
     /// Total number of fragments.
-    pub total: u64,
-}
-
-impl<'a> Message<'a> for Fragment<'a> {
-    const OP: &'static str = "fragment";
-    const FIELDS: &'static [&'static str] = &["data", "num", "total"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let part =
-            |field, least, expected| fields.count(field, least, expected)?.ok_or(Problem::Missing { field, expected });
-        Ok(Self {
-            id: id
-                .ok_or(Problem::Missing { field: "id", expected: "the id common to all fragments of the message" })?,
-            data: fields.data("data", "a piece of the message's text")?,
-            num: part("num", 0, "the fragment's index, from 0,")?,
-            total: part("total", 1, "the number of fragments, 1 or more,")?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        Some(&self.id)
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("data", &self.data);
-        writer.optional_count("num", Some(self.num));
-        writer.optional_count("total", Some(self.total));
-    }
+    total: u64 = "total" Count((1, "the number of fragments, 1 or more,")),
 }
 
 /// Limits of one client's incomplete messages.

@@ -42,3 +42,19 @@ impl From<String> for Id<'static> {
         Id::Text(Cow::Owned(text))
     }
 }
+
+/// Splits the id off a name: old clients wrote a call with id 7 as `/service#7`.
+pub(crate) fn split_name<'a>(name: Cow<'a, str>, id: Option<Id<'a>>) -> (Cow<'a, str>, Option<Id<'a>>) {
+    let Some(at) = name.find('#') else {
+        return (name, id);
+    };
+    let suffix = Id::from(name[at + 1..].to_owned());
+    let name = match name {
+        Cow::Borrowed(name) => Cow::Borrowed(&name[..at]),
+        Cow::Owned(mut name) => {
+            name.truncate(at);
+            Cow::Owned(name)
+        }
+    };
+    (name, id.or(Some(suffix)))
+}

@@ -24,6 +24,7 @@ mod fields;
 mod fragment;
 mod id;
 mod json;
+mod kinds;
 mod message;
 mod op;
 mod payload;

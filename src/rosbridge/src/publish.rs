@@ -2,28 +2,28 @@
 
 use std::borrow::Cow;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Compression, Format, Id, Payload, Problem, QosRequest, Writer};
+use crate::kinds::{Encoding, Flag, MESSAGE_TYPE, MessageOrEmpty, OptionalId, OptionalText, Qos, TOPIC};
+use crate::message::{Message, message};
+use crate::{Compression, Format, Id, Payload, QosRequest, Writer};
 
-/// A message on a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Publish<'a> {
+message! {
+    /// A message on a topic.
+    Publish "publish" ignores ["queue_size"]
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the topic.
-    pub topic: Cow<'a, str>,
-    /// The message; an empty object if the client gave none; [`Payload::raw`] if `compression` is `cbor-raw`.
-    pub msg: Payload<'a>,
+    topic: Cow<'a, str> = "topic" TOPIC,
+    /// `package/Type`, if the client has not advertised (extension).
+    type_name: Option<Cow<'a, str>> = "type" OptionalText(MESSAGE_TYPE),
     /// Encoding of `msg`. Clients must say `cbor-raw` when they send it; the server does not repeat what a client asked
     /// for.
-    pub compression: Compression,
+    compression: Compression = "compression" Encoding,
     /// Latches, as in `advertise`; some clients repeat it here instead.
-    pub latch: bool,
-    /// `package/Type`, if the client has not advertised (extension).
-    pub type_name: Option<Cow<'a, str>>,
+    latch: bool = "latch" Flag,
     /// Quality of service offered, if the client has not advertised.
-    pub qos: Option<QosRequest>,
+    qos: Option<QosRequest> = "qos" Qos,
+    /// The message; an empty object if the client gave none; [`Payload::raw`] if `compression` is `cbor-raw`.
+    msg: Payload<'a> = "msg" MessageOrEmpty,
 }
 
 impl<'a> Publish<'a> {
@@ -50,38 +50,6 @@ impl<'a> Publish<'a> {
         writer.text("topic", topic);
         writer.raw("msg", Some(stamp), bytes);
         writer.end();
-    }
-}
-
-impl<'a> Message<'a> for Publish<'a> {
-    const OP: &'static str = "publish";
-    const FIELDS: &'static [&'static str] = &["topic", "msg", "compression", "latch", "type", "queue_size", "qos"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            topic: fields.required_text("topic", "a topic name")?,
-            msg: fields.object_or_empty("msg")?,
-            compression: Compression::read(fields)?,
-            latch: fields.boolean("latch")?.unwrap_or(false),
-            type_name: fields.text("type", "a message type such as \"std_msgs/String\"")?,
-            qos: QosRequest::read(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("topic", &self.topic);
-        writer.optional_text("type", &self.type_name);
-        self.compression.write(writer);
-        if self.latch {
-            writer.boolean("latch", true);
-        }
-        QosRequest::write(self.qos, writer);
-        writer.payload("msg", self.msg);
     }
 }
 

@@ -187,12 +187,12 @@ impl<T: Copy + PartialEq + 'static> PolicyField<T> {
 
 impl QosRequest {
     /// Reads the `qos` of an operation, if it has one.
-    pub(crate) fn read(fields: &Fields<'_>) -> Result<Option<Self>, Problem> {
-        let Some(value) = fields.get("qos") else {
+    pub(crate) fn read(fields: &Fields<'_>, field: &'static str) -> Result<Option<Self>, Problem> {
+        let Some(value) = fields.get(field) else {
             return Ok(None);
         };
         let Some(qos) = qos_fields(fields) else {
-            return Err(fields.mistyped_error("qos", QOS, value));
+            return Err(fields.mistyped_error(field, QOS, value));
         };
         let depth = qos.get("depth").map(|value| match qos.as_integer(value) {
             // A depth too large for usize means all.
@@ -229,17 +229,16 @@ impl QosRequest {
         unknown.map(|name| format!("qos.{name}")).collect()
     }
 
-    pub(crate) fn write(qos: Option<Self>, writer: &mut Writer<'_>) {
-        let Some(qos) = qos else { return };
-        writer.object("qos", |writer| {
-            HISTORY.write(qos.history, writer);
-            writer.optional_count("depth", qos.depth.map(|depth| depth as u64));
-            RELIABILITY.write(qos.reliability, writer);
-            DURABILITY.write(qos.durability, writer);
-            write_period("deadline", qos.deadline, writer);
-            write_period("lifespan", qos.lifespan, writer);
-            LIVELINESS.write(qos.liveliness, writer);
-            let lease = qos.liveliness_lease_duration;
+    pub(crate) fn write(&self, writer: &mut Writer<'_>, field: &str) {
+        writer.object(field, |writer| {
+            HISTORY.write(self.history, writer);
+            writer.optional_count("depth", self.depth.map(|depth| depth as u64));
+            RELIABILITY.write(self.reliability, writer);
+            DURABILITY.write(self.durability, writer);
+            write_period("deadline", self.deadline, writer);
+            write_period("lifespan", self.lifespan, writer);
+            LIVELINESS.write(self.liveliness, writer);
+            let lease = self.liveliness_lease_duration;
             write_period("liveliness_lease_duration", lease, writer);
         });
     }

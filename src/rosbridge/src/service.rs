@@ -3,190 +3,67 @@
 use std::borrow::Cow;
 use std::time::Duration;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::subscribe::fragment_size;
-use crate::{Compression, Id, Payload, Problem, Writer};
+use crate::kinds::{
+    AnyValue, Arguments, Encoding, FrameSize, OptionalEncoding, OptionalId, OptionalText, Outcome, SERVICE,
+    SERVICE_TYPE, Seconds, Text,
+};
+use crate::message::message;
+use crate::{Compression, Id, Payload};
 
-/// Calls a service: from the client, or from the server to a client that serves it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CallService<'a> {
+message! {
+    /// Calls a service: from the client, or from the server to a client that serves it.
+    CallService "call_service"
     /// Id of the call, repeated in the response.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId => service,
     /// Name of the service (without the old `#id` suffix, which becomes the id).
-    pub service: Cow<'a, str>,
+    service: Cow<'a, str> = "service" SERVICE,
     /// `package/Type`, if given.
-    pub type_name: Option<Cow<'a, str>>,
+    type_name: Option<Cow<'a, str>> = "type" OptionalText(SERVICE_TYPE),
     /// Arguments: an object, or a list of values in the order of the request's fields.
-    pub args: Option<Payload<'a>>,
+    args: Option<Payload<'a>> = "args" Arguments,
     /// Time to wait for the response.
-    pub timeout: Option<Duration>,
+    timeout: Option<Duration> = "timeout" Seconds,
     /// Maximum frame size in bytes; a longer response is fragmented.
-    pub fragment_size: Option<usize>,
+    fragment_size: Option<usize> = "fragment_size" FrameSize,
     /// Encoding of the response; with `cbor-raw` also of the arguments. If absent, as in the call.
-    pub compression: Option<Compression>,
+    compression: Option<Compression> = "compression" OptionalEncoding,
 }
 
-impl<'a> Message<'a> for CallService<'a> {
-    const OP: &'static str = "call_service";
-    const FIELDS: &'static [&'static str] = &["service", "type", "args", "timeout", "fragment_size", "compression"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let service = fields.required_text("service", "a service name")?;
-        let (service, id) = split_name(service, id);
-        Ok(Self {
-            id,
-            service,
-            type_name: fields
-                .text("type", "a service type such as \"std_srvs/Trigger\"")?
-                .filter(|name| !name.is_empty()),
-            args: fields.arguments("args")?,
-            timeout: fields.duration("timeout", Duration::from_secs(1), "a number of seconds, 0 or more,")?,
-            fragment_size: fragment_size(fields)?,
-            compression: Compression::read_optional(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("service", &self.service);
-        writer.optional_text("type", &self.type_name);
-        if let Some(args) = self.args {
-            writer.payload("args", args);
-        }
-        if let Some(timeout) = self.timeout {
-            writer.number("timeout", timeout.as_secs_f64());
-        }
-        writer.optional_count("fragment_size", self.fragment_size.map(|size| size as u64));
-        if let Some(compression) = self.compression {
-            writer.text("compression", compression.name());
-        }
-    }
-}
-
-/// Splits the id off a name: old clients wrote a call with id 7 as `/service#7`.
-pub(crate) fn split_name<'a>(name: Cow<'a, str>, id: Option<Id<'a>>) -> (Cow<'a, str>, Option<Id<'a>>) {
-    let Some(at) = name.find('#') else {
-        return (name, id);
-    };
-    let suffix = Id::from(name[at + 1..].to_owned());
-    let name = match name {
-        Cow::Borrowed(name) => Cow::Borrowed(&name[..at]),
-        Cow::Owned(mut name) => {
-            name.truncate(at);
-            Cow::Owned(name)
-        }
-    };
-    (name, id.or(Some(suffix)))
-}
-
-/// Response to a service call.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ServiceResponse<'a> {
+message! {
+    /// Response to a service call.
+    ServiceResponse "service_response"
     /// Id of the call.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the service.
-    pub service: Cow<'a, str>,
-    /// Response message, or, if `result` is false, the reason as a string.
-    pub values: Option<Payload<'a>>,
-    /// True if the call succeeded.
-    pub result: bool,
+    service: Cow<'a, str> = "service" SERVICE,
     /// Encoding: `cbor-raw` if `values` holds the ROS serialization (extension).
-    pub compression: Compression,
+    compression: Compression = "compression" Encoding,
+    /// Response message, or, if `result` is false, the reason as a string.
+    values: Option<Payload<'a>> = "values" AnyValue,
+    /// True if the call succeeded.
+    result: bool = "result" Outcome,
 }
 
-impl<'a> Message<'a> for ServiceResponse<'a> {
-    const OP: &'static str = "service_response";
-    const FIELDS: &'static [&'static str] = &["service", "values", "result", "compression"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            service: fields.required_text("service", "a service name")?,
-            values: fields.payload("values"),
-            result: fields.boolean("result")?.ok_or(Problem::Missing { field: "result", expected: "true or false" })?,
-            compression: Compression::read(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("service", &self.service);
-        self.compression.write(writer);
-        if let Some(values) = self.values {
-            writer.payload("values", values);
-        }
-        writer.boolean("result", self.result);
-    }
-}
-
-/// Advertises that the client serves a service.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct AdvertiseService<'a> {
+message! {
+    /// Advertises that the client serves a service.
+    AdvertiseService "advertise_service"
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the service.
-    pub service: Cow<'a, str>,
+    service: Cow<'a, str> = "service" SERVICE,
     /// Type of the service: `package/Type`.
-    pub type_name: Cow<'a, str>,
+    type_name: Cow<'a, str> = "type" Text(SERVICE_TYPE),
     /// Encoding in which the client wants the calls (extension).
-    pub compression: Compression,
+    compression: Compression = "compression" Encoding,
 }
 
-impl<'a> Message<'a> for AdvertiseService<'a> {
-    const OP: &'static str = "advertise_service";
-    const FIELDS: &'static [&'static str] = &["service", "type", "compression"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self {
-            id,
-            service: fields.required_text("service", "a service name")?,
-            type_name: fields.required_text("type", "a service type such as \"std_srvs/Trigger\"")?,
-            compression: Compression::read(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("service", &self.service);
-        writer.text("type", &self.type_name);
-        self.compression.write(writer);
-    }
-}
-
-/// Ends an [`AdvertiseService`].
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct UnadvertiseService<'a> {
+message! {
+    /// Ends an [`AdvertiseService`].
+    UnadvertiseService "unadvertise_service" ignores ["type"]
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the service.
-    pub service: Cow<'a, str>,
-}
-
-impl<'a> Message<'a> for UnadvertiseService<'a> {
-    const OP: &'static str = "unadvertise_service";
-    const FIELDS: &'static [&'static str] = &["service", "type"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self { id, service: fields.required_text("service", "a service name")? })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("service", &self.service);
-    }
+    service: Cow<'a, str> = "service" SERVICE,
 }
 
 #[cfg(test)]

@@ -2,9 +2,9 @@
 
 use std::borrow::Cow;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Id, Problem, Writer};
+use crate::Id;
+use crate::kinds::{Data, Level, OptionalId};
+use crate::message::message;
 
 /// Severity of a status message; in `set_level` the least severe level to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
@@ -31,74 +31,31 @@ impl StatusLevel {
         }
     }
 
-    fn read(fields: &Fields<'_>) -> Result<Self, Problem> {
-        const EXPECTED: &str = "info, warning, error or none";
-        match &*fields.required_text("level", EXPECTED)? {
-            "none" => Ok(StatusLevel::None),
-            "error" => Ok(StatusLevel::Error),
-            "warning" => Ok(StatusLevel::Warning),
-            "info" => Ok(StatusLevel::Info),
-            other => {
-                let found = format!("{:?}", other.chars().take(48).collect::<String>());
-                Err(Problem::Mistyped { field: "level", expected: EXPECTED, found })
-            }
-        }
+    /// Converts from the name in the protocol.
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
+        let all = [StatusLevel::None, StatusLevel::Error, StatusLevel::Warning, StatusLevel::Info];
+        all.into_iter().find(|level| level.name() == name)
     }
 }
 
-/// Sets the level of status messages that are sent.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct SetLevel<'a> {
+message! {
+    /// Sets the level of status messages that are sent.
+    SetLevel "set_level"
     /// Id of the interaction.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Least severe level to send.
-    pub level: StatusLevel,
+    level: StatusLevel = "level" Level,
 }
 
-impl<'a> Message<'a> for SetLevel<'a> {
-    const OP: &'static str = "set_level";
-    const FIELDS: &'static [&'static str] = &["level"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self { id, level: StatusLevel::read(fields)? })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("level", self.level.name());
-    }
-}
-
-/// A status message.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Status<'a> {
+message! {
+    /// A status message.
+    Status "status"
     /// Id of the op it answers.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Severity.
-    pub level: StatusLevel,
+    level: StatusLevel = "level" Level,
     /// Text of the message.
-    pub msg: Cow<'a, str>,
-}
-
-impl<'a> Message<'a> for Status<'a> {
-    const OP: &'static str = "status";
-    const FIELDS: &'static [&'static str] = &["level", "msg"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self { id, level: StatusLevel::read(fields)?, msg: fields.data("msg", "a text")? })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("level", self.level.name());
-        writer.text("msg", &self.msg);
-    }
+    msg: Cow<'a, str> = "msg" Data("a text"),
 }
 
 #[cfg(test)]

@@ -3,9 +3,11 @@
 use std::borrow::Cow;
 use std::time::Duration;
 
-use crate::fields::Fields;
-use crate::message::Message;
-use crate::{Id, Problem, QosRequest, Writer};
+use crate::kinds::{
+    Encoding, FrameSize, MESSAGE_TYPE, Milliseconds, OptionalId, OptionalText, Qos, QueueLength, TOPIC,
+};
+use crate::message::message;
+use crate::{Id, QosRequest};
 
 /// Encoding of payloads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
@@ -32,126 +34,41 @@ impl Compression {
         }
     }
 
-    pub(crate) fn read(fields: &Fields<'_>) -> Result<Self, Problem> {
-        Ok(Self::read_optional(fields)?.unwrap_or_default())
-    }
-
-    pub(crate) fn read_optional(fields: &Fields<'_>) -> Result<Option<Self>, Problem> {
-        const EXPECTED: &str = "none, png, cbor or cbor-raw";
-        match fields.text("compression", EXPECTED)?.as_deref() {
-            None => Ok(None),
-            Some("none" | "") => Ok(Some(Compression::None)),
-            Some("png") => Ok(Some(Compression::Png)),
-            Some("cbor") => Ok(Some(Compression::Cbor)),
-            Some("cbor-raw") => Ok(Some(Compression::CborRaw)),
-            Some(other) => {
-                let found = format!("{:?}", other.chars().take(48).collect::<String>());
-                Err(Problem::Mistyped { field: "compression", expected: EXPECTED, found })
-            }
-        }
-    }
-
-    pub(crate) fn write(self, writer: &mut Writer<'_>) {
-        if self != Compression::None {
-            writer.text("compression", self.name());
-        }
+    /// Converts from the name in the protocol.
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
+        let all = [Compression::None, Compression::Png, Compression::Cbor, Compression::CborRaw];
+        all.into_iter().find(|compression| compression.name() == name)
     }
 }
 
-/// Reads the field `fragment_size`, which several ops have.
-pub(crate) fn fragment_size(fields: &Fields<'_>) -> Result<Option<usize>, Problem> {
-    let size = fields.count("fragment_size", 1, "a number of bytes, 1 or more,")?;
-    Ok(size.map(|size| usize::try_from(size).unwrap_or(usize::MAX)))
-}
-
-/// Subscribes to a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Subscribe<'a> {
+message! {
+    /// Subscribes to a topic.
+    Subscribe "subscribe"
     /// Id of this subscription, for `unsubscribe`.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the topic.
-    pub topic: Cow<'a, str>,
+    topic: Cow<'a, str> = "topic" TOPIC,
     /// `package/Type`; inferred if absent.
-    pub type_name: Option<Cow<'a, str>>,
+    type_name: Option<Cow<'a, str>> = "type" OptionalText(MESSAGE_TYPE),
     /// Minimum time between two messages.
-    pub throttle_rate: Duration,
+    throttle_rate: Duration = "throttle_rate" Milliseconds,
     /// Number of messages queued while throttled; 0: none.
-    pub queue_length: usize,
+    queue_length: usize = "queue_length" QueueLength,
     /// Maximum frame size in bytes; longer frames are fragmented.
-    pub fragment_size: Option<usize>,
+    fragment_size: Option<usize> = "fragment_size" FrameSize,
     /// Encoding of the messages.
-    pub compression: Compression,
+    compression: Compression = "compression" Encoding,
     /// Quality of service requested.
-    pub qos: Option<QosRequest>,
+    qos: Option<QosRequest> = "qos" Qos,
 }
 
-impl<'a> Message<'a> for Subscribe<'a> {
-    const OP: &'static str = "subscribe";
-    const FIELDS: &'static [&'static str] =
-        &["topic", "type", "throttle_rate", "queue_length", "fragment_size", "compression", "qos"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        let milliseconds = "a number of milliseconds, 0 or more,";
-        let length = fields.count("queue_length", 0, "a number of messages, 0 or more,")?;
-        Ok(Self {
-            id,
-            topic: fields.required_text("topic", "a topic name")?,
-            type_name: fields
-                .text("type", "a message type such as \"std_msgs/String\"")?
-                .filter(|name| !name.is_empty()),
-            throttle_rate: fields
-                .duration("throttle_rate", Duration::from_millis(1), milliseconds)?
-                .unwrap_or_default(),
-            queue_length: usize::try_from(length.unwrap_or(0)).unwrap_or(usize::MAX),
-            fragment_size: fragment_size(fields)?,
-            compression: Compression::read(fields)?,
-            qos: QosRequest::read(fields)?,
-        })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("topic", &self.topic);
-        writer.optional_text("type", &self.type_name);
-        if !self.throttle_rate.is_zero() {
-            writer.number("throttle_rate", self.throttle_rate.as_secs_f64() * 1e3);
-        }
-        if self.queue_length > 0 {
-            writer.optional_count("queue_length", Some(self.queue_length as u64));
-        }
-        writer.optional_count("fragment_size", self.fragment_size.map(|size| size as u64));
-        self.compression.write(writer);
-        QosRequest::write(self.qos, writer);
-    }
-}
-
-/// Ends one or all subscriptions to a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Unsubscribe<'a> {
+message! {
+    /// Ends one or all subscriptions to a topic.
+    Unsubscribe "unsubscribe"
     /// Id of the subscription; all of the topic's if absent.
-    pub id: Option<Id<'a>>,
+    id: Option<Id<'a>> = OptionalId,
     /// Name of the topic.
-    pub topic: Cow<'a, str>,
-}
-
-impl<'a> Message<'a> for Unsubscribe<'a> {
-    const OP: &'static str = "unsubscribe";
-    const FIELDS: &'static [&'static str] = &["topic"];
-
-    fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
-        Ok(Self { id, topic: fields.required_text("topic", "a topic name")? })
-    }
-
-    fn id(&self) -> Option<&Id<'a>> {
-        self.id.as_ref()
-    }
-
-    fn write(&self, writer: &mut Writer<'_>) {
-        writer.text("topic", &self.topic);
-    }
+    topic: Cow<'a, str> = "topic" TOPIC,
 }
 
 #[cfg(test)]

@@ -1,7 +1,5 @@
 //! Prints a message field by field, in either format, straight into the socket's output buffer.
 
-use std::borrow::Cow;
-
 use crate::{Format, Id, Payload, cbor, json};
 
 /// Largest count that fits into a one-byte CBOR head.
@@ -61,13 +59,6 @@ impl<'o> Writer<'o> {
         match self.format {
             Format::Json => json::write_string(self.out, value),
             Format::Cbor => cbor::write_text(self.out, value),
-        }
-    }
-
-    /// Writes a string field, if there is a value.
-    pub fn optional_text(&mut self, key: &str, value: &Option<Cow<'_, str>>) {
-        if let Some(value) = value {
-            self.text(key, value);
         }
     }
 

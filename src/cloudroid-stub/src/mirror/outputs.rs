@@ -12,7 +12,7 @@ use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
 use qos::Responder;
-use ros::bus::{SerializedMessage, WireType};
+use ros::bus::{SerializedMessage, TopicPeer, WireType};
 
 use self::topic::OutputTopic;
 use super::reports;
@@ -161,9 +161,11 @@ fn watch_listeners(mirror: &Arc<Mirror>, topic: &Arc<OutputTopic>) {
                 let siblings = mirror.siblings.read().clone();
                 let others = matched.peers.iter();
                 let others = others.filter(|peer| !siblings.contains(peer.id.node()));
-                let count = others.count();
-                if told != Some(count) {
-                    told = Some(count);
+                let requests_latched = |peer: &TopicPeer| peer.offer.as_ref().is_none_or(|request| request.latching);
+                let (count, latching) =
+                    others.fold((0, false), |(count, latching), peer| (count + 1, latching || requests_latched(peer)));
+                if told != Some((count, latching)) {
+                    told = Some((count, latching));
                     topic.listeners.store(count, Ordering::Relaxed);
                     if let Some(keeper) = mirror.keeper() {
                         keeper.set_wanted(&topic.name, count > 0);
@@ -173,7 +175,7 @@ fn watch_listeners(mirror: &Arc<Mirror>, topic: &Arc<OutputTopic>) {
                     }
                     let channel = *topic.channel.lock();
                     if channel != NOWHERE {
-                        mirror.session().send_control(&FromRobot::Listeners { channel, count });
+                        mirror.session().send_control(&FromRobot::Listeners { channel, count, latching });
                     }
                 }
                 if topic.advertise_pending(&*mirror.bus).await {

@@ -4,9 +4,10 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bridge::{WaitDeadlines, find_missing_subscribers, wait_for_subscribers};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Graph, Publisher, QosLiveliness, QosProfile, RosVersion, WireType};
+use ros::bus::{Graph, MatchedPeers, Publisher, QosLiveliness, QosProfile, RosVersion, WireType};
 use ros::ring::{Ring, RingBounds};
 use ros::schema::{MessageType, SchemaError};
 use ros::sizes::SizeCounters;
@@ -27,8 +28,6 @@ use ros::codec::Stamps;
 const QUEUE: usize = 256;
 /// History depth for a transient-local publisher of ROS 2 if the robot does not announce one; the default of ROS 2.
 const KEPT: usize = 10;
-/// Factor of the warm-up time for which a registered node is awaited while nobody is connected.
-const ALONE: u32 = 10;
 /// Limit on what waits until the topic is advertised and the node connected.
 const WAITING: RingBounds = RingBounds { messages: 256, bytes: 32 << 20 };
 
@@ -140,25 +139,9 @@ impl InputChannels {
             let count = publisher.as_ref().map_or(0, |it| it.dropped_count());
             (count, publisher.is_none())
         });
-        let graph = hub.bus.graph().borrow().clone();
-        // Observers may connect before the node does.
-        let listeners = graph.topics.get(&input.topic).map_or(0, |ends| {
-            let nodes = ends.subscribers.iter();
-            let own = hub.bus.node();
-            let beside = nodes.filter(|node| *node != bridge::INSIDE && *node != own);
-            beside.count()
-        });
-        let mut matched = publisher.matched_subscribers();
-        let mut connected = async |count: usize, patience: Duration| {
-            let reached = matched.wait_for(|now| now.connected_count_except(bridge::INSIDE) >= count);
-            tokio::time::timeout(patience, reached).await.is_ok()
-        };
-        let warm_up = hub.options.warm_up;
-        if !connected(listeners.max(1), warm_up).await && listeners > 0 {
-            // A registered node is slow to connect on a busy machine. While nobody is connected, waiting delays nobody
-            // else.
-            connected(1, warm_up * ALONE).await;
-        }
+        let missing = |matched: &MatchedPeers| find_missing_subscribers(&*hub.bus, &input.topic, matched);
+        let deadlines = WaitDeadlines::start(hub.options.warm_up);
+        wait_for_subscribers(&mut publisher.matched_subscribers(), deadlines, missing).await;
         let mut channels = self.channels.lock();
         if let Some(channel) = channels.get_mut(&input.channel) {
             if let State::Waiting(waiting) = &mut channel.state {

@@ -13,7 +13,7 @@ use tracing::Instrument;
 use super::inputs::InputChannels;
 use super::lent::RobotServices;
 use super::node_time;
-use super::outputs::Outputs;
+use super::outputs::{ChannelListeners, Outputs};
 use super::requests::{MeasuredRequest, RequestLog};
 use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine};
 use super::unsent::UnsentCounter;
@@ -279,7 +279,7 @@ impl NodeLink {
                         }
                         None
                     }
-                    FromRobot::Listeners { channel, count } => {
+                    FromRobot::Listeners { channel, count, .. } => {
                         let begin = self.outputs.expect_listeners(*channel, *count);
                         begin.then(|| HoldGuard::new(this))
                     }
@@ -352,8 +352,8 @@ async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::Un
                 link.inputs.close(channel);
                 link.session.on_peer_closed(channel);
             }
-            FromRobot::Listeners { channel, count } => {
-                link.outputs.set_listeners(&link, &hub, (channel, count), hold);
+            FromRobot::Listeners { channel, count, latching } => {
+                link.outputs.set_listeners(&link, &hub, ChannelListeners { channel, count, latching }, hold);
             }
             FromRobot::Parameters(changes) => hub.parameters.apply_changes(&hub, changes).await,
             FromRobot::Requests(requests) => {

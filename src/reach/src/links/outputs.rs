@@ -41,15 +41,27 @@ struct OutputChannelState {
     stamps: Stamps,
     /// Number of subscribers once all messages of the robot are processed.
     expected: usize,
-    reading: Option<AbortHandle>,
+    reading: Option<OutputReading>,
 }
 
-impl Drop for OutputChannelState {
+/// Subscription to an output; ends when dropped.
+struct OutputReading {
+    task: AbortHandle,
+    latching: bool,
+}
+
+impl Drop for OutputReading {
     fn drop(&mut self) {
-        if let Some(reading) = self.reading.take() {
-            reading.abort();
-        }
+        self.task.abort();
     }
+}
+
+/// Subscribers of an output on the robot.
+pub(super) struct ChannelListeners {
+    pub(super) channel: u32,
+    pub(super) count: usize,
+    /// True if one of them requests what was published before it came.
+    pub(super) latching: bool,
 }
 
 impl Outputs {
@@ -98,12 +110,13 @@ impl Outputs {
         std::mem::replace(&mut known.expected, count) == 0 && count > 0
     }
 
-    /// Sets the number of subscribers on the robot; `hold` is released once the node knows of them.
+    /// Sets the subscribers on the robot; `hold` is released once the node knows of them. What was published before is
+    /// read only if a subscriber requests it; for a later subscriber that does, the topic is read anew.
     pub(super) fn set_listeners(
         &self,
         link: &Arc<NodeLink>,
         hub: &Arc<Hub>,
-        (channel, count): (u32, usize),
+        ChannelListeners { channel, count, latching }: ChannelListeners,
         hold: Option<HoldGuard>,
     ) {
         let (topic, stamps) = {
@@ -111,16 +124,12 @@ impl Outputs {
             let Some(known) = channels.get_mut(&channel) else {
                 return;
             };
-            match (&known.reading, count) {
-                (Some(_), 0) => {
-                    if let Some(reading) = known.reading.take() {
-                        reading.abort();
-                    }
-                    return;
-                }
-                (None, 1..) => (known.topic.clone(), known.stamps.clone()),
-                _ => return,
+            let suffices = |reading: &OutputReading| reading.latching || !latching;
+            if count == 0 || known.reading.as_ref().is_some_and(suffices) {
+                known.reading = known.reading.take().filter(|_| count > 0);
+                return;
             }
+            (known.topic.clone(), known.stamps.clone())
         };
         let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
@@ -130,7 +139,7 @@ impl Outputs {
                 None => BTreeSet::new(),
             };
             // As a whole: if it were destructured, its guard would stay behind and end the subscription.
-            let subscription = &mut { subscribe(&*bus, &topic).await };
+            let subscription = &mut { subscribe(&*bus, &topic, latching).await };
             reader.drops.watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
             let publishers = subscription.matched.clone();
             let connected = async {
@@ -168,7 +177,7 @@ impl Outputs {
         };
         let reading = tokio::spawn(reading.in_current_span());
         if let Some(known) = self.channels.lock().get_mut(&channel) {
-            known.reading = Some(reading.abort_handle());
+            known.reading = Some(OutputReading { task: reading.abort_handle(), latching });
         } else {
             reading.abort();
         }
@@ -176,9 +185,9 @@ impl Outputs {
 }
 
 /// Subscribes to an output; retries while that is refused.
-async fn subscribe(bus: &dyn Bus, topic: &str) -> Subscription {
-    // As latching as the node: with QoS it is a request that adapts to the node's offer.
-    let qos = QosProfile::keep_last(QUEUE).latching(true);
+async fn subscribe(bus: &dyn Bus, topic: &str, latching: bool) -> Subscription {
+    // A request that adapts to the node's offer.
+    let qos = QosProfile::keep_last(QUEUE).latching(latching);
     let mut retry = Retry::default();
     loop {
         match bus.subscribe(topic, WireType::any(), qos).await {

@@ -205,7 +205,7 @@ impl LinkedRobot {
     /// Subscribes to an output on behalf of a node of the robot.
     pub fn listen(&self, output: &OutputChannel) {
         let (channel, count) = (output.channel, 1);
-        let listening = FromRobot::Listeners { channel, count };
+        let listening = FromRobot::Listeners { channel, count, latching: true };
         self.session.send_control(&listening);
     }
 

@@ -47,6 +47,27 @@ async fn ends_have_the_quality_of_service_of_the_node() {
 }
 
 #[tokio::test]
+async fn an_old_message_is_given_to_nobody_who_does_not_request_it() {
+    let scene = Scene::new(RosVersion::Two, "/node").await;
+    let string = || string_type(RosVersion::Two);
+    let state = QosProfile::keep_last(1).latching(true);
+    let command = scene.real.advertise("/command", string(), state).await.unwrap();
+    command.publish(scene.bytes("old"));
+    let _link = scene.connect().await;
+    let app = scene.robot.node("/app").await;
+    wait_for_graph(&app, "the output", |graph| is_published(graph, "/command")).await;
+    let mut heard = app.subscribe("/command", string(), QosProfile::keep_last(5)).await.unwrap();
+    let mut listeners = command.matched_subscribers();
+    let connected = listeners.wait_for(|now| now.connected_count() > 0);
+    timeout(SOON, connected).await.unwrap().unwrap();
+    command.publish(scene.bytes("new"));
+    assert_eq!(next_text(&mut heard).await, "new");
+    // A later subscriber that requests it is given it.
+    let late = scene.robot.node("/late").await;
+    assert_eq!(next_text(&mut subscribe(&late, "/command").await).await, "new");
+}
+
+#[tokio::test]
 async fn the_cloud_is_told_with_whom_no_messages_pass() {
     let scene = Scene::new(RosVersion::Two, "/node").await;
     let string = || string_type(RosVersion::Two);
