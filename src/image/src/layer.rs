@@ -151,7 +151,8 @@ impl Store {
         if let Some(error) = copy.failed.take() {
             return Err(Error::file("write a layer to", self.images_dir(), error).with_needed_bytes(needed));
         }
-        let (diff_id, unpacked) = read?;
+        // Blob and tree are written at the same time: either may be the first to find no room.
+        let (diff_id, unpacked) = read.map_err(|error| error.with_needed_bytes(needed))?;
         let (_, digest, size) = copy.to.finish();
         let layer = LayerInfo { digest, diff_id, size, unpacked };
         accept(&layer)?;
