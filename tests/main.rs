@@ -501,7 +501,7 @@ fn main() -> ExitCode {
             mistakes_in_cmake_are_told_before_anything_is_compiled,
             a_package_may_use_others_that_it_does_not_name,
             packages_with_the_same_libraries_share_their_layers,
-            an_unchanged_push_builds_no_layer,
+            an_unchanged_push_builds_no_layer_and_makes_no_revision,
             a_failed_build_leaves_the_earlier_revision_serving,
             what_package_xml_forgot_is_named_and_added,
             a_revision_is_rolled_back,

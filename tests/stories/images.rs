@@ -103,9 +103,9 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
         Ok(())
     };
     adds("sevens")?;
-    // Imported again it becomes another revision, or a service with another name; rows of the existing service are
-    // kept.
+    // Imported again it is unchanged, or a service with another name; rows of the existing service are kept.
     let again = types(&["import", &file])?.expect_success()?;
+    ensure!(again.stdout.contains("== unchanged: revision 1 serves"), "{}", again.output());
     ensure!(again.output().contains("keeps its existing SLA table"), "{}", again.output());
     types(&["import", &file, "--name", "sevens_too"])?.expect_success()?;
     adds("sevens_too")?;

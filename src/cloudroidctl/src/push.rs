@@ -1,6 +1,7 @@
 //! `push`: publishes a package as a service.
 
 mod archive;
+mod newest;
 mod progress;
 mod shared;
 
@@ -237,6 +238,7 @@ impl PushArgs {
             stateless: self.stateful == Some(false),
             shared: self.shared.shared_settings(),
             rollout: self.rollout.terms(),
+            created: self.path.as_deref().and_then(newest::find_newest_source),
             source,
         })
     }

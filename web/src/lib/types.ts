@@ -615,7 +615,7 @@ export type PushEvent =
   | { line: string; type: 'log' }
   | { done: number; total?: number; type: 'progress'; unit: string }
   | { message: string; type: 'warning' }
-  | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done' }
+  | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done'; unchanged?: boolean }
   | { problem: Problem; type: 'error' };
 
 export interface PushOptions {
@@ -623,6 +623,7 @@ export interface PushOptions {
   args?: Record<string, string>;
   base?: string;
   caps?: Caps;
+  created?: number;
   grants?: Grants;
   interface?: string;
   launch?: string;

@@ -308,6 +308,7 @@ fn options() -> PushOptions {
         stateless: true,
         shared: Some(api::Shared::default()),
         rollout: Some(rollout_terms()),
+        created: Some(1),
         source: "--apt x".into(),
     }
 }
@@ -715,6 +716,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             service: Box::new(detail()),
             layers: vec![Layer { name: "base".into(), digest: "sha256:0".into(), size: 1, cached: true }],
             took: 1,
+            unchanged: true,
         },
         PushEvent::Error { problem: problem() },
     ] {
