@@ -284,6 +284,7 @@ fn main() -> ExitCode {
             nothing_is_given_unasked_or_unallowed,
         ],
         stories![clients:
+            the_first_five_minutes_of_the_readme_end_well,
             roslibpy_finds_nothing_missing,
             roslib_finds_nothing_missing,
             roslibrust_finds_nothing_missing,
@@ -302,6 +303,7 @@ fn main() -> ExitCode {
         stories![images:
             skopeo_and_umoci_read_the_store,
             an_exported_service_is_published_on_another_server,
+            a_base_is_moved_to_a_server_without_network,
             what_nobody_refers_to_is_collected,
         ],
         stories![registries: skopeo_and_containerd_pull_with_a_token],

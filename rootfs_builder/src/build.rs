@@ -36,6 +36,8 @@ pub(crate) struct Build<'a> {
     pub(crate) base: Base,
     pub(crate) archive: Arc<Archive>,
     pub(crate) base_layer: LayerSet,
+    /// Layers in which sources are compiled, if an imported base has them.
+    pub(crate) tools: Option<Vec<Digest>>,
     pub(crate) request: &'a PushRequest,
     pub(crate) progress: &'a Progress,
     pub(crate) log: PathBuf,
@@ -118,11 +120,7 @@ impl Build<'_> {
                 ros.extend(self.archive.contents.ros_packages_in(name).into_iter().map(str::to_owned));
                 debs.insert(name.clone());
             } else {
-                missing.push(crate::error::Unresolved {
-                    key: name.clone(),
-                    wanted_by: vec!["--with".into()],
-                    similar: self.archive.similar(name),
-                });
+                missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with"));
             }
         }
         if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }

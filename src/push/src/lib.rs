@@ -12,6 +12,7 @@
 
 #![forbid(unsafe_code)]
 
+mod bases;
 mod bounds;
 mod deployer;
 mod disks;

@@ -54,6 +54,29 @@ export interface BackOff {
   service: string;
 }
 
+export interface BaseDetail extends BaseSummary {
+  debian_packages: Record<string, string>;
+  includes: string[];
+  python_packages: Record<string, string>;
+  ros_packages: Record<string, string>;
+}
+
+export type BaseState =
+  | 'not-set-up'
+  | 'ready'
+  | 'imported';
+
+export interface BaseSummary {
+  bytes: Size;
+  distribution: string;
+  name: string;
+  ros: number;
+  state: BaseState;
+  summary: string;
+  system: string;
+  toolchain: boolean;
+}
+
 export interface Calibration {
   ended: string;
   inputs: Fed[];
