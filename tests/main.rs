@@ -284,6 +284,7 @@ fn main() -> ExitCode {
             nothing_is_given_unasked_or_unallowed,
         ],
         stories![clients:
+            the_first_five_minutes_of_the_readme_end_well,
             roslibpy_finds_nothing_missing,
             roslib_finds_nothing_missing,
             roslibrust_finds_nothing_missing,
@@ -302,6 +303,7 @@ fn main() -> ExitCode {
         stories![images:
             skopeo_and_umoci_read_the_store,
             an_exported_service_is_published_on_another_server,
+            a_base_is_moved_to_a_server_without_network,
             what_nobody_refers_to_is_collected,
         ],
         stories![registries: skopeo_and_containerd_pull_with_a_token],
@@ -501,7 +503,7 @@ fn main() -> ExitCode {
             mistakes_in_cmake_are_told_before_anything_is_compiled,
             a_package_may_use_others_that_it_does_not_name,
             packages_with_the_same_libraries_share_their_layers,
-            an_unchanged_push_builds_no_layer,
+            an_unchanged_push_builds_no_layer_and_makes_no_revision,
             a_failed_build_leaves_the_earlier_revision_serving,
             what_package_xml_forgot_is_named_and_added,
             a_revision_is_rolled_back,

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use image::{Digest, ImageSpec};
 use package::inventory::{Inventory, SearchHints};
@@ -12,6 +13,7 @@ use ros::flavour::Version;
 use crate::advice::{self, AdviceIndex};
 use crate::archive::Archive;
 use crate::base::Base;
+use crate::bootstrap::EPOCH;
 use crate::debian_package::Deb;
 use crate::error::Error;
 use crate::event::Progress;
@@ -34,6 +36,8 @@ pub(crate) struct Build<'a> {
     pub(crate) base: Base,
     pub(crate) archive: Arc<Archive>,
     pub(crate) base_layer: LayerSet,
+    /// Layers in which sources are compiled, if an imported base has them.
+    pub(crate) tools: Option<Vec<Digest>>,
     pub(crate) request: &'a PushRequest,
     pub(crate) progress: &'a Progress,
     pub(crate) log: PathBuf,
@@ -116,11 +120,7 @@ impl Build<'_> {
                 ros.extend(self.archive.contents.ros_packages_in(name).into_iter().map(str::to_owned));
                 debs.insert(name.clone());
             } else {
-                missing.push(crate::error::Unresolved {
-                    key: name.clone(),
-                    wanted_by: vec!["--with".into()],
-                    similar: self.archive.similar(name),
-                });
+                missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with"));
             }
         }
         if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }
@@ -213,6 +213,7 @@ impl Build<'_> {
                 ("org.opencontainers.image.title".to_owned(), package.clone()),
                 ("org.opencontainers.image.version".to_owned(), version.clone()),
             ]),
+            created: creation_time(request.created, SystemTime::now()),
             ..ImageSpec::default()
         };
         let store = self.shop.layers.store().clone();
@@ -251,5 +252,31 @@ impl Build<'_> {
             whole.collect()
         })
         .await?
+    }
+}
+
+/// Returns the creation time of an image in seconds since 1970: that of its newest source, but not in the future.
+fn creation_time(newest: Option<u64>, now: SystemTime) -> u64 {
+    let now = now.duration_since(UNIX_EPOCH).map_or(EPOCH, |since| since.as_secs());
+    newest.map_or(EPOCH, |newest| newest.min(now))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn an_image_is_not_newer_than_now() {
+        let now = UNIX_EPOCH + Duration::from_secs(1_800_000_000);
+        for (newest, expected) in [
+            (None, EPOCH),
+            (Some(1_750_000_000), 1_750_000_000),
+            (Some(1_900_000_000), 1_800_000_000),
+            (Some(u64::MAX), 1_800_000_000),
+        ] {
+            assert_eq!(creation_time(newest, now), expected, "{newest:?}");
+        }
     }
 }

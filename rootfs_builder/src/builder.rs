@@ -27,9 +27,10 @@ use crate::install::LayerSet;
 use crate::removal::PendingRemovals;
 use crate::request::{BuildOutcome, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
+use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
 use crate::{
-    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, unused, wheels,
+    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, stock, unused, wheels,
 };
 
 /// Default base for packages that support ROS 1.
@@ -133,6 +134,21 @@ impl Builder {
         &self.config.cache_dir
     }
 
+    /// Returns the cache of layers.
+    pub(crate) fn layers(&self) -> &LayerCache {
+        &self.layers
+    }
+
+    /// Returns the directory of the base definitions.
+    pub(crate) fn bases_dir(&self) -> &Path {
+        &self.config.bases_dir
+    }
+
+    /// Returns the work directory.
+    pub(crate) fn build_dir(&self) -> &Path {
+        &self.config.build_dir
+    }
+
     /// Waits until the containers of a build have ended and its directory is removed.
     pub async fn wait_removed(&self, id: &str) {
         self.removals.wait(id).await;
@@ -175,10 +191,18 @@ impl Builder {
             PushContent::Tree(pushed) => check_dependencies(&archive, &base, request, pushed)?,
             PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, &base, &request.map)?),
         }
-        let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
-        let base_layer = wheels::add_runtime_wheels(&shop, &base, base_layer, progress).await?;
+        let (layers, of) = (self.layers.clone(), base.clone());
+        let imported = blocking::spawn(move || stock::find_imported(&layers, &of)).await??;
+        let (base_layer, archive) = match &imported {
+            Some(stock) => (stock.layer_set(), archive),
+            None => {
+                let (layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
+                (wheels::add_runtime_wheels(&shop, &base, layer, progress).await?, archive)
+            }
+        };
+        let tools = imported.as_ref().and_then(BaseStock::tool_layers);
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
-        let build = Build { shop, base, archive, base_layer, request, progress, log };
+        let build = Build { shop, base, archive, base_layer, tools, request, progress, log };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
         let swept = cache.clone();
@@ -194,6 +218,12 @@ impl Builder {
         let outcome = work.await;
         // What was installed and compiled before a failure is kept: the next push continues there.
         let settled = build.shop.wait_until_packed().await;
+        if settled.is_ok()
+            && imported.is_none()
+            && let Err(error) = stock::record(&build).await
+        {
+            tracing::warn!("cannot record what base {} has: {error}", build.base.name);
+        }
         // A failed build also fills the cache.
         let most = self.config.cache_bytes;
         blocking::spawn(move || unused::shrink(&cache, most)).await?;
@@ -232,8 +262,24 @@ impl Builder {
             return Ok(opened.archive.clone());
         }
         let scratch = shop.site.directory("sources")?;
-        let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
-        let archive = Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
+        let opened = async {
+            let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
+            Archive::open(&self.config.cache_dir, sources, false, progress).await
+        };
+        let archive = match opened.await {
+            Ok(archive) => archive,
+            Err(error) => {
+                let (layers, of) = (self.layers.clone(), base.clone());
+                let index = blocking::spawn(move || stock::open_index(&layers, &of)).await??;
+                let Some(archive) = index else {
+                    return Err(error);
+                };
+                let words = format!("only packages of the imported base {} can be used now: {error}", base.name);
+                progress.warn(words).await;
+                archive
+            }
+        };
+        let archive = Arc::new(archive);
         archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         Ok(archive)
     }
@@ -329,7 +375,7 @@ fn sweep_logs(directory: &Path) {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use async_trait::async_trait;
     use servant::container::ContainerSpec;
     use servant::sandbox::SandboxContainer;
@@ -346,12 +392,11 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn what_is_no_package_is_refused_before_anything_is_made_for_it() {
-        let place = tempfile::tempdir().expect("a directory");
-        let at = |name: &str| place.path().join(name);
+    /// Creates a builder with the repository's bases, whose files are below `place` and which runs nothing.
+    pub(crate) fn new_builder(place: &Path) -> Builder {
+        let at = |name: &str| place.join(name);
         let store = Store::open(&at("images"), &at("layers")).expect("a store");
-        let builder = Builder::new(Config {
+        Builder::new(Config {
             cache_dir: at("cache"),
             cache_bytes: u64::MAX,
             bases_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"),
@@ -362,7 +407,14 @@ mod tests {
             sandbox: Arc::new(UnusedSandbox),
             limits: Limits::default(),
         })
-        .expect("prepared");
+        .expect("prepared")
+    }
+
+    #[tokio::test]
+    async fn what_is_no_package_is_refused_before_anything_is_made_for_it() {
+        let place = tempfile::tempdir().expect("a directory");
+        let at = |name: &str| place.path().join(name);
+        let builder = new_builder(place.path());
         let trees = [
             &[][..],
             &["README", "notes/todo.txt"],

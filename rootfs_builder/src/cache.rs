@@ -2,6 +2,7 @@
 //! daemons import into their store instead of building it again.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -104,6 +105,15 @@ impl LayerCache {
     /// Stores a note.
     pub(crate) fn write_note<T: Serialize>(&self, key: &str, value: &T) -> Result<(), Error> {
         write_atomically(&self.notes.join(key), &serde_json::to_vec(value).unwrap_or_default())
+    }
+
+    /// Removes a note, if it exists.
+    pub(crate) fn remove_note(&self, key: &str) -> Result<(), Error> {
+        let path = self.notes.join(key);
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::io("removing", path, error)),
+            _ => Ok(()),
+        }
     }
 
     /// Stores a layer that is in the image store. Blocking.

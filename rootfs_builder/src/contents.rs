@@ -77,6 +77,19 @@ impl Contents {
         Ok(Self { lines: text.lines().map(str::to_owned).collect() })
     }
 
+    /// Reads the result of [`Contents::as_text`].
+    pub(crate) fn from_text(text: &str) -> Self {
+        let mut lines: Vec<String> = text.lines().map(str::to_owned).collect();
+        // It comes from another server; lookups rely on the order.
+        lines.sort();
+        Self { lines }
+    }
+
+    /// Returns the text form, for a file.
+    pub(crate) fn as_text(&self) -> String {
+        self.lines.join("\n")
+    }
+
     /// Returns the lines that begin with `prefix`, without it.
     fn with_prefix<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = &'a str> {
         let start = self.lines.partition_point(|line| line.as_str() < prefix);
@@ -157,6 +170,23 @@ impl Contents {
     pub fn ros_carriers(&self) -> BTreeSet<String> {
         let fields = self.with_prefix("r").filter_map(|rest| rest.split('\t').nth(1));
         fields.map(str::to_owned).collect()
+    }
+
+    /// Returns the names of all ROS packages, sorted; a name may be repeated.
+    pub(crate) fn ros_package_names(&self) -> impl Iterator<Item = &str> {
+        self.with_prefix("r").filter_map(|rest| Some(rest.split_once('\t')?.0))
+    }
+
+    /// Returns the ROS packages with a part in these Debian packages, each with the first of them.
+    pub(crate) fn ros_packages_by_deb(&self, debs: &BTreeSet<&str>) -> BTreeMap<String, String> {
+        let mut found = BTreeMap::new();
+        for (name, rest) in self.with_prefix("r").filter_map(|rest| rest.split_once('\t')) {
+            let deb = rest.split('\t').next().unwrap_or(rest);
+            if debs.contains(deb) {
+                found.entry(name.to_owned()).or_insert_with(|| deb.to_owned());
+            }
+        }
+        found
     }
 
     /// Returns the ROS packages of which a Debian package contains parts.

@@ -99,6 +99,33 @@ pub enum Error {
         /// Missing Debian packages.
         missing: String,
     },
+    /// There is nothing to export of a base.
+    #[error("base {base} was not set up on this server yet; the first push that uses it does that, then export again")]
+    BaseNotSetUp {
+        /// Name of the base.
+        base: String,
+    },
+    /// The base was not imported.
+    #[error("base {base} was not imported; there is nothing to remove")]
+    BaseNotImported {
+        /// Name of the base.
+        base: String,
+    },
+    /// A file to import is not an exported base.
+    #[error("the file is not an exported base: {problem}; create one with `cloudroidctl base export`")]
+    NotABase {
+        /// Description of the problem.
+        problem: String,
+    },
+    /// A base was exported from another definition.
+    #[error(
+        "the file was made from another definition of base {base} than this server has; export it from a server of the \
+            same version, with the same `definitions`"
+    )]
+    OtherDefinition {
+        /// Name of the base.
+        base: String,
+    },
     /// Dependencies that nothing provides.
     #[error("{}", unresolved_text(.0))]
     Unresolved(Vec<Unresolved>),
@@ -356,12 +383,17 @@ pub struct Unresolved {
     pub wanted_by: Vec<String>,
     /// Debian packages with similar names.
     pub similar: Vec<String>,
+    /// Known rosdep keys and ROS packages that are spelled almost like it, nearest first.
+    pub nearest: Vec<String>,
 }
 
 fn unresolved_text(all: &[Unresolved]) -> String {
     let mut text = String::from("nothing provides:");
     for one in all {
         text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
+        if !one.nearest.is_empty() {
+            text.push_str(&format!("; did you mean {}?", one.nearest.join(", ")));
+        }
         if !one.similar.is_empty() {
             text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
         }
@@ -409,15 +441,21 @@ impl<T> IoContext<T> for io::Result<T> {
 mod tests {
     use super::*;
 
+    fn unresolved(key: &str) -> Unresolved {
+        Unresolved { key: key.to_owned(), wanted_by: vec!["a".into()], similar: Vec::new(), nearest: Vec::new() }
+    }
+
     #[test]
     fn all_that_is_missing_is_named_with_the_next_step() {
         let error = Error::Unresolved(vec![
-            Unresolved { key: "warp".into(), wanted_by: vec!["a".into(), "b".into()], similar: vec![] },
-            Unresolved { key: "eigne".into(), wanted_by: vec!["a".into()], similar: vec!["libeigen3-dev".into()] },
+            Unresolved { wanted_by: vec!["a".into(), "b".into()], ..unresolved("warp") },
+            Unresolved { similar: vec!["libeigen3-dev".into()], ..unresolved("eigne") },
+            Unresolved { nearest: vec!["cv_bridge".into()], ..unresolved("cv_brigde") },
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
         assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
+        assert!(text.contains("cv_brigde (wanted by a); did you mean cv_bridge?\n"), "{text}");
         assert!(text.contains("--map KEY=DEB"), "{text}");
     }
 

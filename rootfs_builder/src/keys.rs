@@ -158,9 +158,8 @@ fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTre
         missing
             .into_iter()
             .map(|(key, by)| Unresolved {
-                similar: similar(archive, base, &key),
                 wanted_by: by.into_iter().collect(),
-                key,
+                ..unresolved_name(archive, base, &key, "")
             })
             .collect(),
     ))
@@ -180,7 +179,60 @@ pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Opti
 
 /// Creates the error entry for a name that nothing provides.
 pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
-    Unresolved { key: name.to_owned(), wanted_by: vec![by.to_owned()], similar: similar(archive, base, name) }
+    Unresolved {
+        key: name.to_owned(),
+        wanted_by: vec![by.to_owned()],
+        similar: similar(archive, base, name),
+        nearest: nearest(archive, base, name),
+    }
+}
+
+/// Maximum number of names to suggest for one that is misspelled.
+const SUGGESTED: usize = 3;
+
+/// Returns the known keys and ROS packages that differ from a key by a few letters, nearest first.
+fn nearest(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
+    let key = key.to_lowercase();
+    let most = (key.len() / 4).clamp(1, 3);
+    let own = format!("ros-{}-", base.ros_distribution);
+    let packages: BTreeSet<String> = match base.ros {
+        Version::Ros1 => archive.contents.ros_package_names().map(str::to_owned).collect(),
+        Version::Ros2 => {
+            let debs = archive.candidates.names().filter_map(|deb| deb.strip_prefix(&own));
+            debs.map(|name| name.replace('-', "_")).collect()
+        }
+    };
+    let known: BTreeSet<&str> = base.keys.keys().chain(&packages).map(String::as_str).collect();
+    let mut near: Vec<(usize, &str)> = known
+        .into_iter()
+        .filter(|name| name.len().abs_diff(key.len()) <= most)
+        .map(|name| (edit_distance(&key, name), name))
+        .filter(|(distance, _)| (1..=most).contains(distance))
+        .collect();
+    near.sort_unstable();
+    near.into_iter().take(SUGGESTED).map(|(_, name)| name.to_owned()).collect()
+}
+
+/// Returns the number of bytes to insert, remove, replace or exchange with the next one that turns one name into the
+/// other (optimal string alignment).
+fn edit_distance(one: &str, other: &str) -> usize {
+    let (one, other) = (one.as_bytes(), other.as_bytes());
+    let mut before: Vec<usize> = Vec::new();
+    let mut above: Vec<usize> = (0..=other.len()).collect();
+    for (row, letter) in one.iter().enumerate() {
+        let mut current = vec![row + 1];
+        for (column, with) in other.iter().enumerate() {
+            let replaced = above[column] + usize::from(letter != with);
+            let mut least = replaced.min(above[column + 1] + 1).min(current[column] + 1);
+            let is_exchange = row > 0 && column > 0 && *letter == other[column - 1] && one[row - 1] == *with;
+            if is_exchange {
+                least = least.min(before[column - 1] + 1);
+            }
+            current.push(least);
+        }
+        before = std::mem::replace(&mut above, current);
+    }
+    above[other.len()]
 }
 
 /// Returns names similar to a key. A name of the distribution's own ROS 1 is similar only to packages of the base's
@@ -260,6 +312,20 @@ mod tests {
         // No development packages at run time, and no build tools.
         assert_eq!(resolved.run, set(&["libfrob3", "python3-six"]));
         assert_eq!(resolved.run_ros, set(&["tf"]));
+    }
+
+    #[test]
+    fn misspelled_keys_are_told_with_those_that_are_meant() {
+        for (one, other, distance) in [("", "", 0), ("tf", "tf", 0), ("cv_brigde", "cv_bridge", 1), ("ab", "", 2)] {
+            assert_eq!(edit_distance(one, other), distance, "{one} {other}");
+        }
+        assert_eq!(edit_distance("eigen", "tf"), 5);
+        let lab = new_fixture();
+        let nearest = |key: &str| nearest(&lab.archive, &lab.base, key);
+        assert_eq!(nearest("mesage_generation"), ["message_generation"]);
+        assert_eq!(nearest("Eigne"), ["eigen"]);
+        assert_eq!(nearest("opencv5")[0], "opencv");
+        assert!(nearest("flux_capacitor").is_empty());
     }
 
     #[test]

@@ -35,6 +35,9 @@ pub struct PushRequest {
     pub map: BTreeMap<String, String>,
     /// Additional Debian or ROS packages, while compiling and at run time.
     pub with: Vec<String>,
+    /// Time of the newest source in seconds since 1970, which becomes that of the image (default: the time to which
+    /// those of files in layers are clamped).
+    pub created: Option<u64>,
 }
 
 /// Content of a push.

@@ -52,6 +52,9 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
 
 /// Returns the layers of base and toolchain.
 async fn toolchain(build: &Build<'_>) -> Result<Vec<Digest>, Error> {
+    if let Some(tools) = &build.tools {
+        return Ok(tools.clone());
+    }
     let mut below = build.base_diff_ids();
     let toolchain = build.base.build.packages.iter().cloned().collect();
     let toolchain = build.add_packages("toolchain", &below, &toolchain, Vec::new()).await?;

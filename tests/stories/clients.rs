@@ -56,6 +56,28 @@ pub fn what_a_node_that_is_well_prints_is_in_its_log_at_once() -> Verdict {
     })
 }
 
+pub fn the_first_five_minutes_of_the_readme_end_well() -> Verdict {
+    let daemon = world().ensure_shared()?;
+    let checkout = binaries::checkout();
+    daemon.deployer().run(&["push", path_str(&checkout.join("examples/shout"))])?.expect_success()?;
+    let readme = std::fs::read_to_string(checkout.join("README.md"))?;
+    let (_, program) = readme.split_once("```python\n").context("a program")?;
+    let (program, _) = program.split_once("```").context("its end")?;
+    let address = daemon.url("shout?robot=r2");
+    let stated = "ws://127.0.0.1:9090/shout?robot=r2";
+    ensure!(program.contains(stated) && program.lines().filter(|line| !line.is_empty()).count() <= 10, "{program}");
+    let mut robot = Command::new(binaries::python())
+        .args(["-c", &program.replace(stated, &address)])
+        .stdout(Stdio::piped())
+        .spawn()?;
+    let said = robot.stdout.take().context("its standard output")?;
+    let first = BufReader::new(said).lines().next();
+    robot.kill()?;
+    robot.wait()?;
+    ensure!(first.context("it said nothing")?? == "HELLO");
+    Ok(())
+}
+
 /// Returns the directory of a service's package.
 fn package_path(service: StoryService) -> anyhow::Result<String> {
     let package = binaries::package(service.package.context("a package of the repository")?);

@@ -29,8 +29,8 @@ const PAUSE: Duration = Duration::from_secs(1);
 const PASSWORD: &str = "four words of no sense";
 const NDJSON: &str = "application/x-ndjson";
 /// Operations that run separately: two never end, whatever is requested; the third is the document, with which
-/// Schemathesis starts.
-const APART: &[&str] = &["stream", "followEvents", "openapi"];
+/// Schemathesis starts; the last has hundreds of megabytes (see `bases`).
+const APART: &[&str] = &["stream", "followEvents", "openapi", "exportBase"];
 /// Operations that never end for an existing servant or service, or become a WebSocket.
 const ASKED_HERE: &[&str] = &["inside", "shadow", "topics"];
 /// Operations that remove what the others need: called last, in this order.
@@ -46,6 +46,8 @@ const NOT_DONE: &[(&str, &str)] = &[
     ("oidcCallback", "the same"),
     ("signOut", "a token is no session"),
     ("trial", "the service listens to no topic"),
+    ("importBase", "no base is sent"),
+    ("removeBase", "no base was imported"),
 ];
 
 /// Number of responses by operation and status.
@@ -92,6 +94,7 @@ impl ApiScene {
         let scene = ApiScene {
             names: json!({
                 "services": ["adder_py"],
+                "bases": ["bookworm-ros1"],
                 "servants": [servant],
                 "robots": ["rover"],
                 "recordings": [recording],

@@ -1,12 +1,13 @@
 //! The image store, checked with independent tools.
 
+use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::deployer::run;
-use support::world::{ADDER, world};
+use support::world::{ADDER, LOCALISER_TWO, world};
 
 use crate::access::create_token;
 
@@ -103,9 +104,9 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
         Ok(())
     };
     adds("sevens")?;
-    // Imported again it becomes another revision, or a service with another name; rows of the existing service are
-    // kept.
+    // Imported again it is unchanged, or a service with another name; rows of the existing service are kept.
     let again = types(&["import", &file])?.expect_success()?;
+    ensure!(again.stdout.contains("== unchanged: revision 1 serves"), "{}", again.output());
     ensure!(again.output().contains("keeps its existing SLA table"), "{}", again.output());
     types(&["import", &file, "--name", "sevens_too"])?.expect_success()?;
     adds("sevens_too")?;
@@ -142,6 +143,60 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     ensure!(said.output().contains("only the image is exported"), "{}", said.output());
     let typed = ["--server", &server, "--token", &admin, "import", &hers];
     types(&typed)?.expect_failure(&["is not an exported service"])?;
+    other.stop()?;
+    Ok(())
+}
+
+pub fn a_base_is_moved_to_a_server_without_network() -> Verdict {
+    const BASE: &str = "bookworm-jazzy-wheels";
+    let one = world().daemon_with(LOCALISER_TWO)?;
+    let place = world().directory("base")?;
+    let at = |name: &str| place.path().join(name).display().to_string();
+    let (file, called) = (at("base.oci.tar"), place.path().join("called"));
+    one.deployer().run(&["base", "export", BASE, "-o", &file])?.expect_success()?;
+    let before = one.deployer().run_json(&["bases", "show", BASE])?;
+
+    // Nothing is cached there, nothing answers where packages come from, and what would set a base up does not.
+    let programs = place.path().join("bin");
+    std::fs::create_dir(&programs)?;
+    for program in ["mmdebstrap", "pip3"] {
+        let path = programs.join(program);
+        std::fs::write(&path, format!("#!/bin/sh\necho $0 >> {}\nexit 1\n", called.display()))?;
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755))?;
+    }
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH")?);
+    let other = world()
+        .setup("base-imported")
+        .environment("PATH", &path)
+        .environment("XDG_CACHE_HOME", &at("cache"))
+        .config(&format!("[archives]\n{BASE} = [\"deb http://127.0.0.1:9/debian bookworm main\"]\n"))
+        .start()?;
+    let types = |words: &[&str]| other.deployer().run(words);
+    ensure!(types(&["bases", "show", BASE])?.expect_success()?.stdout.contains("not set up yet"));
+    types(&["base", "export", BASE, "-o", &at("none")])?.expect_failure(&["was not set up on this server"])?;
+    let bytes = std::fs::read(&file)?;
+    std::fs::write(at("torn.tar"), &bytes[..bytes.len() / 2])?;
+    let record = bytes.windows(12).position(|part| part == b"\"made_for\":\"");
+    let mut changed = bytes;
+    changed[record.context("a record")? + 12] ^= 1;
+    std::fs::write(at("changed.tar"), changed)?;
+    types(&["base", "import", &at("torn.tar")])?.expect_failure(&["next:"])?;
+    types(&["base", "import", &at("changed.tar")])?.expect_failure(&["has the content of"])?;
+    let imported = types(&["base", "import", &file])?.expect_success()?;
+    ensure!(imported.stdout.contains("is imported, with the toolchain"), "{}", imported.output());
+    let after = other.deployer().run_json(&["bases", "show", BASE])?;
+    ensure!(after["state"] == "imported" && after["ros_packages"] == before["ros_packages"], "{after:#}");
+    ensure!(after["ros_packages"]["rclpy"].as_str().is_some_and(|version| version.starts_with("7.")), "{after:#}");
+    let arguments = [&["--format", "json"][..], LOCALISER_TWO.arguments].concat();
+    let pushed = other.deployer().push("localiser_ros2", &arguments)?.expect_success()?;
+    let events = pushed.stdout.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let done = events.into_iter().find(|event| event["type"] == "done").context("a done event")?;
+    let layers = done["layers"].as_array().context("layers")?;
+    let base = layers.iter().filter(|layer| layer["name"] == "base");
+    ensure!(base.clone().count() > 0 && base.into_iter().all(|layer| layer["cached"] == true), "{layers:#?}");
+    ensure!(!called.exists(), "{}", std::fs::read_to_string(&called)?);
+    types(&["base", "rm", BASE])?.expect_success()?;
+    types(&["base", "rm", BASE])?.expect_failure(&["was not imported"])?;
     other.stop()?;
     Ok(())
 }

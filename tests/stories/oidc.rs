@@ -127,7 +127,7 @@ pub fn a_token_that_is_not_good_signs_nobody_in() -> Verdict {
         ("cut", "Crypto error"),
         ("access-token", "at_hash"),
         ("unknown-key", "No matching key"),
-        ("no-token", "there is none"),
+        ("no-token", "it is missing"),
         ("userinfo", "another person"),
     ] {
         provider.set_user("alice")?;

@@ -54,6 +54,16 @@ pub fn a_python_package_adds() -> Verdict {
     robot.subscribe("/sums")?;
     let answer = robot.call("/add_two", json!({"a": 20, "b": 22}))?;
     ensure!(answer["result"] == true && answer["values"]["sum"] == 42, "{answer}");
+    // What its base has is listed, and what another one would have.
+    let deployer = daemon.deployer();
+    let base = deployer.run_json(&["bases", "show", "bookworm-ros1"])?;
+    let version = base["ros_packages"]["rospy"].as_str().unwrap_or_default();
+    ensure!(version.starts_with("1.") && base["state"] == "ready" && base["toolchain"] == true, "{base:#}");
+    let listed = deployer.run(&["bases"])?.expect_success()?.stdout;
+    ensure!(listed.contains("bookworm-ros1") && listed.contains("ubuntu noble"), "{listed}");
+    let absent = deployer.run(&["bases", "show", "noble-jazzy"])?.expect_success()?.stdout;
+    ensure!(absent.contains("not set up yet") && absent.contains("ros-jazzy-rclcpp"), "{absent}");
+    deployer.run(&["bases", "show", "nothing"])?.expect_failure(&["no base \"nothing\"", "available: bookworm-"])?;
     Ok(())
 }
 
@@ -295,32 +305,41 @@ pub fn extract_install_space(
     Ok(space)
 }
 
-pub fn an_unchanged_push_builds_no_layer() -> Verdict {
+pub fn an_unchanged_push_builds_no_layer_and_makes_no_revision() -> Verdict {
     let daemon = world().daemon_with(GREETER)?;
-    let outcome = daemon.deployer().push("greeter_cpp", &["--name", "again", "--node", "greeter"])?.expect_success()?;
-    ensure!(outcome.stdout.contains("again"), "{}", outcome.output());
+    let place = tempfile::tempdir()?;
+    let deployer = daemon.deployer();
+    let copy = |name: &str| -> anyhow::Result<PathBuf> {
+        let to = place.path().join(name);
+        run(Command::new("cp").arg("-r").arg(binaries::package("greeter_cpp")).arg(&to))?.expect_success()?;
+        Ok(to)
+    };
+    let push = |from: &Path, more: &[&str]| {
+        let words = ["--format", "json", "push", path_str(from), "--name", "again", "--node", "greeter"];
+        let pushed = deployer.run(&[&words[..], more].concat())?.expect_success()?;
+        let events = pushed.stdout.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let done = events.into_iter().find(|event| event["type"] == "done");
+        done.with_context(|| format!("a done event in {}", pushed.stdout))
+    };
+    let told = push(&copy("first")?, &[])?;
+    ensure!(told.get("unchanged").is_none(), "{told:#}");
     let first = daemon.get_json("/api/v1/services/again")?;
-    let answer = daemon.deployer().run(&[
-        "--format",
-        "json",
-        "push",
-        path_str(&binaries::package("greeter_cpp")),
-        "--name",
-        "again",
-        "--node",
-        "greeter",
-    ])?;
-    let answer = answer.expect_success()?;
-    let done: Value = answer
-        .stdout
-        .lines()
-        .filter_map(|line| serde_json::from_str::<Value>(line).ok())
-        .find(|event| event["type"] == "done")
-        .with_context(|| format!("a done event in {}", answer.stdout))?;
+    // The image is as old as its newest source, not of 1970.
+    let inspected = format!("oci:{}:again", daemon.home.join("images").display());
+    let inspected = run(Command::new("skopeo").args(["inspect", "--config", &inspected]))?.expect_success()?;
+    let config: Value = serde_json::from_str(&inspected.stdout)?;
+    let created = config["created"].as_str().unwrap_or_default();
+    ensure!(created > "2024", "it was copied just now: {created:?}");
+    // The same sources, elsewhere and newer.
+    let done = push(&copy("second")?, &[])?;
     let layers = done["layers"].as_array().context("layers")?;
     ensure!(!layers.is_empty() && layers.iter().all(|layer| layer["cached"] == true), "{layers:#?}");
+    ensure!(done["unchanged"] == true && done["service"]["revision"] == 1, "{done:#}");
     let second = daemon.get_json("/api/v1/services/again")?;
-    ensure!(first["image"] == second["image"], "the same inputs give the same digest");
+    ensure!(first["image"] == second["image"] && first["revisions"] == second["revisions"], "{second:#}");
+    // Another setting is another revision.
+    let done = push(&copy("third")?, &["--cpus", "0.5"])?;
+    ensure!(done["service"]["revision"] == 2, "{done:#}");
     Ok(())
 }
 
@@ -374,8 +393,16 @@ pub fn a_revision_is_rolled_back() -> Verdict {
         Ok(robot.call("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"].clone())
     };
     ensure!(sum("new")? == 102);
+    let diff = || deployer.run_json(&["diff", "moody"]);
+    let compared = |found: &Value| (found["from"].as_u64(), found["to"].as_u64());
+    ensure!(compared(&diff()?) == (Some(1), Some(2)));
     deployer.run(&["rollback", "moody"])?.expect_success()?;
     ensure!(sum("old")? == 3);
+    // What the rollback changed, not what led to revision 1.
+    let found = diff()?;
+    let offset = json!({"part": "parameter", "name": "/adder/offset", "before": "100", "after": "1"});
+    ensure!(compared(&found) == (Some(2), Some(1)), "{found:#}");
+    ensure!(found["differences"].as_array().is_some_and(|all| all.contains(&offset)), "{found:#}");
     deployer.run(&["rm", "moody"])?.expect_success()?;
     ensure!(daemon.servants_of("moody")?.is_empty(), "its servants went with it");
     ensure!(daemon.get("/api/v1/services/moody")?.0 == 404);

@@ -1,13 +1,14 @@
 //! Invalid input: an error that names the problem and the next step, and no partial results.
 
 use std::path::Path;
+use std::process::Command;
 
 use anyhow::ensure;
-use support::Verdict;
 use support::daemon::{Daemon, DaemonSetup};
-use support::deployer::path_str;
+use support::deployer::{path_str, run};
 use support::small_disk::SmallDisk;
 use support::world::{ADDER, world};
+use support::{Verdict, binaries};
 
 /// Checks that there is no service of this name, no build directory and no servant.
 fn expect_nothing_left(daemon: &Daemon, service: &str) -> Verdict {
@@ -44,7 +45,16 @@ pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Verdict {
         "flux_capacitor_msgs",
         "--map",
     ])?;
-    expect_nothing_left(&daemon, "wants_the_impossible")
+    expect_nothing_left(&daemon, "wants_the_impossible")?;
+    // What is only misspelled is told with the name that is meant.
+    let place = tempfile::tempdir()?;
+    run(Command::new("cp").arg("-r").arg(binaries::package("adder_py")).arg(place.path()))?.expect_success()?;
+    let manifest = place.path().join("adder_py/package.xml");
+    let text = std::fs::read_to_string(&manifest)?;
+    std::fs::write(&manifest, text.replace(">rospy<", ">rsopy<"))?;
+    let push = ["push", path_str(&place.path().join("adder_py")), "--name", "misspelled", "--node", "adder.py"];
+    daemon.deployer().run(&push)?.expect_failure(&["rsopy (wanted by adder_py); did you mean rospy"])?;
+    expect_nothing_left(&daemon, "misspelled")
 }
 
 pub fn a_node_that_leaves_at_once() -> Verdict {

@@ -111,7 +111,7 @@ pub fn a_service_that_fails_again_and_again_says_when_it_is_tried() -> Verdict {
     daemon.wait_for_event("the pause", |event| event["kind"] == "servant-back-off")?;
     // Other robots are served, and so is this robot by another revision.
     daemon.robot("adder_py?robot=two")?.call("/add_two", json!({"a": 1, "b": 1}))?;
-    daemon.deployer().push("adder_py", &["--node", "adder.py"])?.expect_success()?;
+    daemon.deployer().push("adder_py", &["--node", "adder.py", "--param", "offset=1"])?.expect_success()?;
     daemon.robot("adder_py?robot=one")?.call("/add_two", json!({"a": 1, "b": 1}))?;
     Ok(())
 }

@@ -9,8 +9,8 @@
 const assert = require('node:assert');
 const { execFileSync } = require('node:child_process');
 const { randomBytes } = require('node:crypto');
-const { cpSync, mkdirSync, readFileSync, rmSync, writeFileSync } = require('node:fs');
-const { basename, dirname, join, resolve } = require('node:path');
+const { appendFileSync, cpSync, mkdirSync, readFileSync, rmSync, writeFileSync } = require('node:fs');
+const { join, resolve } = require('node:path');
 const jsQR = require('jsqr');
 const puppeteer = require('puppeteer-core');
 
@@ -256,8 +256,14 @@ const STEPS = {
     const answered = visitor.page.waitForResponse((answer) => answer.url().endsWith('/stubs/adder_py.tar.gz'));
     await visitor.clicks('Download the stub');
     assert.strictEqual((await answered).status(), 200);
-    const archive = join(pictures, 'adder_py.tar.gz');
-    execFileSync('tar', ['czf', archive, '-C', dirname(sources), basename(sources)]);
+    // The same package makes no revision, a changed one does.
+    await visitor.clicks('Push');
+    await visitor.sees('Unchanged: adder_py, revision 1 serves');
+    const [archive, changed] = [join(pictures, 'adder_py.tar.gz'), join(pictures, 'changed')];
+    cpSync(sources, join(changed, 'adder_py'), { recursive: true });
+    appendFileSync(join(changed, 'adder_py', 'package.xml'), '<!-- Revision 2. -->\n');
+    execFileSync('tar', ['czf', archive, '-C', changed, 'adder_py']);
+    rmSync(changed, { recursive: true });
     await file.uploadFile(archive);
     await visitor.sees('Chosen: adder_py.tar.gz');
     await visitor.clicks('Push');

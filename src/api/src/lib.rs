@@ -5,6 +5,7 @@
 //! with the HTTP status that it contains.
 
 pub mod access;
+pub mod bases;
 pub mod calibration;
 pub mod cpuset;
 pub mod dictionary;

@@ -78,6 +78,10 @@ pub struct PushOptions {
     /// Rollout terms (default: the revision replaces the previous one at once).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rollout: Option<crate::rollout::RolloutTerms>,
+    /// Time of the newest source in seconds since 1970 (like SOURCE_DATE_EPOCH), which becomes the creation time of the
+    /// image (default: 2023-11-14, the time to which those of files in layers are clamped).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub created: Option<u64>,
     /// Human-readable description of what was pushed, stored with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,
@@ -137,7 +141,7 @@ pub enum PushEvent {
         /// Text of the warning.
         message: String,
     },
-    /// The service is published.
+    /// The service is published, or was already.
     Done {
         /// The published service.
         service: Box<ServiceDetail>,
@@ -145,6 +149,10 @@ pub enum PushEvent {
         layers: Vec<Layer>,
         /// Duration of the push in milliseconds, from the first byte.
         took: u64,
+        /// True if the current revision has the same image, launch plan and interface: it continues to serve, and no
+        /// revision was published.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        unchanged: bool,
     },
     /// The push failed; an earlier revision remains in service.
     Error {

@@ -17,6 +17,7 @@ pub mod names;
 mod owned;
 mod publish;
 pub mod stubs;
+mod unchanged;
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -19,9 +19,9 @@ use crate::output::{self, OutputFormat, Table};
 use crate::stated::aux;
 use crate::trial::describe_renamed_topics;
 
-/// Measure how fast a service answers recorded requests at several CPU limits, and propose rows of its dictionary.
+/// Measure how fast a service answers recorded requests at several CPU limits, and propose entries of its SLA table.
 ///
-/// Starts a servant of its own, which gives way to robots and is ended afterwards. The rows are written after
+/// Starts a servant of its own, which gives way to robots and is ended afterwards. The entries are written after
 /// confirmation.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "frames", "live"])))]
@@ -62,13 +62,13 @@ pub struct CalibrateArgs {
     /// Latency that the robots' network adds to each request, in milliseconds; measured with --live.
     #[arg(long, value_name = "MS")]
     network: Option<f64>,
-    /// Auxiliary parameter of the rows, such as width=640; may be given several times.
+    /// Auxiliary parameter of the entries, such as width=640; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
     /// Output file of the curve (default: SERVICE-calibration.svg).
     #[arg(long, value_name = "FILE")]
     curve: Option<PathBuf>,
-    /// Write the rows without asking for confirmation.
+    /// Write the entries without asking for confirmation.
     #[arg(long)]
     yes: bool,
 }

@@ -11,9 +11,9 @@ use crate::output::{self, OutputFormat, Table};
 pub struct DiffArgs {
     /// Service whose revisions are compared.
     service: String,
-    /// Older revision (default: the one before TO).
+    /// Revision to compare with (default: after a rollback, the one that was rolled back; otherwise the one before TO).
     from: Option<u64>,
-    /// Newer revision (default: the current one).
+    /// Revision to compare (default: the current one).
     to: Option<u64>,
 }
 

@@ -50,8 +50,8 @@ pub struct EvalArgs {
     /// Memory of the robot (default: that of its class).
     #[arg(long, value_name = "BYTES", value_parser = robot::memory)]
     robot_memory: Option<Size>,
-    /// Cores of the outsourced servant (default: the limit it was pushed with, otherwise one core, which the row then
-    /// promises).
+    /// Cores of the outsourced servant (default: the limit it was pushed with, otherwise one core, which the entry
+    /// then reserves).
     #[arg(long, value_name = "N", value_parser = robot::cores, allow_hyphen_values = true)]
     cpus: Option<f64>,
     /// Network to add to the measured times, when this is run on the server itself: lan (1 ms each way, 100 Mbit/s),
@@ -73,7 +73,7 @@ pub struct EvalArgs {
     /// Output file of the plot of response times (default: SERVICE-evaluation.svg).
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
-    /// Write the row to the dictionary without asking for confirmation.
+    /// Write the entry to the SLA table without asking for confirmation.
     #[arg(long)]
     yes: bool,
 }

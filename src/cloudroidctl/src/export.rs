@@ -30,7 +30,7 @@ const RECORD: &str = "org.cloudroid.record";
 /// Export a service to a file for another server, where `cloudroidctl import FILE` publishes it.
 ///
 /// The file is a tar archive of an OCI image layout, which skopeo, umoci and podman can read. Besides the image it
-/// contains the service's interface, the commands and limits of its nodes, and its dictionary.
+/// contains the service's interface, the commands and limits of its nodes, and its SLA table.
 #[derive(Debug, clap::Args)]
 pub struct ExportArgs {
     /// Service to export.

@@ -14,7 +14,7 @@ use crate::wait::WaitFlag;
 
 /// Import a service that `cloudroidctl export` has written on another server: the same image, commands and limits.
 ///
-/// It is started once, like a push, to check that it works here. Its dictionary is imported unless the service has one
+/// It is started once, like a push, to check that it works here. Its SLA table is imported unless the service has one
 /// already.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {

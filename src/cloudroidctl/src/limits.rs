@@ -6,7 +6,7 @@ use api::{Caps, CpuSet, Limits, Size};
 /// Resource limits of a servant.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct LimitFlags {
-    /// CPU limit in cores, which is also promised.
+    /// CPU limit in cores, which is also reserved.
     #[arg(long, value_name = "N", value_parser = cores)]
     cpus: Option<f64>,
     /// CPU weight when cores are scarce, 1 to 10000 (default: 100).
@@ -16,7 +16,7 @@ pub struct LimitFlags {
     /// started with it.
     #[arg(long, value_name = "CORES")]
     cpuset: Option<CpuSet>,
-    /// Memory limit, which is also promised, such as 512M.
+    /// Memory limit, which is also reserved, such as 512M.
     #[arg(long, value_name = "SIZE")]
     memory: Option<Size>,
     /// Memory above which the servant is slowed down and its memory reclaimed (cgroup v2).

@@ -5,6 +5,7 @@
 
 mod account;
 mod audit;
+mod bases;
 mod calibrate;
 mod client;
 mod diff;
@@ -105,6 +106,8 @@ enum CtlCommand {
     Diff(diff::DiffArgs),
     Export(export::ExportArgs),
     Import(Box<import::ImportArgs>),
+    #[command(visible_alias = "base")]
+    Bases(bases::BasesArgs),
     Rollout(rollout::RolloutArgs),
     Stub(stub::StubArgs),
     Try(Box<trial::TryArgs>),
@@ -177,6 +180,7 @@ async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
         CtlCommand::Diff(verb) => verb.run(&client, format).await,
         CtlCommand::Export(verb) => verb.run(&client, format).await,
         CtlCommand::Import(verb) => verb.run(&client, format).await,
+        CtlCommand::Bases(verb) => verb.run(&client, format).await,
         CtlCommand::Rollout(verb) => verb.run(&client, format).await,
         CtlCommand::Stub(verb) => verb.run(&client, format).await,
         CtlCommand::Try(verb) => verb.run(&client, format).await,

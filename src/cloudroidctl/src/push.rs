@@ -1,10 +1,11 @@
 //! `push`: publishes a package as a service.
 
 mod archive;
+mod newest;
 mod progress;
 mod shared;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail, ensure};
@@ -13,7 +14,7 @@ use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
 
-use crate::client::{self, DaemonClient, percent_encode};
+use crate::client::{self, DaemonClient, RequestBody, percent_encode};
 use crate::limits::{CapFlags, LimitFlags};
 use crate::output::{self, OutputFormat};
 use crate::push::shared::SharedFlags;
@@ -237,9 +238,18 @@ impl PushArgs {
             stateless: self.stateful == Some(false),
             shared: self.shared.shared_settings(),
             rollout: self.rollout.terms(),
+            created: self.path.as_deref().and_then(newest::find_newest_source),
             source,
         })
     }
+}
+
+/// Returns a file as the body of a request.
+pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
+    let about = std::fs::metadata(path).with_context(|| format!("cannot read {}", path.display()))?;
+    ensure!(about.is_file(), "{} is not a file", path.display());
+    // A failed read ends the body with an error.
+    archive::request_body(path).map(|(body, _)| body)
 }
 
 /// Returns the message for a push that was interrupted here; `publishing` is set if the daemon had begun to publish.

@@ -14,7 +14,7 @@ use crate::inside;
 use crate::output::{self, OutputFormat, Table};
 use crate::whole::AtomicFile;
 
-/// Manage black boxes: recordings of the seconds in servants before their robots waited too long.
+/// Manage ring-buffer recordings: the seconds in servants before their robots waited too long.
 ///
 /// The daemon writes them if its configuration enables it ([black_box]).
 #[derive(Debug, clap::Args)]

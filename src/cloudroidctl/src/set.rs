@@ -8,7 +8,7 @@ use crate::inside;
 use crate::limits::LimitFlags;
 use crate::output::{self, OutputFormat};
 
-/// Change limits of a running servant, and what it is promised. Limits that are not named stay the same.
+/// Change limits of a running servant, and what is reserved for it. Limits that are not named stay the same.
 #[derive(Debug, clap::Args)]
 pub struct SetArgs {
     /// Id of the servant, or name of a service that has one servant.

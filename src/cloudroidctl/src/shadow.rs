@@ -38,7 +38,7 @@ pub struct ShadowArgs {
     /// Field that may differ, such as pose.covariance or detections[].id; may be given several times.
     #[arg(long, value_name = "FIELD")]
     ignore: Vec<String>,
-    /// Allowed relative increase of the candidate's median response time (default: 0.1).
+    /// Allowed relative increase of the candidate's p50 response time (default: 0.1).
     #[arg(long, value_name = "PART")]
     bound: Option<f64>,
     /// Let the candidate use the hosts and devices granted to its revision, although the robot's servant uses them,

@@ -12,7 +12,7 @@ use crate::limits::LimitFlags;
 use crate::output::{self, OutputFormat, Table};
 use crate::stated::{StatedFlags, aux, to_query, unique_aux};
 
-/// Manage the dictionary of a service, which maps SLAs to resources: list, set, remove and explain its rows.
+/// Manage the SLA table of a service, which maps SLAs to resources: list, set, remove and explain its entries.
 #[derive(Debug, clap::Args)]
 pub struct SlaArgs {
     #[command(subcommand)]
@@ -27,19 +27,19 @@ enum SlaCommand {
     Explain(ExplainRow),
 }
 
-/// List the rows of a service's dictionary.
+/// List the entries of a service's SLA table.
 #[derive(Debug, clap::Args)]
 struct ListRows {
-    /// Service of the dictionary.
+    /// Service of the table.
     service: String,
 }
 
-/// Set a row: with these limits, a servant reaches this value. Replaces a row with the same value and auxiliary
+/// Set an entry: with these limits, a servant reaches this value. Replaces an entry with the same value and auxiliary
 /// parameters.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("value").required(true).args(["rrt", "fps", "age"])))]
 struct SetRow {
-    /// Service of the dictionary.
+    /// Service of the table.
     service: String,
     /// Response time that is reached, such as 100ms.
     #[arg(long, value_name = "TIME", value_parser = rrt, allow_hyphen_values = true)]
@@ -50,30 +50,30 @@ struct SetRow {
     /// Age of an output that is reached, such as 500ms.
     #[arg(long, value_name = "TIME", value_parser = age, allow_hyphen_values = true)]
     age: Option<f64>,
-    /// Auxiliary parameter for which the row holds, up to this value for a number; may be given several times.
+    /// Auxiliary parameter for which the entry holds, up to this value for a number; may be given several times.
     #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
     #[command(flatten)]
     limits: LimitFlags,
-    /// Measurement of the row: median, 95th percentile and number of requests, such as 80ms,95ms,200.
+    /// Measurement of the entry: p50, p95 and number of requests, such as 80ms,95ms,200.
     #[arg(long, value_name = "P50,P95,N")]
     spread: Option<String>,
 }
 
-/// Remove rows by their ids.
+/// Remove entries by their ids.
 #[derive(Debug, clap::Args)]
 struct RemoveRows {
-    /// Service of the dictionary.
+    /// Service of the table.
     service: String,
-    /// Ids of rows, as shown by `sla list`.
+    /// Ids of entries, as shown by `sla list`.
     #[arg(required = true)]
     rows: Vec<i64>,
 }
 
-/// Explain which row a robot with these terms would get, why, and which rows come next.
+/// Explain which entry a robot with these requests would get, why, and which entries come next.
 #[derive(Debug, clap::Args)]
 struct ExplainRow {
-    /// Service of the dictionary.
+    /// Service of the table.
     service: String,
     #[command(flatten)]
     stated: StatedFlags,

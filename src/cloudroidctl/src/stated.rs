@@ -32,10 +32,10 @@ pub struct StatedFlags {
     /// Class of the daemon's configuration.
     #[arg(long, value_name = "NAME")]
     class: Option<String>,
-    /// Requested cores, instead of those of a row.
+    /// Requested cores, instead of those of an entry.
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     cpus: Option<String>,
-    /// Requested memory, such as 512M, instead of that of a row.
+    /// Requested memory, such as 512M, instead of that of an entry.
     #[arg(long, value_name = "SIZE", allow_hyphen_values = true)]
     memory: Option<String>,
     /// Auxiliary parameter; may be given several times.

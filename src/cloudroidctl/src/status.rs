@@ -65,7 +65,7 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         ("isolation", isolation),
         ("limits of a servant", output::limits(&status.limits)),
         (
-            "promised",
+            "reserved",
             format!(
                 "{} of {} cpus, {} of {}; {} waiting",
                 room.cpus_reserved,

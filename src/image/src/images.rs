@@ -2,12 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use chrono::{DateTime, SecondsFormat};
+
 use crate::oci::{self, Config, Descriptor, History, Process, REF_NAME, RootFs};
 use crate::store::to_json;
 use crate::{Digest, Error, LayerInfo, Store};
-
-/// Creation date of all images: a real one would give equal images different digests. umoci requires one.
-const EPOCH: &str = "1970-01-01T00:00:00Z";
 
 /// Specification of an image. Equal values give equal digests.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -24,9 +23,20 @@ pub struct ImageSpec {
     pub labels: BTreeMap<String, String>,
     /// Annotations of the manifest.
     pub annotations: BTreeMap<String, String>,
+    /// Time of the newest source, in seconds since 1970; it is recorded as the creation date, since the real one would
+    /// give equal images different digests.
+    pub created: u64,
 }
 
 impl ImageSpec {
+    /// Returns whether the images have the same content and settings, whenever their sources were written and however
+    /// their layers are compressed.
+    pub fn is_same_content(&self, other: &ImageSpec) -> bool {
+        let settings = |spec: &ImageSpec| ImageSpec { layers: Vec::new(), created: 0, ..spec.clone() };
+        let contents = |spec: &ImageSpec| -> Vec<Digest> { spec.layers.iter().map(|layer| layer.diff_id).collect() };
+        settings(self) == settings(other) && contents(self) == contents(other)
+    }
+
     /// Creates the specification from a configuration, a manifest and their layers.
     pub(crate) fn from_documents(layers: Vec<LayerInfo>, config: Config, manifest: oci::Manifest) -> Self {
         let process = config.config;
@@ -38,8 +48,21 @@ impl ImageSpec {
             working_dir: process.working_dir,
             labels: process.labels,
             annotations: manifest.annotations,
+            created: config.created.as_deref().map_or(0, parse_time),
         }
     }
+}
+
+/// Parses a time of RFC 3339 to seconds since 1970; 0 for anything else.
+fn parse_time(text: &str) -> u64 {
+    let time = DateTime::parse_from_rfc3339(text).ok();
+    time.and_then(|time| u64::try_from(time.timestamp()).ok()).unwrap_or(0)
+}
+
+/// Returns seconds since 1970 as a time of RFC 3339, which the image specification requires.
+fn format_time(seconds: u64) -> String {
+    let time = i64::try_from(seconds).ok().and_then(|seconds| DateTime::from_timestamp(seconds, 0));
+    time.unwrap_or_default().to_rfc3339_opts(SecondsFormat::Secs, true)
 }
 
 /// An image read from the store.
@@ -238,8 +261,9 @@ fn check_tag(name: &str) -> Result<(), Error> {
 
 fn make_config(spec: &ImageSpec) -> Config {
     let (architecture, variant) = oci::platform();
+    let created = format_time(spec.created);
     Config {
-        created: Some(EPOCH.to_owned()),
+        created: Some(created.clone()),
         architecture: architecture.to_owned(),
         variant: variant.map(str::to_owned),
         os: "linux".to_owned(),
@@ -253,7 +277,7 @@ fn make_config(spec: &ImageSpec) -> Config {
         history: spec
             .layers
             .iter()
-            .map(|_| History { created: EPOCH.to_owned(), created_by: "cloudroid".to_owned() })
+            .map(|_| History { created: created.clone(), created_by: "cloudroid".to_owned() })
             .collect(),
     }
 }
@@ -276,6 +300,35 @@ fn make_manifest(spec: &ImageSpec, config: Descriptor) -> oci::Manifest {
 mod tests {
     use super::*;
     use crate::TreeOptions;
+
+    #[test]
+    fn an_image_is_as_old_as_its_newest_source() {
+        for (seconds, text) in [(0, "1970-01-01T00:00:00Z"), (1_700_000_000, "2023-11-14T22:13:20Z")] {
+            assert_eq!(format_time(seconds), text);
+            assert_eq!(parse_time(text), seconds);
+        }
+        assert_eq!(parse_time("2023-11-14T23:13:20.5+01:00"), 1_700_000_000);
+        for unknown in ["", "yesterday", "1969-12-31T23:59:59Z", "2023-11-14"] {
+            assert_eq!(parse_time(unknown), 0, "{unknown}");
+        }
+        assert_eq!(format_time(u64::MAX), "1970-01-01T00:00:00Z");
+    }
+
+    #[test]
+    fn the_time_of_the_sources_is_no_content() {
+        let place = tempfile::tempdir().expect("a directory");
+        let store = Store::open(&place.path().join("images"), &place.path().join("layers")).expect("a store");
+        let image = |created: u64, command: &str| {
+            let spec = ImageSpec { created, cmd: vec![command.to_owned()], ..ImageSpec::default() };
+            let digest = store.put_image(&spec).expect("an image");
+            store.image(&digest).expect("there")
+        };
+        let (first, touched, other) = (image(1_700_000_000, "a"), image(1_800_000_000, "a"), image(1_700_000_000, "b"));
+        assert_eq!(first.spec.created, 1_700_000_000);
+        assert_ne!(first.digest, touched.digest);
+        assert!(first.spec.is_same_content(&touched.spec));
+        assert!(!first.spec.is_same_content(&other.spec));
+    }
 
     #[test]
     fn what_a_manifest_only_mentions_is_not_part_of_its_image() {

@@ -28,6 +28,7 @@ mod gzip;
 mod images;
 mod layer;
 mod layer_writer;
+mod layout;
 mod names;
 pub mod oci;
 mod pipe;

@@ -229,7 +229,7 @@ impl Provider {
         let known = known.map_err(|error| self.unreachable(error.to_string()))?;
         let response = self.exchange(&known, code, started.verifier).await?;
         let Some(id_token) = response.id_token() else {
-            return Err(self.token_error("there is none".into()));
+            return Err(self.token_error("it is missing".into()));
         };
         let checks = token::IdTokenChecks {
             client_id: &self.settings.client_id,

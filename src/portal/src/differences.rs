@@ -5,13 +5,14 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use api::differences::{Difference, Differences, RevisionPart as Part};
+use api::rollout::RolloutState;
 use axum::Json;
 use axum::extract::{Path, State};
 use package::interface::Interface;
 use package::inventory::Inventory;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use store::RevisionRecord;
+use store::{EventFilter, RevisionRecord};
 use utoipa::IntoParams;
 
 use crate::app::App;
@@ -22,7 +23,8 @@ use crate::query::Query;
 /// Query: which revisions.
 #[derive(Debug, Deserialize, IntoParams)]
 pub struct DifferencesQuery {
-    /// Number of the revision to compare with (default: the one published before `to`).
+    /// Number of the revision to compare with (default: after a rollback, the one that was rolled back; otherwise the
+    /// one published before `to`).
     from: Option<u64>,
     /// Number of the revision to compare (default: the current one).
     to: Option<u64>,
@@ -39,8 +41,14 @@ pub async fn differences(
         Some(to) => to,
         None => app.catalogue.current_revision(&name)?.number,
     };
-    let before = || revisions.iter().find(|line| line.number < to);
-    let from = between.from.or_else(|| Some(before()?.number));
+    let from = match between.from {
+        Some(from) => Some(from),
+        None => {
+            let numbers: Vec<u64> = revisions.iter().map(|line| line.number).collect();
+            let is_rolled_back = between.to.is_none() && was_rolled_back(&app, &name)?;
+            default_from(&numbers, to, is_rolled_back, untried_candidate(&app, &name))
+        }
+    };
     let unknown = |revision: String| -> Error {
         let exists = revisions.iter().map(|line| line.number.to_string());
         catalogue::Error::UnknownRevision { service: name.clone(), revision, exists: exists.collect() }.into()
@@ -56,6 +64,27 @@ pub async fn differences(
     let before = revision_parts(&from, &app.catalogue.revision_contents(&from).await?.inventory);
     let after = revision_parts(&to, &app.catalogue.revision_contents(&to).await?.inventory);
     Ok(Json(Differences { service: name, from: from.number, to: to.number, differences: compare(before, after) }))
+}
+
+/// Returns whether the journal has a rollback of the service.
+fn was_rolled_back(app: &App, service: &str) -> Result<bool, Error> {
+    let filter = EventFilter { kind: Some("rolled-back"), service: Some(service), ..EventFilter::default() };
+    Ok(!app.state.filtered_events(filter, 0, 1)?.is_empty())
+}
+
+/// Returns the candidate of the last rollout if it never became the current revision.
+fn untried_candidate(app: &App, service: &str) -> Option<u64> {
+    let rollout = app.choreographer.rollout(service).ok()?;
+    let was_current = matches!(rollout.state, RolloutState::Promoted | RolloutState::Draining);
+    (!was_current).then_some(rollout.candidate)
+}
+
+/// Returns the revision to compare with `to`, of those with these numbers, newest first: after a rollback the newest
+/// one that was current, otherwise the one published before.
+fn default_from(numbers: &[u64], to: u64, is_rolled_back: bool, untried: Option<u64>) -> Option<u64> {
+    let mut later = numbers.iter().filter(|number| **number > to && Some(**number) != untried);
+    let before = numbers.iter().find(|number| **number < to);
+    later.next().filter(|_| is_rolled_back).or(before).copied()
 }
 
 /// Parts of a revision: each with a text and, where the text does not show every change, a number that differs.
@@ -218,6 +247,25 @@ mod tests {
                 ..store::Plan::default()
             },
             interface: Interface::default(),
+        }
+    }
+
+    #[test]
+    fn a_revision_is_compared_with_the_one_that_it_replaced() {
+        for (to, is_rolled_back, untried, expected) in [
+            (3, false, None, Some(2)),
+            (1, false, None, None),
+            // Rolled back from 3 to 1, or to 2; once it is pushed again there is nothing later.
+            (1, true, None, Some(3)),
+            (2, true, None, Some(3)),
+            (3, true, None, Some(2)),
+            // Revision 3 is or was a canary.
+            (2, false, Some(3), Some(1)),
+            (2, true, Some(3), Some(1)),
+            (1, true, Some(3), Some(2)),
+        ] {
+            let from = default_from(&[3, 2, 1], to, is_rolled_back, untried);
+            assert_eq!(from, expected, "{to} {is_rolled_back} {untried:?}");
         }
     }
 

@@ -300,6 +300,7 @@ impl Error {
         | Error::UnknownToken { exists, .. }
         | Error::UnknownPairing { exists, .. }
         | Error::UnknownAccount { exists, .. }
+        | Error::Push(push::Error::UnknownBase { exists, .. })
         | Error::UnknownRule { exists, .. } = self
         {
             problem.exists = exists.clone();
@@ -447,6 +448,9 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::NotAllowed(_) => (S::FORBIDDEN, "forbidden", "not allowed"),
         P::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
         P::Options(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
+        P::UnknownBase { .. } => (S::NOT_FOUND, "unknown-base", "unknown base"),
+        P::BaseNotImported(_) => (S::CONFLICT, "base-not-imported", "base not imported"),
+        P::BaseNotSetUp(_) => (S::CONFLICT, "base-not-set-up", "base not set up"),
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
         P::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
         P::Ending => ENDING,

@@ -17,6 +17,7 @@ mod api_v1;
 mod app;
 mod audit;
 mod auth;
+mod bases;
 mod body;
 mod calibration;
 mod caller;

@@ -59,14 +59,14 @@ pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<
     write_gauge(
         &mut out,
         "cloudroid_strangers",
-        "TCP connections on which nobody has shown yet who asks.",
+        "Unauthenticated TCP connections.",
         [(String::new(), app.strangers.count() as f64)],
     );
     write_family(
         &mut out,
         "cloudroid_dropped_strangers_total",
         "counter",
-        "TCP connections that were dropped before anybody had shown who asks, because newer ones needed their places.",
+        "Unauthenticated TCP connections that were closed because newer ones needed their places.",
         [(String::new(), app.strangers.dropped_count() as f64)],
     );
     if let Some(end) = app.tls.as_ref().and_then(|tls| tls.expiry()) {
@@ -184,10 +184,10 @@ fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
 fn write_capacity_metrics(out: &mut String, choreographer: &Choreographer) {
     let (capacity, taken, waiting) = choreographer.admission().snapshot();
     let rows = [
-        ("cloudroid_capacity_cpus", "Cores that may be promised.", capacity.cpus()),
-        ("cloudroid_capacity_memory_bytes", "Memory that may be promised.", capacity.memory as f64),
-        ("cloudroid_promised_cpus", "Cores promised.", taken.cpus()),
-        ("cloudroid_promised_memory_bytes", "Memory promised.", taken.memory as f64),
+        ("cloudroid_capacity_cpus", "Cores that may be reserved.", capacity.cpus()),
+        ("cloudroid_capacity_memory_bytes", "Memory that may be reserved.", capacity.memory as f64),
+        ("cloudroid_promised_cpus", "Cores reserved.", taken.cpus()),
+        ("cloudroid_promised_memory_bytes", "Memory reserved.", taken.memory as f64),
         ("cloudroid_waiting", "Robots that wait for capacity.", waiting as f64),
     ];
     for (name, help, value) in rows {
@@ -231,7 +231,7 @@ async fn write_usage_metrics(out: &mut String, handles: &[Arc<Handle>]) {
     );
     write_pressure_metrics(out, &rows);
     let kills = of(|usage| usage.oom_kills as f64);
-    write_family(out, "cloudroid_servant_oom_kills_total", "counter", "Processes killed for want of memory.", kills);
+    write_family(out, "cloudroid_servant_oom_kills_total", "counter", "Processes killed at the memory limit.", kills);
 }
 
 /// Writes the pressure metrics, which cgroup v1 does not have.

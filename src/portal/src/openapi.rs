@@ -58,17 +58,22 @@ const NAMED: &[u16] = &[404];
 const WITH_BODY: &[u16] = &[408, 413, 503];
 /// Further refusals of operations, by operation id.
 const MORE: &[(&str, &[u16])] = &[
+    ("base", &[422]),
+    ("bases", &[422]),
     ("calibrate", &[409]),
     ("createAccount", &[409]),
     ("createToken", &[409]),
     ("explainSla", &[422]),
+    ("exportBase", &[409, 422]),
     ("fit", &[422]),
+    ("importBase", &[404, 422]),
     ("inside", &[409, 426]),
     ("logs", &[409]),
     ("oidcCallback", &[404, 502, 503]),
     ("oidcLogin", &[404, 502, 503]),
     ("orderRollout", &[409]),
     ("push", &[409, 422]),
+    ("removeBase", &[409, 422]),
     ("removeService", &[503]),
     ("rollback", &[409]),
     ("setLimits", &[409, 422, 502]),

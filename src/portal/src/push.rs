@@ -49,7 +49,9 @@ pub async fn push(
     let last = sender.clone();
     // Owned by the response: if the client disconnects, the push is aborted with it.
     let guard = pusher.start(options, by, archive, sender, |outcome| async move {
-        if let Ok(published) = &outcome {
+        if let Ok(published) = &outcome
+            && !published.unchanged
+        {
             let object = format!("service {}", published.service);
             app.audit.record(&caller, AccessAction::Deploy, "published", &object, 200);
         }
@@ -92,6 +94,7 @@ fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {
         service: Box::new(views::service(app, &published.service)?),
         layers: published.layers,
         took: published.took.as_millis() as u64,
+        unchanged: published.unchanged,
     })
 }
 

@@ -16,8 +16,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, calibration, dictionary, differences, events, goals, history, inside, machines, metrics, oci,
-    openapi, page, people, policy, push, recordings, robots, shadow, stream, stubs, topics, viewers,
+    App, api_v1, audit, bases, calibration, dictionary, differences, events, goals, history, inside, machines, metrics,
+    oci, openapi, page, people, policy, push, recordings, robots, shadow, stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -30,6 +30,8 @@ use AccessAction::{Deploy, Enter, Logs, Look, Operate, See, Try};
 const ENTER: Access = May(Enter, AccessTarget::Machine);
 /// The whole machine.
 const LOOK: Access = May(Look, AccessTarget::Machine);
+/// Bases of images, which concern all services.
+const KEEP_BASES: Access = May(Operate, AccessTarget::Machine);
 /// Pairings of robots.
 const PAIR: Access = May(AccessAction::Pair, AccessTarget::Machine);
 /// Tokens and policy.
@@ -462,6 +464,25 @@ pub const ROUTES: &[Route] = &[
             .asks_json::<api::PushOptions>("options", "Options of the push.")
             .takes_file("application/x-tar", "A tar archive, optionally gzipped; empty with `apt`.", Required::False)
             .streams::<api::PushEvent>()
+    }),
+    route("GET", "/api/v1/bases", ENTER, || get(bases::bases)).with_operation(|| {
+        operation("bases", "Bases of images: operating system and ROS.").lists::<api::bases::BaseSummary>()
+    }),
+    route("POST", "/api/v1/bases", KEEP_BASES, || post(bases::import).layer(DefaultBodyLimit::disable()))
+        .with_operation(|| {
+            operation("importBase", "Imports an exported base, in place of that of the same name.")
+                .takes_file(api::bases::BASE_ARCHIVE, "A file of exportBase.", Required::True)
+                .answers::<api::bases::BaseDetail>()
+        }),
+    route("GET", "/api/v1/bases/{name}", ENTER, || get(bases::base))
+        .with_operation(|| operation("base", "A base with its packages.").answers::<api::bases::BaseDetail>()),
+    route("DELETE", "/api/v1/bases/{name}", KEEP_BASES, || delete(bases::remove)).with_operation(|| {
+        operation("removeBase", "Removes an imported base: the next push that uses it sets it up.")
+            .answers::<api::bases::BaseDetail>()
+    }),
+    route("GET", "/api/v1/bases/{name}/archive", KEEP_BASES, || get(bases::export)).with_operation(|| {
+        operation("exportBase", "The layers of a base as a tar archive of an OCI image layout, for another server.")
+            .answers_file(api::bases::BASE_ARCHIVE)
     }),
     route("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
         .with_operation(|| operation("openapi", "This document.").answers_object()),

@@ -34,6 +34,20 @@ pub enum Error {
         /// Log lines that explain the failure.
         log: Vec<String>,
     },
+    /// The base does not exist.
+    #[error("there is no base {name:?}")]
+    UnknownBase {
+        /// Name that was requested.
+        name: String,
+        /// Names of existing bases.
+        exists: Vec<String>,
+    },
+    /// There is nothing to export of a base.
+    #[error("{0}")]
+    BaseNotSetUp(String),
+    /// The base was not imported.
+    #[error("{0}")]
+    BaseNotImported(String),
     /// The archive is too large.
     #[error("the archive is larger than {limit}")]
     TooLarge {

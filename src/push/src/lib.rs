@@ -12,6 +12,7 @@
 
 #![forbid(unsafe_code)]
 
+mod bases;
 mod bounds;
 mod deployer;
 mod disks;
@@ -193,11 +194,14 @@ impl Pusher {
         // From here on the push cannot be cancelled: a published revision must not be reported as cancelled.
         report.publishing.cancel();
         let terms = options.rollout;
-        Box::pin(self.publish_and_rollout(record, inventory, terms, report)).await?;
+        let unchanged = self.find_unchanged(&record, terms).await?;
+        if unchanged.is_none() {
+            Box::pin(self.publish_and_rollout(record, inventory, terms, report)).await?;
+        }
         if let Some((record, _)) = &imported {
             self.import_dictionary(&name, record, report);
         }
-        Ok(PushResult { layers, service: name, took: began.elapsed() })
+        Ok(PushResult { layers, service: name, took: began.elapsed(), unchanged: unchanged.is_some() })
     }
 
     /// Builds or imports the image.
@@ -327,6 +331,7 @@ impl Pusher {
             remaps: options.remaps.clone(),
             map: options.map.clone(),
             with: options.with.clone(),
+            created: options.created,
         };
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use api::rollout::RolloutTerms;
+use api::rollout::{RolloutState, RolloutTerms};
 use catalogue::RollbackResult;
 use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
@@ -12,6 +12,20 @@ use super::reporter::Reporter;
 use crate::Error;
 
 impl Pusher {
+    /// Returns the number of the current revision if it is the same as the pushed one. A push with rollout terms, or
+    /// during a canary, is always published, since it shall move robots to its revision.
+    pub(super) async fn find_unchanged(
+        &self,
+        record: &RevisionRecord,
+        terms: Option<RolloutTerms>,
+    ) -> Result<Option<u64>, Error> {
+        let rollout = self.choreographer.rollout(&record.service);
+        if terms.is_some() || rollout.is_ok_and(|rollout| rollout.state == RolloutState::Canary) {
+            return Ok(None);
+        }
+        Ok(self.catalogue.find_unchanged(record).await?)
+    }
+
     /// Publishes the revision on these terms and refills the warm pool. A failure after publication is only a warning,
     /// since the revision is published.
     pub(super) async fn publish_and_rollout(

@@ -26,6 +26,8 @@ pub struct PushResult {
     pub layers: Vec<api::push::Layer>,
     /// Duration, including the time spent waiting for other pushes.
     pub took: Duration,
+    /// True if the revision that serves is the same, so that none was published.
+    pub unchanged: bool,
 }
 
 impl Pusher {

@@ -21,6 +21,7 @@ class Push {
   warnings = $state<string[]>([]);
   log = $state.raw<{ number: number; line: string }[]>([]);
   done = $state.raw<ServiceDetail>();
+  unchanged = $state(false);
   problem = $state.raw<unknown>();
   cancelled = $state(false);
 
@@ -96,6 +97,7 @@ class Push {
         return;
       case 'done':
         this.done = event.service;
+        this.unchanged = event.unchanged ?? false;
         return;
       case 'error':
         this.problem = Problem.of(event.problem);

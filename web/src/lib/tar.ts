@@ -20,6 +20,9 @@ export function chosen(all: Entry[]): Entry[] {
     .sort((a, b) => (a.path < b.path ? -1 : 1));
 }
 
+/** Time of the newest file, in seconds since 1970. */
+export const newestSource = (entries: Entry[]) => Math.floor(entries.reduce((newest, { file }) => Math.max(newest, file.lastModified), 0) / 1000);
+
 export const holdsPackage = (entries: Entry[]) => entries.some(({ path }) => path === 'package.xml' || path.endsWith('/package.xml'));
 
 function header(name: Uint8Array, size: number, mode: number, kind: string): Uint8Array {

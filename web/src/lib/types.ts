@@ -54,6 +54,29 @@ export interface BackOff {
   service: string;
 }
 
+export interface BaseDetail extends BaseSummary {
+  debian_packages: Record<string, string>;
+  includes: string[];
+  python_packages: Record<string, string>;
+  ros_packages: Record<string, string>;
+}
+
+export type BaseState =
+  | 'not-set-up'
+  | 'ready'
+  | 'imported';
+
+export interface BaseSummary {
+  bytes: Size;
+  distribution: string;
+  name: string;
+  ros: number;
+  state: BaseState;
+  summary: string;
+  system: string;
+  toolchain: boolean;
+}
+
 export interface Calibration {
   ended: string;
   inputs: Fed[];
@@ -615,7 +638,7 @@ export type PushEvent =
   | { line: string; type: 'log' }
   | { done: number; total?: number; type: 'progress'; unit: string }
   | { message: string; type: 'warning' }
-  | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done' }
+  | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done'; unchanged?: boolean }
   | { problem: Problem; type: 'error' };
 
 export interface PushOptions {
@@ -623,6 +646,7 @@ export interface PushOptions {
   args?: Record<string, string>;
   base?: string;
   caps?: Caps;
+  created?: number;
   grants?: Grants;
   interface?: string;
   launch?: string;

@@ -21,9 +21,9 @@ const CHUNKS_AHEAD: usize = 8;
 /// Depth of the search for a package.xml.
 const DEPTH: usize = 6;
 /// Directories that never belong to a package.
-const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
+pub(super) const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
 /// Directories beside `src` of a workspace that catkin or colcon generate.
-const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
+pub(super) const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
 
 /// Handle of the thread that packs the archive.
 #[derive(Debug)]

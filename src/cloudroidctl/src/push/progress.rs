@@ -42,13 +42,18 @@ impl PushProgress {
             PushEvent::Log { line } => self.print(&format!("  | {line}")),
             PushEvent::Progress { unit, done, total } => self.progress(unit, *done, *total),
             PushEvent::Warning { message } => self.print(&format!("warning: {message}")),
-            PushEvent::Done { layers, took, .. } => {
+            PushEvent::Done { service, layers, took, unchanged } => {
                 self.finish();
                 for layer in layers {
                     let how = if layer.cached { "unchanged" } else { "new" };
                     output::line(&format!("   layer {:<14} {:>8}  {how}", layer.name, Size(layer.size).to_string()))?;
                 }
-                output::line(&format!("== published in {:.1} s\n", *took as f64 / 1000.0))
+                let took = *took as f64 / 1000.0;
+                if *unchanged {
+                    let number = service.summary.revision;
+                    return output::line(&format!("== unchanged: revision {number} serves ({took:.1} s)\n"));
+                }
+                output::line(&format!("== published in {took:.1} s\n"))
             }
             PushEvent::Error { .. } => {
                 self.finish();

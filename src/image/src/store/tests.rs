@@ -467,6 +467,7 @@ fn spec(layers: &[LayerInfo]) -> ImageSpec {
         working_dir: "/root".to_owned(),
         labels: (0..20).map(|i| pair(&format!("label{i}"), "v")).collect(),
         annotations: BTreeMap::from([pair("org.opencontainers.image.title", "x")]),
+        created: 0,
     }
 }
 

@@ -6,6 +6,7 @@ mod observed;
 use std::sync::Arc;
 
 use api::access::{Audited, NewRule, NewToken, Rule, Secret, Token, Whoami};
+use api::bases::{BaseDetail, BaseState, BaseSummary};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
@@ -308,7 +309,28 @@ fn options() -> PushOptions {
         stateless: true,
         shared: Some(api::Shared::default()),
         rollout: Some(rollout_terms()),
+        created: Some(1),
         source: "--apt x".into(),
+    }
+}
+
+fn base() -> BaseDetail {
+    let versions = || [("a".to_owned(), "1.0".to_owned())].into();
+    BaseDetail {
+        summary: BaseSummary {
+            name: "x".into(),
+            summary: "x".into(),
+            ros: 1,
+            distribution: "noetic".into(),
+            system: "debian bookworm".into(),
+            state: BaseState::Ready,
+            toolchain: true,
+            bytes: Size(1),
+        },
+        includes: one_text("x"),
+        ros_packages: versions(),
+        python_packages: versions(),
+        debian_packages: versions(),
     }
 }
 
@@ -634,6 +656,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             },
         ),
         sample("BackOff", back_off()),
+        sample("BaseDetail", base()),
+        sample("BaseSummary", base().summary),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
         sample("Explained", explained_sla()),
@@ -715,6 +739,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             service: Box::new(detail()),
             layers: vec![Layer { name: "base".into(), digest: "sha256:0".into(), size: 1, cached: true }],
             took: 1,
+            unchanged: true,
         },
         PushEvent::Error { problem: problem() },
     ] {

@@ -1,0 +1,226 @@
+//! `bases`: what images are built upon, and moving it to another server.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use api::Size;
+use api::bases::{BaseDetail, BaseState, BaseSummary};
+use futures_util::StreamExt;
+use http_body_util::BodyStream;
+use hyper::Method;
+
+use crate::client::{self, DaemonClient, empty_body, percent_encode};
+use crate::output::{self, OutputFormat, Table};
+use crate::push;
+use crate::whole::AtomicFile;
+
+/// List bases, what each has, and move one to another server.
+///
+/// A base is the operating system and ROS below an image. The first push that uses it sets it up and downloads packages
+/// for that; a base that another server has exported is there at once.
+#[derive(Debug, clap::Args)]
+pub struct BasesArgs {
+    #[command(subcommand)]
+    verb: Option<BasesCommand>,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum BasesCommand {
+    List(ListBases),
+    Show(ShowBase),
+    Export(ExportBase),
+    Import(ImportBase),
+    Rm(RemoveBase),
+}
+
+/// List bases (the default).
+#[derive(Debug, clap::Args)]
+struct ListBases {}
+
+/// Show the ROS and Python packages of a base, with their versions.
+#[derive(Debug, clap::Args)]
+struct ShowBase {
+    /// Name of the base.
+    name: String,
+    /// List the Debian packages, too.
+    #[arg(long)]
+    all: bool,
+}
+
+/// Export a base to a file for another server, where `cloudroidctl base import FILE` takes it.
+///
+/// The file is a tar archive of an OCI image layout: the layers of the base and, once sources were pushed, of the
+/// toolchain, with the index of the package archive.
+#[derive(Debug, clap::Args)]
+struct ExportBase {
+    /// Name of the base.
+    name: String,
+    /// Output file (default: NAME.oci.tar). An existing file is replaced when the new one is complete.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+}
+
+/// Import a base that `cloudroidctl base export` has written on another server.
+///
+/// The server must have the same definition of it. Its layers are used as they are, until the definition changes.
+/// Packages that need nothing else are pushed without any download.
+#[derive(Debug, clap::Args)]
+struct ImportBase {
+    /// File written by base export.
+    file: PathBuf,
+}
+
+/// Remove an imported base: the next push that uses it sets it up with what the package archive has then.
+#[derive(Debug, clap::Args)]
+struct RemoveBase {
+    /// Name of the base.
+    name: String,
+}
+
+impl BasesArgs {
+    /// Sends the requests and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        match self.verb.unwrap_or(BasesCommand::List(ListBases {})) {
+            BasesCommand::List(_) => list(&client.get::<Vec<BaseSummary>>("/api/v1/bases").await?, format),
+            BasesCommand::Show(verb) => {
+                let path = format!("/api/v1/bases/{}", percent_encode(&verb.name));
+                show(&client.get::<BaseDetail>(&path).await?, verb.all, format)
+            }
+            BasesCommand::Export(verb) => verb.run(client, format).await,
+            BasesCommand::Import(verb) => verb.run(client, format).await,
+            BasesCommand::Rm(verb) => {
+                let path = format!("/api/v1/bases/{}", percent_encode(&verb.name));
+                let base: BaseDetail = client.delete(&path).await?;
+                match format {
+                    OutputFormat::Json => output::json(&base),
+                    OutputFormat::Table => output::line(&format!("the imported base {} is removed", verb.name)),
+                }
+            }
+        }
+    }
+}
+
+impl ExportBase {
+    async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let target = self.output.unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.name)));
+        let path = format!("/api/v1/bases/{}/archive", percent_encode(&self.name));
+        let answer = client.send(Method::GET, &path, empty_body()).await?;
+        let half = AtomicFile::create_beside(&target)?;
+        let mut bytes = 0;
+        let mut parts = BodyStream::new(answer.into_body());
+        while let Some(part) = parts.next().await {
+            let part = part.context("the daemon's response was cut off")?;
+            let part = part.into_data().unwrap_or_default();
+            bytes += part.len() as u64;
+            (&half.file).write_all(&part).with_context(|| half.error_context())?;
+        }
+        half.persist()?;
+        match format {
+            OutputFormat::Json => output::json(&serde_json::json!({ "path": target, "bytes": bytes })),
+            OutputFormat::Table => output::line(&format!("{}: base {}, {}", target.display(), self.name, Size(bytes))),
+        }
+    }
+}
+
+impl ImportBase {
+    async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let body = push::file_body(&self.file)?;
+        let answer = client.send(Method::POST, "/api/v1/bases", body).await?;
+        let base: BaseDetail = client::read_json(answer).await?;
+        match format {
+            OutputFormat::Json => output::json(&base),
+            OutputFormat::Table => {
+                let tools = if base.summary.toolchain { "with" } else { "without" };
+                let name = &base.summary.name;
+                output::line(&format!("base {name} is imported, {tools} the toolchain for compiling"))
+            }
+        }
+    }
+}
+
+fn state_word(state: BaseState) -> &'static str {
+    match state {
+        BaseState::NotSetUp => "not set up",
+        BaseState::Ready => "ready",
+        BaseState::Imported => "imported",
+    }
+}
+
+fn list(all: &[BaseSummary], format: OutputFormat) -> anyhow::Result<()> {
+    if format == OutputFormat::Json {
+        return output::json(&all);
+    }
+    let mut table = Table::new(&["NAME", "ROS", "SYSTEM", "STATE", "SIZE", "SUMMARY"]);
+    for one in all {
+        let size = if one.bytes.0 == 0 { "-".to_owned() } else { one.bytes.to_string() };
+        table.row([
+            one.name.clone(),
+            format!("{} {}", one.ros, one.distribution),
+            one.system.clone(),
+            state_word(one.state).to_owned(),
+            size,
+            one.summary.clone(),
+        ]);
+    }
+    table.print()
+}
+
+fn show(base: &BaseDetail, all: bool, format: OutputFormat) -> anyhow::Result<()> {
+    if format == OutputFormat::Json {
+        return output::json(base);
+    }
+    let about = &base.summary;
+    output::line(&format!("{}: {}", about.name, about.summary))?;
+    output::line(&format!("ROS {} {} on {}", about.ros, about.distribution, about.system))?;
+    if about.state == BaseState::NotSetUp {
+        output::line("not set up yet: the first push with it does that, or import it with: cloudroidctl base import")?;
+        let includes = base.includes.join(", ");
+        return output::line(&format!("it will have these packages and what they depend on: {includes}"));
+    }
+    let tools = if about.toolchain { "with" } else { "without" };
+    output::line(&format!("{}, {}, {tools} the toolchain for compiling\n", state_word(about.state), about.bytes))?;
+    let kinds = [("ROS PACKAGE", &base.ros_packages), ("PYTHON PACKAGE", &base.python_packages)];
+    let debian = all.then_some(("DEBIAN PACKAGE", &base.debian_packages));
+    for (title, packages) in kinds.into_iter().chain(debian) {
+        print_versions(title, packages)?;
+    }
+    if all {
+        return Ok(());
+    }
+    output::line(&format!("and {} Debian packages (--all lists them)", base.debian_packages.len()))
+}
+
+fn print_versions(title: &str, packages: &BTreeMap<String, String>) -> anyhow::Result<()> {
+    if packages.is_empty() {
+        return Ok(());
+    }
+    let mut table = Table::new(&[title, "VERSION"]);
+    for (name, version) in packages {
+        table.row([name.clone(), version.clone()]);
+    }
+    table.print()?;
+    output::line("")
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        bases: BasesArgs,
+    }
+
+    #[test]
+    fn without_a_verb_bases_are_listed() {
+        let parse = |words: &[&str]| Line::try_parse_from([&["bases"][..], words].concat()).map(|line| line.bases.verb);
+        assert!(parse(&[]).expect("valid").is_none());
+        assert!(matches!(parse(&["show", "x", "--all"]).expect("valid"), Some(BasesCommand::Show(show)) if show.all));
+        assert_eq!(parse(&["show"]).expect_err("no name").exit_code(), 2);
+    }
+}
