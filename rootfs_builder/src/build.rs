@@ -140,7 +140,7 @@ impl Build<'_> {
                 Some(deb) => {
                     debs.insert(deb);
                 }
-                None => missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with")),
+                None => missing.push(keys::unresolved_name(&self.archive, &self.base, name, &there)),
             }
         }
         if missing.is_empty() { Ok(debs) } else { Err(Error::Unresolved(missing)) }

@@ -104,8 +104,8 @@ pub enum Error {
     Unresolved(Vec<Unresolved>),
     /// `--apt` names an unknown package.
     #[error(
-        "{name} is neither a ROS package nor a Debian package of {suite}{hint}; look for it with \
-         `apt-cache search {name}`"
+        "{name} is neither a ROS package nor a Debian package of {suite}; look for it with \
+         `apt-cache search {name}`{hint}"
     )]
     UnknownPackage {
         /// Name that was requested.
@@ -192,6 +192,18 @@ pub enum Error {
         /// Note about these lists.
         more: &'static str,
     },
+    /// Because of mistakes in build files, no program would be there to run.
+    #[error("there is nothing to run: {problems}")]
+    NoPrograms {
+        /// Descriptions of the mistakes, with their remedies.
+        problems: String,
+    },
+    /// Options about compiling were given for what is not compiled.
+    #[error(
+        "--packages-up-to, --packages-skip and --cmake-args are for sources, and nothing is compiled here; leave them \
+            out"
+    )]
+    NothingToCompile,
     /// The package does not support the base's ROS version.
     #[error(
         "{package} {because}, which is ROS {version}, but base {base} is of ROS {base_version}; push it with {fitting}"
@@ -363,7 +375,7 @@ fn unresolved_text(all: &[Unresolved]) -> String {
     for one in all {
         text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
         if !one.similar.is_empty() {
-            text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
+            text.push_str(&format!("; did you mean {}?", one.similar.join(", ")));
         }
     }
     text.push_str(
@@ -417,7 +429,7 @@ mod tests {
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
-        assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
+        assert!(text.contains("eigne (wanted by a); did you mean libeigen3-dev?"), "{text}");
         assert!(text.contains("--map KEY=DEB"), "{text}");
     }
 

@@ -11,6 +11,7 @@ use crate::archive::Archive;
 use crate::base::Base;
 use crate::error::{Error, Unresolved};
 use crate::indexed::IndexedPackages;
+use crate::spelling;
 
 /// Required keys and the packages that need them.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -116,7 +117,7 @@ pub(crate) fn resolve_keys(
     }
     // The deployer's mapping may be wrong as well.
     add_unknown(archive, map, &mut missing);
-    refuse_missing(archive, base, missing)?;
+    refuse_missing(archive, base, missing, &there.build)?;
     Ok(resolved)
 }
 
@@ -129,7 +130,7 @@ pub(crate) fn mapped_packages(
 ) -> Result<BTreeSet<String>, Error> {
     let mut unknown = BTreeMap::new();
     add_unknown(archive, map, &mut unknown);
-    refuse_missing(archive, base, unknown)?;
+    refuse_missing(archive, base, unknown, &BTreeSet::new())?;
     let names = map.values().flat_map(|debs| split_names(debs));
     Ok(names.map(str::to_owned).collect())
 }
@@ -149,8 +150,13 @@ fn add_unknown(archive: &Archive, map: &BTreeMap<String, String>, missing: &mut 
     }
 }
 
-/// Fails with all missing names, if there are any.
-fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTreeSet<String>>) -> Result<(), Error> {
+/// Fails with all missing names, if there are any; `there` are the ROS packages of the base.
+fn refuse_missing(
+    archive: &Archive,
+    base: &Base,
+    missing: BTreeMap<String, BTreeSet<String>>,
+    there: &BTreeSet<String>,
+) -> Result<(), Error> {
     if missing.is_empty() {
         return Ok(());
     }
@@ -158,7 +164,7 @@ fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTre
         missing
             .into_iter()
             .map(|(key, by)| Unresolved {
-                similar: similar(archive, base, &key),
+                similar: similar(archive, base, &key, there),
                 wanted_by: by.into_iter().collect(),
                 key,
             })
@@ -178,21 +184,36 @@ pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Opti
     find_ros_deb(archive, base, name).or_else(|| own.then(|| name.to_owned()))
 }
 
-/// Creates the error entry for a name that nothing provides.
-pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
-    Unresolved { key: name.to_owned(), wanted_by: vec![by.to_owned()], similar: similar(archive, base, name) }
+/// Creates the error entry for a name given with `--with` that nothing provides; `there` are the ROS packages of the
+/// base.
+pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, there: &BTreeSet<String>) -> Unresolved {
+    let similar = similar(archive, base, name, there);
+    Unresolved { key: name.to_owned(), wanted_by: vec!["--with".to_owned()], similar }
 }
 
-/// Returns names similar to a key. A name of the distribution's own ROS 1 is similar only to packages of the base's
-/// ROS.
-fn similar(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
+/// Maximum number of similar names.
+const MOST_SIMILAR: usize = 3;
+
+/// Returns names similar to a key. On a base of ROS 2 these are not of the distribution's own ROS 1, and ROS packages
+/// of the base (`there`) and its archive come first.
+fn similar(archive: &Archive, base: &Base, key: &str, there: &BTreeSet<String>) -> Vec<String> {
     let mut similar = archive.similar(key);
-    if base.ros != Version::Ros1 {
-        let of_one = !archive.contents.ros_package(key).is_empty();
-        let own = format!("ros-{}-", base.ros_distribution);
-        similar.retain(|deb| deb.starts_with(&own) || !of_one && !is_of_other_ros(archive, base, deb));
+    if base.ros == Version::Ros1 {
+        return similar;
     }
-    similar
+    let is_ros1 = |name: &str| !archive.contents.ros_package(name).is_empty();
+    let own = format!("ros-{}-", base.ros_distribution);
+    let of_one = is_ros1(key);
+    similar.retain(|deb| deb.starts_with(&own) || !of_one && !is_ros1(deb) && !is_of_other_ros(archive, base, deb));
+    let packaged = archive.candidates.names().filter_map(|deb| deb.strip_prefix(&*own));
+    let packaged = packaged.map(|name| name.replace('-', "_"));
+    let known = packaged.chain(there.iter().cloned());
+    let near = known.filter_map(|name| Some((spelling::slips(key, &name)?, name)));
+    let near: BTreeSet<(usize, String)> = near.filter(|(_, name)| name != key).collect();
+    let mut found: Vec<String> = near.into_iter().map(|(_, name)| name).collect();
+    found.append(&mut similar);
+    found.truncate(MOST_SIMILAR);
+    found
 }
 
 #[cfg(test)]
@@ -348,5 +369,16 @@ mod tests {
         assert_eq!(keys, ["libtf-dev", "rclcpp", "tf"]);
         assert!(missing.iter().all(|one| one.similar.is_empty()), "{missing:?}");
         assert!(error.to_string().contains("or push a workspace"), "{error}");
+    }
+
+    #[test]
+    fn a_misspelt_package_of_ros_2_is_suggested() {
+        let lab = new_ros2_fixture();
+        let there = set(&["cv_bridge", "rclpy"]);
+        for (key, expected) in
+            [("cv_brigde", &["cv_bridge"][..]), ("nav_mgs", &["nav_msgs"]), ("message_genration", &[])]
+        {
+            assert_eq!(similar(&lab.archive, &lab.base, key, &there), expected, "{key}");
+        }
     }
 }

@@ -1,13 +1,15 @@
 //! `push`: publishes a package as a service.
 
 mod archive;
+mod ignore;
 mod progress;
+mod selection;
 mod shared;
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 use api::push::ParsePairError;
 use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
@@ -52,11 +54,11 @@ pub struct PushArgs {
     /// or PACKAGE/CLASS), followed by remaps and -p NAME:=VALUE; the component gets a container of its own.
     #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
-    /// Private parameter of the nodes, or a global one (/K=V); may be given several times.
+    /// Private parameter of the nodes, or a global one (/K=V); K:=V is the same; may be given several times.
     #[arg(long = "param", value_name = "K=V", value_parser = parameter)]
     params: Vec<(String, serde_json::Value)>,
-    /// Argument of the launch file; may be given several times.
-    #[arg(long = "arg", value_name = "K:=V", value_parser = assignment)]
+    /// Argument of the launch file; K=V is the same; may be given several times.
+    #[arg(long = "arg", value_name = "K:=V", value_parser = argument)]
     args: Vec<(String, String)>,
     /// Remapping of a name; may be given several times.
     #[arg(long = "remap", value_name = "A:=B", value_parser = assignment)]
@@ -75,6 +77,17 @@ pub struct PushArgs {
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
+    /// Build only this package of the workspace and those that it needs; may be given several times. By default, what no
+    /// chosen node or launch file needs is not built.
+    #[arg(long = "packages-up-to", value_name = "PKG")]
+    packages_up_to: Vec<String>,
+    /// Do not build this package of the workspace; may be given several times.
+    #[arg(long = "packages-skip", value_name = "PKG")]
+    packages_skip: Vec<String>,
+    /// Arguments of CMake for the packages of the push: --cmake-args '-DWITH_QT=OFF -DCMAKE_BUILD_TYPE=Release'; may be
+    /// given several times.
+    #[arg(long = "cmake-args", value_name = "ARGS", allow_hyphen_values = true)]
+    cmake_args: Vec<String>,
     /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
     /// down, and hands back. Otherwise both may be asked, and the first answer is used. =false states that answers are
     /// independent, if the push would ask.
@@ -108,10 +121,21 @@ pub struct PushArgs {
 }
 
 fn parameter(text: &str) -> anyhow::Result<(String, serde_json::Value)> {
-    let (key, value) = text.split_once('=').context("write K=V")?;
-    ensure!(!key.is_empty(), "write K=V");
+    let (key, value) = key_and_value(text).context("write K=V or K:=V")?;
     let value = serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
     Ok((key.to_owned(), value))
+}
+
+fn argument(text: &str) -> anyhow::Result<(String, String)> {
+    let (key, value) = key_and_value(text).context("write K:=V or K=V")?;
+    Ok((key.to_owned(), value.to_owned()))
+}
+
+/// Splits `K=V`, or `K:=V` as ROS writes it; `None` without a key.
+fn key_and_value(text: &str) -> Option<(&str, &str)> {
+    let (key, value) = text.split_once('=')?;
+    let key = key.strip_suffix(':').unwrap_or(key);
+    (!key.is_empty()).then_some((key, value))
 }
 
 fn assignment(text: &str) -> anyhow::Result<(String, String)> {
@@ -225,6 +249,9 @@ impl PushArgs {
             requests: self.requests.clone(),
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
+            packages_up_to: self.packages_up_to.clone(),
+            packages_skip: self.packages_skip.clone(),
+            cmake_args: self.cmake_args.iter().flat_map(|text| text.split_whitespace()).map(str::to_owned).collect(),
             limits: self.limits.into(),
             caps: self.caps.into(),
             sla: Sla { rrt: self.rrt, max_rrt: self.max_rrt, ..Sla::default() },
@@ -260,7 +287,7 @@ async fn send(
 ) -> anyhow::Result<ServiceDetail> {
     let (body, packing) = match path {
         Some(path) => {
-            let (body, packing) = archive::request_body(&path)?;
+            let (body, packing) = archive::request_body(&path).await?;
             (body, Some(packing))
         }
         None => (archive::empty_body(), None),
@@ -358,11 +385,47 @@ mod tests {
 
     #[test]
     fn a_launch_file_takes_arguments() {
-        let push = parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:=").expect("valid");
+        let push =
+            parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:= --arg plain=x:=y").expect("valid");
         let options = push.options().expect("no file is read");
         assert_eq!(options.args["word"], "bonjour");
         assert_eq!(options.args["empty"], "");
+        assert_eq!(options.args["plain"], "x:=y");
         assert_eq!(options.source, "./pkg");
+    }
+
+    #[test]
+    fn parameters_are_written_as_in_ros_or_shorter() {
+        for (written, key, value) in [
+            ("rate=1.5", "rate", serde_json::json!(1.5)),
+            ("rate:=1.5", "rate", serde_json::json!(1.5)),
+            ("/lab/word:=a=b", "/lab/word", serde_json::json!("a=b")),
+            ("word=:=", "word", serde_json::json!(":=")),
+        ] {
+            let options = parse(&format!("./pkg --param {written}")).expect(written).options().expect("no file");
+            assert_eq!(options.params, [(key.to_owned(), value)].into(), "{written}");
+        }
+    }
+
+    #[test]
+    fn packages_are_selected_in_colcons_words() {
+        let words = [
+            "push",
+            "./ws",
+            "--packages-up-to",
+            "a",
+            "--packages-skip",
+            "b",
+            "--packages-skip",
+            "c",
+            "--cmake-args",
+            "-DA=1  -DB=2",
+            "--cmake-args=-Wno-dev",
+        ];
+        let options = Line::try_parse_from(words).expect("valid").push.options().expect("no file is read");
+        assert_eq!(options.packages_up_to, ["a"]);
+        assert_eq!(options.packages_skip, ["b", "c"]);
+        assert_eq!(options.cmake_args, ["-DA=1", "-DB=2", "-Wno-dev"]);
     }
 
     /// Source of the page's fields, one per line.
@@ -447,7 +510,8 @@ mod tests {
             "./pkg --launch a.launch --node b",
             "./pkg --param novalue",
             "./pkg --param =v",
-            "./pkg --arg a=b",
+            "./pkg --param :=v",
+            "./pkg --arg a",
             "./pkg --remap a",
             "./pkg --map key=",
             "./pkg --request /image",

@@ -29,6 +29,7 @@ mod reporter;
 mod request;
 mod room;
 mod shared;
+mod spelling;
 mod stateful;
 mod supplement;
 mod told;
@@ -327,6 +328,9 @@ impl Pusher {
             remaps: options.remaps.clone(),
             map: options.map.clone(),
             with: options.with.clone(),
+            packages_up_to: options.packages_up_to.clone(),
+            packages_skip: options.packages_skip.clone(),
+            cmake_args: options.cmake_args.clone(),
         };
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {

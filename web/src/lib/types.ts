@@ -623,6 +623,7 @@ export interface PushOptions {
   args?: Record<string, string>;
   base?: string;
   caps?: Caps;
+  cmake_args?: string[];
   grants?: Grants;
   interface?: string;
   launch?: string;
@@ -630,6 +631,8 @@ export interface PushOptions {
   map?: Record<string, string>;
   name?: string;
   nodes?: string[];
+  packages_skip?: string[];
+  packages_up_to?: string[];
   params?: Record<string, unknown>;
   remaps?: Record<string, string>;
   requests?: string[];
