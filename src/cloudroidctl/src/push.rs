@@ -77,8 +77,8 @@ pub struct PushArgs {
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
-    /// Build only this package of the workspace and those that it needs; may be given several times. By default, what no
-    /// chosen node or launch file needs is not built.
+    /// Build only this package of the workspace and those that it needs; may be given several times. By default, what
+    /// no chosen node or launch file needs is not built.
     #[arg(long = "packages-up-to", value_name = "PKG")]
     packages_up_to: Vec<String>,
     /// Do not build this package of the workspace; may be given several times.

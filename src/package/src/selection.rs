@@ -20,7 +20,7 @@ use crate::workspace::{Package, Workspace};
 /// Kinds of dependencies that a package needs to be built or run.
 const NEEDS: [Kind; 5] = [Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport, Kind::Exec];
 
-/// What a push says about the packages to build.
+/// Options of a push that determine the packages to build.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PackageQuery<'a> {
     /// Packages to build with those that they need; empty if they follow from what is run.

@@ -370,8 +370,8 @@ pub(super) fn unused_parameters(
             warnings.push(format!("no node declares a parameter {key}, so it has no effect; {has}"));
         } else if version == RosVersion::One && (known || !of_a_name) && !is_read(interface, key, &names) {
             warnings.push(format!(
-                "no node has read a parameter {key} since it was started, so it has no effect unless one reads it later; \
-                 {}",
+                "no node has read a parameter {key} since it was started, so it has no effect unless one reads it \
+                 later; {}",
                 describe_read(interface)
             ));
         }

@@ -34,14 +34,14 @@ pub struct SelectedEntry {
     pub inside: PathBuf,
 }
 
-/// What is sent of a directory.
+/// Files that are sent of a directory.
 #[derive(Debug, Default)]
 pub struct Selection {
     /// Entries, each directory before its content.
     pub entries: Vec<SelectedEntry>,
     /// True if there is a package.xml.
     pub has_package: bool,
-    /// What the deployer should know before it is sent: links that were followed, and large files.
+    /// Notes for the deployer before anything is sent: links that were followed, and large files.
     pub notes: Vec<String>,
 }
 
