@@ -170,7 +170,7 @@ mod tests {
         });
         let entries: Vec<_> = entries.collect();
         let regular = tar::EntryType::Regular;
-        let expected = [("map.db".to_owned(), regular, (3 << 20) + 3), ("package.xml".to_owned(), regular, 10)];
+        let expected = [("map.db".to_owned(), regular, (3_u64 << 20) + 3), ("package.xml".to_owned(), regular, 10_u64)];
         assert_eq!(entries, expected);
     }
 }

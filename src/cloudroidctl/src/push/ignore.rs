@@ -2,6 +2,7 @@
 
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use anyhow::{Context, ensure};
 
@@ -13,8 +14,15 @@ const MAX_BYTES: u64 = 1 << 20;
 /// The ignore files that apply to a directory: its own and those of the directories above.
 #[derive(Debug, Clone, Default)]
 pub struct IgnoreRules {
-    /// From the root downwards; of each file the directory and the patterns.
-    files: Vec<(PathBuf, Vec<IgnorePattern>)>,
+    /// From the root downwards.
+    files: Vec<Rc<IgnoreFile>>,
+}
+
+#[derive(Debug)]
+struct IgnoreFile {
+    /// Directory of the file, relative to what is pushed.
+    base: PathBuf,
+    patterns: Vec<IgnorePattern>,
 }
 
 impl IgnoreRules {
@@ -36,16 +44,17 @@ impl IgnoreRules {
         let lines = text.split(|byte| *byte == b'\n');
         let patterns = lines.map(IgnorePattern::parse).collect::<anyhow::Result<Vec<_>>>();
         let patterns = patterns.with_context(|| format!("cannot use {}", path.display()))?;
-        rules.files.push((inside.to_owned(), patterns.into_iter().flatten().collect()));
+        let patterns = patterns.into_iter().flatten().collect();
+        rules.files.push(Rc::new(IgnoreFile { base: inside.to_owned(), patterns }));
         Ok(rules)
     }
 
     /// Returns whether a file or directory, given by its path relative to what is pushed, is left out. The last pattern
     /// that matches decides, and files of deeper directories come later.
     pub fn is_ignored(&self, inside: &Path, is_directory: bool) -> bool {
-        let decides = |(base, patterns): &(PathBuf, Vec<IgnorePattern>)| {
-            let below = inside.strip_prefix(base).ok()?.as_os_str().as_bytes();
-            let mut matching = patterns.iter().rev();
+        let decides = |file: &Rc<IgnoreFile>| {
+            let below = inside.strip_prefix(&file.base).ok()?.as_os_str().as_bytes();
+            let mut matching = file.patterns.iter().rev();
             let found = matching.find(|pattern| pattern.matches(below, is_directory));
             found.map(|pattern| !pattern.is_negated)
         };

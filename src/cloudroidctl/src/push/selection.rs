@@ -64,7 +64,7 @@ pub fn select_files(root: &Path) -> anyhow::Result<Selection> {
     let place = Place { source: root, inside: Path::new(""), is_generated: is_workspace, in_package: false, depth: 0 };
     walk.add_directory(&place, &IgnoreRules::default())?;
     let SelectionWalk { mut selection, mut large, .. } = walk;
-    large.sort_by(|a, b| b.1.cmp(&a.1));
+    large.sort_by_key(|(_, size)| std::cmp::Reverse(*size));
     for (path, size) in large.iter().take(NAMED) {
         let size = Size(*size);
         let text = format!("{} has {size} and is sent; a line in {IGNORE_FILE} leaves it out", path.display());
