@@ -283,12 +283,25 @@ impl Builder {
     }
 }
 
-/// Fails before compiling if the sources show that the push must state what to run. Blocking.
+/// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
+/// file. Blocking.
 fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
+    let version = base.ros.ros_version();
+    if let Some(launch) = &request.launch
+        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
+    {
+        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+        return Err(Error::NotInPackage {
+            what: "launch file",
+            name: launch.clone(),
+            known: launch::join_names(&foreseen.launch_files),
+            elsewhere: String::new(),
+        });
+    }
     if request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, base.ros.ros_version()));
+    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
     if !foreseen.must_be_chosen() {
         return Ok(());
     }

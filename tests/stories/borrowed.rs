@@ -179,5 +179,8 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     let titles = events.filter_map(|event| Some(event["title"].as_str()?.to_owned()));
     let titles: Vec<String> = titles.collect();
     ensure!(titles.iter().all(|title| !title.contains("compil")), "{titles:?}");
+    let push = ["push", path_str(place.path()), "--launch", "lft.launch"];
+    let outcome = daemon.deployer().run(&push)?.expect_failure(&["no launch file \"lft.launch\" in the package"])?;
+    ensure!(!outcome.output().contains("compil"), "{}", outcome.output());
     Ok(())
 }

@@ -54,6 +54,30 @@ pub(crate) fn programs_of(workspace: &Workspace, package: &Package, version: Ros
     executables::scan_package(&workspace.root, package, version).programs
 }
 
+/// Returns whether no package can have a launch file of this name, because no file has it and no build file mentions it
+/// or configures files. Unreadable directories may have anything. Blocking.
+pub fn lacks_launch_file(workspace: &Workspace, launch: &str, version: RosVersion) -> bool {
+    let Some(name) = Path::new(launch).file_name().and_then(|name| name.to_str()) else {
+        return false;
+    };
+    let lacks = |package: &Package| {
+        let text = executables::scan_package(&workspace.root, package, version).text;
+        if text.contains("configure_file") || text.contains(name) {
+            return false;
+        }
+        let mut found = false;
+        let directory = workspace.root.join(&package.path).canonicalize();
+        let walked = directory.map(|directory| {
+            foreign::walk(&directory, |entry| {
+                found |= entry.name().to_string_lossy().starts_with(name);
+                Ok::<_, foreign::Error>(if found { Visit::Skip } else { Visit::Into })
+            })
+        });
+        !found && walked.is_ok_and(|walked| walked.is_ok())
+    };
+    !launch.starts_with('/') && workspace.packages.iter().all(lacks)
+}
+
 impl SourceScan {
     /// Returns whether the push must state what to run, whatever else the packages contain.
     pub fn must_be_chosen(&self) -> bool {

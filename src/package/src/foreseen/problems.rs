@@ -121,18 +121,22 @@ fn find_python_problem(workspace: &Workspace, package: &Package) -> Option<Sourc
 }
 
 fn find_forgotten_scripts(workspace: &Workspace, package: &Package, version: RosVersion) -> Vec<SourceProblem> {
-    let scan: BuildFileScan = executables::scan_package(&workspace.root, package, version);
-    // Scripts may be listed by a pattern or a macro.
-    if scan.text.is_empty() || scan.text.contains("GLOB") {
+    let BuildFileScan { mut text, .. } = executables::scan_package(&workspace.root, package, version);
+    // Scripts may be listed by a pattern.
+    if text.is_empty() || text.contains("GLOB") {
         return Vec::new();
     }
+    // catkin also installs the scripts of a setup.py.
+    let setup = workspace.root.join(&package.path).join("setup.py");
+    text.push_str(&read::read_text(&workspace.root, &setup, MAX_BYTES).unwrap_or_default());
     let tree = foreign::Tree::open(&workspace.root);
     let found = scripts::find_scripts(&workspace.root.join(&package.path)).into_iter();
     let forgotten = found.filter(|script| {
         let directory = script.path.parent().and_then(|parent| parent.to_str()).unwrap_or_default();
-        let is_named = script.name().is_some_and(|name| scan.text.contains(name));
-        // A whole directory may be installed; at the top there is only the package's own.
-        let is_below = !directory.is_empty() && scan.text.contains(directory) && scan.text.contains("DIRECTORY");
+        let is_named = script.name().is_some_and(|name| text.contains(name));
+        // A whole directory may be installed, or files by a variable; at the top there is only the package's own.
+        let is_listed = text.contains("DIRECTORY") && text.contains(directory);
+        let is_below = !directory.is_empty() && (is_listed || text.contains(&format!("{directory}/$")));
         // A build file that was not read, since it is added under a condition.
         let own_list = package.path.join(directory).join("CMakeLists.txt");
         let has_list = !directory.is_empty() && tree.as_ref().is_ok_and(|tree| tree.has_file(own_list));

@@ -24,12 +24,16 @@ impl SourceFixture {
         self.write(&format!("src/{name}/CMakeLists.txt"), build)
     }
 
-    fn scan(&self, version: RosVersion) -> SourceScan {
+    fn workspace(&self, version: RosVersion) -> Workspace {
         let variables = Variables::for_distribution(version.number(), "any");
         let PushedDirectory::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace") else {
             panic!("sources")
         };
-        scan_sources(&workspace, version)
+        workspace
+    }
+
+    fn scan(&self, version: RosVersion) -> SourceScan {
+        scan_sources(&self.workspace(version), version)
     }
 
     fn must_be_chosen(&self, version: RosVersion) -> bool {
@@ -69,6 +73,28 @@ fn several_programs_and_launch_files_must_be_chosen_from() {
     let foreseen = place.scan(RosVersion::One);
     assert_eq!(foreseen.executables, ["ekf", "driver"]);
     assert!(foreseen.must_be_chosen(), "{foreseen:?}");
+}
+
+#[test]
+fn a_launch_file_that_cannot_be_there_is_known() {
+    let lacks = |place: &SourceFixture, launch: &str| {
+        lacks_launch_file(&place.workspace(RosVersion::One), launch, RosVersion::One)
+    };
+    let place = ros1_package(WTF);
+    place.write("src/ekf/launch/a.launch", "").write("src/ekf/launch/b.launch.in", "");
+    for (launch, is_lacking) in [
+        ("a.launch", false),
+        ("launch/a.launch", false),
+        ("ekf/launch/a.launch", false),
+        ("b.launch", false),
+        ("/opt/x/c.launch", false),
+        ("lft.launch", true),
+        ("ekf/a.lunch", true),
+    ] {
+        assert_eq!(lacks(&place, launch), is_lacking, "{launch}");
+    }
+    assert!(!lacks(&ros1_package("configure_file(${IN} ${OUT})"), "lft.launch"));
+    assert!(!lacks(&ros1_package("install(FILES ${CMAKE_BINARY_DIR}/lft.launch DESTINATION x)"), "lft.launch"));
 }
 
 #[test]
@@ -228,10 +254,7 @@ impl SourceFixture {
     }
 
     fn problems(&self, version: RosVersion) -> (Vec<String>, bool) {
-        let variables = Variables::for_distribution(version.number(), "any");
-        let PushedDirectory::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace") else {
-            panic!("sources")
-        };
+        let workspace = self.workspace(version);
         let problems = find_problems(&workspace, version).iter().map(ToString::to_string).collect();
         (problems, has_no_programs(&workspace, version))
     }
