@@ -214,6 +214,7 @@ fn main() -> ExitCode {
             services_elsewhere_and_modules_of_plain_packages_are_found,
             all_that_a_package_forgot_is_named_at_once,
             a_python_module_that_a_package_forgot_is_named,
+            a_package_whose_programs_are_not_found_is_refused_at_once,
             what_to_run_is_asked_for_before_anything_is_compiled,
         ],
         stories![calibration:
@@ -506,6 +507,7 @@ fn main() -> ExitCode {
             an_unchanged_push_builds_no_layer_and_makes_no_revision,
             a_failed_build_leaves_the_earlier_revision_serving,
             what_package_xml_forgot_is_named_and_added,
+            what_is_packed_follows_links_and_leaves_out_what_is_ignored,
             a_revision_is_rolled_back,
             five_packaged_nodes_answer,
         ],

@@ -56,7 +56,11 @@ impl Archive {
         let names = self.candidates.names();
         let mut near: Vec<&str> = names.filter(|name| has_word(name, &bare)).collect();
         near.sort_by_key(|name| (name.len(), *name));
-        near.into_iter().take(3).map(str::to_owned).collect()
+        // A misspelt ROS package is more likely than a package with a word in common.
+        let mut found: Vec<String> = self.contents.misspelt_ros_packages(key).into_iter().map(str::to_owned).collect();
+        found.extend(near.into_iter().map(str::to_owned));
+        found.truncate(3);
+        found
     }
 
     /// Returns the packages to install to run with a ROS package, and the development packages that contain further
@@ -187,6 +191,34 @@ mod tests {
             ("pcl", &["libpcl-dev", "libpcl1.13"]),
             ("eigen", &["libeigen3-dev"]),
             ("robot_localization", &["ros-robot-localization"]),
+        ] {
+            assert_eq!(archive.similar(key), expected, "{key}");
+        }
+    }
+
+    #[test]
+    fn a_misspelt_ros_package_is_the_first_suggestion() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let text = "usr/share/cv_bridge/package.xml libdevel/libcv-bridge-dev\n\
+                    usr/share/tf2_ros/package.xml libdevel/libtf2-ros-dev\n\
+                    usr/share/tf/package.xml libdevel/libtf-dev\n";
+        let lists = [crate::contents::tests::list(directory.path(), "c.gz", text)];
+        let archive = Archive {
+            apt: Apt::open(directory.path(), "").expect("prepared"),
+            contents: Contents::open(directory.path(), &lists).expect("read").into(),
+            candidates: crate::candidates::tests::candidates_named(&["libcv-bridge-dev", "libcvbridge9"]),
+            stamp: String::new(),
+            sources: String::new(),
+        };
+        for (key, expected) in [
+            ("cv_brigde", &["cv_bridge"][..]),
+            ("cv-bridge", &["cv_bridge", "libcv-bridge-dev"]),
+            ("cvbridge", &["cv_bridge", "libcvbridge9"]),
+            ("cv_bridges", &["cv_bridge"]),
+            ("tf2_rso", &["tf2_ros"]),
+            // Of short names every other one is similar.
+            ("tg", &[]),
+            ("move_base", &[]),
         ] {
             assert_eq!(archive.similar(key), expected, "{key}");
         }

@@ -43,6 +43,13 @@ impl Base {
     pub(crate) fn build_key(&self) -> String {
         serde_json::to_string(&(&self.build, &self.environment)).unwrap_or_default()
     }
+
+    /// Returns the base with these arguments of CMake after its own; the later one of two that contradict each other is
+    /// used.
+    pub(crate) fn with_cmake_arguments(mut self, arguments: &[String]) -> Base {
+        self.definition.build.cmake.extend_from_slice(arguments);
+        self
+    }
 }
 
 impl std::ops::Deref for Base {

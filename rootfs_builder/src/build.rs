@@ -120,7 +120,7 @@ impl Build<'_> {
                 ros.extend(self.archive.contents.ros_packages_in(name).into_iter().map(str::to_owned));
                 debs.insert(name.clone());
             } else {
-                missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with"));
+                missing.push(keys::unresolved_name(&self.archive, &self.base, name, &BTreeSet::new()));
             }
         }
         if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }
@@ -140,7 +140,7 @@ impl Build<'_> {
                 Some(deb) => {
                     debs.insert(deb);
                 }
-                None => missing.push(keys::unresolved_name(&self.archive, &self.base, name, "--with")),
+                None => missing.push(keys::unresolved_name(&self.archive, &self.base, name, &there)),
             }
         }
         if missing.is_empty() { Ok(debs) } else { Err(Error::Unresolved(missing)) }

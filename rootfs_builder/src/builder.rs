@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, Store};
-use package::foreseen;
+use package::foreseen::{self, SourceProblem};
 use package::workspace::{PushedDirectory, Workspace};
 use ros::flavour::Version;
 use servant::sandbox::Sandbox;
@@ -24,6 +24,7 @@ use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
 use crate::indexed::IndexedPackages;
 use crate::install::LayerSet;
+use crate::pushed::InspectedTree;
 use crate::removal::PendingRemovals;
 use crate::request::{BuildOutcome, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
@@ -174,9 +175,14 @@ impl Builder {
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             PushSource::Tree(path) => {
-                let pushed = privilege::run_as_reader(|| pushed::inspect_pushed(path, &base))?;
+                let inspect = || pushed::inspect_pushed(path, &base, &request.package_query());
+                let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
                 if let PushedDirectory::Source(workspace) = &pushed {
+                    tell_selection(workspace, &left_out, progress).await;
                     ask_what_to_run(request, workspace, &base)?;
+                    for problem in find_source_problems(request, workspace, &base)? {
+                        progress.warn(problem.to_string()).await;
+                    }
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;
                 }
@@ -184,6 +190,9 @@ impl Builder {
             }
             PushSource::Packaged(name) => PushContent::Packaged(name),
         };
+        if !matches!(what, PushContent::Tree(PushedDirectory::Source(_))) && request.has_build_options() {
+            return Err(Error::NothingToCompile);
+        }
         let push = PushLabel { id: request.id.clone(), name: request.name.clone().unwrap_or_else(|| what.name()) };
         let shop = BuildContext::new(site, self.layers.clone(), self.turns.clone(), push, progress.clone());
         let archive = self.archive(&shop, &base, progress).await?;
@@ -202,6 +211,7 @@ impl Builder {
         };
         let tools = imported.as_ref().and_then(BaseStock::tool_layers);
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
+        let base = base.with_cmake_arguments(&request.cmake_args);
         let build = Build { shop, base, archive, base_layer, tools, request, progress, log };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
@@ -319,12 +329,25 @@ impl Builder {
     }
 }
 
-/// Fails before compiling if the sources show that the push must state what to run. Blocking.
+/// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
+/// file. Blocking.
 fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
+    let version = base.ros.ros_version();
+    if let Some(launch) = &request.launch
+        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
+    {
+        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+        return Err(Error::NotInPackage {
+            what: "launch file",
+            name: launch.clone(),
+            known: launch::join_names(&foreseen.launch_files),
+            elsewhere: String::new(),
+        });
+    }
     if request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, base.ros.ros_version()));
+    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
     if !foreseen.must_be_chosen() {
         return Ok(());
     }
@@ -332,6 +355,44 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
         executables: launch::join_names(&foreseen.executables),
         launch_files: launch::join_names(&foreseen.launch_files),
         more: "; nothing is compiled yet, so there may be more",
+    })
+}
+
+/// Maximum number of packages that are named when they are not built.
+const NAMED: usize = 12;
+
+/// Tells which packages are not built.
+async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &Progress) {
+    if left_out.is_empty() {
+        return;
+    }
+    let built = workspace.packages.len();
+    let more = if left_out.len() > NAMED { ", …" } else { "" };
+    let names = left_out[..left_out.len().min(NAMED)].join(", ");
+    let all = built + left_out.len();
+    progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
+}
+
+/// Returns mistakes in build files; fails if no program is left because of them. Blocking.
+fn find_source_problems(
+    request: &PushRequest,
+    workspace: &Workspace,
+    base: &Base,
+) -> Result<Vec<SourceProblem>, Error> {
+    let version = base.ros.ros_version();
+    privilege::run_as_reader(|| {
+        let problems = foreseen::find_problems(workspace, version);
+        let is_own = |node: &String| {
+            let program = node.split_whitespace().next().unwrap_or_default();
+            let package = program.split_once('/').map(|(package, _)| package);
+            package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
+        };
+        let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
+        if runs_own && foreseen::has_no_programs(workspace, version) {
+            let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+            return Err(Error::NoPrograms { problems: problems.join("; ") });
+        }
+        Ok(problems)
     })
 }
 

@@ -12,6 +12,7 @@ use std::time::SystemTime;
 use flate2::read::MultiGzDecoder;
 
 use crate::error::{Error, IoContext};
+use crate::spelling;
 
 /// The reduced index.
 #[derive(Debug)]
@@ -133,6 +134,14 @@ impl Contents {
             carriers.insert(deb.to_owned(), parts.collect());
         }
         carriers
+    }
+
+    /// Returns the ROS packages whose names differ from this one by a slip of the hand, nearest first.
+    pub fn misspelt_ros_packages(&self, name: &str) -> Vec<&str> {
+        let fields = self.with_prefix("r").filter_map(|rest| rest.split('\t').next());
+        let near = fields.filter_map(|other| Some((spelling::slips(name, other)?, other)));
+        let near: BTreeSet<(usize, &str)> = near.collect();
+        near.into_iter().map(|(_, other)| other).collect()
     }
 
     /// Returns the Debian packages that satisfy CMake's `find_package(NAME)`.

@@ -131,8 +131,8 @@ pub enum Error {
     Unresolved(Vec<Unresolved>),
     /// `--apt` names an unknown package.
     #[error(
-        "{name} is neither a ROS package nor a Debian package of {suite}{hint}; look for it with \
-         `apt-cache search {name}`"
+        "{name} is neither a ROS package nor a Debian package of {suite}; look for it with \
+         `apt-cache search {name}`{hint}"
     )]
     UnknownPackage {
         /// Name that was requested.
@@ -219,6 +219,18 @@ pub enum Error {
         /// Note about these lists.
         more: &'static str,
     },
+    /// Because of mistakes in build files, no program would be there to run.
+    #[error("there is nothing to run: {problems}")]
+    NoPrograms {
+        /// Descriptions of the mistakes, with their remedies.
+        problems: String,
+    },
+    /// Options about compiling were given for what is not compiled.
+    #[error(
+        "--packages-up-to, --packages-skip and --cmake-args are for sources, and nothing is compiled here; leave them \
+            out"
+    )]
+    NothingToCompile,
     /// The package does not support the base's ROS version.
     #[error(
         "{package} {because}, which is ROS {version}, but base {base} is of ROS {base_version}; push it with {fitting}"
@@ -381,21 +393,16 @@ pub struct Unresolved {
     pub key: String,
     /// Packages whose package.xml depends on it.
     pub wanted_by: Vec<String>,
-    /// Debian packages with similar names.
+    /// Keys and packages with similar names.
     pub similar: Vec<String>,
-    /// Known rosdep keys and ROS packages that are spelled almost like it, nearest first.
-    pub nearest: Vec<String>,
 }
 
 fn unresolved_text(all: &[Unresolved]) -> String {
     let mut text = String::from("nothing provides:");
     for one in all {
         text.push_str(&format!("\n  {} (wanted by {})", one.key, one.wanted_by.join(", ")));
-        if !one.nearest.is_empty() {
-            text.push_str(&format!("; did you mean {}?", one.nearest.join(", ")));
-        }
         if !one.similar.is_empty() {
-            text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
+            text.push_str(&format!("; did you mean {}?", one.similar.join(", ")));
         }
     }
     text.push_str(
@@ -442,7 +449,7 @@ mod tests {
     use super::*;
 
     fn unresolved(key: &str) -> Unresolved {
-        Unresolved { key: key.to_owned(), wanted_by: vec!["a".into()], similar: Vec::new(), nearest: Vec::new() }
+        Unresolved { key: key.to_owned(), wanted_by: vec!["a".into()], similar: Vec::new() }
     }
 
     #[test]
@@ -450,12 +457,10 @@ mod tests {
         let error = Error::Unresolved(vec![
             Unresolved { wanted_by: vec!["a".into(), "b".into()], ..unresolved("warp") },
             Unresolved { similar: vec!["libeigen3-dev".into()], ..unresolved("eigne") },
-            Unresolved { nearest: vec!["cv_bridge".into()], ..unresolved("cv_brigde") },
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");
-        assert!(text.contains("eigne (wanted by a); perhaps libeigen3-dev"), "{text}");
-        assert!(text.contains("cv_brigde (wanted by a); did you mean cv_bridge?\n"), "{text}");
+        assert!(text.contains("eigne (wanted by a); did you mean libeigen3-dev?"), "{text}");
         assert!(text.contains("--map KEY=DEB"), "{text}");
     }
 

@@ -1,35 +1,56 @@
 //! Excerpts of a build's output for error messages.
 
-use crate::advice;
 use crate::process::LastLines;
+use crate::{advice, cause};
 
-/// Excerpt of a build's output: its last lines, preceded by those that name a missing dependency.
+/// Excerpt of a build's output: its last lines, preceded by the first errors and by lines that name a missing
+/// dependency.
 #[derive(Debug, Default)]
 pub(crate) struct Excerpt {
-    missing: Vec<String>,
+    /// First errors with the lines after them, and lines about missing dependencies, in the order of the output.
+    early: Vec<String>,
+    /// Number of lines about missing dependencies.
+    missing: usize,
+    /// Number of lines of errors.
+    errors: usize,
+    /// Number of lines that still belong to the last error.
+    context: usize,
     last: LastLines,
 }
 
 impl Excerpt {
     /// Maximum number of lines about missing dependencies; more usually have the same cause.
     const MOST: usize = 25;
+    /// Maximum number of lines of the first errors, and number of lines after each that explain it.
+    const MOST_ERRORS: usize = 12;
+    const CONTEXT: usize = 3;
 
     /// Adds a line; irrelevant ones are left out.
     pub(crate) fn push(&mut self, line: &str) {
         if !is_worth_showing(line) {
             return;
         }
-        if let Some(dropped) = self.last.push(line)
-            && self.missing.len() < Self::MOST
-            && advice::mentions_missing(&dropped)
-        {
-            self.missing.push(dropped);
+        let Some(dropped) = self.last.push(line) else {
+            return;
+        };
+        if self.missing < Self::MOST && advice::mentions_missing(&dropped) {
+            self.missing += 1;
+            self.early.push(dropped);
+            return;
+        }
+        if cause::is_build_error(&dropped) {
+            self.context = Self::CONTEXT + 1;
+        }
+        if self.context > 0 && self.errors < Self::MOST_ERRORS {
+            self.context -= 1;
+            self.errors += 1;
+            self.early.push(dropped);
         }
     }
 
     /// Returns the lines of the excerpt.
     pub(crate) fn text(&self) -> String {
-        let mut lines: Vec<&str> = self.missing.iter().map(String::as_str).collect();
+        let mut lines: Vec<&str> = self.early.iter().map(String::as_str).collect();
         let last = self.last.text();
         lines.push(&last);
         lines.join("\n")
@@ -102,5 +123,26 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), LAST_LINES + 1);
         assert!(lines[0].contains("\"csm\"") && lines[1] == "later line 0", "{text}");
+    }
+
+    #[test]
+    fn an_excerpt_keeps_the_first_errors_of_a_long_log() {
+        let mut excerpt = Excerpt::default();
+        for number in 0..40 {
+            excerpt.push(&format!("before {number}"));
+        }
+        excerpt.push("x.cpp:3:5: error: 'y' was not declared");
+        excerpt.push("    3 | y();");
+        for number in 0..1000 {
+            excerpt.push(&format!("x.cpp:{number}:1: warning: unused"));
+        }
+        for number in 0..1000 {
+            excerpt.push(&format!("x.cpp:{number}:1: error: more"));
+        }
+        let text = excerpt.text();
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines.len(), Excerpt::MOST_ERRORS + LAST_LINES);
+        assert_eq!(lines[0], "x.cpp:3:5: error: 'y' was not declared");
+        assert!(lines[1].contains("y();") && lines[4] == "x.cpp:0:1: error: more", "{text}");
     }
 }

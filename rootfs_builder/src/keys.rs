@@ -11,6 +11,7 @@ use crate::archive::Archive;
 use crate::base::Base;
 use crate::error::{Error, Unresolved};
 use crate::indexed::IndexedPackages;
+use crate::spelling;
 
 /// Required keys and the packages that need them.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -116,7 +117,7 @@ pub(crate) fn resolve_keys(
     }
     // The deployer's mapping may be wrong as well.
     add_unknown(archive, map, &mut missing);
-    refuse_missing(archive, base, missing)?;
+    refuse_missing(archive, base, missing, &there.build)?;
     Ok(resolved)
 }
 
@@ -129,7 +130,7 @@ pub(crate) fn mapped_packages(
 ) -> Result<BTreeSet<String>, Error> {
     let mut unknown = BTreeMap::new();
     add_unknown(archive, map, &mut unknown);
-    refuse_missing(archive, base, unknown)?;
+    refuse_missing(archive, base, unknown, &BTreeSet::new())?;
     let names = map.values().flat_map(|debs| split_names(debs));
     Ok(names.map(str::to_owned).collect())
 }
@@ -149,8 +150,13 @@ fn add_unknown(archive: &Archive, map: &BTreeMap<String, String>, missing: &mut 
     }
 }
 
-/// Fails with all missing names, if there are any.
-fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTreeSet<String>>) -> Result<(), Error> {
+/// Fails with all missing names, if there are any; `there` are the ROS packages of the base.
+fn refuse_missing(
+    archive: &Archive,
+    base: &Base,
+    missing: BTreeMap<String, BTreeSet<String>>,
+    there: &BTreeSet<String>,
+) -> Result<(), Error> {
     if missing.is_empty() {
         return Ok(());
     }
@@ -158,8 +164,9 @@ fn refuse_missing(archive: &Archive, base: &Base, missing: BTreeMap<String, BTre
         missing
             .into_iter()
             .map(|(key, by)| Unresolved {
+                similar: similar(archive, base, &key, there),
                 wanted_by: by.into_iter().collect(),
-                ..unresolved_name(archive, base, &key, "")
+                key,
             })
             .collect(),
     ))
@@ -177,74 +184,37 @@ pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Opti
     find_ros_deb(archive, base, name).or_else(|| own.then(|| name.to_owned()))
 }
 
-/// Creates the error entry for a name that nothing provides.
-pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
-    Unresolved {
-        key: name.to_owned(),
-        wanted_by: vec![by.to_owned()],
-        similar: similar(archive, base, name),
-        nearest: nearest(archive, base, name),
-    }
+/// Creates the error entry for a name given with `--with` that nothing provides; `there` are the ROS packages of the
+/// base.
+pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, there: &BTreeSet<String>) -> Unresolved {
+    let similar = similar(archive, base, name, there);
+    Unresolved { key: name.to_owned(), wanted_by: vec!["--with".to_owned()], similar }
 }
 
-/// Maximum number of names to suggest for one that is misspelled.
-const SUGGESTED: usize = 3;
+/// Maximum number of similar names.
+const MOST_SIMILAR: usize = 3;
 
-/// Returns the known keys and ROS packages that differ from a key by a few letters, nearest first.
-fn nearest(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
-    let key = key.to_lowercase();
-    let most = (key.len() / 4).clamp(1, 3);
-    let own = format!("ros-{}-", base.ros_distribution);
-    let packages: BTreeSet<String> = match base.ros {
-        Version::Ros1 => archive.contents.ros_package_names().map(str::to_owned).collect(),
-        Version::Ros2 => {
-            let debs = archive.candidates.names().filter_map(|deb| deb.strip_prefix(&own));
-            debs.map(|name| name.replace('-', "_")).collect()
-        }
-    };
-    let known: BTreeSet<&str> = base.keys.keys().chain(&packages).map(String::as_str).collect();
-    let mut near: Vec<(usize, &str)> = known
-        .into_iter()
-        .filter(|name| name.len().abs_diff(key.len()) <= most)
-        .map(|name| (edit_distance(&key, name), name))
-        .filter(|(distance, _)| (1..=most).contains(distance))
-        .collect();
-    near.sort_unstable();
-    near.into_iter().take(SUGGESTED).map(|(_, name)| name.to_owned()).collect()
-}
-
-/// Returns the number of bytes to insert, remove, replace or exchange with the next one that turns one name into the
-/// other (optimal string alignment).
-fn edit_distance(one: &str, other: &str) -> usize {
-    let (one, other) = (one.as_bytes(), other.as_bytes());
-    let mut before: Vec<usize> = Vec::new();
-    let mut above: Vec<usize> = (0..=other.len()).collect();
-    for (row, letter) in one.iter().enumerate() {
-        let mut current = vec![row + 1];
-        for (column, with) in other.iter().enumerate() {
-            let replaced = above[column] + usize::from(letter != with);
-            let mut least = replaced.min(above[column + 1] + 1).min(current[column] + 1);
-            let is_exchange = row > 0 && column > 0 && *letter == other[column - 1] && one[row - 1] == *with;
-            if is_exchange {
-                least = least.min(before[column - 1] + 1);
-            }
-            current.push(least);
-        }
-        before = std::mem::replace(&mut above, current);
-    }
-    above[other.len()]
-}
-
-/// Returns names similar to a key. A name of the distribution's own ROS 1 is similar only to packages of the base's
-/// ROS.
-fn similar(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
+/// Returns names similar to a key: keys that the base knows first. On a base of ROS 2 these are not of the
+/// distribution's own ROS 1, and ROS packages of the base (`there`) and its archive come before others.
+fn similar(archive: &Archive, base: &Base, key: &str, there: &BTreeSet<String>) -> Vec<String> {
     let mut similar = archive.similar(key);
+    let mut known: BTreeSet<String> = base.keys.keys().cloned().collect();
     if base.ros != Version::Ros1 {
-        let of_one = !archive.contents.ros_package(key).is_empty();
+        let is_ros1 = |name: &str| !archive.contents.ros_package(name).is_empty();
         let own = format!("ros-{}-", base.ros_distribution);
-        similar.retain(|deb| deb.starts_with(&own) || !of_one && !is_of_other_ros(archive, base, deb));
+        let of_one = is_ros1(key);
+        similar.retain(|deb| deb.starts_with(&own) || !of_one && !is_ros1(deb) && !is_of_other_ros(archive, base, deb));
+        let packaged = archive.candidates.names().filter_map(|deb| deb.strip_prefix(&*own));
+        known.extend(packaged.map(|name| name.replace('-', "_")));
+        known.extend(there.iter().cloned());
     }
-    similar
+    let near = known.into_iter().filter_map(|name| Some((spelling::slips(key, &name)?, name)));
+    let near: BTreeSet<(usize, String)> = near.filter(|(_, name)| name != key).collect();
+    let mut found: Vec<String> = near.into_iter().map(|(_, name)| name).collect();
+    similar.retain(|name| !found.contains(name));
+    found.append(&mut similar);
+    found.truncate(MOST_SIMILAR);
+    found
 }
 
 #[cfg(test)]
@@ -312,20 +282,6 @@ mod tests {
         // No development packages at run time, and no build tools.
         assert_eq!(resolved.run, set(&["libfrob3", "python3-six"]));
         assert_eq!(resolved.run_ros, set(&["tf"]));
-    }
-
-    #[test]
-    fn misspelled_keys_are_told_with_those_that_are_meant() {
-        for (one, other, distance) in [("", "", 0), ("tf", "tf", 0), ("cv_brigde", "cv_bridge", 1), ("ab", "", 2)] {
-            assert_eq!(edit_distance(one, other), distance, "{one} {other}");
-        }
-        assert_eq!(edit_distance("eigen", "tf"), 5);
-        let lab = new_fixture();
-        let nearest = |key: &str| nearest(&lab.archive, &lab.base, key);
-        assert_eq!(nearest("mesage_generation"), ["message_generation"]);
-        assert_eq!(nearest("Eigne"), ["eigen"]);
-        assert_eq!(nearest("opencv5")[0], "opencv");
-        assert!(nearest("flux_capacitor").is_empty());
     }
 
     #[test]
@@ -414,5 +370,16 @@ mod tests {
         assert_eq!(keys, ["libtf-dev", "rclcpp", "tf"]);
         assert!(missing.iter().all(|one| one.similar.is_empty()), "{missing:?}");
         assert!(error.to_string().contains("or push a workspace"), "{error}");
+    }
+
+    #[test]
+    fn a_misspelt_package_of_ros_2_is_suggested() {
+        let lab = new_ros2_fixture();
+        let there = set(&["cv_bridge", "rclpy"]);
+        for (key, expected) in
+            [("cv_brigde", &["cv_bridge"][..]), ("nav_mgs", &["nav_msgs"]), ("message_genration", &[])]
+        {
+            assert_eq!(similar(&lab.archive, &lab.base, key, &there), expected, "{key}");
+        }
     }
 }

@@ -38,7 +38,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, E
     }
     if packages.is_empty() {
         let similar = archive.similar(name);
-        let hint = if similar.is_empty() { String::new() } else { format!(" (available: {})", similar.join(", ")) };
+        let hint = if similar.is_empty() { String::new() } else { format!("; did you mean {}?", similar.join(", ")) };
         return Err(Error::UnknownPackage { name: name.to_owned(), suite: build.base.suite.clone(), hint });
     }
     roots.extend(packages.iter().cloned());

@@ -7,6 +7,7 @@ use std::path::Path;
 use foreign::Visit;
 use package::condition::Variables;
 use package::manifest::Kind;
+use package::selection::{self, PackageQuery};
 use package::workspace::{self, Package, PushedDirectory};
 use ros::bus::RosVersion;
 use rustix::fs::FileType;
@@ -16,12 +17,22 @@ use crate::error::Error;
 use crate::keys::RequiredKeys;
 use crate::launch::LaunchNode;
 
-/// Inspects a pushed tree.
-pub(crate) fn inspect_pushed(root: &Path, base: &Base) -> Result<PushedDirectory, Error> {
+/// A pushed tree, and what of it is not built.
+#[derive(Debug)]
+pub(crate) struct InspectedTree {
+    pub(crate) pushed: PushedDirectory,
+    /// Names of packages that are not built.
+    pub(crate) left_out: Vec<String>,
+}
+
+/// Inspects a pushed tree, and selects the packages to build. Blocking.
+pub(crate) fn inspect_pushed(root: &Path, base: &Base, query: &PackageQuery<'_>) -> Result<InspectedTree, Error> {
     let version = base.ros.ros_version();
     let variables = Variables::for_distribution(version.number(), &base.ros_distribution);
-    let pushed = workspace::inspect(root, &variables)?;
-    if let PushedDirectory::Source(sources) = &pushed {
+    let mut pushed = workspace::inspect(root, &variables)?;
+    let mut left_out = Vec::new();
+    if let PushedDirectory::Source(sources) = &mut pushed {
+        left_out = selection::select_packages(sources, query, version)?;
         for Package { manifest, .. } in &sources.packages {
             if !manifest.supports_ros(version) {
                 return Err(Error::BuildType {
@@ -33,7 +44,7 @@ pub(crate) fn inspect_pushed(root: &Path, base: &Base) -> Result<PushedDirectory
             }
         }
     }
-    Ok(pushed)
+    Ok(InspectedTree { pushed, left_out })
 }
 
 fn supported_build_types(version: RosVersion) -> &'static str {
@@ -145,7 +156,7 @@ mod tests {
         }
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let pushed = inspect_pushed(root.path(), &base).expect("a workspace");
+        let pushed = inspect_pushed(root.path(), &base, &PackageQuery::default()).expect("a workspace").pushed;
         (root, pushed)
     }
 
@@ -216,7 +227,7 @@ mod tests {
         .expect("written");
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let error = inspect_pushed(root.path(), &base).expect_err("ROS 2").to_string();
+        let error = inspect_pushed(root.path(), &base, &PackageQuery::default()).expect_err("ROS 2").to_string();
         assert!(error.contains("build type ament_cmake"), "{error}");
     }
 

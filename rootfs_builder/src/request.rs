@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use image::{Digest, LayerInfo};
 use package::inventory::Inventory;
+use package::selection::PackageQuery;
 use ros::flavour::Flavour;
 
 use crate::launch::LaunchPlan;
@@ -38,6 +39,32 @@ pub struct PushRequest {
     /// Time of the newest source in seconds since 1970, which becomes that of the image (default: the time to which
     /// those of files in layers are clamped).
     pub created: Option<u64>,
+    /// Packages of the workspace to build, with those that they need; empty for what the chosen nodes need.
+    pub packages_up_to: Vec<String>,
+    /// Packages of the workspace that are not built.
+    pub packages_skip: Vec<String>,
+    /// Arguments of CMake for the packages of the push, after those of the base.
+    pub cmake_args: Vec<String>,
+}
+
+impl PushRequest {
+    /// Returns whether an option is about compiling.
+    pub(crate) fn has_build_options(&self) -> bool {
+        !(self.packages_up_to.is_empty() && self.packages_skip.is_empty() && self.cmake_args.is_empty())
+    }
+
+    /// Returns what the request says about the packages to build.
+    pub(crate) fn package_query(&self) -> PackageQuery<'_> {
+        // Plugins are named in parameters.
+        let values = self.params.values().map(ToString::to_string);
+        PackageQuery {
+            up_to: &self.packages_up_to,
+            skip: &self.packages_skip,
+            launch: self.launch.as_deref(),
+            nodes: &self.nodes,
+            texts: values.chain(self.args.values().cloned()).collect(),
+        }
+    }
 }
 
 /// Content of a push.

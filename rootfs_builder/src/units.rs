@@ -88,6 +88,10 @@ impl WorkspaceUnits {
             sources.push(key::hash_sources(&directory)?);
             own.insert(directory);
         }
+        for package in &workspace.left_out {
+            let directory = root.join(package);
+            own.insert(directory.canonicalize().io_context("opening", &directory)?);
+        }
         let rest = place.join("rest");
         fs::create_dir(&rest).io_context("making", &rest)?;
         if !own.contains(&root) {

@@ -115,11 +115,41 @@ pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
             ("package.xml", manifest("counts_py", needs)),
             ("CMakeLists.txt", build.to_owned()),
             ("counts.py", program.to_owned()),
+            // Named by no build file.
+            ("scripts/also.py", program.to_owned()),
         ],
     )?;
     let push = ["push", path_str(place.path())];
-    let missing = "the Python module scipy is missing: push with `--with python3-scipy`";
-    daemon.deployer().run(&push)?.expect_failure(&["exited with status 1", missing])?;
+    daemon.deployer().run(&push)?.expect_failure(&[
+        "exited with status 1 before its interface was found: ModuleNotFoundError: No module named 'scipy'",
+        "the Python module scipy is missing: push with `--with python3-scipy`",
+        "scripts/also.py of counts_py is installed by no catkin_install_python",
+    ])?;
+    Ok(())
+}
+
+/// The most frequent mistake in a first package of ROS 2.
+pub fn a_package_whose_programs_are_not_found_is_refused_at_once() -> Verdict {
+    let daemon = world().ensure_shared()?;
+    let place = tempfile::tempdir()?;
+    let built = "<depend>rclpy</depend><export><build_type>ament_python</build_type></export>";
+    let setup = "from setuptools import setup\nsetup(name='lost', version='1.0.0', packages=['lost'],\n\
+                 entry_points={'console_scripts': ['talk = lost.node:main']})\n";
+    let files = [
+        ("package.xml", manifest("lost", built)),
+        ("setup.py", setup.to_owned()),
+        ("lost/__init__.py", String::new()),
+        ("lost/node.py", "def main():\n    pass\n".to_owned()),
+    ];
+    write_files(place.path(), &files)?;
+    let push = ["push", path_str(place.path()), "--node", "talk"];
+    let steps = daemon.deployer().run(&push)?.expect_failure(&[
+        "there is nothing to run: lost has no setup.cfg that installs its programs (talk) to lib/lost",
+        "install_scripts=$base/lib/lost",
+    ])?;
+    ensure!(!steps.output().contains("bootstrapping"), "{}", steps.output());
+    std::fs::write(place.path().join("setup.py"), setup.replace("console_scripts", "other_scripts"))?;
+    daemon.deployer().run(&push)?.expect_failure(&["lost has no console_scripts in its setup.py"])?;
     Ok(())
 }
 
@@ -149,5 +179,8 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     let titles = events.filter_map(|event| Some(event["title"].as_str()?.to_owned()));
     let titles: Vec<String> = titles.collect();
     ensure!(titles.iter().all(|title| !title.contains("compil")), "{titles:?}");
+    let push = ["push", path_str(place.path()), "--launch", "lft.launch"];
+    let outcome = daemon.deployer().run(&push)?.expect_failure(&["no launch file \"lft.launch\" in the package"])?;
+    ensure!(!outcome.output().contains("compil"), "{}", outcome.output());
     Ok(())
 }

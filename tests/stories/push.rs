@@ -239,8 +239,29 @@ pub fn a_package_may_use_others_that_it_does_not_name() -> Verdict {
     let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let workspace = write_workspace(place.path(), "")?;
-    let (outcome, _) = push_workspace(&daemon, &workspace, "unnamed")?;
+    // A demo that needs what this host has not; the node does not need the demo.
+    let demo = workspace.join("src/cc_demo");
+    std::fs::create_dir(&demo)?;
+    std::fs::write(
+        demo.join("package.xml"),
+        "<package format=\"2\"><name>cc_demo</name><version>1.0.0</version><description>A demo.</description>\
+         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>\
+         <buildtool_depend>catkin</buildtool_depend><depend>bb_app</depend><depend>no_such_simulator</depend>\
+         </package>\n",
+    )?;
+    let path = path_str(&workspace);
+    for (option, words) in [
+        (["--packages-up-to", "cc_demo"], &["no_such_simulator"][..]),
+        (["--packages-up-to", "cc_dmeo"], &["no package \"cc_dmeo\" was pushed", "aa_lib, bb_app, cc_demo"]),
+        (["--cmake-args", "-DCMAKE_INSTALL_PREFIX=/usr"], &["the server sets this variable"]),
+    ] {
+        let push = [&["push", path, "--name", "unnamed", "--node", "bb_app/app"][..], &option].concat();
+        daemon.deployer().run(&push)?.expect_failure(words)?;
+    }
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "unnamed")?;
     let outcome = outcome.expect_success()?;
+    let selected = "building 2 of 3 packages; not needed, or skipped: cc_demo";
+    ensure!(steps.iter().any(|title| title == selected), "{steps:?}");
     ensure!(outcome.stdout.contains("bb_app uses packages of the workspace"), "{}", outcome.output());
     let mut robot = daemon.robot("unnamed")?;
     robot.subscribe("/said")?;
@@ -380,6 +401,31 @@ pub fn what_package_xml_forgot_is_named_and_added() -> Verdict {
         "{service:#}"
     );
     ensure!(pushed.output().contains("parameter /recorder/file matches no node"), "{}", pushed.output());
+    Ok(())
+}
+
+pub fn what_is_packed_follows_links_and_leaves_out_what_is_ignored() -> Verdict {
+    let daemon = world().daemon_with(ADDER)?;
+    let place = tempfile::tempdir()?;
+    let (elsewhere, workspace) = (place.path().join("checkout"), place.path().join("linked_ws"));
+    std::fs::create_dir_all(&elsewhere)?;
+    std::fs::create_dir_all(workspace.join("src"))?;
+    run(Command::new("cp").arg("-r").arg(binaries::package("adder_py")).arg(&elsewhere))?.expect_success()?;
+    std::os::unix::fs::symlink(elsewhere.join("adder_py"), workspace.join("src/adder_py"))?;
+    // Files with holes: one that is sent as it is, and a recording that need not be sent.
+    for (name, bytes) in [("map.db", 1 << 20), ("run.bag", 1 << 40)] {
+        std::fs::File::create(elsewhere.join("adder_py").join(name))?.set_len(bytes)?;
+    }
+    std::fs::write(workspace.join(".cloudroidignore"), "# recordings\n*.bag\n")?;
+    let parameters = ["--param", "offset:=5", "--param", "ofset=6"];
+    let push = ["push", path_str(&workspace), "--name", "linked", "--node", "adder.py"];
+    let pushed = daemon.deployer().run(&[&push[..], &parameters].concat())?.expect_success()?;
+    let said = pushed.output();
+    ensure!(said.contains("src/adder_py is a link to ") && !said.contains("run.bag"), "{said}");
+    ensure!(said.contains("no node has read a parameter ofset since it was started"), "{said}");
+    ensure!(!said.contains("no node has read a parameter offset"), "{said}");
+    let answer = daemon.robot("linked")?.call("/add_two", json!({"a": 1, "b": 1}))?;
+    ensure!(answer["values"]["sum"] == 7, "{answer}");
     Ok(())
 }
 

@@ -55,6 +55,15 @@ pub struct PushOptions {
     /// Additional Debian or ROS packages, for the build and at run time.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
+    /// Packages of the workspace to build, with those that they need (default: what the chosen nodes need).
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub packages_up_to: Vec<String>,
+    /// Packages of the workspace that are not built.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub packages_skip: Vec<String>,
+    /// Arguments of CMake for the packages of the push, such as `-DWITH_QT=OFF`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cmake_args: Vec<String>,
     /// Resource limits of a servant; limits that are given are also reserved.
     pub limits: Limits,
     /// Upper limits on what robots may request.

@@ -1,8 +1,9 @@
 //! `push`: publishes a package as a service.
 
 mod archive;
-mod newest;
+mod ignore;
 mod progress;
+mod selection;
 mod shared;
 
 use std::path::{Path, PathBuf};
@@ -21,6 +22,7 @@ use crate::push::shared::SharedFlags;
 use crate::rollout::{self, TermFlags};
 use crate::services;
 use crate::wait::WaitFlag;
+use archive::PushSource;
 use progress::PushProgress;
 
 /// Largest query in bytes: HTTP servers refuse longer ones.
@@ -53,11 +55,11 @@ pub struct PushArgs {
     /// or PACKAGE/CLASS), followed by remaps and -p NAME:=VALUE; the component gets a container of its own.
     #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
-    /// Private parameter of the nodes, or a global one (/K=V); may be given several times.
+    /// Private parameter of the nodes, or a global one (/K=V); K:=V is the same; may be given several times.
     #[arg(long = "param", value_name = "K=V", value_parser = parameter)]
     params: Vec<(String, serde_json::Value)>,
-    /// Argument of the launch file; may be given several times.
-    #[arg(long = "arg", value_name = "K:=V", value_parser = assignment)]
+    /// Argument of the launch file; K=V is the same; may be given several times.
+    #[arg(long = "arg", value_name = "K:=V", value_parser = argument)]
     args: Vec<(String, String)>,
     /// Remapping of a name; may be given several times.
     #[arg(long = "remap", value_name = "A:=B", value_parser = assignment)]
@@ -76,6 +78,17 @@ pub struct PushArgs {
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
+    /// Build only this package of the workspace and those that it needs; may be given several times. By default, what
+    /// no chosen node or launch file needs is not built.
+    #[arg(long = "packages-up-to", value_name = "PKG")]
+    packages_up_to: Vec<String>,
+    /// Do not build this package of the workspace; may be given several times.
+    #[arg(long = "packages-skip", value_name = "PKG")]
+    packages_skip: Vec<String>,
+    /// Arguments of CMake for the packages of the push: --cmake-args '-DWITH_QT=OFF -DCMAKE_BUILD_TYPE=Release'; may be
+    /// given several times.
+    #[arg(long = "cmake-args", value_name = "ARGS", allow_hyphen_values = true)]
+    cmake_args: Vec<String>,
     /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
     /// down, and hands back. Otherwise both may be asked, and the first answer is used. =false states that answers are
     /// independent, if the push would ask.
@@ -109,10 +122,21 @@ pub struct PushArgs {
 }
 
 fn parameter(text: &str) -> anyhow::Result<(String, serde_json::Value)> {
-    let (key, value) = text.split_once('=').context("write K=V")?;
-    ensure!(!key.is_empty(), "write K=V");
+    let (key, value) = key_and_value(text).context("write K=V or K:=V")?;
     let value = serde_json::from_str(value).unwrap_or_else(|_| serde_json::Value::String(value.to_owned()));
     Ok((key.to_owned(), value))
+}
+
+fn argument(text: &str) -> anyhow::Result<(String, String)> {
+    let (key, value) = key_and_value(text).context("write K:=V or K=V")?;
+    Ok((key.to_owned(), value.to_owned()))
+}
+
+/// Splits `K=V`, or `K:=V` as ROS writes it; `None` without a key.
+fn key_and_value(text: &str) -> Option<(&str, &str)> {
+    let (key, value) = text.split_once('=')?;
+    let key = key.strip_suffix(':').unwrap_or(key);
+    (!key.is_empty()).then_some((key, value))
 }
 
 fn assignment(text: &str) -> anyhow::Result<(String, String)> {
@@ -187,7 +211,12 @@ impl PushArgs {
     }
 
     async fn publish(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<ServiceDetail> {
-        let options = self.options()?;
+        let mut options = self.options()?;
+        let source = match self.path {
+            Some(path) => Some(PushSource::open(path).await?),
+            None => None,
+        };
+        options.created = source.as_ref().and_then(PushSource::created);
         let query = serde_json::to_string(&options)?;
         let uri = format!("/api/v1/push?options={}", percent_encode(&query));
         if uri.len() > LONGEST_QUERY {
@@ -195,7 +224,7 @@ impl PushArgs {
         }
         let publishing = AtomicBool::new(false);
         tokio::select! {
-            outcome = send(client, format, &uri, self.path, &publishing) => outcome,
+            outcome = send(client, format, &uri, source, &publishing) => outcome,
             _ = tokio::signal::ctrl_c() => bail!(cancellation_message(publishing.into_inner())),
         }
     }
@@ -226,6 +255,9 @@ impl PushArgs {
             requests: self.requests.clone(),
             map: self.map.iter().cloned().collect(),
             with: self.with.clone(),
+            packages_up_to: self.packages_up_to.clone(),
+            packages_skip: self.packages_skip.clone(),
+            cmake_args: self.cmake_args.iter().flat_map(|text| text.split_whitespace()).map(str::to_owned).collect(),
             limits: self.limits.into(),
             caps: self.caps.into(),
             sla: Sla { rrt: self.rrt, max_rrt: self.max_rrt, ..Sla::default() },
@@ -238,7 +270,7 @@ impl PushArgs {
             stateless: self.stateful == Some(false),
             shared: self.shared.shared_settings(),
             rollout: self.rollout.terms(),
-            created: self.path.as_deref().and_then(newest::find_newest_source),
+            created: None,
             source,
         })
     }
@@ -249,7 +281,7 @@ pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
     let about = std::fs::metadata(path).with_context(|| format!("cannot read {}", path.display()))?;
     ensure!(about.is_file(), "{} is not a file", path.display());
     // A failed read ends the body with an error.
-    archive::request_body(path).map(|(body, _)| body)
+    Ok(PushSource::Archive(path.to_owned()).into_body().0)
 }
 
 /// Returns the message for a push that was interrupted here; `publishing` is set if the daemon had begun to publish.
@@ -265,12 +297,12 @@ async fn send(
     client: &DaemonClient,
     format: OutputFormat,
     uri: &str,
-    path: Option<PathBuf>,
+    source: Option<PushSource>,
     publishing: &AtomicBool,
 ) -> anyhow::Result<ServiceDetail> {
-    let (body, packing) = match path {
-        Some(path) => {
-            let (body, packing) = archive::request_body(&path)?;
+    let (body, packing) = match source {
+        Some(source) => {
+            let (body, packing) = source.into_body();
             (body, Some(packing))
         }
         None => (archive::empty_body(), None),
@@ -368,11 +400,47 @@ mod tests {
 
     #[test]
     fn a_launch_file_takes_arguments() {
-        let push = parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:=").expect("valid");
+        let push =
+            parse("./pkg --launch two.launch --arg word:=bonjour --arg empty:= --arg plain=x:=y").expect("valid");
         let options = push.options().expect("no file is read");
         assert_eq!(options.args["word"], "bonjour");
         assert_eq!(options.args["empty"], "");
+        assert_eq!(options.args["plain"], "x:=y");
         assert_eq!(options.source, "./pkg");
+    }
+
+    #[test]
+    fn parameters_are_written_as_in_ros_or_shorter() {
+        for (written, key, value) in [
+            ("rate=1.5", "rate", serde_json::json!(1.5)),
+            ("rate:=1.5", "rate", serde_json::json!(1.5)),
+            ("/lab/word:=a=b", "/lab/word", serde_json::json!("a=b")),
+            ("word=:=", "word", serde_json::json!(":=")),
+        ] {
+            let options = parse(&format!("./pkg --param {written}")).expect(written).options().expect("no file");
+            assert_eq!(options.params, [(key.to_owned(), value)].into(), "{written}");
+        }
+    }
+
+    #[test]
+    fn packages_are_selected_in_colcons_words() {
+        let words = [
+            "push",
+            "./ws",
+            "--packages-up-to",
+            "a",
+            "--packages-skip",
+            "b",
+            "--packages-skip",
+            "c",
+            "--cmake-args",
+            "-DA=1  -DB=2",
+            "--cmake-args=-Wno-dev",
+        ];
+        let options = Line::try_parse_from(words).expect("valid").push.options().expect("no file is read");
+        assert_eq!(options.packages_up_to, ["a"]);
+        assert_eq!(options.packages_skip, ["b", "c"]);
+        assert_eq!(options.cmake_args, ["-DA=1", "-DB=2", "-Wno-dev"]);
     }
 
     /// Source of the page's fields, one per line.
@@ -457,7 +525,8 @@ mod tests {
             "./pkg --launch a.launch --node b",
             "./pkg --param novalue",
             "./pkg --param =v",
-            "./pkg --arg a=b",
+            "./pkg --param :=v",
+            "./pkg --arg a",
             "./pkg --remap a",
             "./pkg --map key=",
             "./pkg --request /image",

@@ -70,6 +70,22 @@ pub enum Error {
         /// Directory.
         path: PathBuf,
     },
+    /// An option names a package that is not in the workspace.
+    #[error("{option}: no package {name:?} was pushed; the packages are {known}")]
+    UnknownPackage {
+        /// The option, such as `--packages-skip`.
+        option: &'static str,
+        /// Name of the package.
+        name: String,
+        /// Names of the packages of the workspace.
+        known: String,
+    },
+    /// No package is left to build.
+    #[error("nothing is left to build without {skipped}; leave a package out of --packages-skip")]
+    NothingSelected {
+        /// Packages that are not built.
+        skipped: String,
+    },
     /// Two packages have the same name.
     #[error("two packages are named {name:?}: {} and {}; remove one, or put a file COLCON_IGNORE (or \
              CATKIN_IGNORE) beside it", .first.display(), .second.display())]

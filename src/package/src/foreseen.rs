@@ -5,14 +5,19 @@
 //! anything, so only unconditional literal statements count.
 
 mod executables;
+mod problems;
+mod scripts;
 
-use std::path::{Component, Path};
+use std::collections::BTreeSet;
+use std::path::Path;
 
 use foreign::Visit;
 use ros::bus::RosVersion;
 use rustix::fs::FileType;
 
 use crate::workspace::{Package, Workspace};
+
+pub use problems::{SourceProblem, find_problems, has_no_programs};
 
 /// Minimum content of the image of a workspace.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -27,10 +32,6 @@ pub struct SourceScan {
     may_launch_more: bool,
 }
 
-/// Directories of a ROS 1 package whose files are installed only if its build files state so.
-const LEFT_OUT: [&str; 10] =
-    ["build", "devel", "install", "test", "tests", "doc", "docs", "include", "__pycache__", "cmake"];
-
 /// File name suffixes of ROS 2 launch files, wherever they are installed.
 const LAUNCH_OF_TWO: [&str; 4] = ["launch.py", "launch.xml", "launch.yaml", "launch.yml"];
 
@@ -43,9 +44,38 @@ pub fn scan_sources(workspace: &Workspace, version: RosVersion) -> SourceScan {
         let names = own.programs.into_iter().filter(|name| !name.contains('$'));
         foreseen.executables.extend(names);
         foreseen.may_launch_more |= own.mentions_launch;
-        foreseen.add_launch_files(&workspace.root, package, version, &own.launch_directories);
+        foreseen.add_launch_files(&workspace.root, package, version, (&own.launch_directories, &own.launch_files));
     }
     foreseen
+}
+
+/// Returns the names of a package's executables, as far as its build files show them. Blocking.
+pub(crate) fn programs_of(workspace: &Workspace, package: &Package, version: RosVersion) -> BTreeSet<String> {
+    executables::scan_package(&workspace.root, package, version).programs
+}
+
+/// Returns whether no package can have a launch file of this name, because no file has it and no build file mentions it
+/// or configures files. Unreadable directories may have anything. Blocking.
+pub fn lacks_launch_file(workspace: &Workspace, launch: &str, version: RosVersion) -> bool {
+    let Some(name) = Path::new(launch).file_name().and_then(|name| name.to_str()) else {
+        return false;
+    };
+    let lacks = |package: &Package| {
+        let text = executables::scan_package(&workspace.root, package, version).text;
+        if text.contains("configure_file") || text.contains(name) {
+            return false;
+        }
+        let mut found = false;
+        let directory = workspace.root.join(&package.path).canonicalize();
+        let walked = directory.map(|directory| {
+            foreign::walk(&directory, |entry| {
+                found |= entry.name().to_string_lossy().starts_with(name);
+                Ok::<_, foreign::Error>(if found { Visit::Skip } else { Visit::Into })
+            })
+        });
+        !found && walked.is_ok_and(|walked| walked.is_ok())
+    };
+    !launch.starts_with('/') && workspace.packages.iter().all(lacks)
 }
 
 impl SourceScan {
@@ -55,7 +85,14 @@ impl SourceScan {
         self.programs > 1 && (launch_files > 1 || launch_files == 0 && !self.may_launch_more)
     }
 
-    fn add_launch_files(&mut self, root: &Path, package: &Package, version: RosVersion, installed: &[String]) {
+    /// Adds the launch files of a package; `installed` are its directories and files that are installed.
+    fn add_launch_files(
+        &mut self,
+        root: &Path,
+        package: &Package,
+        version: RosVersion,
+        (directories, files): (&[String], &[String]),
+    ) {
         // The package may be behind a link that stays inside, as in the search of the workspace.
         let Ok(directory) = root.join(&package.path).canonicalize() else {
             self.may_launch_more = true;
@@ -69,10 +106,11 @@ impl SourceScan {
             let name = entry.name().to_string_lossy();
             let is_installed = entry.kind() == FileType::RegularFile
                 && match version {
-                    RosVersion::One => name.ends_with(".launch") && is_shared(path),
+                    RosVersion::One => name.ends_with(".launch") && scripts::is_shared(path),
                     RosVersion::Two => {
                         LAUNCH_OF_TWO.iter().any(|end| name.ends_with(end))
-                            && installed.iter().any(|directory| path.starts_with(directory))
+                            && (directories.iter().any(|directory| path.starts_with(directory))
+                                || files.iter().any(|file| path == Path::new(file)))
                     }
                 };
             if is_installed {
@@ -84,17 +122,6 @@ impl SourceScan {
         });
         self.may_launch_more |= walked.is_err();
     }
-}
-
-/// Returns whether a file of a ROS 1 package is copied to its share directory regardless of its build files.
-fn is_shared(path: &Path) -> bool {
-    path.components().all(|part| match part {
-        Component::Normal(name) => {
-            let name = name.to_string_lossy();
-            !name.starts_with('.') && !LEFT_OUT.contains(&&*name)
-        }
-        _ => false,
-    })
 }
 
 #[cfg(test)]

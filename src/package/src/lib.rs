@@ -3,6 +3,7 @@
 //! ```text
 //!   directory ──workspace::inspect──▶ PushedDirectory: packages in build order │ an install space
 //!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
+//!   sources ──selection──▶ packages that are built
 //!   sources ──foreseen──▶ programs and launch files that can be found
 //!   layers ──inventory::scan──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
@@ -36,6 +37,7 @@ mod order;
 mod read;
 mod request;
 pub mod requests;
+pub mod selection;
 pub mod stub;
 mod supplement;
 pub mod workspace;

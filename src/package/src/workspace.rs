@@ -35,6 +35,8 @@ pub struct Workspace {
     pub root: PathBuf,
     /// At least one package; each after its build dependencies.
     pub packages: Vec<Package>,
+    /// Directories of packages that are not built, relative to the root.
+    pub left_out: Vec<PathBuf>,
 }
 
 /// An install space.
@@ -93,7 +95,8 @@ pub fn inspect(root: &Path, variables: &Variables) -> Result<PushedDirectory, Er
     let packages = packages.into_values().collect();
     Ok(match located.what {
         LocatedKind::Sources(_) => {
-            PushedDirectory::Source(Workspace { root: located.root, packages: order::build_order(packages)? })
+            let packages = order::build_order(packages)?;
+            PushedDirectory::Source(Workspace { root: located.root, packages, left_out: Vec::new() })
         }
         LocatedKind::Space(space) => PushedDirectory::Installed(InstallSpace {
             prefix: install_space::read_prefix(&located.root, &space.root)?,

@@ -117,6 +117,38 @@ pub enum OptionsError {
     /// Invalid additions to the interface.
     #[error("the interface supplement: {0}")]
     Supplement(Box<SupplementError>),
+    /// A key of a parameter or launch argument that is no name.
+    #[error("{what} {name:?} is no name; write the name alone as the key, such as {:?}", suggest_name(name))]
+    ParameterName {
+        /// `parameter` or `launch argument`.
+        what: &'static str,
+        /// The key.
+        name: String,
+    },
+    /// A value of `--packages-up-to` or `--packages-skip` that is no name of a package.
+    #[error("{option}: {name:?} is not a package name: a letter, then letters, digits, _ and -")]
+    PackageName {
+        /// The option.
+        option: &'static str,
+        /// The value.
+        name: String,
+    },
+    /// Too many values of an option.
+    #[error("{option} may be given at most {most} times")]
+    TooMany {
+        /// The option.
+        option: &'static str,
+        /// Maximum number.
+        most: usize,
+    },
+    /// An argument that cannot be passed to CMake.
+    #[error("--cmake-args {argument:?}: {problem}")]
+    CmakeArgument {
+        /// The argument.
+        argument: String,
+        /// Description of the problem.
+        problem: &'static str,
+    },
     /// A stateful service cannot be shared.
     #[error(
         "--stateful and --shared exclude each other: in a shared servant, answers would depend on other robots' \
@@ -154,6 +186,15 @@ pub enum OptionsError {
         "an exported service includes its start commands and limits; only its name and the rollout options can be given"
     )]
     Exported,
+}
+
+/// Returns the part of a key that may be meant as the name: `rate` of `rate:` and of `rate:=1`.
+fn suggest_name(key: &str) -> &str {
+    let end = key.find(|c: char| c == ':' || c == '=' || c.is_whitespace());
+    match &key[..end.unwrap_or(key.len())] {
+        "" => "rate",
+        name => name,
+    }
 }
 
 #[cfg(test)]

@@ -30,6 +30,7 @@ mod reporter;
 mod request;
 mod room;
 mod shared;
+mod spelling;
 mod stateful;
 mod supplement;
 mod told;
@@ -332,6 +333,9 @@ impl Pusher {
             map: options.map.clone(),
             with: options.with.clone(),
             created: options.created,
+            packages_up_to: options.packages_up_to.clone(),
+            packages_skip: options.packages_skip.clone(),
+            cmake_args: options.cmake_args.clone(),
         };
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {

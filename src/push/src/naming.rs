@@ -336,10 +336,18 @@ pub(super) fn move_nodes(plan: &mut Plan, moved: &BTreeMap<String, String>) {
     }
 }
 
-/// Returns warnings about parameters that were given for an unknown node and read by none.
-pub(super) fn unused_parameters(plan: &Plan, interface: &Interface, options: &PushOptions) -> Vec<String> {
-    let below =
-        |key: &str, name: &str| key.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'));
+/// Returns whether a name is another one, or below it.
+fn is_below(key: &str, name: &str) -> bool {
+    key.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+}
+
+/// Returns warnings about parameters that were given for an unknown node, or that no node declared (ROS 2) or read.
+pub(super) fn unused_parameters(
+    plan: &Plan,
+    interface: &Interface,
+    options: &PushOptions,
+    version: RosVersion,
+) -> Vec<String> {
     let loaded = plan.components.values().flatten();
     let loaded: Vec<String> = loaded.filter_map(Component::full_name).collect();
     let names = plan.nodes.iter().map(|node| node.name.as_str());
@@ -348,9 +356,9 @@ pub(super) fn unused_parameters(plan: &Plan, interface: &Interface, options: &Pu
     for key in options.params.keys() {
         // A global parameter such as `/rate` is for all nodes.
         let of_a_name = key.starts_with('/') && key[1..].contains('/');
-        let known = names.iter().any(|name| below(key, name));
+        let known = names.iter().any(|name| is_below(key, name));
         let read = interface.parameters.iter().any(|parameter| {
-            !parameter.read_by.is_empty() && (below(key, &parameter.name) || below(&parameter.name, key))
+            !parameter.read_by.is_empty() && (is_below(key, &parameter.name) || is_below(&parameter.name, key))
         });
         if of_a_name && !known && !read {
             warnings.push(format!(
@@ -360,9 +368,42 @@ pub(super) fn unused_parameters(plan: &Plan, interface: &Interface, options: &Pu
         }
         if let Some(has) = describe_undeclared(interface, key) {
             warnings.push(format!("no node declares a parameter {key}, so it has no effect; {has}"));
+        } else if version == RosVersion::One && (known || !of_a_name) && !is_read(interface, key, &names) {
+            warnings.push(format!(
+                "no node has read a parameter {key} since it was started, so it has no effect unless one reads it \
+                 later; {}",
+                describe_read(interface)
+            ));
         }
     }
     warnings
+}
+
+/// Returns whether a node of ROS 1, which declares nothing, was seen to read a parameter: the whole of it, a part, or
+/// what it is a part of.
+fn is_read(interface: &Interface, key: &str, nodes: &[&str]) -> bool {
+    let bare = key.trim_start_matches(['~', '_']);
+    if plumbing::is_builtin_parameter(bare.rsplit('/').next().unwrap_or_default()) {
+        return true;
+    }
+    let full: Vec<String> = if bare.starts_with('/') {
+        vec![bare.to_owned()]
+    } else {
+        nodes.iter().map(|node| format!("{node}/{bare}")).collect()
+    };
+    let end = format!("/{}", bare.trim_start_matches('/'));
+    interface.parameters.iter().filter(|parameter| !parameter.read_by.is_empty()).any(|parameter| {
+        let name = &parameter.name;
+        // A program may read it under the name of another node, as nodelets do.
+        name.ends_with(&end) || full.iter().any(|full| is_below(full, name) || is_below(name, full))
+    })
+}
+
+/// Names the parameters that were read.
+fn describe_read(interface: &Interface) -> String {
+    let read = interface.parameters.iter().filter(|parameter| !parameter.read_by.is_empty());
+    let names: Vec<&str> = read.map(|parameter| parameter.name.as_str()).take(NAMED).collect();
+    if names.is_empty() { "none was read".to_owned() } else { format!("read were {}", names.join(", ")) }
 }
 
 /// If nodes have their own parameters (ROS 2) and none has one of this name, returns a description of those that exist.

@@ -13,7 +13,7 @@ use reach::{describe_exit, master};
 use rootfs_builder::BuildOutcome;
 use rootfs_builder::probe::{CpuTime, CpuTimeSource, ProbeOptions, ProbeResult};
 use ros::schema::Registry;
-use servant::engine::{ContainerState, NodeExit, ServantHandle};
+use servant::engine::{ContainerState, LogLine, NodeExit, ServantHandle};
 use servant::spec::Spec;
 use tracing::Instrument;
 
@@ -21,6 +21,7 @@ use super::reporter::Reporter;
 use super::{Pusher, naming, supplement};
 use crate::Error;
 use choreographer::Permit;
+use foreign::terminal;
 use store::Plan;
 
 pub(super) use started::{ProbeServant, RoomGuard};
@@ -76,7 +77,9 @@ async fn probe_once(
     options: &PushOptions,
     alive: &RoomGuard,
 ) -> Result<ProbeResult, Error> {
-    naming::resolve_names(pusher, id, built, plan, options, alive).await?;
+    if let Err(error) = naming::resolve_names(pusher, id, built, plan, options, alive).await {
+        return Err(with_advice(pusher, built, error).await);
+    }
     let mut marked = plan.clone();
     let marks = naming::mark_nodes_without_namespace(&mut marked, &built.flavour);
     let spec = self::probe_spec(pusher, id, built, &marked, options);
@@ -89,7 +92,8 @@ async fn probe_once(
         Err(error) => return Err(with_advice(pusher, built, error).await),
     };
     naming::move_nodes(plan, &found.moved);
-    let unused = naming::unused_parameters(plan, &found.interface, options);
+    let version = built.flavour.ros.ros_version();
+    let unused = naming::unused_parameters(plan, &found.interface, options, version);
     found.warnings.extend(unused);
     let warn = |what| format!("servants will run without a requested limit: {what}");
     found.warnings.extend(unmet.into_iter().map(warn));
@@ -239,15 +243,30 @@ pub(super) async fn wait_for_failure(servant: &Arc<dyn ServantHandle>, plan: &Pl
     }
 }
 
-/// Adds the last lines printed by the nodes to an error.
+/// Adds the last lines printed by the nodes to an error, and to its message what the node that it is about said last on
+/// its standard error.
 pub(super) async fn with_node_logs(error: Error, servant: &Arc<dyn ServantHandle>) -> Error {
     match error {
         Error::Failed { message, next, log } if log.is_empty() => {
             let lines = servant.logs(LOG_LINES, None).await;
+            let message = with_last_words(message, &lines);
             let log = lines.into_iter().map(|line| format!("{}: {}", line.node, line.line)).collect();
             Error::Failed { message, next, log }
         }
         other => other,
+    }
+}
+
+/// Adds the cause of an exit to a message that begins with the name of a node.
+fn with_last_words(message: String, lines: &[LogLine]) -> String {
+    let is_of_node = |line: &&LogLine| {
+        let rest = message.strip_prefix(line.node.as_str());
+        line.stream == "stderr" && !line.node.is_empty() && rest.is_some_and(|rest| rest.starts_with(' '))
+    };
+    let own: Vec<&str> = lines.iter().filter(is_of_node).map(|line| line.line.as_str()).collect();
+    match rootfs_builder::find_exit_cause(own.iter().copied()) {
+        Some(cause) => format!("{message}: {}", terminal::escape(&cause, false)),
+        None => message,
     }
 }
 
@@ -260,5 +279,35 @@ pub(super) fn probe_spec(pusher: &Pusher, id: &str, built: &BuildOutcome, plan: 
         nodes: plan.nodes.clone(),
         grants: plan.grants.clone(),
         resident: master::resident_config(&built.flavour, &plan.parameters),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::SystemTime;
+
+    use super::*;
+
+    #[test]
+    fn a_failure_is_told_with_the_last_words_of_its_node() {
+        let line = |node: &str, stream: &str, line: &str| LogLine {
+            number: None,
+            time: SystemTime::UNIX_EPOCH,
+            node: node.to_owned(),
+            stream: stream.to_owned(),
+            line: line.to_owned(),
+        };
+        let lines = [
+            line("/see", "stderr", "    import scipy"),
+            line("/see", "stderr", "ModuleNotFoundError: No module named 'scipy'"),
+            line("/see_more", "stderr", "ValueError: another node's"),
+            line("/see", "stdout", "RuntimeError: only printed"),
+        ];
+        let said = |message: &str| with_last_words(message.to_owned(), &lines);
+        let exited = "/see exited with code 1 before its interface was found";
+        assert_eq!(said(exited), format!("{exited}: ModuleNotFoundError: No module named 'scipy'"));
+        for other in ["/quiet exited with code 1", "the started image ended"] {
+            assert_eq!(said(other), other);
+        }
     }
 }

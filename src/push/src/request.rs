@@ -15,7 +15,7 @@ use tracing::Instrument;
 
 use super::deployer::Deployer;
 use super::reporter::Reporter;
-use super::{Archive, Error, OptionsError, Pusher, receive, shared};
+use super::{Archive, Error, OptionsError, Pusher, receive, shared, spelling};
 
 /// Result of a push.
 #[derive(Debug)]
@@ -87,6 +87,7 @@ impl Pusher {
         }
         check_caps(options)?;
         check_sla(options)?;
+        spelling::check_options(options)?;
         options.parse_requests().map_err(OptionsError::RequestPair)?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;

@@ -36,7 +36,9 @@ pub(super) fn to_push_error(error: &rootfs_builder::Error, home: &Path, source: 
         rootfs_builder::Error::BuildFailed { package, last_lines, advice, .. } => {
             next = (!advice.is_empty()).then(|| advice.join("; "));
             let lines = last_lines.lines().map(str::to_owned).collect();
-            (format!("the build of {package} failed"), lines)
+            let cause = rootfs_builder::find_build_cause(last_lines);
+            let cause = cause.map_or_else(String::new, |cause| format!(": {cause}"));
+            (format!("the build of {package} failed{cause}"), lines)
         }
         error => (strip_build_paths(&error.to_string(), home, source), Vec::new()),
     };
@@ -105,7 +107,7 @@ mod tests {
         let Error::Failed { message, next, log } = to_push_error(&failed, Path::new("/home"), "broken") else {
             panic!("it failed");
         };
-        assert_eq!(message, "the build of broken failed");
+        assert_eq!(message, "the build of broken failed: main.cpp:3: error: expected ;");
         assert_eq!(log, ["main.cpp:3: error: expected ;", "make: *** [all] Error 2"]);
         let next = next.expect("what to do");
         assert!(next.contains("`--with libwarp-dev`"), "{next}");

@@ -12,11 +12,11 @@ export interface Field {
 }
 
 /** What is told of every push. */
-export const PARAMETERS: Field = { key: 'params', label: 'Parameters, KEY=VALUE, one per line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 };
+export const PARAMETERS: Field = { key: 'params', label: 'Parameters, KEY=VALUE or KEY:=VALUE, one per line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 };
 export const NAME: Field = { key: 'name', label: "Service name (default: the package's)", flag: '--name' };
 export const NODES: Field = { key: 'nodes', label: 'Programs with their arguments, one per line', flag: '--node', example: 'people_detect', lines: 2 };
 export const LAUNCH: Field = { key: 'launch', label: 'Launch file of the package, as for roslaunch', flag: '--launch', example: 'my.launch' };
-export const ARGUMENTS: Field = { key: 'args', label: 'Launch arguments, KEY:=VALUE, one per line', flag: '--arg', lines: 2 };
+export const ARGUMENTS: Field = { key: 'args', label: 'Launch arguments, KEY:=VALUE or KEY=VALUE, one per line', flag: '--arg', lines: 2 };
 
 /** What is told of some, by what it is about. */
 export const GROUPS: { title: string; fields: Field[] }[] = [
@@ -54,6 +54,9 @@ export const GROUPS: { title: string; fields: Field[] }[] = [
     { key: 'remaps', label: 'Names to remap, FROM:=TO, one per line', flag: '--remap', lines: 2 },
     { key: 'map', label: 'Dependencies mapped by hand, KEY=DEBIAN-PACKAGE, one per line', flag: '--map', lines: 2 },
     { key: 'with', label: 'Additional Debian or ROS packages, one per line', flag: '--with', lines: 2 },
+    { key: 'packages_up_to', label: 'Packages of the workspace to build, with what they need, one per line (default: what the programs need)', flag: '--packages-up-to', lines: 2 },
+    { key: 'packages_skip', label: 'Packages of the workspace not to build, one per line', flag: '--packages-skip', lines: 2 },
+    { key: 'cmake_args', label: 'Arguments of CMake, one per line', flag: '--cmake-args', example: '-DWITH_QT=OFF', lines: 2 },
     { key: 'interface', label: 'Additional interface, as TOML or JSON', flag: '--interface', lines: 3 },
     { key: 'requests', label: 'Which output answers which input, INPUT=OUTPUT, one per line (default: as detected)', flag: '--request', example: '/image=/boxes', lines: 2 },
     { key: 'devices', label: 'Devices by CDI name, one per line; where the operator allows them', flag: '--device', example: 'nvidia.com/gpu=0', lines: 2 },
@@ -83,6 +86,15 @@ function pairs(text: string | undefined, sign: string, label: string): [string, 
     const at = line.indexOf(sign);
     if (at < 1) throw new Error(`${label}: ${JSON.stringify(line)} has no ${sign}`);
     return [line.slice(0, at), line.slice(at + sign.length)];
+  });
+}
+
+/** Lines of KEY=VALUE, or KEY:=VALUE as ROS writes it. */
+function assignments(text: string | undefined, label: string): [string, string][] {
+  return pairs(text, '=', label).map(([key, written]) => {
+    const name = key.replace(/:$/, '');
+    if (!name) throw new Error(`${label}: ${JSON.stringify(`${key}=${written}`)} has no name`);
+    return [name, written];
   });
 }
 
@@ -119,7 +131,8 @@ export function options(values: Values, chosen: Chosen): Options {
     const all = pairs(values[key], sign, label);
     return all.length ? Object.fromEntries(all) : undefined;
   };
-  const params = pairs(values.params, '=', 'Parameters').map(([key, written]) => [key, value(written)] as const);
+  const params = assignments(values.params, 'Parameters').map(([key, written]) => [key, value(written)] as const);
+  const args = assignments(values.args, 'Arguments');
   const terms = filled({
     canary: text('canary'), bound: figure('bound', '--bound'), samples: figure('samples', '--samples'),
     deadline: time('deadline', '--deadline'), promote_after: time('promote_after', '--promote-after'),
@@ -133,10 +146,13 @@ export function options(values: Values, chosen: Chosen): Options {
     launch: chosen.run === 'launch' ? text('launch') : undefined,
     nodes: chosen.run === 'nodes' ? list(values.nodes) : undefined,
     params: params.length ? Object.fromEntries(params) : undefined,
-    args: chosen.run === 'launch' ? map('args', ':=', 'Arguments') : undefined,
+    args: chosen.run === 'launch' && args.length ? Object.fromEntries(args) : undefined,
     remaps: map('remaps', ':=', 'Remapped names'),
     map: map('map', '=', 'Dependencies mapped by hand'),
     with: list(values.with),
+    packages_up_to: list(values.packages_up_to),
+    packages_skip: list(values.packages_skip),
+    cmake_args: list(values.cmake_args),
     interface: text('interface'),
     requests: list(values.requests),
     limits: filled({

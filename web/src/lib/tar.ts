@@ -1,5 +1,7 @@
 // A tar archive (POSIX pax) of a folder that a browser was given, as a Blob: nothing is copied into memory.
 
+import { unignored } from './ignore';
+
 export interface Entry { path: string; file: File }
 
 /** Directories that hold nothing of a package, as `cloudroidctl push` leaves them out. */
@@ -58,9 +60,10 @@ async function isProgram(file: File): Promise<boolean> {
   return (one === 0x23 && two === 0x21) || (one === 0x7f && two === 0x45 && three === 0x4c && four === 0x46);
 }
 
+/** The archive of a folder's files, without those that its `.cloudroidignore` files leave out. */
 export async function tar(entries: Entry[]): Promise<Blob> {
   const parts: BlobPart[] = [];
-  for (const { path, file } of entries) {
+  for (const { path, file } of await unignored(entries)) {
     const name = utf8.encode(path);
     if (name.length > 100) parts.push(...(longName(name) as BlobPart[]));
     parts.push(header(name, file.size, (await isProgram(file)) ? 0o755 : 0o644, '0') as BlobPart, file, filled(file.size) as BlobPart);

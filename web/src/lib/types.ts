@@ -647,6 +647,7 @@ export interface PushOptions {
   base?: string;
   caps?: Caps;
   created?: number;
+  cmake_args?: string[];
   grants?: Grants;
   interface?: string;
   launch?: string;
@@ -654,6 +655,8 @@ export interface PushOptions {
   map?: Record<string, string>;
   name?: string;
   nodes?: string[];
+  packages_skip?: string[];
+  packages_up_to?: string[];
   params?: Record<string, unknown>;
   remaps?: Record<string, string>;
   requests?: string[];

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::sync_channel;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, ensure};
 use bytes::Bytes;
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -13,17 +13,13 @@ use http_body_util::{BodyExt, Full, StreamBody};
 use hyper::body::Frame;
 use tokio::sync::mpsc;
 
+use super::selection::{self, Selection};
 use crate::client::RequestBody;
+use crate::output;
 
 /// Size and number of chunks that packing may be ahead of sending.
 const CHUNK: usize = 256 << 10;
 const CHUNKS_AHEAD: usize = 8;
-/// Depth of the search for a package.xml.
-const DEPTH: usize = 6;
-/// Directories that never belong to a package.
-pub(super) const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
-/// Directories beside `src` of a workspace that catkin or colcon generate.
-pub(super) const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
 
 /// Handle of the thread that packs the archive.
 #[derive(Debug)]
@@ -43,53 +39,80 @@ pub fn empty_body() -> RequestBody {
     Full::default().map_err(|never| match never {}).boxed_unsync()
 }
 
-/// Returns the archive of a directory, or an existing archive, as a body.
-pub fn request_body(path: &Path) -> anyhow::Result<(RequestBody, Packing)> {
-    let metadata = std::fs::metadata(path).with_context(|| format!("cannot push {}", path.display()))?;
-    if metadata.is_dir() && !holds_package(path, DEPTH)? {
-        bail!(
-            "{} contains no package.xml; push the directory of a ROS package, a workspace or an install space, or a \
-                Debian package with --apt NAME",
-            path.display()
-        );
-    }
-    let (chunks, received) = mpsc::channel(CHUNKS_AHEAD);
-    let (failed, failure) = sync_channel(1);
-    let source = path.to_owned();
-    std::thread::spawn(move || {
-        let outcome = if metadata.is_dir() { pack(&source, &chunks) } else { copy(&source, &chunks) };
-        if let Err(error) = outcome {
-            let error = error.context(format!("cannot pack {}", source.display()));
-            let torn = io::Error::other(error.to_string());
-            let _ = failed.try_send(error);
-            // The body ends with an error, so that the daemon does not accept a truncated archive.
-            let _ = chunks.blocking_send(Err(torn));
+/// Content of a push on this machine.
+#[derive(Debug)]
+pub enum PushSource {
+    /// Files of a directory.
+    Directory(PathBuf, Selection),
+    /// An archive.
+    Archive(PathBuf),
+}
+
+impl PushSource {
+    /// Selects the files to send of a directory, or takes a file as an archive. What the deployer should know of a
+    /// directory is printed.
+    pub async fn open(path: PathBuf) -> anyhow::Result<PushSource> {
+        let source = tokio::task::spawn_blocking(move || open_source(path)).await??;
+        if let PushSource::Directory(_, selection) = &source {
+            for note in &selection.notes {
+                output::eprint_line(&format!("note: {note}"));
+            }
         }
-    });
-    let frames =
-        futures_util::stream::unfold(received, |mut received| async move { Some((received.recv().await?, received)) });
-    let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
-    Ok((body.boxed_unsync(), Packing { failure }))
+        Ok(source)
+    }
+
+    /// Returns the time of the newest source in seconds since 1970, or `SOURCE_DATE_EPOCH`
+    /// (<https://reproducible-builds.org/specs/source-date-epoch/>), which becomes the creation time of the image: what
+    /// is sent has no times. `None` for an archive.
+    pub fn created(&self) -> Option<u64> {
+        let PushSource::Directory(_, selection) = self else {
+            return None;
+        };
+        let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
+        given.or(selection.newest)
+    }
+
+    /// Returns it as a body.
+    pub fn into_body(self) -> (RequestBody, Packing) {
+        let (chunks, received) = mpsc::channel(CHUNKS_AHEAD);
+        let (failed, failure) = sync_channel(1);
+        std::thread::spawn(move || {
+            let (path, outcome) = match &self {
+                PushSource::Directory(path, selection) => (path, pack(selection, &chunks)),
+                PushSource::Archive(path) => (path, copy(path, &chunks)),
+            };
+            if let Err(error) = outcome {
+                let error = error.context(format!("cannot pack {}", path.display()));
+                let torn = io::Error::other(error.to_string());
+                let _ = failed.try_send(error);
+                // The body ends with an error, so that the daemon does not accept a truncated archive.
+                let _ = chunks.blocking_send(Err(torn));
+            }
+        });
+        let frames = futures_util::stream::unfold(received, |mut received| async move {
+            Some((received.recv().await?, received))
+        });
+        let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
+        (body.boxed_unsync(), Packing { failure })
+    }
 }
 
 type Chunks = mpsc::Sender<io::Result<Bytes>>;
 
-fn holds_package(directory: &Path, depth: usize) -> anyhow::Result<bool> {
-    if directory.join("package.xml").exists() {
-        return Ok(true);
+/// Selects the files to send. Blocking.
+fn open_source(path: PathBuf) -> anyhow::Result<PushSource> {
+    let metadata = std::fs::metadata(&path).with_context(|| format!("cannot push {}", path.display()))?;
+    if !metadata.is_dir() {
+        return Ok(PushSource::Archive(path));
     }
-    if depth == 0 {
-        return Ok(false);
-    }
-    let entries = std::fs::read_dir(directory).with_context(|| format!("cannot read {}", directory.display()))?;
-    for entry in entries {
-        let entry = entry?;
-        let skipped = LEFT_OUT.iter().any(|name| entry.file_name() == *name);
-        if !skipped && entry.file_type()?.is_dir() && holds_package(&entry.path(), depth - 1)? {
-            return Ok(true);
-        }
-    }
-    Ok(false)
+    let selection = selection::select_files(&path)?;
+    ensure!(
+        selection.has_package,
+        "{} contains no package.xml; push the directory of a ROS package, a workspace or an install space, or a \
+         Debian package with --apt NAME",
+        path.display()
+    );
+    Ok(PushSource::Directory(path, selection))
 }
 
 fn copy(archive: &Path, chunks: &Chunks) -> anyhow::Result<()> {
@@ -100,53 +123,19 @@ fn copy(archive: &Path, chunks: &Chunks) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn pack(root: &Path, chunks: &Chunks) -> anyhow::Result<()> {
+fn pack(selection: &Selection, chunks: &Chunks) -> anyhow::Result<()> {
     let encoder = GzEncoder::new(ChunkWriter::new(chunks), Compression::fast());
     let mut archive = tar::Builder::new(encoder);
     archive.follow_symlinks(false);
     archive.mode(tar::HeaderMode::Deterministic);
-    let workspace = root.join("src").is_dir() && !root.join("package.xml").exists();
-    add_directory(&mut archive, root, &PathBuf::new(), workspace)?;
+    // The daemon reads no maps of holes: they are sent as zeros, which compress to almost nothing.
+    archive.sparse(false);
+    for entry in &selection.entries {
+        let added = archive.append_path_with_name(&entry.source, &entry.inside);
+        added.with_context(|| entry.source.display().to_string())?;
+    }
     archive.into_inner()?.finish()?.flush()?;
     Ok(())
-}
-
-fn add_directory(
-    archive: &mut tar::Builder<GzEncoder<ChunkWriter<'_>>>,
-    root: &Path,
-    relative: &Path,
-    workspace: bool,
-) -> anyhow::Result<()> {
-    let directory = root.join(relative);
-    let mut entries = std::fs::read_dir(&directory)
-        .and_then(Iterator::collect::<io::Result<Vec<_>>>)
-        .with_context(|| format!("cannot read {}", directory.display()))?;
-    entries.sort_by_key(std::fs::DirEntry::file_name);
-    for entry in entries {
-        let name = entry.file_name();
-        let left_out = LEFT_OUT.iter().any(|left_out| name == *left_out)
-            || (workspace && MADE_OF_IT.iter().any(|made| name == *made));
-        if left_out {
-            continue;
-        }
-        let inside = relative.join(&name);
-        let path = entry.path();
-        let kind = entry.file_type()?;
-        if kind.is_symlink() && is_catkins_toplevel(&path) {
-            continue;
-        }
-        archive.append_path_with_name(&path, &inside).with_context(|| format!("{}", path.display()))?;
-        if kind.is_dir() {
-            add_directory(archive, root, &inside, false)?;
-        }
-    }
-    Ok(())
-}
-
-/// Returns whether a link is `src/CMakeLists.txt` of `catkin_init_workspace`, which points to a file of catkin outside
-/// of the workspace and contains nothing of the package.
-fn is_catkins_toplevel(link: &Path) -> bool {
-    std::fs::read_link(link).is_ok_and(|target| target.is_absolute() && target.ends_with("catkin/cmake/toplevel.cmake"))
 }
 
 /// Collects writes into chunks and sends them; blocks while too many are pending.
@@ -178,5 +167,38 @@ impl Write for ChunkWriter<'_> {
         self.chunks
             .blocking_send(Ok(chunk.into()))
             .map_err(|_| io::Error::new(io::ErrorKind::BrokenPipe, "the daemon stopped reading"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::FileExt;
+
+    use super::*;
+
+    #[test]
+    fn a_sparse_file_is_packed_with_its_holes_as_zeros() {
+        let place = tempfile::tempdir().expect("a directory");
+        std::fs::write(place.path().join("package.xml"), "<package/>").expect("written");
+        let file = std::fs::File::create(place.path().join("map.db")).expect("made");
+        file.write_all_at(b"end", 3 << 20).expect("written");
+        let selection = selection::select_files(place.path()).expect("selected");
+        let (chunks, mut received) = mpsc::channel(1 << 10);
+        pack(&selection, &chunks).expect("packed");
+        drop(chunks);
+        let mut packed = Vec::new();
+        while let Some(chunk) = received.blocking_recv() {
+            packed.extend_from_slice(&chunk.expect("data"));
+        }
+        let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&packed[..]));
+        let entries = archive.entries().expect("an archive").map(|entry| {
+            let entry = entry.expect("whole");
+            let path = entry.path().expect("a name").display().to_string();
+            (path, entry.header().entry_type(), entry.size())
+        });
+        let entries: Vec<_> = entries.collect();
+        let regular = tar::EntryType::Regular;
+        let expected = [("map.db".to_owned(), regular, (3_u64 << 20) + 3), ("package.xml".to_owned(), regular, 10_u64)];
+        assert_eq!(entries, expected);
     }
 }

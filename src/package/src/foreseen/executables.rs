@@ -3,9 +3,10 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use foreign::Tree;
+use foreign::{DirectoryLookup, Tree};
 use ros::bus::RosVersion;
 
+use super::scripts;
 use crate::cmake::{self, Command};
 use crate::read;
 use crate::workspace::Package;
@@ -19,6 +20,13 @@ const MAX_FILES: usize = 200;
 /// Words in a build file that change where executables are installed, or whether they are built.
 const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
 
+/// Words of build files of ROS 1 without which no program is installed as such.
+const WAYS_OF_ONE: [&str; 7] =
+    ["add_executable", "catkin_install_python", "PROGRAMS", "TARGETS", "DIRECTORY", "include", "add_subdirectory"];
+
+/// Keywords that end the list of targets in `install(TARGETS …)`.
+const TARGET_KEYWORDS: [&str; 5] = ["DESTINATION", "RUNTIME", "ARCHIVE", "LIBRARY", "EXPORT"];
+
 /// Commands that begin a block whose content is conditional.
 const BLOCKS: [&str; 6] = ["if", "foreach", "while", "function", "macro", "block"];
 
@@ -29,6 +37,10 @@ pub(super) struct BuildFileScan {
     pub(super) programs: BTreeSet<String>,
     /// Directories of the package that are installed as a whole.
     pub(super) launch_directories: Vec<String>,
+    /// Files of the package that are installed one by one.
+    pub(super) launch_files: Vec<String>,
+    /// Texts of the build files that were read.
+    pub(super) text: String,
     /// True if launch files may be generated or renamed.
     pub(super) mentions_launch: bool,
 }
@@ -42,6 +54,7 @@ pub(super) fn scan_package(root: &Path, package: &Package, version: RosVersion) 
         version,
         shown: BuildFileScan::default(),
         targets: BTreeSet::new(),
+        auto_targets: BTreeSet::new(),
         has_place: version == RosVersion::Two,
         is_unclear: package.manifest.build_type == "cmake",
         files: 0,
@@ -54,6 +67,12 @@ pub(super) fn scan_package(root: &Path, package: &Package, version: RosVersion) 
     if reading.is_unclear {
         reading.shown.programs.clear();
         reading.shown.launch_directories.clear();
+        reading.shown.launch_files.clear();
+    } else if version == RosVersion::One && !WAYS_OF_ONE.iter().any(|word| reading.shown.text.contains(word)) {
+        // Of a package that installs no program, those in its share directory are found.
+        let scripts = scripts::find_scripts(&root.join(&package.path)).into_iter();
+        let scripts = scripts.filter(|script| script.is_executable && scripts::is_shared(&script.path));
+        reading.shown.programs.extend(scripts.filter_map(|script| script.name().map(str::to_owned)));
     }
     reading.shown
 }
@@ -66,6 +85,8 @@ struct BuildFileReader<'a> {
     shown: BuildFileScan,
     /// Targets that are executables.
     targets: BTreeSet<String>,
+    /// Executables of `ament_auto_add_executable`, which `ament_auto_package` installs.
+    auto_targets: BTreeSet<String>,
     /// True if executables from here on are installed where `rosrun` looks, because `catkin_package` has been called.
     has_place: bool,
     is_unclear: bool,
@@ -90,6 +111,8 @@ impl BuildFileReader<'_> {
             RosVersion::Two => "launch",
         };
         self.shown.mentions_launch |= text.contains(launch);
+        self.shown.text.push_str(&text);
+        self.shown.text.push('\n');
         let mut open = 0_usize;
         for command in cmake::parse_commands(&text) {
             if BLOCKS.contains(&command.name.as_str()) {
@@ -125,6 +148,21 @@ impl BuildFileReader<'_> {
             ("add_subdirectory", [inner]) if depth > 0 && !inner.contains('$') => {
                 return self.read_cmake_lists(&directory.join(inner), depth - 1);
             }
+            ("ament_auto_add_executable", [target, ..]) => {
+                let target = self.expand_project_name(target);
+                self.auto_targets.insert(target);
+            }
+            ("ament_auto_package", _) if directory == self.package => {
+                self.shown.programs.append(&mut self.auto_targets);
+                let shared = arguments.iter().skip_while(|word| *word != "INSTALL_TO_SHARE").skip(1);
+                let shared = shared.map(|word| word.trim_end_matches('/').to_owned());
+                self.shown.launch_directories.extend(shared);
+            }
+            ("rclcpp_components_register_node", _) => {
+                let mut words = arguments.iter().skip_while(|word| *word != "EXECUTABLE").skip(1);
+                let program = words.next().map(|program| self.expand_project_name(program));
+                self.shown.programs.extend(program);
+            }
             ("install" | "catkin_install_python", [kind, rest @ ..]) => {
                 self.apply_install(kind, rest, directory);
             }
@@ -134,7 +172,10 @@ impl BuildFileReader<'_> {
     }
 
     fn apply_install(&mut self, kind: &str, arguments: &[String], directory: &Path) {
-        let Some(at) = arguments.iter().position(|word| word == "DESTINATION") else {
+        // Of several destinations, that of `RUNTIME` is for executables.
+        let runtime = arguments.windows(2).position(|words| words[0] == "RUNTIME" && words[1] == "DESTINATION");
+        let runtime = runtime.filter(|_| kind == "TARGETS").map(|at| at + 1);
+        let Some(at) = runtime.or_else(|| arguments.iter().position(|word| word == "DESTINATION")) else {
             return;
         };
         let Some(destination) = arguments.get(at + 1) else {
@@ -142,6 +183,8 @@ impl BuildFileReader<'_> {
         };
         let destination = self.expand_project_name(destination.trim_end_matches('/'));
         let of_programs = ["${CATKIN_PACKAGE_BIN_DESTINATION}".to_owned(), format!("lib/{}", self.name)];
+        let share = format!("share/{}", self.name);
+        let is_in_share = destination.strip_prefix(&share).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'));
         let is_plain = |word: &&String| !word.contains('$');
         let listed = &arguments[..at];
         match kind {
@@ -154,21 +197,21 @@ impl BuildFileReader<'_> {
                 self.shown.programs.extend(names);
             }
             "TARGETS" if of_programs.contains(&destination) => {
+                let names = listed.iter().take_while(|word| !TARGET_KEYWORDS.contains(&word.as_str()));
+                let names = names.map(|target| self.expand_project_name(target));
+                let names: Vec<String> = names.filter(|name| self.targets.contains(name)).collect();
                 let is_for_others = |word: &String| word == "ARCHIVE" || word == "LIBRARY";
-                if !listed.iter().any(is_for_others) {
-                    let names = listed.iter().map(|target| self.expand_project_name(target));
-                    let names: Vec<String> = names.filter(|name| self.targets.contains(name)).collect();
+                if runtime.is_some() || !listed.iter().any(is_for_others) {
                     self.shown.programs.extend(names);
                 }
             }
-            "DIRECTORY"
-                if destination == format!("share/{}", self.name)
-                    && arguments.len() == at + 2
-                    && directory == self.package =>
-            {
+            "DIRECTORY" if is_in_share && arguments.len() == at + 2 && directory == self.package => {
                 let directories = listed.iter().filter(is_plain);
                 let names = directories.map(|name| name.trim_end_matches('/').to_owned());
                 self.shown.launch_directories.extend(names);
+            }
+            "FILES" if is_in_share && arguments.len() == at + 2 && directory == self.package => {
+                self.shown.launch_files.extend(listed.iter().filter(is_plain).cloned());
             }
             _ => {}
         }
@@ -195,6 +238,15 @@ impl BuildFileReader<'_> {
         if places.contains(&format!("/lib/{}", self.name)) {
             self.shown.programs.extend(console_scripts(&setup));
         }
+        let launch = Tree::open(self.root).and_then(|tree| tree.open_directory(self.package.join("launch")));
+        let names = match launch {
+            Ok(DirectoryLookup::Directory(launch)) => launch.names().unwrap_or_default(),
+            _ => Vec::new(),
+        };
+        let names = names.iter().filter_map(|name| name.to_str());
+        let installed = names.filter(|name| installs_launch_file(&setup, name));
+        self.shown.launch_files.extend(installed.map(|name| format!("launch/{name}")));
+        self.shown.text = setup;
     }
 }
 
@@ -203,8 +255,30 @@ fn includes_own_file(command: &Command) -> bool {
     command.arguments.first().is_some_and(|file| file.contains(['/', '.', '$']))
 }
 
+/// Returns whether the `data_files` of a `setup.py` include a file of its directory `launch`: by its path as a literal,
+/// or by one of the usual patterns of `glob`.
+fn installs_launch_file(setup: &str, name: &str) -> bool {
+    let lines = setup.lines().filter(|line| !line.trim_start().starts_with('#'));
+    let text: String = lines.flat_map(|line| line.chars().filter(|c| !c.is_whitespace() && *c != '"')).collect();
+    // Without spaces and double quotes, which may stand for single ones.
+    let text = text.replace('\'', "");
+    let has = |words: &str| text.contains(words);
+    let by_pattern = |pattern: &str| {
+        let starts = ["glob(launch/", "glob(os.path.join(launch,"];
+        starts.iter().any(|start| has(&format!("{start}{pattern})")))
+    };
+    let extension = name.rsplit('.').next().unwrap_or_default();
+    let is_usual = name.contains("launch.") && ["py", "xml", "yaml"].contains(&extension);
+    has(&format!("launch/{name}"))
+        || by_pattern("*")
+        || by_pattern(&format!("*.{extension}"))
+        || by_pattern(&format!("*launch.{extension}")) && name.ends_with(&format!("launch.{extension}"))
+        || by_pattern(&format!("*.launch.{extension}")) && name.ends_with(&format!(".launch.{extension}"))
+        || is_usual && (by_pattern("*launch.[pxy][yma]*") || by_pattern("*launch.*"))
+}
+
 /// Returns the names before `=` in the list of `console_scripts`; empty unless it consists of string literals only.
-fn console_scripts(setup: &str) -> Vec<String> {
+pub(super) fn console_scripts(setup: &str) -> Vec<String> {
     let Some((_, rest)) = setup.split_once("console_scripts") else {
         return Vec::new();
     };

@@ -24,12 +24,16 @@ impl SourceFixture {
         self.write(&format!("src/{name}/CMakeLists.txt"), build)
     }
 
-    fn scan(&self, version: RosVersion) -> SourceScan {
+    fn workspace(&self, version: RosVersion) -> Workspace {
         let variables = Variables::for_distribution(version.number(), "any");
         let PushedDirectory::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace") else {
             panic!("sources")
         };
-        scan_sources(&workspace, version)
+        workspace
+    }
+
+    fn scan(&self, version: RosVersion) -> SourceScan {
+        scan_sources(&self.workspace(version), version)
     }
 
     fn must_be_chosen(&self, version: RosVersion) -> bool {
@@ -69,6 +73,28 @@ fn several_programs_and_launch_files_must_be_chosen_from() {
     let foreseen = place.scan(RosVersion::One);
     assert_eq!(foreseen.executables, ["ekf", "driver"]);
     assert!(foreseen.must_be_chosen(), "{foreseen:?}");
+}
+
+#[test]
+fn a_launch_file_that_cannot_be_there_is_known() {
+    let lacks = |place: &SourceFixture, launch: &str| {
+        lacks_launch_file(&place.workspace(RosVersion::One), launch, RosVersion::One)
+    };
+    let place = ros1_package(WTF);
+    place.write("src/ekf/launch/a.launch", "").write("src/ekf/launch/b.launch.in", "");
+    for (launch, is_lacking) in [
+        ("a.launch", false),
+        ("launch/a.launch", false),
+        ("ekf/launch/a.launch", false),
+        ("b.launch", false),
+        ("/opt/x/c.launch", false),
+        ("lft.launch", true),
+        ("ekf/a.lunch", true),
+    ] {
+        assert_eq!(lacks(&place, launch), is_lacking, "{launch}");
+    }
+    assert!(!lacks(&ros1_package("configure_file(${IN} ${OUT})"), "lft.launch"));
+    assert!(!lacks(&ros1_package("install(FILES ${CMAKE_BINARY_DIR}/lft.launch DESTINATION x)"), "lft.launch"));
 }
 
 #[test]
@@ -158,4 +184,126 @@ fn scripts_of_python_are_those_that_are_listed_as_texts() {
         assert_eq!(foreseen.executables, expected, "{list}");
         assert_eq!(foreseen.must_be_chosen(), expected.len() > 1, "{list}");
     }
+}
+
+#[test]
+fn of_ros_2_the_usual_ways_to_install_are_known() {
+    let both = "add_executable(a a.cpp)\nadd_executable(b b.cpp)\n";
+    let apart = "install(TARGETS a b EXPORT x ARCHIVE DESTINATION lib LIBRARY DESTINATION lib RUNTIME DESTINATION \
+                 lib/${PROJECT_NAME})\n";
+    let auto = "ament_auto_add_executable(a a.cpp)\nament_auto_add_executable(b b.cpp)\n";
+    let registered = "rclcpp_components_register_node(c PLUGIN \"c::A\" EXECUTABLE a)\n\
+                      rclcpp_components_register_nodes(c \"c::B\")\n";
+    let launch = "install(DIRECTORY launch/ DESTINATION share/${PROJECT_NAME}/launch)\n";
+    let files = "install(FILES launch/x.launch.py launch/y.launch.py DESTINATION share/p/launch)\n";
+    for (build, launch_files, programs, is_asked) in [
+        (format!("{both}{apart}"), 0, &["a", "b"][..], true),
+        (format!("{both}{apart}{launch}"), 2, &["a", "b"], true),
+        (format!("{both}{apart}{files}"), 2, &["a", "b"], true),
+        (format!("{auto}ament_auto_package(INSTALL_TO_SHARE launch config)"), 2, &["a", "b"], true),
+        (auto.to_owned(), 0, &[], false),
+        (format!("{registered}{both}"), 0, &["a"], false),
+    ] {
+        let place = SourceFixture::new();
+        place.package("p", "ament_cmake", &build);
+        if launch_files > 0 {
+            place.write("src/p/launch/x.launch.py", "").write("src/p/launch/y.launch.py", "");
+        }
+        let foreseen = place.scan(RosVersion::Two);
+        assert_eq!(foreseen.executables, programs, "{build}");
+        assert_eq!((foreseen.launch_files.len(), foreseen.must_be_chosen()), (launch_files, is_asked), "{build}");
+    }
+}
+
+#[test]
+fn launch_files_of_python_packages_are_those_that_its_data_files_name() {
+    let setup = |files: &str| {
+        format!(
+            "setup(data_files=[(os.path.join('share', name, 'launch'), {files})],\n\
+             entry_points={{'console_scripts': ['a = p.a:main', 'b = p.b:main']}})"
+        )
+    };
+    for (files, expected) in [
+        ("glob('launch/*.launch.py')", true),
+        ("glob(\"launch/*\")", true),
+        ("glob(os.path.join('launch', '*launch.[pxy][yma]*'))", true),
+        ("['launch/x.launch.py', 'launch/y.launch.py']", true),
+        ("['launch/x.launch.py']", false),
+        ("glob('launch/*.xml')", false),
+        ("find_launch_files()", false),
+    ] {
+        let place = SourceFixture::new();
+        place
+            .package("p", "ament_python", "")
+            .write("src/p/setup.py", &setup(files))
+            .write("src/p/setup.cfg", "[install]\ninstall_scripts=$base/lib/p\n")
+            .write("src/p/launch/x.launch.py", "")
+            .write("src/p/launch/y.launch.py", "");
+        assert_eq!(place.must_be_chosen(RosVersion::Two), expected, "{files}");
+    }
+}
+
+impl SourceFixture {
+    /// Writes an executable script of a package.
+    fn script(&self, path: &str) -> &Self {
+        use std::os::unix::fs::PermissionsExt;
+        self.write(path, "#!/usr/bin/env python3\n");
+        let mode = std::fs::Permissions::from_mode(0o755);
+        std::fs::set_permissions(self.0.path().join(path), mode).expect("set");
+        self
+    }
+
+    fn problems(&self, version: RosVersion) -> (Vec<String>, bool) {
+        let workspace = self.workspace(version);
+        let problems = find_problems(&workspace, version).iter().map(ToString::to_string).collect();
+        (problems, has_no_programs(&workspace, version))
+    }
+}
+
+#[test]
+fn scripts_of_ros_1_that_nothing_installs_are_programs_and_are_told() {
+    let place = SourceFixture::new();
+    place.package("p", "catkin", "catkin_package()\n").script("src/p/scripts/a.py").script("src/p/b.py");
+    place.script("src/p/test/c.py").script("src/p/setup.py");
+    assert_eq!(place.scan(RosVersion::One).executables, ["a.py", "b.py"]);
+    assert!(place.must_be_chosen(RosVersion::One));
+    let (problems, _) = place.problems(RosVersion::One);
+    assert_eq!(problems.len(), 2, "{problems:?}");
+    assert!(problems[1].contains("add catkin_install_python(PROGRAMS scripts/a.py DESTINATION"), "{problems:?}");
+    for build in [
+        "catkin_install_python(PROGRAMS scripts/a.py b.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})",
+        "install(DIRECTORY scripts/ DESTINATION x)\ninstall(PROGRAMS b.py DESTINATION x)",
+        "file(GLOB all scripts/*.py)\ninstall(PROGRAMS ${all} DESTINATION x)",
+    ] {
+        place.package("p", "catkin", build);
+        assert_eq!(place.problems(RosVersion::One).0, [""; 0], "{build}");
+    }
+}
+
+#[test]
+fn of_ros_2_mistakes_that_leave_no_program_are_told() {
+    let listed = "setup(entry_points={'console_scripts': ['talk = p.talk:main']})";
+    let places = "[install]\ninstall_scripts=$base/lib/p\n";
+    for (setup, cfg, expected) in [
+        (listed, places, None),
+        (listed, "", Some("p has no setup.cfg that installs its programs (talk) to lib/p")),
+        (listed, "[metadata]\nname=p\n", Some("p has no setup.cfg that installs")),
+        ("setup(name='p')", places, None),
+        ("setup(name='p')", "", Some("p has no console_scripts in its setup.py")),
+    ] {
+        let place = SourceFixture::new();
+        place.package("p", "ament_python", "").write("src/p/setup.py", setup).write("src/p/setup.cfg", cfg);
+        let (problems, has_none) = place.problems(RosVersion::Two);
+        assert_eq!((problems.len(), has_none), (usize::from(expected.is_some()), expected.is_some()), "{problems:?}");
+        assert!(problems.iter().all(|told| told.starts_with(expected.unwrap_or("?"))), "{problems:?}");
+        // Beside a package that may have programs, another one may be meant.
+        place.package("q", "ament_cmake", "add_executable(a a.cpp)\n");
+        assert!(!place.problems(RosVersion::Two).1);
+        place.package("q", "ament_cmake", "rosidl_generate_interfaces(q msg/X.msg)\n");
+        assert_eq!(place.problems(RosVersion::Two).1, expected.is_some());
+    }
+    let place = SourceFixture::new();
+    place.package("p", "ament_cmake", "add_executable(a a.cpp)\n").script("src/p/scripts/b.py");
+    let (problems, _) = place.problems(RosVersion::Two);
+    assert!(problems[0].contains("add install(PROGRAMS scripts/b.py DESTINATION lib/${PROJECT_NAME})"), "{problems:?}");
 }

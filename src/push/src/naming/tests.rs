@@ -43,7 +43,7 @@ fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
     assert_eq!(plan.nodes[0].argv, ["/x", "__name:=costmap_2d"]);
     let keys: Vec<&String> = plan.parameters.keys().collect();
     assert_eq!(keys, ["/costmap_2d/rate", "/costmap_2d_node/stays"]);
-    let words = unused_parameters(&plan, &Interface::default(), &options).join("\n");
+    let words = unused_parameters(&plan, &Interface::default(), &options, RosVersion::Two).join("\n");
     assert!(words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"), "{words}");
     // Somebody may still read it.
     let interface = Interface {
@@ -54,7 +54,7 @@ fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
         }],
         ..Interface::default()
     };
-    assert!(unused_parameters(&plan, &interface, &options).is_empty());
+    assert!(unused_parameters(&plan, &interface, &options, RosVersion::Two).is_empty());
 }
 
 #[test]
@@ -163,6 +163,28 @@ fn parameters_that_no_node_of_ros_2_has_declared_are_told() {
     }
     // ROS 1 nodes declare no parameters.
     assert_eq!(describe_undeclared(&Interface::default(), "rat"), None);
+}
+
+#[test]
+fn parameters_that_no_node_of_ros_1_has_read_are_told() {
+    let read =
+        |name: &str| Parameter { name: name.to_owned(), read_by: vec!["/see".to_owned()], ..Parameter::default() };
+    let written =
+        Parameter { name: "/see/made".to_owned(), written_by: vec!["/see".to_owned()], ..Parameter::default() };
+    let parameters = vec![read("/see/rate"), read("/see/camera"), read("/lab"), written];
+    let interface = Interface { parameters, ..Interface::default() };
+    let plan = plan(&["/see"]);
+    let warnings = |key: &str, version| unused_parameters(&plan, &interface, &options_with_params(&[key]), version);
+    for known in ["rate", "~rate", "_rate", "/see/rate", "camera/width", "/lab", "/lab/size", "use_sim_time"] {
+        assert_eq!(warnings(known, RosVersion::One), [""; 0], "{known}");
+    }
+    for unknown in ["rat", "/see/rat", "/rates", "made"] {
+        let words = warnings(unknown, RosVersion::One).join("; ");
+        let expected = format!("no node has read a parameter {unknown} since it was started");
+        assert!(words.starts_with(&expected) && words.ends_with("read were /see/rate, /see/camera, /lab"), "{words}");
+    }
+    // Of another node that is said otherwise.
+    assert!(warnings("/other/rate", RosVersion::One).join("; ").contains("matches no node"));
 }
 
 #[test]
