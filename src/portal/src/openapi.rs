@@ -59,6 +59,7 @@ const WITH_BODY: &[u16] = &[408, 413, 503];
 /// Further refusals of operations, by operation id.
 const MORE: &[(&str, &[u16])] = &[
     ("calibrate", &[409]),
+    ("cancelPush", &[409]),
     ("createAccount", &[409]),
     ("createToken", &[409]),
     ("explainSla", &[422]),
