@@ -264,6 +264,8 @@ impl Builder {
     }
 
     async fn archive(&self, shop: &BuildContext, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
+        // Opening may take minutes: whoever waits is told for whom.
+        let _turn = shop.lock_key(&format!("archive of {}", base.name)).await;
         let mut archives = self.archives.lock().await;
         if let Some(opened) = archives.get_mut(&base.name)
             && opened.archive.is_fresh()
@@ -271,6 +273,7 @@ impl Builder {
             opened.base = base.clone();
             return Ok(opened.archive.clone());
         }
+        progress.step(&format!("reading the package lists of {}", base.name)).await;
         let scratch = shop.site.directory("sources")?;
         let opened = async {
             let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;

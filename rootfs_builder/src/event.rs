@@ -26,11 +26,15 @@ pub enum BuildEvent {
         /// Total number of units, if known.
         total: Option<u64>,
     },
-    /// The build waits for another push to create a layer that both need.
+    /// The build waits for another push to make something that both need.
     Waits {
+        /// Id of that push; see [`crate::PushRequest::id`].
+        id: String,
         /// Service of that push, or the package that becomes one.
         push: String,
     },
+    /// The build no longer waits for another push.
+    Continues,
     /// A warning; the build continues.
     Warning {
         /// Human-readable text.
@@ -56,8 +60,12 @@ impl Progress {
         let _ = self.0.send(BuildEvent::Log { line: line.to_owned() }).await;
     }
 
-    pub(crate) async fn waits(&self, push: String) {
-        let _ = self.0.send(BuildEvent::Waits { push }).await;
+    pub(crate) async fn waits(&self, id: String, push: String) {
+        let _ = self.0.send(BuildEvent::Waits { id, push }).await;
+    }
+
+    pub(crate) async fn continues(&self) {
+        let _ = self.0.send(BuildEvent::Continues).await;
     }
 
     pub(crate) async fn warn(&self, message: impl Into<String>) {

@@ -273,7 +273,8 @@ async fn install_part(
         ("HOME".to_owned(), "/root".to_owned()),
     ]);
     environment.extend(base.environment.get_key_value("PATH").map(|(key, value)| (key.clone(), value.clone())));
-    let total = part.debs.len() as u64;
+    // Each package is unpacked, and set up later.
+    let total = 2 * part.debs.len() as u64;
     let mut done = 0;
     let mut complaint = FirstError::default();
     let finished = shop
@@ -297,9 +298,9 @@ async fn install_part(
             },
             |line| {
                 complaint.push_line(line);
-                if line.starts_with("Setting up ") {
-                    done += 1;
-                    progress.count("packages", done, Some(total));
+                if line.starts_with("Unpacking ") || line.starts_with("Setting up ") {
+                    done = total.min(done + 1);
+                    progress.count("packages unpacked or set up", done, Some(total));
                 }
             },
         )

@@ -161,10 +161,15 @@ impl KeyLocks {
             Err(_) => {
                 let by = lock_unpoisoned(&turn.by).clone();
                 // Layers of one push waiting for each other are not reported.
-                if by.id != push.id {
-                    progress.waits(by.name).await;
+                let is_anothers = by.id != push.id;
+                if is_anothers {
+                    progress.waits(by.id, by.name).await;
                 }
-                Arc::clone(&turn.taken).lock_owned().await
+                let guard = Arc::clone(&turn.taken).lock_owned().await;
+                if is_anothers {
+                    progress.continues().await;
+                }
+                guard
             }
         };
         lock_unpoisoned(&turn.by).clone_from(push);
@@ -196,11 +201,12 @@ mod tests {
         let _other = turns.lock("b", &field, &progress).await;
         let (again, by, telling) = (turns.clone(), field.clone(), progress.clone());
         let waiting = tokio::spawn(async move { again.lock("a", &by, &telling).await });
-        let waits = BuildEvent::Waits { push: "lab".to_owned() };
+        let waits = BuildEvent::Waits { id: lab.id.clone(), push: "lab".to_owned() };
         assert_eq!(told.recv().await, Some(waits));
         assert!(!waiting.is_finished());
         drop(first);
         let second = waiting.await.expect("it comes");
+        assert_eq!(told.recv().await, Some(BuildEvent::Continues));
         // Its own layers wait without a report.
         let (again, by, telling) = (turns.clone(), field, progress.clone());
         let own = tokio::spawn(async move { again.lock("a", &by, &telling).await });

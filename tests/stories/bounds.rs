@@ -3,20 +3,20 @@
 use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use serde_json::json;
+use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::world::world;
 use support::{Verdict, binaries, leftovers, procfs};
 
-use crate::access::create_token;
+use crate::access::{create_token, push_adder, run_with_token};
 
 const GREETER: (&str, &[&str]) = ("greeter_cpp", &["--node", "greeter", "--param", "word=hi"]);
 
@@ -95,23 +95,105 @@ fn write_waiting_package(below: &Path) -> anyhow::Result<PathBuf> {
     Ok(place)
 }
 
+/// Program of a build that never ends by itself.
+const SLEEPER: &str = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
+
+/// Starts a push over TCP with a token, without a terminal; its errors go to a file.
+fn spawn_push(daemon: &Daemon, secret: &str, arguments: &[&str], errors: &Path) -> anyhow::Result<Child> {
+    let push = Command::new(binaries::path("cloudroidctl"))
+        .args(["--server", &format!("http://{}", daemon.address), "--token", secret, "push"])
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::from(File::create(errors)?))
+        .spawn()?;
+    Ok(push)
+}
+
+/// Waits until a push has printed these words.
+fn wait_until_printed(push: &mut Child, words: &str) -> Verdict {
+    let mut said = String::new();
+    for line in BufReader::new(push.stdout.as_mut().context("piped")?).lines() {
+        said += &line?;
+        if said.contains(words) {
+            return Ok(());
+        }
+        said.push('\n');
+    }
+    bail!("the push did not print {words:?}, but:\n{said}")
+}
+
+pub fn a_push_outlives_its_client() -> Verdict {
+    let daemon = world().setup("outlived").start()?;
+    let deployer = daemon.deployer();
+    let place = world().directory("outlived-packages")?;
+    let package = write_package(place.path(), "sleeps_alone", SLEEPER)?;
+    let errors = place.path().join("errors");
+    let arguments = [path_str(&package), "--name", "alone", "--node", "x"];
+    let ada = create_token(&daemon, &["ada", "--role", "deployer", "--service", "*"])?;
+    let bob = create_token(&daemon, &["bob", "--role", "deployer", "--service", "*"])?;
+    let eve = create_token(&daemon, &["eve", "--role", "viewer", "--service", "*"])?;
+    let stranger = create_token(&daemon, &["sam", "--role", "viewer", "--service", "other*"])?;
+    let newest = |token: &str| -> anyhow::Result<Value> {
+        let listed = run_with_token(&daemon, token, &["--format", "json", "pushes"])?.expect_success()?;
+        Ok(serde_json::from_str::<Value>(&listed.stdout)?[0].clone())
+    };
+    // Its client is killed, and the push continues.
+    let mut push = spawn_push(&daemon, &ada, &arguments, &errors)?;
+    wait_until_printed(&mut push, "it sleeps")?;
+    push.kill()?;
+    push.wait()?;
+    let seen = newest(&ada)?;
+    let number = seen["number"].to_string();
+    ensure!(seen["state"] == "running" && seen["by"] == "ada" && seen["service"] == "alone", "{seen:#}");
+    ensure!(seen["step"].as_str().is_some_and(|step| !step.is_empty()) && seen["can_cancel"] == true, "{seen:#}");
+    // Those who see the service see the push; it is for others to read and to end.
+    let seen = newest(&eve)?;
+    ensure!(seen["state"] == "running" && seen["can_cancel"] == false && seen["can_read"] == false, "{seen:#}");
+    ensure!(newest(&stranger)?.is_null());
+    for token in [&eve, &bob] {
+        for verb in ["cancel", "logs"] {
+            let refused = run_with_token(&daemon, token, &["pushes", verb, &number])?.expect_failure(&["may not"])?;
+            ensure!(refused.status == 4, "{}", refused.output());
+        }
+    }
+    let said = run_with_token(&daemon, &ada, &["pushes", "logs", &number])?.expect_success()?;
+    ensure!(said.stdout.contains("it sleeps"), "{}", said.output());
+    ensure!(list_builds(&daemon)?.len() == 1, "{:?}", list_builds(&daemon)?);
+    deployer.run(&["pushes", "cancel", &number])?.expect_success()?;
+    ensure!(list_builds(&daemon)?.is_empty(), "{:?}", list_builds(&daemon)?);
+    ensure!(newest(&ada)?["state"] == "cancelled");
+    let said = deployer.run(&["pushes", "logs", &number])?.expect_success()?;
+    ensure!(said.stdout.contains("it sleeps") && said.stdout.contains("was cancelled"), "{}", said.output());
+    deployer.run(&["pushes", "cancel", &number])?.expect_failure(&["it has ended"])?;
+    // An interrupt without a terminal stops it.
+    let mut push = spawn_push(&daemon, &ada, &arguments, &errors)?;
+    wait_until_printed(&mut push, "it sleeps")?;
+    kill(Pid::from_raw(i32::try_from(push.id())?), Signal::SIGINT)?;
+    let status = push.wait()?;
+    let said = std::fs::read_to_string(&errors)?;
+    ensure!(status.code() == Some(1) && said.contains("cancelled; nothing was published"), "{status}: {said}");
+    ensure!(newest(&ada)?["state"] == "cancelled" && list_builds(&daemon)?.is_empty());
+    // What is detached is published.
+    let detached = push_adder(&daemon, &ada, &["--detach"])?.expect_success()?;
+    let number = detached.stdout.trim().to_owned();
+    ensure!(number.parse::<u64>().is_ok(), "{}", detached.output());
+    run_with_token(&daemon, &ada, &["pushes", "logs", &number, "--follow"])?.expect_success()?;
+    let seen = newest(&ada)?;
+    ensure!(seen["state"] == "published" && seen["service"] == "adder_py", "{seen:#}");
+    Ok(())
+}
+
 pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
     let daemon = world().setup("disowned").start()?;
     let place = world().directory("disowned-packages")?;
-    let sleeper = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
     // During the build, and while the node is examined.
     for (name, package, node, words) in [
-        ("alice", write_package(place.path(), "sleeps_on", sleeper)?, "x", "it sleeps"),
+        ("alice", write_package(place.path(), "sleeps_on", SLEEPER)?, "x", "it sleeps"),
         ("bob", write_waiting_package(place.path())?, "waits.py", "starting it once"),
     ] {
         let secret = create_token(&daemon, &[name, "--role", "deployer", "--service", "*"])?;
-        let mut push = Command::new(binaries::path("cloudroidctl"))
-            .args(["--server", &format!("http://{}", daemon.address), "--token", &secret])
-            .args(["push", path_str(&package), "--node", node])
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::from(File::create(place.path().join(name))?))
-            .spawn()?;
+        let mut push = spawn_push(&daemon, &secret, &[path_str(&package), "--node", node], &place.path().join(name))?;
         let told = BufReader::new(push.stdout.take().context("piped")?).lines();
         let mut said = String::new();
         for line in told {
@@ -138,8 +220,7 @@ pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
 pub fn a_push_nobody_waits_for_ends_with_its_daemon() -> Verdict {
     let daemon = world().setup("cancelled").start()?;
     let place = world().directory("cancelled-packages")?;
-    let sleeper = "import time\nprint('it sleeps')\nwhile True: time.sleep(1)\n";
-    let package = write_package(place.path(), "sleeps_for_ever", sleeper)?;
+    let package = write_package(place.path(), "sleeps_for_ever", SLEEPER)?;
     let (deployer, home) = (daemon.deployer(), daemon.home.clone());
     let push = std::thread::spawn(move || deployer.run(&["push", path_str(&package)]));
     let logs = home.join("logs");

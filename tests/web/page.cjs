@@ -252,6 +252,8 @@ const STEPS = {
     await visitor.sees('Published: adder_py, revision 1');
     await visitor.sees('Interface found');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
+    // The earlier ones are listed, and what they printed can be read.
+    await visitor.sees('Log of push');
     await visitor.judges('deploy');
     const answered = visitor.page.waitForResponse((answer) => answer.url().endsWith('/stubs/adder_py.tar.gz'));
     await visitor.clicks('Download the stub');

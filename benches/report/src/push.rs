@@ -43,6 +43,9 @@ impl BenchDaemon {
     }
 }
 
+/// Beginnings of the titles of steps before the build.
+const PREPARING: [&str; 3] = ["receiving", "looking at what was pushed", "reading the package lists"];
+
 impl TimedPush {
     /// Returns the final event.
     pub fn done_event(&self) -> Result<&Value> {
@@ -58,9 +61,14 @@ impl TimedPush {
         Ok(made.map(|layer| layer["name"].as_str().unwrap_or_default().to_owned()).collect())
     }
 
-    /// Returns the time until the first step began: the daemon opens the archive's index and the base, once.
+    /// Returns the time until the first step of the build began: before, the daemon receives what is pushed, and opens
+    /// the archive's index and the base, once.
     pub fn time_to_first_step(&self) -> Duration {
-        let first = self.events.iter().find(|(_, event)| event["type"] == "step");
+        let prepares = |event: &Value| {
+            let title = event["title"].as_str().unwrap_or_default();
+            PREPARING.iter().any(|beginning| title.starts_with(beginning))
+        };
+        let first = self.events.iter().find(|(_, event)| event["type"] == "step" && !prepares(event));
         first.map_or(Duration::ZERO, |(time, _)| *time)
     }
 

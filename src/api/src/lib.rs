@@ -24,6 +24,7 @@ pub mod machines;
 pub mod people;
 pub mod problem;
 pub mod push;
+pub mod pushes;
 pub mod recordings;
 pub mod rollout;
 pub mod servant;
@@ -48,6 +49,7 @@ pub use interface::Interface;
 pub use limits::{Caps, Limits, Pressure, Usage};
 pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
+pub use pushes::{PushCount, PushState, PushStatus};
 pub use rollout::Rollout;
 pub use servant::{
     BackOff, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms, TopicDrops,

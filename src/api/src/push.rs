@@ -120,15 +120,30 @@ pub fn parse_request(text: &str) -> Result<qos::TopicPair, ParsePairError> {
 /// Title of the last step, which cannot be cancelled.
 pub const PUBLISHING: &str = "publishing";
 
+impl PushEvent {
+    /// Creates a step whose earlier duration is not known.
+    pub fn step(title: impl Into<String>) -> PushEvent {
+        PushEvent::Step { title: title.into(), last_took: None }
+    }
+}
+
 /// One line of the response. The last line is `done` or `error`; a stream that ends otherwise was truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum PushEvent {
+    /// The archive is complete: from now on the push continues without this client.
+    Accepted {
+        /// Number of the push, by which it is followed and cancelled.
+        number: u64,
+    },
     /// A new step begins.
     Step {
         /// Title of the step.
         title: String,
+        /// Duration of this step when it was completed last, in milliseconds; absent if that is unknown.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        last_took: Option<u64>,
     },
     /// A line of the build log.
     Log {

@@ -27,6 +27,7 @@ mod pair;
 mod policy;
 mod published;
 mod push;
+mod pushes;
 mod record;
 mod recordings;
 mod replay;
@@ -87,6 +88,7 @@ struct CtlArguments {
 #[derive(Debug, Subcommand)]
 enum CtlCommand {
     Push(Box<push::PushArgs>),
+    Pushes(pushes::PushesArgs),
     Services(services::ServicesArgs),
     Servants(servants::ServantsArgs),
     Top(top::TopArgs),
@@ -161,6 +163,7 @@ async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
     let format = arguments.format;
     match arguments.verb {
         CtlCommand::Push(verb) => verb.run(&client, format).await,
+        CtlCommand::Pushes(verb) => verb.run(&client, format).await,
         CtlCommand::Services(verb) => verb.run(&client, format).await,
         CtlCommand::Servants(verb) => verb.run(&client, format).await,
         CtlCommand::Top(verb) => verb.run(&client, format).await,

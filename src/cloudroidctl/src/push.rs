@@ -2,18 +2,19 @@
 
 mod archive;
 mod ignore;
-mod progress;
+mod interrupt;
+pub mod progress;
 mod selection;
 mod shared;
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use anyhow::{Context, bail, ensure};
 use api::push::ParsePairError;
-use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
+use api::{Grants, PushEvent, PushOptions, PushStatus, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
-use hyper::Method;
+use hyper::{HeaderMap, Method, header};
 
 use crate::client::{self, DaemonClient, RequestBody, percent_encode};
 use crate::limits::{CapFlags, LimitFlags};
@@ -23,6 +24,7 @@ use crate::rollout::{self, TermFlags};
 use crate::services;
 use crate::wait::WaitFlag;
 use archive::PushSource;
+use interrupt::InterruptAnswer;
 use progress::PushProgress;
 
 /// Largest query in bytes: HTTP servers refuse longer ones.
@@ -32,6 +34,10 @@ const LONGEST_QUERY: usize = 60_000;
 ///
 /// PATH is a package or workspace of ROS 1 (catkin) or ROS 2 (ament), which is compiled on the server, a prebuilt
 /// install space, or a tar archive of one. With --apt, a Debian package is used instead.
+///
+/// Once the package is sent, the push continues on the server even if this command ends; `cloudroidctl pushes` lists,
+/// follows and cancels pushes. Ctrl-C asks whether to stop it or to leave it; without a terminal, or pressed twice, it
+/// stops it.
 #[derive(Debug, Default, clap::Args)]
 #[command(group(clap::ArgGroup::new("what").required(true).args(["path", "apt"])))]
 pub struct PushArgs {
@@ -100,6 +106,9 @@ pub struct PushArgs {
     rollout: TermFlags,
     #[command(flatten)]
     wait: WaitFlag,
+    /// Print the number of the push when the package is sent, and end: the server continues.
+    #[arg(long, conflicts_with = "wait")]
+    detach: bool,
     #[command(flatten)]
     limits: LimitFlags,
     #[command(flatten)]
@@ -176,7 +185,9 @@ impl PushArgs {
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let rolls_out = self.rollout.terms().is_some();
         let wait = self.wait;
-        let service = self.publish(client, format).await?;
+        let Some(service) = self.publish(client, format, interrupt::ask).await? else {
+            return Ok(());
+        };
         let name = &service.summary.name;
         let newest = service.revisions.iter().map(|one| one.number).max();
         if let Some(newest) = newest.filter(|newest| rolls_out && *newest != service.summary.revision) {
@@ -206,11 +217,21 @@ impl PushArgs {
 
     /// Publishes the package under another name, without printing the service's address and interface.
     pub async fn publish_as(mut self, name: &str, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        ensure!(!self.detach, "--detach is for push alone: this command needs the result");
         self.name = Some(name.to_owned());
-        self.publish(client, format).await.map(|_| ())
+        // What needs the result has no use for a push that is left alone.
+        let stop = async |_: u64| InterruptAnswer::Stop;
+        self.publish(client, format, stop).await.map(|_| ())
     }
 
-    async fn publish(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<ServiceDetail> {
+    /// Publishes the package; `None` if the push goes on without this command. `on_interrupt` decides what becomes of
+    /// the push with this number.
+    async fn publish(
+        self,
+        client: &DaemonClient,
+        format: OutputFormat,
+        on_interrupt: impl AsyncFn(u64) -> InterruptAnswer,
+    ) -> anyhow::Result<Option<ServiceDetail>> {
         let mut options = self.options()?;
         let source = match self.path {
             Some(path) => Some(PushSource::open(path).await?),
@@ -222,10 +243,42 @@ impl PushArgs {
         if uri.len() > LONGEST_QUERY {
             bail!("the options are too long, {} bytes; shorten --interface or the parameters", uri.len());
         }
-        let publishing = AtomicBool::new(false);
-        tokio::select! {
-            outcome = send(client, format, &uri, source, &publishing) => outcome,
-            _ = tokio::signal::ctrl_c() => bail!(cancellation_message(publishing.into_inner())),
+        let state = SentPush::default();
+        let mut progress = PushProgress::new(format);
+        let pause = progress.pauses();
+        let mut sending = Box::pin(send(client, &mut progress, (uri.as_str(), source, self.detach), &state));
+        let mut is_stopping = false;
+        loop {
+            tokio::select! {
+                outcome = &mut sending => match outcome {
+                    Err(_) if is_stopping => bail!(CANCELLED),
+                    outcome => return outcome,
+                },
+                _ = tokio::signal::ctrl_c() => {}
+            }
+            let Some(number) = state.number() else { bail!(CANCELLED) };
+            if !state.is_accepted() {
+                // It ends with this command; if it was just accepted, by being cancelled.
+                let _ = stop(client, number).await;
+                bail!(CANCELLED);
+            }
+            if is_stopping {
+                bail!("push {number} is being cancelled; see cloudroidctl pushes");
+            }
+            if state.publishing.load(Ordering::Relaxed) {
+                bail!("interrupted, but the daemon goes on publishing; see cloudroidctl services");
+            }
+            pause.begin();
+            let answer = on_interrupt(number).await;
+            pause.end();
+            match answer {
+                InterruptAnswer::Stop => is_stopping = stop(client, number).await?,
+                InterruptAnswer::Leave => {
+                    output::eprint_line(&continuation(number));
+                    return Ok(None);
+                }
+                InterruptAnswer::Follow => {}
+            }
         }
     }
 
@@ -284,22 +337,65 @@ pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
     Ok(PushSource::Archive(path.to_owned()).into_body().0)
 }
 
-/// Returns the message for a push that was interrupted here; `publishing` is set if the daemon had begun to publish.
-fn cancellation_message(publishing: bool) -> &'static str {
-    if publishing {
-        "interrupted, but the daemon goes on publishing; see cloudroidctl services"
-    } else {
-        "cancelled; nothing was published"
+/// Message for a push that was stopped from here.
+const CANCELLED: &str = "cancelled; nothing was published";
+
+/// What is known of the push that is being sent.
+#[derive(Debug, Default)]
+struct SentPush {
+    /// Number of the push; 0 while it is unknown.
+    number: AtomicU64,
+    /// True once the push continues without this command.
+    accepted: AtomicBool,
+    /// True once the daemon publishes, after which the push cannot be cancelled.
+    publishing: AtomicBool,
+}
+
+impl SentPush {
+    fn number(&self) -> Option<u64> {
+        Some(self.number.load(Ordering::Relaxed)).filter(|number| *number > 0)
+    }
+
+    fn is_accepted(&self) -> bool {
+        self.accepted.load(Ordering::Relaxed)
+    }
+
+    /// Reads the number of the push from the head of the response.
+    fn read_number(&self, headers: &HeaderMap) {
+        let location = headers.get(header::LOCATION).and_then(|location| location.to_str().ok());
+        let number = location.and_then(|location| location.rsplit('/').next()?.parse().ok());
+        self.number.store(number.unwrap_or_default(), Ordering::Relaxed);
     }
 }
 
+/// Cancels a push; false if that is too late, which its output then shows.
+async fn stop(client: &DaemonClient, number: u64) -> anyhow::Result<bool> {
+    match client.delete::<PushStatus>(&format!("/api/v1/pushes/{number}")).await {
+        Ok(_) => Ok(true),
+        Err(error) if error.downcast_ref::<api::Problem>().is_some_and(|problem| problem.status == 409) => {
+            output::eprint_line(&format!("{error:#}"));
+            Ok(false)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// Describes how to go on with a push that continues without this command.
+fn continuation(number: u64) -> String {
+    format!(
+        "push {number} continues on the server; follow it with: cloudroidctl pushes logs {number} --follow; stop it \
+            with: cloudroidctl pushes cancel {number}"
+    )
+}
+
+/// Sends the package and shows the progress until the push ends; with `detach` only until the package is sent. Returns
+/// `None` if the push continues.
 async fn send(
     client: &DaemonClient,
-    format: OutputFormat,
-    uri: &str,
-    source: Option<PushSource>,
-    publishing: &AtomicBool,
-) -> anyhow::Result<ServiceDetail> {
+    progress: &mut PushProgress,
+    (uri, source, detach): (&str, Option<PushSource>, bool),
+    state: &SentPush,
+) -> anyhow::Result<Option<ServiceDetail>> {
     let (body, packing) = match source {
         Some(source) => {
             let (body, packing) = source.into_body();
@@ -311,25 +407,52 @@ async fn send(
         Ok(response) => response,
         Err(error) => return Err(packing_error(packing).unwrap_or(error)),
     };
-    let mut progress = PushProgress::new(format);
+    state.read_number(response.headers());
     let mut events = client::json_lines::<PushEvent>(response);
-    while let Some(event) = events.next().await {
-        let event = match event {
-            Ok(event) => event,
-            Err(error) => return Err(packing_error(packing).unwrap_or(error)),
+    let mut ticks = tokio::time::interval(progress::TICK);
+    loop {
+        let event = tokio::select! {
+            event = events.next() => event,
+            _ = ticks.tick() => {
+                if !detach {
+                    progress.tick()?;
+                }
+                continue;
+            }
         };
-        progress.show(&event)?;
+        let accepted = state.number().filter(|_| state.is_accepted());
+        let event = match (event, accepted) {
+            (Some(Ok(event)), _) => event,
+            (Some(Err(error)), Some(number)) if client::is_unavailable(&error) => {
+                return Err(error.context(format!("lost sight of push {number}; see cloudroidctl pushes")));
+            }
+            (Some(Err(error)), _) => return Err(packing_error(packing).unwrap_or(error)),
+            (None, _) => bail!("the daemon aborted the push; see its log, and cloudroidctl status"),
+        };
+        if !detach {
+            progress.show(&event)?;
+        }
         match event {
+            PushEvent::Accepted { number } => {
+                state.number.store(number, Ordering::Relaxed);
+                state.accepted.store(true, Ordering::Relaxed);
+                if detach {
+                    output::eprint_line(&continuation(number));
+                    progress.show_number(number)?;
+                    return Ok(None);
+                }
+            }
             // Title of the daemon's last step.
-            PushEvent::Step { title } if title == api::push::PUBLISHING => publishing.store(true, Ordering::Relaxed),
-            PushEvent::Done { service, .. } => return Ok(*service),
+            PushEvent::Step { title, .. } if title == api::push::PUBLISHING => {
+                state.publishing.store(true, Ordering::Relaxed);
+            }
+            PushEvent::Done { service, .. } => return Ok(Some(*service)),
             PushEvent::Error { problem } => {
                 return Err(packing_error(packing).unwrap_or_else(|| problem.into()));
             }
             _ => {}
         }
     }
-    bail!("the daemon aborted the push; see its log, and cloudroidctl status")
 }
 
 /// Returns the error of packing, if any: it is the cause, whatever the daemon reported about the truncated stream.
@@ -471,8 +594,8 @@ mod tests {
         assert!(fields.len() > 30, "{fields:?}");
         // Chosen with controls of the form that are not fields.
         let chosen = ["--apt", "--stateful", "--shared", "--idempotent"];
-        // The service's own page shows the progress of a rollout while it is open.
-        let needless = ["--wait"];
+        // The service's own page shows the progress of a rollout while it is open, and a page may always be left.
+        let needless = ["--wait", "--detach"];
         let command = Line::command();
         let flags: Vec<String> =
             command.get_arguments().filter_map(|argument| Some(format!("--{}", argument.get_long()?))).collect();
@@ -523,6 +646,7 @@ mod tests {
             "",
             "./pkg --apt opencv_apps",
             "./pkg --launch a.launch --node b",
+            "./pkg --detach --canary 1 --wait",
             "./pkg --param novalue",
             "./pkg --param =v",
             "./pkg --param :=v",

@@ -39,13 +39,12 @@ impl TryArgs {
         // Read the file before minutes are spent on building.
         let material = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         let name = format!("try-{}", std::process::id());
-        let tried = async {
-            self.push.publish_as(&name, client, format).await?;
-            run_trial(client, &name, kind, material).await
-        };
-        let tried = tokio::select! {
-            tried = tried => tried,
-            _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("cancelled")),
+        let tried = match self.push.publish_as(&name, client, format).await {
+            Ok(()) => tokio::select! {
+                tried = run_trial(client, &name, kind, material) => tried,
+                _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("cancelled")),
+            },
+            Err(error) => Err(error),
         };
         // There is no service if the push failed.
         let removed = client.delete::<Stopped>(&format!("/api/v1/services/{name}")).await;

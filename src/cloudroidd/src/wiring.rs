@@ -65,6 +65,7 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
         opener,
         choreographer: choreographer.clone(),
         journal: Journal::new(Arc::clone(&state)),
+        state: Arc::clone(&state),
     };
     let pusher = Pusher::new(config.push_options(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();

@@ -113,7 +113,7 @@ fn check_recording(app: &App, caller: &Caller, action: AccessAction, number: &st
 }
 
 /// Refuses a missing object like a forbidden one: only callers that see everything learn whether it exists.
-fn conceal_missing(
+pub fn conceal_missing(
     caller: &Caller,
     action: AccessAction,
     may: Result<bool, Error>,

@@ -168,6 +168,17 @@ pub enum Error {
     /// No such recording.
     #[error("there is no recording {0}")]
     UnknownRecording(String),
+    /// No such push.
+    #[error("there is no push {0}")]
+    UnknownPush(String),
+    /// The push cannot be cancelled.
+    #[error("push {number} cannot be cancelled: {why}")]
+    PushNotCancelled {
+        /// Number of the push.
+        number: u64,
+        /// Reason.
+        why: &'static str,
+    },
     /// The servant's last seconds could not be recorded.
     #[error("the last seconds of servant {servant} could not be recorded: {reason}")]
     NotRecorded {
@@ -394,6 +405,8 @@ impl Error {
             Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not ready"),
             Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "no ring-buffer recording"),
             Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
+            Error::UnknownPush(_) => (S::NOT_FOUND, "unknown-push", "unknown push"),
+            Error::PushNotCancelled { .. } => (S::CONFLICT, "not-cancelled", "push not cancelled"),
             Error::NotRecorded { .. } => (S::INSUFFICIENT_STORAGE, "not-recorded", "not recorded"),
             Error::RecordedLately { .. } => (S::TOO_MANY_REQUESTS, "recorded-lately", "already recorded"),
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
@@ -454,6 +467,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
         P::TooLarge { .. } => (S::PAYLOAD_TOO_LARGE, "too-large", "archive too large"),
         P::Ending => ENDING,
+        P::Cancelled => (S::CONFLICT, "push-cancelled", "push cancelled"),
         P::Choreographer(error) => kind_of_choreographer(error),
         P::Catalogue(error) => kind_of_catalogue(error),
         P::Engine(error) => kind_of_engine(error),

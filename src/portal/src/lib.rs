@@ -48,6 +48,7 @@ mod policy;
 mod principals;
 mod proxies;
 mod push;
+mod pushes;
 mod query;
 mod recordings;
 mod registry_clients;

@@ -61,6 +61,7 @@ const MORE: &[(&str, &[u16])] = &[
     ("base", &[422]),
     ("bases", &[422]),
     ("calibrate", &[409]),
+    ("cancelPush", &[409]),
     ("createAccount", &[409]),
     ("createToken", &[409]),
     ("explainSla", &[422]),

@@ -2,7 +2,6 @@
 
 use std::io;
 use std::sync::Arc;
-use std::time::Duration;
 
 use access::{AccessAction, ConnectionAccess};
 use api::{PushEvent, PushOptions};
@@ -11,21 +10,15 @@ use axum::body::Body;
 use axum::extract::{OriginalUri, State};
 use axum::response::{IntoResponse, Response};
 use futures_util::{FutureExt, StreamExt, TryStreamExt};
-use push::{Deployer, PushResult};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
+use push::{Deployer, PushResult, ReceptionGuard};
 
 use crate::app::App;
 use crate::caller::Caller;
 use crate::errors::Error;
-use crate::json::json_lines;
 use crate::query::query_value;
-use crate::views;
+use crate::{pushes, views};
 
-/// Timeout for sending the last event to a client that does not read.
-const FAREWELL: Duration = Duration::from_secs(5);
-
-/// Runs a push.
+/// Starts a push and sends its events. It goes on without this client when the archive is complete.
 pub async fn push(
     State(app): State<Arc<App>>,
     OriginalUri(uri): OriginalUri,
@@ -45,34 +38,31 @@ pub async fn push(
             return error.into_response();
         }
     };
-    let (sender, receiver) = mpsc::channel(push::EVENTS_AHEAD);
-    let last = sender.clone();
-    // Owned by the response: if the client disconnects, the push is aborted with it.
-    let guard = pusher.start(options, by, archive, sender, |outcome| async move {
+    let started = pusher.start(options, by, archive, move |outcome| {
         if let Ok(published) = &outcome
             && !published.unchanged
         {
             let object = format!("service {}", published.service);
             app.audit.record(&caller, AccessAction::Deploy, "published", &object, 200);
         }
-        let event = match outcome.map_err(Error::from).and_then(|done| done_event(&app, done)) {
+        match outcome.map_err(Error::from).and_then(|done| done_event(&app, done)) {
             Ok(event) => event,
             Err(error) => PushEvent::Error { problem: error.problem() },
-        };
-        // A client that does not read must not keep the push, and with it the daemon, from ending.
-        let _ = tokio::time::timeout(FAREWELL, last.send(event)).await;
+        }
     });
-    json_lines(ReceiverStream::new(receiver).map(move |event| {
-        let _ = &guard;
-        event
-    }))
+    match started {
+        // Owned by the response: if the client disconnects while it sends, the push is cancelled.
+        Ok(running) => pushes::stream_output(&running, ReceptionGuard::new(Arc::clone(&running))),
+        Err(error) => Error::from(error).into_response(),
+    }
 }
 
 /// Returns the permissions of the pushing caller, checked when the service's name is known, which without `--name` is
 /// after the build.
 fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     let principal = &caller.who.principal;
-    let owner = (!principal.is_unscoped()).then(|| principal.name.clone());
+    let name = principal.name.clone();
+    let owner = (!principal.is_unscoped()).then(|| name.clone());
     let (known, who) = (Arc::clone(app), caller.who.clone());
     let over = move || {
         let (app, who) = (Arc::clone(&known), who.clone());
@@ -86,7 +76,7 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
         let may = caller.check_service_access(&app, AccessAction::Deploy, name, None);
         may.map_err(|error| push::Error::NotAllowed(error.to_string()))
     };
-    Deployer { owner, may: Box::new(may), over: Box::new(over) }
+    Deployer { name, owner, may: Box::new(may), over: Box::new(over) }
 }
 
 fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {

@@ -17,7 +17,7 @@ use utoipa::openapi::Required;
 
 use super::{
     App, api_v1, audit, bases, calibration, dictionary, differences, events, goals, history, inside, machines, metrics,
-    oci, openapi, page, people, policy, push, recordings, robots, shadow, stream, stubs, topics, viewers,
+    oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -460,10 +460,14 @@ pub const ROUTES: &[Route] = &[
         post(push::push).layer(DefaultBodyLimit::disable())
     })
     .with_operation(|| {
-        operation("push", "Builds an image of a package and publishes it. The last line is `done` or `error`.")
-            .asks_json::<api::PushOptions>("options", "Options of the push.")
-            .takes_file("application/x-tar", "A tar archive, optionally gzipped; empty with `apt`.", Required::False)
-            .streams::<api::PushEvent>()
+        operation(
+            "push",
+            "Builds an image of a package and publishes it. From `accepted` on it continues without the client. The \
+                last line is `done` or `error`.",
+        )
+        .asks_json::<api::PushOptions>("options", "Options of the push.")
+        .takes_file("application/x-tar", "A tar archive, optionally gzipped; empty with `apt`.", Required::False)
+        .streams::<api::PushEvent>()
     }),
     route("GET", "/api/v1/bases", ENTER, || get(bases::bases)).with_operation(|| {
         operation("bases", "Bases of images: operating system and ROS.").lists::<api::bases::BaseSummary>()
@@ -484,6 +488,20 @@ pub const ROUTES: &[Route] = &[
         operation("exportBase", "The layers of a base as a tar archive of an OCI image layout, for another server.")
             .answers_file(api::bases::BASE_ARCHIVE)
     }),
+    route("GET", "/api/v1/pushes", ENTER, || get(pushes::list)).with_operation(|| {
+        operation("pushes", "Pushes that run and those that ended lately, newest first.").lists::<api::PushStatus>()
+    }),
+    route("GET", "/api/v1/pushes/{number}/output", May(Logs, AccessTarget::Handler), || get(pushes::output))
+        .with_operation(|| {
+            operation("pushOutput", "Events of a push. The last line of one that has ended is `done` or `error`.")
+                .asks::<pushes::PushOutputQuery>()
+                .streams::<api::PushEvent>()
+        }),
+    route("DELETE", "/api/v1/pushes/{number}", May(Deploy, AccessTarget::Handler), || delete(pushes::cancel))
+        .with_operation(|| {
+            operation("cancelPush", "Cancels a running push, which ends when nothing is left of it.")
+                .answers::<api::PushStatus>()
+        }),
     route("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
         .with_operation(|| operation("openapi", "This document.").answers_object()),
     route("GET", "/v2", ENTER, || get(oci::version)),

@@ -12,6 +12,8 @@ type Revocation = dyn Fn() -> BoxFuture<'static, String> + Send + Sync;
 
 /// Principal that pushes.
 pub struct Deployer {
+    /// Name of the principal.
+    pub name: String,
     /// Owner of services that are published for the first time; `None` for operators.
     pub owner: Option<String>,
     /// Check of the services that it may publish.

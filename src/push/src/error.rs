@@ -54,6 +54,9 @@ pub enum Error {
         /// Maximum size.
         limit: api::Size,
     },
+    /// Somebody cancelled the push.
+    #[error("the push was cancelled; nothing was published")]
+    Cancelled,
     /// The daemon is shutting down.
     #[error("the daemon is shutting down")]
     Ending,

@@ -7,8 +7,9 @@
 //!            new connections get the new revision ◀─ tags ◀─ database ◀┘
 //! ```
 //!
-//! Nothing of a revision is visible until the database has it, so if anything fails or the client disconnects, the
-//! earlier revision remains in service. Pushes of the same service are serialized; others run concurrently.
+//! Nothing of a revision is visible until the database has it, so if anything fails, the earlier revision remains in
+//! service. Pushes of the same service are serialized; others run concurrently. A push needs its client until the
+//! archive is complete; then it runs by itself, and anyone who may can follow or cancel it ([`RunningPush`]).
 
 #![forbid(unsafe_code)]
 
@@ -18,6 +19,7 @@ mod deployer;
 mod disks;
 mod error;
 mod exported;
+mod forward;
 mod interface_limits;
 mod naming;
 mod options;
@@ -26,9 +28,11 @@ mod places;
 mod probe;
 mod publish;
 mod receive;
+mod registry;
 mod reporter;
 mod request;
 mod room;
+mod running;
 mod shared;
 mod spelling;
 mod stateful;
@@ -57,8 +61,9 @@ use bounds::PushBudget;
 use disks::Disks;
 use exported::ImportedService;
 use places::PushQueue;
+use registry::PushRegistry;
 use reporter::Reporter;
-use store::{Journal, Plan, RevisionRecord};
+use store::{Journal, Plan, RevisionRecord, State};
 use told::PUSHED;
 
 pub use deployer::Deployer;
@@ -67,9 +72,10 @@ pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
 pub use request::PushResult;
+pub use running::{PushFollower, ReceptionGuard, RunningPush};
 
-/// Capacity of the event queue of a client; a build blocks when a slow client lets it fill up.
-pub const EVENTS_AHEAD: usize = 256;
+/// Capacity of a queue of events, which the task of the push empties.
+const EVENTS_AHEAD: usize = 256;
 /// Home directory of nodes in the container, a tmpfs.
 const HOME_INSIDE: &str = "/root";
 
@@ -87,6 +93,8 @@ pub struct PusherParts {
     pub choreographer: Choreographer,
     /// Records the outcome for the operator.
     pub journal: Journal,
+    /// Database, which keeps the pushes of late.
+    pub state: Arc<State>,
 }
 
 /// Publishes, rolls back and removes services.
@@ -100,6 +108,7 @@ pub struct Pusher {
     builder: Arc<Builder>,
     journal: Journal,
     places: PushQueue,
+    registry: PushRegistry,
     disks: Disks,
     published: AtomicU64,
     failed: AtomicU64,
@@ -110,9 +119,10 @@ pub struct Pusher {
 impl Pusher {
     /// Creates a pusher with build directories below `home`, the state directory.
     pub fn new(options: Options, home: PathBuf, parts: PusherParts) -> Pusher {
-        let PusherParts { builder, catalogue, engine, opener, choreographer, journal } = parts;
+        let PusherParts { builder, catalogue, engine, opener, choreographer, journal, state } = parts;
         Pusher {
             places: PushQueue::new(&options),
+            registry: PushRegistry::new(state),
             disks: Disks::new(&home, builder.cache_dir(), options.free),
             options,
             home,
@@ -144,7 +154,7 @@ impl Pusher {
         }
     }
 
-    /// Runs a push when its turn comes, within its budget.
+    /// Receives a push, and runs it when its turn comes, within its budget.
     async fn push(
         &self,
         id: &str,
@@ -156,12 +166,17 @@ impl Pusher {
         let began = Instant::now();
         let asked_name = options.name.as_deref();
         let known = asked_name.or(options.apt.as_deref());
-        let mut admitted = self.places.admit(known, report).await?;
+        let _entered = self.places.enter()?;
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
         let build = self.home.join("build").join(id);
         let mut left = PushBudget::new(&self.options, build, &self.disks);
-        let made = left.run_within(Box::pin(self.build_or_import(id, options, archive, (by, report)))).await?;
+        let source = left.run_within(Box::pin(self.receive(id, options, archive, report))).await?;
+        // From here on the push needs no client.
+        report.received.cancel();
+        let mut admitted = self.places.admit(known, report).await?;
+        report.step("looking at what was pushed").await;
+        let made = left.run_within(Box::pin(self.build_or_import(id, options, source, (by, report)))).await?;
         let (built, imported) = match made {
             PushedImage::Built(built) => (*built, None),
             PushedImage::Imported(imported) => {
@@ -174,6 +189,9 @@ impl Pusher {
         let options = imported.as_ref().map_or(options, |(_, options)| options);
         let name = options.name.clone().unwrap_or_else(|| built.package.clone());
         names::validate_service(&name).map_err(catalogue::Error::from)?;
+        if let Some(push) = self.registry.find_build(id) {
+            push.set_service(&name);
+        }
         if asked_name.is_none() {
             tracing::Span::current().record("service", &*name);
         }
@@ -205,29 +223,42 @@ impl Pusher {
         Ok(PushResult { layers, service: name, took: began.elapsed(), unchanged: unchanged.is_some() })
     }
 
+    /// Receives what is pushed.
+    async fn receive(
+        &self,
+        id: &str,
+        options: &PushOptions,
+        archive: Archive,
+        report: &Reporter,
+    ) -> Result<PushSource, Error> {
+        if let Some(package) = &options.apt {
+            return Ok(PushSource::Packaged(package.clone()));
+        }
+        report.step("receiving the package").await;
+        let tree = self.home.join("build").join(id).join(PUSHED);
+        receive::unpack(archive, &tree, &self.options, report).await?;
+        Ok(PushSource::Tree(tree))
+    }
+
     /// Builds or imports the image.
     async fn build_or_import(
         &self,
         id: &str,
         options: &PushOptions,
-        archive: Archive,
+        source: PushSource,
         (by, report): (&Deployer, &Reporter),
     ) -> Result<PushedImage, Error> {
-        let source = match &options.apt {
-            Some(package) => {
+        match &source {
+            PushSource::Packaged(package) => {
                 // Names of Debian packages contain hyphens, those of ROS packages do not.
                 if let (Some(name), false) = (&options.name, package.contains('-')) {
                     self.check_owner(name, std::slice::from_ref(package))?;
                 }
-                PushSource::Packaged(package.clone())
             }
-            None => {
-                report.step("receiving the package").await;
-                let tree = self.home.join("build").join(id).join(PUSHED);
-                receive::unpack(archive, &tree, &self.options, report).await?;
+            PushSource::Tree(tree) => {
                 let of = tree.clone();
                 if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
-                    return self.import(options, tree, report).await;
+                    return self.import(options, tree.clone(), report).await;
                 }
                 if let Some(name) = &options.name {
                     let of = tree.clone();
@@ -236,9 +267,8 @@ impl Pusher {
                         privilege::spawn_blocking(look).await.map_err(|_| Error::Internal("inspecting the package"))?;
                     self.check_owner(name, &packages)?;
                 }
-                PushSource::Tree(tree)
             }
-        };
+        }
         self.build(id, options, source, (by, report)).await.map(|built| PushedImage::Built(Box::new(built)))
     }
 
@@ -337,12 +367,8 @@ impl Pusher {
             packages_skip: options.packages_skip.clone(),
             cmake_args: options.cmake_args.clone(),
         };
-        let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
-        let forwarded = async {
-            while let Some(event) = events.recv().await {
-                report.event(told::to_push_event(event, by)).await;
-            }
-        };
+        let (sender, events) = mpsc::channel(EVENTS_AHEAD);
+        let forwarded = self.forward_events(events, by, report);
         let builder = Arc::clone(&self.builder);
         let work = async move { builder.build(&request, sender).await };
         // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).

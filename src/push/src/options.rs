@@ -19,7 +19,7 @@ pub struct Options {
     pub min_rate: Size,
     /// Maximum number of concurrent builds; further pushes wait.
     pub at_once: usize,
-    /// Maximum number of waiting pushes.
+    /// Maximum number of pushes that wait or are being sent.
     pub queue: usize,
     /// Maximum duration of a push from the start of its build, not counting the time it waits.
     pub time: Duration,

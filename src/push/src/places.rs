@@ -17,6 +17,8 @@ use crate::{Error, Options};
 pub(super) struct PushQueue {
     free: Arc<Semaphore>,
     turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
+    /// Number of pushes that have entered.
+    entered: AtomicUsize,
     waiting: AtomicUsize,
     at_once: usize,
     queue: usize,
@@ -37,10 +39,25 @@ impl PushQueue {
         PushQueue {
             free: Arc::new(Semaphore::new(options.at_once)),
             turns: Mutex::default(),
+            entered: AtomicUsize::new(0),
             waiting: AtomicUsize::new(0),
             at_once: options.at_once,
             queue: options.queue,
         }
+    }
+
+    /// Lets a push in before it has files, unless as many as may build and wait are in. It counts until the result is
+    /// dropped.
+    pub(super) fn enter(&self) -> Result<QueuedPush<'_>, Error> {
+        let entered = QueuedPush::count_in(&self.entered);
+        if entered.before >= self.at_once.saturating_add(self.queue) {
+            return Err(Error::Failed {
+                message: format!("{} pushes are building, and {} are already waiting", self.at_once, self.queue),
+                next: Some("push again later, or raise at_once or queue in [push] of the configuration".to_owned()),
+                log: Vec::new(),
+            });
+        }
+        Ok(entered)
     }
 
     /// Waits for the lock on the service, if it is known, and then for a build slot.
@@ -52,7 +69,7 @@ impl PushQueue {
                 let turn = match self.service_lock(name).try_lock_owned() {
                     Ok(turn) => turn,
                     Err(_) => {
-                        waiting = Some(self.enqueue()?);
+                        waiting = Some(QueuedPush::count_in(&self.waiting));
                         self.report_and_lock_service(name, report).await
                     }
                 };
@@ -62,10 +79,7 @@ impl PushQueue {
         let place = match Arc::clone(&self.free).try_acquire_owned() {
             Ok(place) => place,
             Err(_) => {
-                let waiting = match waiting {
-                    Some(waiting) => waiting,
-                    None => self.enqueue()?,
-                };
+                let waiting = waiting.unwrap_or_else(|| QueuedPush::count_in(&self.waiting));
                 self.report_and_acquire_slot(&waiting, report).await?
             }
         };
@@ -102,19 +116,6 @@ impl PushQueue {
         let place = Arc::clone(&self.free).acquire_owned().await;
         place.map_err(|_| Error::Ending)
     }
-
-    /// Joins the queue, unless it is full.
-    fn enqueue(&self) -> Result<QueuedPush<'_>, Error> {
-        let waiting = QueuedPush::count_in(&self.waiting);
-        if waiting.before >= self.queue {
-            return Err(Error::Failed {
-                message: format!("{} pushes are building, and {} are already waiting", self.at_once, waiting.before),
-                next: Some("push again later, or raise at_once or queue in [push] of the configuration".to_owned()),
-                log: Vec::new(),
-            });
-        }
-        Ok(waiting)
-    }
 }
 
 impl AdmittedPush<'_> {
@@ -141,8 +142,8 @@ impl AdmittedPush<'_> {
     }
 }
 
-/// A queued push; counted until it is dropped.
-struct QueuedPush<'a> {
+/// A counted push; it counts until it is dropped.
+pub(super) struct QueuedPush<'a> {
     count: &'a AtomicUsize,
     before: usize,
 }
@@ -178,13 +179,15 @@ mod tests {
         let first = places.admit(None, &report).await.expect("free");
         let (again, report_again) = (Arc::clone(&places), report.clone());
         let second = tokio::spawn(async move { again.admit(None, &report_again).await.map(drop) });
-        let Some(api::PushEvent::Step { title }) = told.recv().await else {
+        let Some(api::PushEvent::Step { title, .. }) = told.recv().await else {
             panic!("nothing was told");
         };
         assert!(title.contains("1 pushes are building"), "{title}");
-        let refused = places.admit(None, &report).await.map(drop);
-        let refused = refused.expect_err("the queue is full").message_and_advice();
+        let entered = [places.enter().expect("it builds"), places.enter().expect("it may wait")];
+        let refused = places.enter().map(drop).expect_err("the queue is full").message_and_advice();
         assert!(refused.contains("1 are already waiting") && refused.contains("at_once"), "{refused}");
+        drop(entered);
+        drop(places.enter().expect("there is room again"));
         drop(first);
         second.await.expect("no panic").expect("its turn");
         drop(places.admit(None, &report).await.expect("free again"));
@@ -203,7 +206,7 @@ mod tests {
             second.map(drop)
         });
         let waits = |event| match event {
-            Some(api::PushEvent::Step { title }) => {
+            Some(api::PushEvent::Step { title, .. }) => {
                 assert!(title.contains("a is already being pushed"), "{title}");
             }
             other => panic!("{other:?}"),
@@ -216,7 +219,7 @@ mod tests {
             second.assign_service("a", &report_again).await
         });
         waits(told.recv().await);
-        // Two are waiting, and the queue has a place for a third.
+        // Two are waiting for a service, so there is a place for a third.
         let other = places.admit(Some("b"), &report).await.expect("a place");
         drop((first, other));
         for waiting in [named, unnamed] {

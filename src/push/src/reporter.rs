@@ -6,7 +6,9 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-/// Reports progress to the client. A client that has disconnected cancels the push separately.
+use super::running::RunningPush;
+
+/// Reports progress to the task of the push, which keeps it for clients.
 #[derive(Clone)]
 pub(super) struct Reporter {
     events: mpsc::Sender<PushEvent>,
@@ -14,22 +16,34 @@ pub(super) struct Reporter {
     pub(super) building: TaskTracker,
     /// Cancelled when the push begins to publish, after which it can no longer be cancelled.
     pub(super) publishing: CancellationToken,
+    /// Cancelled when the archive is complete.
+    pub(super) received: CancellationToken,
 }
 
 impl Reporter {
     pub(super) fn new(events: mpsc::Sender<PushEvent>) -> Self {
-        Self { events, building: TaskTracker::new(), publishing: CancellationToken::new() }
+        Self {
+            events,
+            building: TaskTracker::new(),
+            publishing: CancellationToken::new(),
+            received: CancellationToken::new(),
+        }
+    }
+
+    /// Creates the reporter of a push that is registered.
+    pub(super) fn for_push(events: mpsc::Sender<PushEvent>, running: &RunningPush) -> Self {
+        Self { publishing: running.publishing.clone(), received: running.received.clone(), ..Self::new(events) }
     }
 
     pub(super) async fn step(&self, title: &str) {
-        self.event(PushEvent::Step { title: title.to_owned() }).await;
+        self.event(PushEvent::step(title)).await;
     }
 
     pub(super) async fn warning(&self, message: String) {
         self.event(PushEvent::Warning { message }).await;
     }
 
-    /// Sends a warning if the client keeps up; publication does not wait for a slow client.
+    /// Sends a warning if the queue is not full; for what cannot wait.
     pub(super) fn try_warning(&self, message: String) {
         let _ = self.events.try_send(PushEvent::Warning { message });
     }

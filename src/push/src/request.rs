@@ -5,17 +5,18 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use api::{Limits, PushEvent, PushOptions, Sla};
+use api::{Limits, PushEvent, PushOptions, PushStatus, Sla};
 use catalogue::names;
 use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
-use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::deployer::Deployer;
 use super::reporter::Reporter;
-use super::{Archive, Error, OptionsError, Pusher, receive, shared, spelling};
+use super::running::RunningPush;
+use super::{Archive, EVENTS_AHEAD, Error, OptionsError, Pusher, receive, shared, spelling};
 
 /// Result of a push.
 #[derive(Debug)]
@@ -31,37 +32,77 @@ pub struct PushResult {
 }
 
 impl Pusher {
-    /// Starts a push; `events` receives its progress, `finished` its result. The push is cancelled when the returned
-    /// guard is dropped.
-    pub fn start<F>(
+    /// Starts a push; `to_last_event` converts its result. It is cancelled if its client leaves before the archive is
+    /// complete ([`ReceptionGuard`](super::ReceptionGuard)).
+    pub fn start(
         self: &Arc<Self>,
         options: PushOptions,
         by: Deployer,
         archive: Archive,
-        events: mpsc::Sender<PushEvent>,
-        finished: impl FnOnce(Result<PushResult, Error>) -> F + Send + 'static,
-    ) -> DropGuard
-    where
-        F: Future<Output = ()> + Send,
-    {
-        let cancel = self.cancel.child_token();
-        let guard = cancel.clone().drop_guard();
+        to_last_event: impl FnOnce(Result<PushResult, Error>) -> PushEvent + Send + 'static,
+    ) -> Result<Arc<RunningPush>, Error> {
         let pusher = Arc::clone(self);
         let id = format!("push-{}", names::random(8));
+        let running = self.registry.begin(&id, (options.name.as_deref(), &options.source, &by.name))?;
         // Of a push that names no service, the name is known once the package was read.
         let span = tracing::error_span!(parent: None, "push", service = options.name, id);
+        let started = Arc::clone(&running);
         let work = async move {
-            let report = Reporter::new(events);
-            let outcome = pusher.run(&id, &options, &by, archive, &report, cancel).await;
+            let outcome = pusher.run_and_record(&options, &by, archive, &running).await;
             let failed = outcome.is_err();
-            finished(outcome).await;
+            pusher.registry.end(&running, to_last_event(outcome));
             if failed && !pusher.cancel.is_cancelled() {
                 // The layers of a failed push are no longer needed.
                 pusher.collect_garbage().await;
             }
         };
         self.tasks.spawn(work.instrument(span));
-        guard
+        Ok(started)
+    }
+
+    /// Runs a push and keeps what it reports.
+    async fn run_and_record(
+        &self,
+        options: &PushOptions,
+        by: &Deployer,
+        archive: Archive,
+        running: &RunningPush,
+    ) -> Result<PushResult, Error> {
+        let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
+        let report = Reporter::for_push(sender, running);
+        let mut work = Box::pin(self.run(options, by, archive, &report, running));
+        let mut accepted = false;
+        let outcome = loop {
+            tokio::select! {
+                biased;
+                Some(event) = events.recv() => self.registry.add_event(running, event),
+                () = running.received.cancelled(), if !accepted => {
+                    accepted = true;
+                    self.registry.add_event(running, PushEvent::Accepted { number: running.number });
+                }
+                outcome = &mut work => break outcome,
+            }
+        };
+        events.close();
+        while let Some(event) = events.recv().await {
+            self.registry.add_event(running, event);
+        }
+        outcome
+    }
+
+    /// Returns all pushes that run or ended lately, newest first.
+    pub fn pushes(&self) -> Result<Vec<PushStatus>, Error> {
+        self.registry.list()
+    }
+
+    /// Returns a running push.
+    pub fn running_push(&self, number: u64) -> Option<Arc<RunningPush>> {
+        self.registry.find(number)
+    }
+
+    /// Returns what a push that has ended printed, as JSON lines; `None` if it is not known.
+    pub fn push_output(&self, number: u64) -> Result<Option<String>, Error> {
+        self.registry.stored_output(number)
     }
 
     /// Reads what a refused client still sends, for a while: if the connection were closed at once, it might not see
@@ -100,18 +141,19 @@ impl Pusher {
     /// Runs a push from start to end.
     async fn run(
         &self,
-        id: &str,
         options: &PushOptions,
         by: &Deployer,
         archive: Archive,
         report: &Reporter,
-        cancel: CancellationToken,
+        running: &RunningPush,
     ) -> Result<PushResult, Error> {
+        let (id, cancel) = (&*running.id, &running.cancel);
         let push = Box::pin(self.push(id, options, by, archive, report));
         let work = blocking::cancellable(push);
         let over = async {
             tokio::select! {
-                () = cancel.cancelled() => Error::Ending,
+                () = self.cancel.cancelled() => Error::Ending,
+                () = cancel.cancelled() => Error::Cancelled,
                 reason = (by.over)() => Error::NotAllowed(reason),
             }
         };
@@ -133,7 +175,10 @@ impl Pusher {
             Err(error) => {
                 self.failed.fetch_add(1, Ordering::Relaxed);
                 let name = options.name.as_deref().or(options.apt.as_deref());
-                let what = if cancel.is_cancelled() { "was cancelled".to_owned() } else { format!("failed: {error}") };
+                let what = match &error {
+                    Error::Cancelled | Error::Ending => "was cancelled".to_owned(),
+                    error => format!("failed: {error}"),
+                };
                 let message = format!("the push of {} {what}", name.unwrap_or(&options.source));
                 let about = NewEvent { service: name, ..NewEvent::default() };
                 self.journal.warning("push-failed", &message, &about);

@@ -5,25 +5,19 @@ use std::path::Path;
 use api::PushEvent;
 use rootfs_builder::BuildEvent;
 
-use super::{Deployer, Error};
+use super::Error;
 
 /// Name of the unpacked archive in the build directory.
 pub(super) const PUSHED: &str = "pushed";
 
-/// Converts a build event for the deployer. Services of others are named only if the deployer may publish them.
-pub(super) fn to_push_event(event: BuildEvent, by: &Deployer) -> PushEvent {
+/// Converts a build event for the deployer; `None` for those about other pushes, which `forward_events` tells.
+pub(super) fn to_push_event(event: BuildEvent) -> Option<PushEvent> {
     match event {
-        BuildEvent::Waits { push } => {
-            let whose = match by.check_may_publish(&push) {
-                Ok(()) => format!("the push of {push}"),
-                Err(_) => "another push".to_owned(),
-            };
-            PushEvent::Step { title: format!("waiting: {whose} is building a layer that this one needs, too") }
-        }
-        BuildEvent::Step { title } => PushEvent::Step { title },
-        BuildEvent::Log { line } => PushEvent::Log { line },
-        BuildEvent::Progress { unit, done, total } => PushEvent::Progress { unit: unit.to_owned(), done, total },
-        BuildEvent::Warning { message } => PushEvent::Warning { message },
+        BuildEvent::Waits { .. } | BuildEvent::Continues => None,
+        BuildEvent::Step { title } => Some(PushEvent::step(title)),
+        BuildEvent::Log { line } => Some(PushEvent::Log { line }),
+        BuildEvent::Progress { unit, done, total } => Some(PushEvent::Progress { unit: unit.to_owned(), done, total }),
+        BuildEvent::Warning { message } => Some(PushEvent::Warning { message }),
     }
 }
 
@@ -75,25 +69,6 @@ mod tests {
         assert_eq!(told(text, "../torn/"), "../torn/src/a/package.xml, line 4: malformed; see log");
         assert_eq!(told("there is no package.xml in /home/build/push-1/pushed", "."), "there is no package.xml in .");
         assert_eq!(told("nothing to fix", "x"), "nothing to fix");
-    }
-
-    #[test]
-    fn whoever_waits_is_told_for_whom_where_that_may_be_known() {
-        let by = Deployer {
-            owner: None,
-            may: Box::new(|name| {
-                if name.starts_with("lab_") { Ok(()) } else { Err(Error::NotAllowed("not yours".to_owned())) }
-            }),
-            over: Box::new(|| Box::pin(std::future::pending())),
-        };
-        for (push, whose) in [("lab_maps", "the push of lab_maps"), ("field", "another push")] {
-            let event = BuildEvent::Waits { push: push.into() };
-            let PushEvent::Step { title } = super::to_push_event(event, &by) else {
-                panic!("a step");
-            };
-            let expected = format!("waiting: {whose} is building a layer that this one needs, too");
-            assert_eq!(title, expected);
-        }
     }
 
     #[test]

@@ -17,6 +17,7 @@ mod pairings;
 mod people;
 pub mod private;
 mod provided;
+mod pushes;
 mod readers;
 mod recordings;
 mod robots;
@@ -46,6 +47,7 @@ pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
 pub use people::{AccountEdit, AccountRecord, NewSession, SessionRecord};
 pub use provided::FederatedPersonRecord;
+pub use pushes::PushRecord;
 use readers::Readers;
 pub use recordings::RecordingRecord;
 pub use robots::{Owner, TokenHash};
@@ -56,7 +58,7 @@ pub use throttle::NoticeThrottle;
 pub use tokens::{NewToken, TokenRecord};
 
 /// Migrations from an empty database to the current schema; append-only.
-const MIGRATIONS: [&str; 15] = [
+const MIGRATIONS: [&str; 16] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -72,6 +74,7 @@ const MIGRATIONS: [&str; 15] = [
     include_str!("013-recordings.sql"),
     include_str!("014-recorded-topics.sql"),
     include_str!("015-events-by-service.sql"),
+    include_str!("016-pushes.sql"),
 ];
 
 /// Errors of the state database.

@@ -108,8 +108,14 @@ export async function* lines(answer: Response): AsyncGenerator<string> {
 /** How often lines of an answer are looked for: each look copies what has come so far. */
 const LOOKS = 200;
 
-/** Sends a body and gives lines of the answer as they come; `gone` is told how much of the body was sent, which `fetch` tells nobody. */
-export async function* exchanged(path: string, body: Blob | undefined, signal: AbortSignal, gone: (done: number, total: number) => void): AsyncGenerator<string> {
+/** Sends a body and gives lines of the answer as they come; `gone` is told how much of the body was sent, which `fetch` tells nobody, and `placed` where the daemon keeps what was begun. */
+export async function* exchanged(
+  path: string,
+  body: Blob | undefined,
+  signal: AbortSignal,
+  gone: (done: number, total: number) => void,
+  placed: (location: string) => void = () => {},
+): AsyncGenerator<string> {
   const request = new XMLHttpRequest();
   request.open('POST', `/api/v1${path}`);
   if (token.get()) request.setRequestHeader('Authorization', `Bearer ${token.get()}`);
@@ -119,6 +125,7 @@ export async function* exchanged(path: string, body: Blob | undefined, signal: A
   let failed: Problem | undefined;
   request.upload.onprogress = ({ loaded, total }) => gone(loaded, total);
   request.onprogress = () => wake();
+  request.onreadystatechange = () => { if (request.readyState === XMLHttpRequest.HEADERS_RECEIVED) placed(request.getResponseHeader('Location') ?? ''); };
   request.onerror = () => { failed = noAnswer(); };
   request.onloadend = () => {
     over = true;

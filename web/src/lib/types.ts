@@ -633,8 +633,15 @@ export interface PublishedTopics {
   topics: PublishedTopic[];
 }
 
+export interface PushCount {
+  done: number;
+  total?: number;
+  unit: string;
+}
+
 export type PushEvent =
-  | { title: string; type: 'step' }
+  | { number: number; type: 'accepted' }
+  | { last_took?: number; title: string; type: 'step' }
   | { line: string; type: 'log' }
   | { done: number; total?: number; type: 'progress'; unit: string }
   | { message: string; type: 'warning' }
@@ -667,6 +674,29 @@ export interface PushOptions {
   stateful?: boolean;
   stateless?: boolean;
   with?: string[];
+}
+
+export type PushState =
+  | 'running'
+  | 'published'
+  | 'failed'
+  | 'cancelled';
+
+export interface PushStatus {
+  began: Millis;
+  by: string;
+  can_cancel: boolean;
+  can_read: boolean;
+  ended?: Millis;
+  last_took?: number;
+  message?: string;
+  number: number;
+  progress?: PushCount;
+  service?: string;
+  source: string;
+  state: PushState;
+  step: string;
+  step_began?: Millis;
 }
 
 export interface Qos {

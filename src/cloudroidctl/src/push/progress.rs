@@ -5,12 +5,14 @@ use std::time::{Duration, Instant};
 
 use api::{PushEvent, Size};
 use foreign::terminal;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::output::{self, OutputFormat};
 
-/// Shortest interval between lines of progress without a terminal.
-const PLAIN_INTERVAL: Duration = Duration::from_secs(5);
+/// Interval of [`PushProgress::tick`], and the shortest one between lines of progress without a terminal.
+pub const TICK: Duration = Duration::from_secs(2);
+/// Longest silence without a terminal while nothing is counted. It begins with [`TICK`] and doubles.
+const LONGEST_SILENCE: Duration = Duration::from_secs(16);
 
 /// Prints the progress of a push.
 pub struct PushProgress {
@@ -19,6 +21,31 @@ pub struct PushProgress {
     /// Progress bar on a terminal.
     bar: Option<ProgressBar>,
     said: Instant,
+    /// Title of the current step, and when it began.
+    step: (String, Instant),
+    /// Time after the last line at which the next tick prints one.
+    silence: Duration,
+}
+
+/// Hides the bar while somebody is asked something.
+#[derive(Debug, Clone)]
+pub struct BarPause(Option<ProgressBar>);
+
+impl BarPause {
+    /// Hides the bar; what is printed then begins on a line of its own.
+    pub fn begin(&self) {
+        if let Some(bar) = &self.0 {
+            bar.set_draw_target(ProgressDrawTarget::hidden());
+            output::eprint_line("");
+        }
+    }
+
+    /// Shows the bar again.
+    pub fn end(&self) {
+        if let Some(bar) = &self.0 {
+            bar.set_draw_target(ProgressDrawTarget::stderr());
+        }
+    }
 }
 
 impl PushProgress {
@@ -29,7 +56,33 @@ impl PushProgress {
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
         });
-        PushProgress { format, began: Instant::now(), bar, said: Instant::now() }
+        let now = Instant::now();
+        PushProgress { format, began: now, bar, said: now, step: (String::new(), now), silence: TICK }
+    }
+
+    /// Returns what hides the bar for a while.
+    pub fn pauses(&self) -> BarPause {
+        BarPause(self.bar.clone())
+    }
+
+    /// Prints the number of a push that is left to itself.
+    pub fn show_number(&self, number: u64) -> anyhow::Result<()> {
+        self.finish();
+        match self.format {
+            OutputFormat::Json => output::json_line(&PushEvent::Accepted { number }),
+            OutputFormat::Table => output::line(&number.to_string()),
+        }
+    }
+
+    /// Prints how long the current step has taken, if nothing else was printed for a while; a terminal shows it anyway.
+    pub fn tick(&mut self) -> anyhow::Result<()> {
+        let is_shown = self.bar.is_some() || self.format == OutputFormat::Json || self.step.0.is_empty();
+        if is_shown || self.said.elapsed() < self.silence {
+            return Ok(());
+        }
+        self.said = Instant::now();
+        self.silence = LONGEST_SILENCE.min(self.silence * 2);
+        output::line(&format!("   {} s: {}", self.step.1.elapsed().as_secs(), self.step.0))
     }
 
     /// Prints an event.
@@ -38,7 +91,8 @@ impl PushProgress {
             return output::json_line(event);
         }
         match event {
-            PushEvent::Step { title } => self.step(title),
+            PushEvent::Accepted { .. } => Ok(()),
+            PushEvent::Step { title, last_took } => self.step(title, *last_took),
             PushEvent::Log { line } => self.print(&format!("  | {line}")),
             PushEvent::Progress { unit, done, total } => self.progress(unit, *done, *total),
             PushEvent::Warning { message } => self.print(&format!("warning: {message}")),
@@ -62,9 +116,11 @@ impl PushProgress {
         }
     }
 
-    fn step(&mut self, title: &str) -> anyhow::Result<()> {
-        self.said = Instant::now();
-        let text = format!("== {:>5.1} s  {title}", self.began.elapsed().as_secs_f64());
+    fn step(&mut self, title: &str, last_took: Option<u64>) -> anyhow::Result<()> {
+        self.step = (title.to_owned(), Instant::now());
+        self.silence = TICK;
+        let last = last_took.map(format_last).unwrap_or_default();
+        let text = format!("== {:>5.1} s  {title}{last}", self.began.elapsed().as_secs_f64());
         self.print(&text)?;
         if let Some(bar) = &self.bar {
             bar.set_style(ProgressStyle::with_template("{spinner} {msg} {elapsed}")?);
@@ -92,8 +148,9 @@ impl PushProgress {
                 bar.set_message(terminal::escape(&text, false).into_owned());
                 Ok(())
             }
-            None if self.said.elapsed() >= PLAIN_INTERVAL => {
+            None if self.said.elapsed() >= TICK => {
                 self.said = Instant::now();
+                self.silence = TICK;
                 output::line(&format!("   {text}"))
             }
             None => Ok(()),
@@ -101,7 +158,8 @@ impl PushProgress {
     }
 
     /// Prints a line above the bar.
-    fn print(&self, text: &str) -> anyhow::Result<()> {
+    fn print(&mut self, text: &str) -> anyhow::Result<()> {
+        self.said = Instant::now();
         match &self.bar {
             Some(bar) => {
                 bar.suspend(|| output::line(text))?;
@@ -118,8 +176,44 @@ impl PushProgress {
     }
 }
 
+/// Returns a remark on how long a step took last, in milliseconds; empty if that is not worth a remark.
+pub fn format_last(took: u64) -> String {
+    match took {
+        0..1000 => String::new(),
+        took => format!(" (last time {} s)", took / 1000),
+    }
+}
+
 impl Drop for PushProgress {
     fn drop(&mut self) {
         self.finish();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_took_a_while_is_remarked() {
+        assert_eq!(format_last(999), "");
+        assert_eq!(format_last(102_400), " (last time 102 s)");
+    }
+
+    #[test]
+    fn silence_is_told_less_and_less_often() {
+        let mut progress = PushProgress::new(OutputFormat::Table);
+        // Not on a terminal.
+        progress.bar = None;
+        progress.step("compiling", None).expect("printed");
+        let mut told = Vec::new();
+        for _ in 0..5 {
+            told.push(progress.silence.as_secs());
+            progress.said -= progress.silence;
+            progress.tick().expect("printed");
+        }
+        assert_eq!(told, [2, 4, 8, 16, 16]);
+        progress.step("packing", None).expect("printed");
+        assert_eq!(progress.silence, TICK, "the next step begins anew");
     }
 }

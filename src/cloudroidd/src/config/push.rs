@@ -24,9 +24,9 @@ pub struct PushConfig {
     pub min_rate: Size,
     /// Largest number of pushes that are built concurrently; others wait.
     pub at_once: usize,
-    /// Largest number of pushes that wait.
+    /// Largest number of pushes that wait or are being sent.
     pub queue: usize,
-    /// Longest time from the start of a push's build (after waiting) to its end.
+    /// Longest duration of a push, without the time that it waits for others.
     pub time: Time,
     /// Disk space of a push's files while it is built; each file counts at least 4 KiB.
     pub disk: Size,

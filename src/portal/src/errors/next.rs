@@ -70,6 +70,11 @@ impl Error {
                     .into()
             }
             Error::UnknownRecording(_) => "list them with: cloudroidctl recordings list".into(),
+            Error::UnknownPush(_) => "list them with: cloudroidctl pushes".into(),
+            Error::PushNotCancelled { .. } => {
+                "see what became of it with: cloudroidctl pushes; change a service back with: cloudroidctl rollback"
+                    .into()
+            }
             Error::NotRecorded { .. } => {
                 "free some space on the disk of the state directory, or set another disk in [black_box] of the \
                     configuration; then: cloudroidctl recordings take SERVANT"
@@ -190,6 +195,7 @@ fn push_next_step(error: &push::Error) -> String {
         P::State(error) => state_next_step(error).into(),
         P::Image(error) => image_next_step(error).into(),
         P::Ending => NEXT_OF_ENDING.into(),
+        P::Cancelled => "push again when it is wanted; what was built before is kept".into(),
         P::Internal(_) => NEXT_OF_INTERNAL.into(),
     }
 }

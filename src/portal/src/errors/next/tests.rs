@@ -64,6 +64,8 @@ fn portal_errors() -> Vec<Error> {
         Error::NotThereYet(x()),
         Error::NoBlackBox(x()),
         Error::UnknownRecording(x()),
+        Error::UnknownPush(x()),
+        Error::PushNotCancelled { number: 1, why: "x" },
         Error::NotRecorded { servant: x(), reason: x() },
         Error::RecordedLately { servant: x(), again: 1 },
         Error::UnknownRule { id: x(), exists: Vec::new() },
@@ -85,6 +87,7 @@ fn push_errors() -> Vec<Error> {
         P::Failed { message: x(), next: None, log: Vec::new() },
         P::TooLarge { limit: Size(1) },
         P::Ending,
+        P::Cancelled,
         P::Engine(E::Exists { id: x() }),
         P::Internal("x"),
     ];

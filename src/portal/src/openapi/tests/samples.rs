@@ -2,6 +2,7 @@
 
 mod machines;
 mod observed;
+mod pushes;
 
 use std::sync::Arc;
 
@@ -734,7 +735,9 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         samples.push(sample("ShadowEvent", event));
     }
     for event in [
-        PushEvent::Step { title: "x".into() },
+        PushEvent::Accepted { number: 1 },
+        PushEvent::Step { title: "x".into(), last_took: Some(1) },
+        PushEvent::step("x"),
         PushEvent::Log { line: "x".into() },
         PushEvent::Progress { unit: "bytes".into(), done: 1, total: Some(2) },
         PushEvent::Warning { message: "x".into() },
@@ -750,5 +753,6 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     }
     samples.extend(machines::samples());
     samples.extend(observed::samples());
+    samples.extend(pushes::samples());
     samples
 }
