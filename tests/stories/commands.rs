@@ -1,13 +1,14 @@
 //! The command line as used by scripts and shells.
 
 use std::io::{BufRead, BufReader, Read, Write};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
 use anyhow::{Context, ensure};
 use serde_json::Value;
 use support::daemon::Daemon;
-use support::deployer::{CommandOutcome, run};
+use support::deployer::{CommandOutcome, Deployer, run};
 use support::patience;
 use support::world::{LOCALISER, world};
 use support::{Verdict, binaries};
@@ -29,7 +30,19 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
         Ok(())
     };
     ends(types(&["services"])?, 0, "adder_py")?;
+    for listed in [&["services", "-q"][..], &["ls", "-o", "name"], &["get", "services", "-q"], &["-q", "list"]] {
+        let names = types(listed)?.expect_success()?.stdout;
+        ensure!(names == "adder_py\n", "{listed:?}: {names}");
+    }
+    let yaml = types(&["services", "-o", "yaml"])?.expect_success()?.stdout;
+    ensure!(yaml.starts_with("- ") && yaml.contains("name: adder_py\n"), "{yaml}");
+    ends(types(&["status", "-q"])?, 2, "verbs that list")?;
+    ends(types(&["version"])?, 0, "cloudroidd ")?;
     ends(types(&["push"])?, 2, "Usage")?;
+    ends(types(&["events", "--kind", "bogus"])?, 5, "servant-ready")?;
+    ends(types(&["events", "--follow", "--kind", "bogus"])?, 5, "node-hung")?;
+    let off = types(&["recordings", "list"])?.expect_success()?.stderr;
+    ensure!(off.contains("black boxes are off") && !off.contains("recordings take"), "{off}");
     ends(types(&["rollback", "nothing"])?, 5, "available: adder_py")?;
     ends(types(&["explain", "nobody"])?, 5, "nobody")?;
     ends(run_with_token(&daemon, &viewer, &["rm", "adder_py"])?, 4, "error")?;
@@ -128,12 +141,22 @@ pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
     let types = |words: &[&str]| deployer.run(words);
     let never = types(&["fit", "adder_py", "--cpus", "4000"])?.expect_success()?;
     ensure!(never.stdout.contains("it would always be refused: a servant of 4000 cores"), "{}", never.output());
+    let unpromised = types(&["fit", "adder_py"])?.expect_success()?.stdout;
+    ensure!(unpromised.contains("no cores are requested"), "{unpromised}");
     types(&["stop", "adder_py"])?.expect_failure(&["adder_py"])?;
     let one = daemon.robot("adder_py?robot=one")?;
     daemon.wait_for_event("a ready servant", |event| event["kind"] == "servant-ready" && event["robot"] == "one")?;
     types(&["set", "adder_py", "--cpus", "0.5"])?.expect_success()?;
     let servant = daemon.servant_of("adder_py", "one")?;
     ensure!(servant["limits"]["cpus"] == 0.5, "{servant:#}");
+    let beyond = types(&["set", "adder_py", "--cpus", "4000"])?.expect_failure(&["does not fit on this machine"])?;
+    ensure!(beyond.status == 6, "{beyond:#?}");
+    let table = types(&["ps"])?.expect_success()?.stdout;
+    ensure!(table.lines().all(|line| line.chars().count() <= 100), "{table}");
+    let coloured = type_in_terminal(&deployer, "servants", "", &[])?.expect_success()?.stdout;
+    ensure!(coloured.contains("\u{1b}[32mready"), "{coloured:?}");
+    let plain = type_in_terminal(&deployer, "servants", "", &[("NO_COLOR", "1")])?.expect_success()?.stdout;
+    ensure!(plain.contains("ready") && !plain.contains('\u{1b}'), "{plain:?}");
     let two = daemon.robot("adder_py?robot=two")?;
     let saying = ["adder_py has 2 servants; name one: "];
     types(&["set", "adder_py", "--cpus", "1"])?.expect_failure(&saying)?;
@@ -148,7 +171,45 @@ pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
     let id = servant["id"].as_str().context("an id")?;
     ensure!(stopped.stdout.contains(id), "{}", stopped.output());
     drop(one);
+    // A person at a terminal is asked, a script is not.
+    let kept = type_in_terminal(&deployer, "rm adder_py", "n\n", &[])?;
+    let kept = kept.expect_failure(&["remove adder_py with 1 revision? [y/N]", "was not removed"])?;
+    ensure!(types(&["services", "-q"])?.stdout == "adder_py\n", "{kept:?}");
+    let removed = type_in_terminal(&deployer, "rm adder_py", "y\n", &[])?.expect_success()?;
+    ensure!(removed.stdout.contains("removed adder_py"), "{removed:?}");
     Ok(())
+}
+
+/// Runs `cloudroidctl WORDS` in a terminal, where these keys are typed.
+fn type_in_terminal(
+    deployer: &Deployer,
+    words: &str,
+    keys: &str,
+    environment: &[(&str, &str)],
+) -> anyhow::Result<CommandOutcome> {
+    let command = format!("{} {words}", binaries::path("cloudroidctl").display());
+    let mut terminal = Command::new("script")
+        .args(["--quiet", "--flush", "--return", "--command", &command])
+        .arg("/dev/null")
+        .env("CLOUDROID_HOME", &deployer.home)
+        .env_remove("CLOUDROID_SERVER")
+        .env_remove("NO_COLOR")
+        .env("TERM", "xterm")
+        .envs(environment.iter().copied())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    // The terminal stays open until the command has ended.
+    let mut keyboard = terminal.stdin.take().context("its keys")?;
+    keyboard.write_all(keys.as_bytes())?;
+    let output = terminal.wait_with_output()?;
+    Ok(CommandOutcome {
+        command,
+        status: output.status.code().unwrap_or(-1),
+        stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+    })
 }
 
 pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verdict {
@@ -189,23 +250,39 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     let daemon = world().daemon_with(LOCALISER)?;
     let deployer = daemon.deployer();
     let script = deployer.run(&["completions", "bash"])?.expect_success()?;
-    let completes = "source \"$0\"; COMP_WORDS=(cloudroidctl \"$@\"); COMP_CWORD=$#; _cloudroidctl cloudroidctl \"${@: \
-        -1}\" x; \
-                     echo \"${COMPREPLY[@]}\"";
+    let completes = "source \"$0\"; COMP_WORDS=(cloudroidctl \"$@\"); COMP_CWORD=$#; _cloudroidctl_names \
+        cloudroidctl \"${@: -1}\" x; echo \"${COMPREPLY[@]}\"";
     let pages = world().directory("pages")?;
     let file = pages.path().join("completions");
     std::fs::write(&file, script.stdout)?;
-    let completed = |words: &[&str]| -> anyhow::Result<String> {
+    let program = binaries::path("cloudroidctl");
+    let places = [program.parent().context("its directory")?.display().to_string(), std::env::var("PATH")?].join(":");
+    let completed_at = |home: &Path, words: &[&str]| -> anyhow::Result<String> {
         let mut bash = Command::new("bash");
-        bash.args(["-c", completes]).arg(&file).args(words);
+        bash.args(["-c", completes]).arg(&file).args(words).env("PATH", &places).env("CLOUDROID_HOME", home);
+        bash.env_remove("CLOUDROID_SERVER");
         Ok(run(&mut bash)?.expect_success()?.stdout)
     };
-    for (words, expected) in
-        [(&["roll"][..], "rollback rollout"), (&["push", "--can"], "--canary"), (&["rollout", "s", "pro"], "promote")]
-    {
-        let found = completed(words)?;
-        ensure!(found.trim() == expected, "{words:?}: {found}");
+    let completed = |words: &[&str]| completed_at(&deployer.home, words);
+    for (words, expected) in [
+        (&["roll"][..], "rollback rollout"),
+        (&["push", "--can"], "--canary"),
+        (&["rollout", "s", "pro"], "promote"),
+        // Names are those of the daemon.
+        (&["rm", "local"], "localiser_py"),
+        (&["stop", "--service", "="], "localiser_py"),
+        (&["events", "--kind", "node-h"], "node-hung"),
+    ] {
+        // The daemon has two seconds for its names, which is little on a busy machine.
+        support::wait_until(&format!("completion of {words:?}"), || {
+            let found = completed(words)?;
+            let is_offered = found.trim() == expected || found.split_whitespace().any(|word| word == expected);
+            Ok(if is_offered { Ok(()) } else { Err(found) })
+        })?;
     }
+    // Without a daemon there are none, and nothing is said.
+    let away = completed_at(pages.path(), &["rm", "local"])?;
+    ensure!(away.trim().is_empty(), "{away}");
     for shell in ["zsh", "fish"] {
         let script = deployer.run(&["completions", shell])?.expect_success()?;
         ensure!(script.stdout.contains("rollback"), "{shell}");
@@ -216,10 +293,13 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     let own = page("cloudroidctl.1")?;
     ensure!(own.contains("invalid or refused request"), "{own}");
     let help = deployer.run(&["--help"])?.expect_success()?.stdout;
-    let verbs = help.split_once("Commands:").context("verbs")?.1;
+    ensure!(help.lines().all(|line| line.chars().count() <= 100), "{help}");
+    let verbs = help.split_once("Services:").context("verbs")?.1;
     let verbs = verbs.split_once("Options:").context("options")?.0;
     let mut count = 0;
-    for verb in verbs.lines().filter_map(|line| line.split_whitespace().next()).filter(|verb| *verb != "help") {
+    // Groups begin in the first column, and descriptions go on further in.
+    let lines = verbs.lines().filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    for verb in lines.filter_map(|line| line.split_whitespace().next()) {
         let text = page(&format!("cloudroidctl-{verb}.1")).context(verb.to_owned())?;
         ensure!(text.contains(".SH NAME"), "{verb}: {text}");
         count += 1;

@@ -58,7 +58,7 @@ pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdi
     let told = second.wait_for_status("this robot is number 1 of 1 waiting")?;
     ensure!(told["level"] == "warning", "{told}");
     let mut third = daemon.robot("greeter_cpp?robot=third")?;
-    let told = third.wait_for_status("1 robots are already waiting")?;
+    let told = third.wait_for_status("1 robot already waiting")?;
     ensure!(told["level"] == "error", "{told}");
     ensure!(u16::from(third.wait_for_close()?.code) == 1013);
     let words = format!("no capacity became free within {waits} s; it was number 1 of 1");

@@ -152,10 +152,12 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
     let types = |words: &[&str]| scene.daemon.deployer().run(words);
 
     // A recording ends with Ctrl-C or with its servant; both leave a complete file.
-    let begins = |name: &str| -> anyhow::Result<Child> {
+    let size_of = |name: &str| std::fs::metadata(at(name)).map_or(0, |found| found.len());
+    let begins = |name: &str, more: &[&str], has_begun: &dyn Fn() -> bool| -> anyhow::Result<Child> {
         let mut child = Command::new(binaries::path("cloudroidctl"))
             .args(["record", "sights_py", "-o", path_str(&at(name))])
             .args(["--topic", "/sights/scan"])
+            .args(more)
             .env("CLOUDROID_HOME", &scene.daemon.deployer().home)
             .env_remove("CLOUDROID_SERVER")
             .stdout(Stdio::piped())
@@ -166,17 +168,25 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         ensure!(line.contains("stop with Ctrl-C"), "{line}");
         // The file is flushed every second.
         support::wait_until("something in the file", || {
-            let size = std::fs::metadata(at(name))?.len();
-            Ok((size > 2000).then_some(()).ok_or(size.to_string()))
+            Ok(has_begun().then_some(()).ok_or_else(|| "nothing".to_owned()))
         })?;
         Ok(child)
     };
-    let interrupted = begins("interrupted.mcap")?;
+    let interrupted = begins("interrupted.mcap", &[], &|| size_of("interrupted.mcap") > 2000)?;
     kill(Pid::from_raw(i32::try_from(interrupted.id())?), Signal::SIGINT)?;
-    let mut killed = begins("killed.mcap")?;
+    // As ros2 bag record does it: -d is the duration of a file, after which the next one begins.
+    let with_messages = || (1..100).map(|number| format!("parts_{number}.mcap")).find(|name| size_of(name) > 700);
+    let parts = begins("parts.mcap", &["-d", "1"], &|| with_messages().is_some())?;
+    kill(Pid::from_raw(i32::try_from(parts.id())?), Signal::SIGINT)?;
+    let parts = parts.wait_with_output()?;
+    let said = String::from_utf8_lossy(&parts.stdout).into_owned();
+    ensure!(parts.status.success() && said.contains("parts_0.mcap") && said.contains("parts_1.mcap"), "{said}");
+    let later = read_recording(&at(&with_messages().context("a later part")?))?;
+    ensure!(later["topics"] == json!({"/sights/scan": "sensor_msgs/LaserScan"}), "{later}");
+    let mut killed = begins("killed.mcap", &[], &|| size_of("killed.mcap") > 2000)?;
     killed.kill()?;
     killed.wait()?;
-    let served = begins("served.mcap")?;
+    let served = begins("served.mcap", &[], &|| size_of("served.mcap") > 2000)?;
     types(&["stop", &scene.servant])?.expect_success()?;
     for child in [interrupted, served] {
         let ended = child.wait_with_output()?;

@@ -111,7 +111,7 @@ pub fn a_robot_is_given_what_its_sla_costs() -> Verdict {
     ensure!(after["terms"]["priority"] == 10, "{after:#}");
     robot.call("/greeter/count", json!({"reset": false}))?;
     for (verb, words) in [
-        (&["servants"][..], ["rrt=50ms", "entry 3"]),
+        (&["servants", "-o", "wide"][..], ["rrt=50ms", "entry 3"]),
         (&["explain", "rover"], ["rrt=50ms", "is the cheapest that reaches"]),
     ] {
         let said = deployer.run(verb)?.expect_success()?.stdout;

@@ -50,6 +50,10 @@ pub struct Fit {
     #[serde(default = "nothing")]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub beyond_memory: Size,
+    /// If no cores are requested for the servant, so that its reservation is only nominal: how many would find enough at
+    /// the present use.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at_present_use: Option<UseForecast>,
     /// Expected response time of one more servant, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
@@ -61,6 +65,20 @@ pub struct Fit {
 
 fn nothing() -> Size {
     Size(0)
+}
+
+/// Forecast from the cores that servants use now.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct UseForecast {
+    /// Cores of the machine that no servant uses now.
+    pub unused_cpus: f64,
+    /// Cores that a servant of the service uses now, on average; absent if none is running or none uses any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cpus: Option<f64>,
+    /// Number of additional servants that these suffice for, within what can be reserved; absent like `cpus`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub more: Option<u64>,
 }
 
 /// Expected response time.

@@ -7,6 +7,7 @@
 pub mod access;
 pub mod bases;
 pub mod calibration;
+mod count;
 pub mod cpuset;
 pub mod dictionary;
 pub mod differences;
@@ -39,10 +40,11 @@ pub mod topics;
 pub mod trial;
 
 pub use calibration::{Calibration, CalibrationEvent, CalibrationOptions};
+pub use count::count;
 pub use cpuset::CpuSet;
 pub use doctor::{Check, CheckStatus, Doctor};
-pub use event::{Event, Level};
-pub use fit::{Cost, Expected, Fit};
+pub use event::{EVENT_KINDS, Event, Level};
+pub use fit::{Cost, Expected, Fit, UseForecast};
 pub use grants::{Grants, Volume};
 pub use group::{Group, GroupServant, Shared};
 pub use interface::Interface;

@@ -51,6 +51,10 @@ pub struct Status {
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub usage: Usage,
+    /// Seconds of each servant that are kept for recordings; 0 if black boxes are off.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub black_box: f64,
     /// Problems of this machine.
     pub warnings: Vec<String>,
 }

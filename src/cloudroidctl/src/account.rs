@@ -199,11 +199,7 @@ fn list(accounts: &[Account], format: OutputFormat) -> anyhow::Result<()> {
             account.disabled.map_or_else(|| "active".into(), |at| format!("disabled {} ago", output::age(at))),
         ]);
     }
-    if table.is_empty() {
-        output::line("no accounts; create one with: cloudroidctl account create NAME --role ROLE")
-    } else {
-        table.print()
-    }
+    table.print_list("no accounts; create one with: cloudroidctl account create NAME --role ROLE")
 }
 
 fn list_sessions(sessions: &[SessionLine], format: OutputFormat) -> anyhow::Result<()> {
@@ -221,5 +217,5 @@ fn list_sessions(sessions: &[SessionLine], format: OutputFormat) -> anyhow::Resu
             format!("expires in {}", output::time_until(session.expires)),
         ]);
     }
-    if table.is_empty() { output::line("nobody is signed in") } else { table.print() }
+    table.print_list("nobody is signed in")
 }

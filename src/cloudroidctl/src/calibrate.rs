@@ -3,7 +3,6 @@
 pub(crate) mod curve;
 
 use std::fs;
-use std::io::{BufRead, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -15,7 +14,8 @@ use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
 use crate::client::{self, DaemonClient, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::confirm;
+use crate::output::{self, OutputFormat, Table, count};
 use crate::stated::aux;
 use crate::trial::describe_renamed_topics;
 
@@ -100,13 +100,13 @@ impl CalibrateArgs {
             OutputFormat::Json => Ok(()),
             OutputFormat::Table => output::line(words),
         };
-        if !self.yes && !confirm(&self.service)? {
+        if !self.yes && !confirm::ask(format!("write these entries to the SLA table of {}?", self.service)).await? {
             return say("nothing was written; --yes writes the entries without asking");
         }
         let rows = calibration.rows;
-        let count = rows.len();
+        let written = count(rows.len(), "entry");
         write_rows(client, &self.service, rows).await?;
-        say(&format!("{count} entries written; see them with: cloudroidctl sla list {}", self.service))
+        say(&format!("{written} written; see them with: cloudroidctl sla list {}", self.service))
     }
 
     /// Returns the body of the request: a recording, or the concatenated images.
@@ -265,23 +265,6 @@ pub(crate) fn check_writable(curve: &Path, option: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Asks for confirmation at the terminal; false if there is no terminal.
-pub(crate) fn confirm(service: &str) -> anyhow::Result<bool> {
-    if !std::io::stdin().is_terminal() {
-        return Ok(false);
-    }
-    let mut out = std::io::stderr().lock();
-    write!(out, "write these entries to the SLA table of {service}? [y/N] ")?;
-    out.flush()?;
-    let mut answer = String::new();
-    std::io::stdin().lock().read_line(&mut answer)?;
-    Ok(is_yes(&answer))
-}
-
-fn is_yes(answer: &str) -> bool {
-    matches!(answer.trim().to_ascii_lowercase().as_str(), "y" | "yes")
-}
-
 /// Prints proposed rows.
 pub(crate) fn print_rows(rows: &[Row]) -> anyhow::Result<()> {
     let mut table = Table::new(&["ENTRY", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
@@ -315,13 +298,6 @@ mod tests {
         fs::write(&fine, "an earlier one").expect("written");
         check_writable(&fine, "curve").expect("it can be written");
         assert_eq!(fs::read_to_string(&fine).expect("read"), "an earlier one");
-    }
-
-    #[test]
-    fn only_a_yes_is_a_yes() {
-        for (answer, yes) in [("y\n", true), ("Yes\n", true), ("\n", false), ("", false), ("yep", false)] {
-            assert_eq!(is_yes(answer), yes, "{answer:?}");
-        }
     }
 
     #[test]

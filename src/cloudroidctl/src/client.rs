@@ -127,6 +127,8 @@ impl ServerAddress {
 pub struct DaemonClient {
     server: ServerAddress,
     token: Option<String>,
+    /// Trusts the certificate of a server that is seen for the first time, and tells its user.
+    trusts_first: bool,
 }
 
 /// The daemon cannot be reached.
@@ -186,7 +188,12 @@ impl DaemonClient {
             Some(text) => ServerAddress::parse(text)?,
             None => ServerAddress::local_daemon(),
         };
-        Ok(DaemonClient { server, token: token.filter(|token| !token.is_empty()) })
+        Ok(DaemonClient { server, token: token.filter(|token| !token.is_empty()), trusts_first: true })
+    }
+
+    /// Refuses servers whose certificate is not known yet: nobody would read what is said about it.
+    pub fn without_first_trust(self) -> DaemonClient {
+        DaemonClient { trusts_first: false, ..self }
     }
 
     /// Sends `GET path`.
@@ -272,11 +279,16 @@ impl DaemonClient {
     }
 
     async fn connect_tls(&self, stream: TcpStream, authority: &str) -> anyhow::Result<TlsStream<TcpStream>> {
+        let known = KnownServers::for_user();
+        let is_known = || known.as_ref().and_then(|known| known.find(authority).ok().flatten()).is_some();
+        if !self.trusts_first && !is_known() {
+            bail!("{} is not known yet; see its certificate with: cloudroidctl status", self.server);
+        }
         let (host, _) = authority.rsplit_once(':').unwrap_or((authority, ""));
         let trust = Trust {
             authorities: None,
             fingerprint: None,
-            known: KnownServers::for_user(),
+            known,
             accept: format!("cloudroidctl trust {}", self.server),
             advice: NOBODY_TRUSTED,
             identity: None,

@@ -59,7 +59,7 @@ async fn check_without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api
 }
 
 fn show(doctor: &api::Doctor) -> anyhow::Result<()> {
-    let mut table = Table::new(&["", "NEED", "FOUND"]);
+    let mut table = Table::new(&["STATE", "NEED", "FOUND"]);
     for check in &doctor.checks {
         let mark = match check.status {
             CheckStatus::Ok => "ok",

@@ -19,8 +19,9 @@ use anyhow::{Context, bail};
 use api::Size;
 use bytes::Bytes;
 
-use crate::calibrate::{check_writable, confirm, write_rows};
+use crate::calibrate::{check_writable, write_rows};
 use crate::client::DaemonClient;
+use crate::confirm;
 use crate::output::{self, OutputFormat};
 use check::invalid_input;
 use network::AddedNetwork;
@@ -140,7 +141,7 @@ impl EvalArgs {
             OutputFormat::Json => Ok(()),
             OutputFormat::Table => output::line(words),
         };
-        if !self.yes && !confirm(&self.service)? {
+        if !self.yes && !confirm::ask(format!("write these entries to the SLA table of {}?", self.service)).await? {
             // After a prompt there is no need to mention --yes.
             return say(if std::io::stdin().is_terminal() {
                 "nothing was written"

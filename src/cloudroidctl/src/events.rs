@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use api::{Event, Level};
+use api::{EVENT_KINDS, Event, Level, Problem};
 use futures_util::StreamExt;
 
 use crate::client::{self, DaemonClient, percent_encode};
+use crate::colour::Colour;
 use crate::output::{self, OutputFormat};
 
 /// Interval between attempts to reach the daemon.
@@ -23,7 +24,8 @@ pub struct EventsArgs {
     /// Keep printing new events.
     #[arg(short, long)]
     follow: bool,
-    /// Only events of this kind, such as node-hung; docs/operators.md lists the kinds.
+    /// Only events of this kind, such as node-hung. For an unknown kind, the error lists all; docs/operators.md
+    /// describes them.
     #[arg(long, value_name = "KIND")]
     kind: Option<String>,
     /// Only events of this service.
@@ -40,14 +42,16 @@ pub struct EventsArgs {
 impl EventsArgs {
     /// Sends the request and prints the events.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        if let Some(kind) = self.kind.as_deref().filter(|kind| !EVENT_KINDS.contains(kind)) {
+            check_kind(client, kind).await?;
+        }
         if self.follow {
             return self.follow(client, format).await;
         }
         let path = format!("/api/v1/events?{}", self.query(0, self.tail));
         let events: Vec<Event> = client.get(&path).await?;
         if let (true, Some(kind)) = (events.is_empty(), &self.kind) {
-            let all: Vec<Event> = client.get(&format!("/api/v1/events?since=0&limit={ALL}")).await?;
-            output::eprint_line(&describe_no_events(kind, &all));
+            output::eprint_line(&format!("no event of kind {kind} in the journal"));
         }
         match format {
             OutputFormat::Json => output::json(&events),
@@ -121,7 +125,12 @@ impl EventsArgs {
 }
 
 fn print(event: &Event) -> anyhow::Result<()> {
-    output::line(&format_event(event))
+    let colour = match event.level {
+        Level::Info => None,
+        Level::Warning => Some(Colour::Yellow),
+        Level::Error => Some(Colour::Red),
+    };
+    output::line(&output::colour_text(&format_event(event), colour))
 }
 
 fn format_event(event: &Event) -> String {
@@ -134,16 +143,23 @@ fn format_event(event: &Event) -> String {
     format!("{time} {mark} {kind:<18} {}", event.message)
 }
 
-/// Returns the message for a kind without events; the kind may be misspelt.
-fn describe_no_events(kind: &str, all: &[Event]) -> String {
-    let kinds: BTreeSet<&str> = all.iter().map(|event| event.kind.as_str()).collect();
-    if kinds.contains(kind) {
-        format!("no event of kind {kind} matches")
-    } else {
-        format!(
-            "no event of kind {kind} in the journal; recorded kinds: {}; docs/operators.md lists all",
-            kinds.into_iter().collect::<Vec<_>>().join(", ")
-        )
+/// Fails if a kind that this version does not know is not in the journal of the daemon either, which may be newer.
+async fn check_kind(client: &DaemonClient, kind: &str) -> anyhow::Result<()> {
+    let all: Vec<Event> = client.get(&format!("/api/v1/events?since=0&limit={ALL}")).await?;
+    let recorded: BTreeSet<&str> = all.iter().map(|event| event.kind.as_str()).collect();
+    if recorded.contains(kind) { Ok(()) } else { Err(unknown_kind(kind, &recorded).into()) }
+}
+
+fn unknown_kind(kind: &str, recorded: &BTreeSet<&str>) -> Problem {
+    let known: BTreeSet<&str> = recorded.iter().copied().chain(EVENT_KINDS).collect();
+    Problem {
+        kind: "urn:cloudroid:unknown-kind".to_owned(),
+        title: "unknown kind of event".to_owned(),
+        status: 404,
+        detail: format!("there are no events of kind {kind}"),
+        next: Some("name one of these kinds with --kind; docs/operators.md describes them".to_owned()),
+        exists: known.into_iter().map(str::to_owned).collect(),
+        ..Problem::default()
     }
 }
 
@@ -183,10 +199,11 @@ mod tests {
             robot: None,
             message: "it hangs".into(),
         };
-        let unknown = describe_no_events("node-hnug", std::slice::from_ref(&event));
-        assert!(unknown.contains("recorded kinds: node-hung;"), "{unknown}");
-        let known = describe_no_events("node-hung", std::slice::from_ref(&event));
-        assert!(!known.contains("recorded kinds"), "{known}");
+        let unknown = unknown_kind("node-hnug", &["of-a-newer-daemon"].into());
+        assert!(unknown.to_string().contains("node-hnug"), "{unknown}");
+        for kind in ["node-hung", "of-a-newer-daemon"] {
+            assert!(unknown.exists.iter().any(|known| known == kind), "{:?}", unknown.exists);
+        }
         assert_eq!(format_event(&event), "00:00:00.000 ! node-hung          it hangs");
     }
 }

@@ -3,7 +3,8 @@
 use api::explain::{Explanation, Link, Served, Weight};
 
 use crate::client::{DaemonClient, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::colour::Colour;
+use crate::output::{self, OutputFormat, Table, count};
 
 /// Explain why a robot is slow or served by its local original.
 #[derive(Debug, clap::Args)]
@@ -34,7 +35,12 @@ fn print(explanation: &Explanation) -> anyhow::Result<()> {
             Weight::Slows => "slows ",
             Weight::Hint => "hint  ",
         };
-        output::line(&format!("{mark}  {}\n        {}", cause.what, cause.next))?;
+        let colour = match cause.weight {
+            Weight::Blocks => Some(Colour::Red),
+            Weight::Slows => Some(Colour::Yellow),
+            Weight::Hint => None,
+        };
+        output::line(&format!("{}  {}\n        {}", output::colour_text(mark, colour), cause.what, cause.next))?;
     }
     for served in &explanation.servants {
         print_servant(served)?;
@@ -51,12 +57,12 @@ fn print(explanation: &Explanation) -> anyhow::Result<()> {
 fn print_servant(served: &Served) -> anyhow::Result<()> {
     let servant = &served.servant;
     output::line(&format!(
-        "\n{} of {} (revision {}): {}, {} connections, {:.2} cores used, throttled {:.0} % of the time, limits {}",
+        "\n{} of {} (revision {}): {}, {}, {:.2} cores used, throttled {:.0} % of the time, limits {}",
         servant.id,
         servant.service,
         servant.revision,
         servant.phase,
-        servant.connections,
+        count(servant.connections, "connection"),
         served.cores,
         served.throttled * 100.0,
         output::limits(&servant.enforced.unwrap_or(servant.limits)),
@@ -96,14 +102,14 @@ fn promise_in_words(link: &Link) -> String {
 fn print_link(link: &Link) -> anyhow::Result<()> {
     let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
     output::line(&format!(
-        "  {}: link {}, round trip {}, clock {}, {}, Q {}; of {} requests {} late, {} answered locally",
+        "  {}: link {}, round trip {}, clock {}, {}, Q {}; of {} {} late, {} answered locally",
         link.node,
         if link.up { "up" } else { "DOWN" },
         millis(link.round_trip),
         millis(link.clock),
         promise_in_words(link),
         link.satisfaction.map_or("-".to_owned(), |q| format!("{q:.1}")),
-        link.requests,
+        count(link.requests, "request"),
         link.late,
         link.local,
     ))?;

@@ -3,7 +3,7 @@
 use api::Size;
 
 use crate::client::{DaemonClient, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputFormat, Table, count};
 use crate::stated::{StatedFlags, to_query};
 
 /// Predict whether the server has capacity for another robot, what it would cost the others, and how many more would
@@ -85,10 +85,7 @@ fn fit_in_words(service: &str, fit: &api::Fit) -> String {
     });
     let expected = expected.unwrap_or_default();
     if let Some(servants @ 1..) = fit.shared {
-        let servants = match servants {
-            1 => "1 servant".to_owned(),
-            more => format!("{more} servants"),
-        };
+        let servants = count(servants, "servant");
         return format!("robots share {servants} of {service}; one more robot needs no more capacity{expected}");
     }
     let wanted = format!("one more servant of {service} reserves {} cores and {} of memory", fit.cpus, fit.memory);
@@ -97,7 +94,7 @@ fn fit_in_words(service: &str, fit: &api::Fit) -> String {
         (Some(why), _) => format!("it would wait: {why}"),
         (None, true) => "it would start at once".to_owned(),
         (None, false) if fit.full => {
-            format!("it would be refused: the queue is full with {} robots ([capacity] queue)", fit.waiting)
+            format!("it would be refused: the queue is full with {} ([capacity] queue)", count(fit.waiting, "robot"))
         }
         (None, false) if lacks => format!(
             "it would wait: {}; {} already waiting",
@@ -119,7 +116,27 @@ fn fit_in_words(service: &str, fit: &api::Fit) -> String {
             lacking_in_words(fit.beyond_cpus, fit.beyond_memory)
         ),
     };
-    format!("{wanted}; {} cores and {} are free\n{answer}\n{more}{expected}", fit.free_cpus, fit.free_memory)
+    let cores = cores_in_words(fit);
+    format!("{wanted}; {} cores and {} are free\n{answer}\n{more}{cores}{expected}", fit.free_cpus, fit.free_memory)
+}
+
+/// Tells what follows from the present use if no cores are requested: room for a nominal reservation means little.
+fn cores_in_words(fit: &api::Fit) -> String {
+    let Some(forecast) = fit.at_present_use else {
+        return String::new();
+    };
+    match (forecast.cpus, forecast.more) {
+        (Some(cpus), Some(more)) => format!(
+            "\nno cores are requested (--cpus): at the present use of {cpus:.2} cores each, with {:.2} cores unused, {} \
+                would find enough",
+            forecast.unused_cpus,
+            count(more, "more servant")
+        ),
+        _ => format!(
+            "\nno cores are requested (--cpus), and how many it would use is not known yet; {:.2} cores are unused",
+            forecast.unused_cpus
+        ),
+    }
 }
 
 #[cfg(test)]
@@ -144,6 +161,7 @@ mod tests {
             more: Some(1),
             beyond_cpus: 1.5,
             beyond_memory: Size(0),
+            at_present_use: None,
             expected: None,
             shared: None,
         }
@@ -161,6 +179,9 @@ mod tests {
             api::Fit { expected: Some(api::Expected { rrt: 0.11, from: "entry 3 of the SLA table".into() }), ..fit() };
         let shared = api::Fit { shared: Some(2), ..expected.clone() };
         let none_yet = api::Fit { shared: Some(0), ..fit() };
+        let forecast = |cpus, more| Some(api::UseForecast { unused_cpus: 1.25, cpus, more });
+        let by_use = api::Fit { at_present_use: forecast(Some(0.4), Some(3)), ..fit() };
+        let unknown = api::Fit { at_present_use: forecast(None, None), ..fit() };
         assert_eq!((time(None).as_str(), time(Some(0.0126)).as_str()), ("-", "13 ms"));
         for (fit, words) in [
             (expected, "lacking 1.5 cores\n95 % of its requests would take up to 110 ms (entry 3"),
@@ -173,6 +194,11 @@ mod tests {
             (full, "it would be refused: the queue is full with 2"),
             (now, "at once\nany number"),
             (stalled, "it would wait: this machine swaps"),
+            (
+                by_use,
+                "2 would not: lacking 1.5 cores\nno cores are requested (--cpus): at the present use of 0.40 cores",
+            ),
+            (unknown, "how many it would use is not known yet; 1.25 cores are unused"),
         ] {
             let said = fit_in_words("a", &fit);
             assert!(said.contains(words), "{said}");

@@ -1,5 +1,5 @@
 //! `cloudroidctl`: the command line for deployers. Each command is one file and uses only the daemon's HTTP API; its
-//! doc comments are its help.
+//! doc comments are its help, which `help` groups and wraps.
 
 #![forbid(unsafe_code)]
 
@@ -7,7 +7,11 @@ mod account;
 mod audit;
 mod bases;
 mod calibrate;
+mod choice;
 mod client;
+mod colour;
+mod complete;
+mod confirm;
 mod diff;
 mod doctor;
 mod eval;
@@ -17,6 +21,7 @@ mod explain;
 mod export;
 mod fit;
 mod goals;
+mod help;
 mod import;
 mod inside;
 mod limits;
@@ -39,6 +44,7 @@ mod services;
 mod set;
 mod shadow;
 mod sla;
+mod spelling;
 mod stated;
 mod status;
 mod stop;
@@ -49,17 +55,21 @@ mod top;
 mod topics;
 mod trial;
 mod trust;
+mod version;
 mod wait;
 mod whole;
+mod wrap;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use api::Problem;
-use clap::{Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
+use choice::OutputChoice;
 use client::DaemonClient;
 use exit::Exit;
-use output::OutputFormat;
 
 /// Manage ROS packages as services: push, observe and end them.
 #[derive(Debug, Parser)]
@@ -78,18 +88,24 @@ struct CtlArguments {
     /// Bearer token; required over TCP if the daemon has tokens configured.
     #[arg(long, global = true, env = "CLOUDROID_TOKEN", value_name = "TOKEN", hide_env_values = true)]
     token: Option<String>,
-    /// Output format.
-    #[arg(long, global = true, value_enum, default_value_t = OutputFormat::Table)]
-    format: OutputFormat,
+    /// Output format; -o is a file in verbs that write one.
+    #[arg(short = 'o', long, global = true, value_enum, default_value_t = OutputChoice::Table)]
+    format: OutputChoice,
+    /// Print only names or ids, of verbs that list: short for -o name.
+    #[arg(short, long, global = true, conflicts_with = "format")]
+    quiet: bool,
     #[command(subcommand)]
     verb: CtlCommand,
 }
 
 #[derive(Debug, Subcommand)]
 enum CtlCommand {
+    #[command(visible_alias = "deploy")]
     Push(Box<push::PushArgs>),
     Pushes(pushes::PushesArgs),
+    #[command(visible_aliases = ["service", "ls", "list", "get"])]
     Services(services::ServicesArgs),
+    #[command(visible_aliases = ["servant", "ps"])]
     Servants(servants::ServantsArgs),
     Top(top::TopArgs),
     Logs(logs::LogsArgs),
@@ -103,6 +119,7 @@ enum CtlCommand {
     Shadow(shadow::ShadowArgs),
     Sla(sla::SlaArgs),
     Stop(stop::StopArgs),
+    #[command(visible_alias = "delete")]
     Rm(rm::RmArgs),
     Rollback(rollback::RollbackArgs),
     Diff(diff::DiffArgs),
@@ -126,12 +143,42 @@ enum CtlCommand {
     Trust(trust::TrustArgs),
     Status(status::StatusArgs),
     Doctor(doctor::DoctorArgs),
+    Version(version::VersionArgs),
     Completions(manual::CompletionsArgs),
     Man(manual::ManArgs),
 }
 
+/// Returns the whole command line, as it is parsed, explained and completed.
+fn command_line() -> clap::Command {
+    help::arrange(CtlArguments::command())
+}
+
+/// Parses the words of the command line.
+fn parse(words: Vec<OsString>) -> Result<CtlArguments, clap::Error> {
+    let matches = command_line().try_get_matches_from(spelling::to_own_words(words))?;
+    let mut arguments = CtlArguments::from_arg_matches(&matches)?;
+    if arguments.quiet {
+        arguments.format = OutputChoice::Name;
+    }
+    if arguments.format == OutputChoice::Name && !help::is_listing(&matches) {
+        let message = "names are printed by verbs that list: services, servants, and list of others\n";
+        return Err(command_line().error(ErrorKind::ArgumentConflict, message));
+    }
+    Ok(arguments)
+}
+
 fn main() -> ExitCode {
-    let arguments = CtlArguments::parse();
+    let words: Vec<OsString> = std::env::args_os().collect();
+    if words.get(1).is_some_and(|word| word == complete::VERB) {
+        return run_to_end(complete::print_names(&words[2..], command_line()));
+    }
+    match parse(words) {
+        Ok(arguments) => run_to_end(run(arguments)),
+        Err(error) => help::print(&error),
+    }
+}
+
+fn run_to_end(work: impl Future<Output = anyhow::Result<()>>) -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => {
@@ -139,7 +186,7 @@ fn main() -> ExitCode {
             return Exit::Failed.into();
         }
     };
-    let outcome = runtime.block_on(run(arguments));
+    let outcome = runtime.block_on(work);
     // A pending read of standard input or a directory must not delay the exit.
     runtime.shutdown_background();
     match outcome {
@@ -155,12 +202,12 @@ fn main() -> ExitCode {
 async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
     // These run while a package is built, where there is no daemon.
     let arguments = match arguments.verb {
-        CtlCommand::Completions(verb) => return verb.run::<CtlArguments>(),
-        CtlCommand::Man(verb) => return verb.run::<CtlArguments>(),
+        CtlCommand::Completions(verb) => return verb.run(command_line()),
+        CtlCommand::Man(verb) => return verb.run(command_line()),
         verb => CtlArguments { verb, ..arguments },
     };
     let client = DaemonClient::new(arguments.server.as_deref(), arguments.token)?;
-    let format = arguments.format;
+    let format = arguments.format.apply();
     match arguments.verb {
         CtlCommand::Push(verb) => verb.run(&client, format).await,
         CtlCommand::Pushes(verb) => verb.run(&client, format).await,
@@ -200,6 +247,7 @@ async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
         CtlCommand::Trust(verb) => verb.run(),
         CtlCommand::Status(verb) => verb.run(&client, format).await,
         CtlCommand::Doctor(verb) => verb.run(&client, format).await,
+        CtlCommand::Version(verb) => verb.run(&client, format).await,
         CtlCommand::Completions(_) | CtlCommand::Man(_) => Ok(()),
     }
 }
@@ -226,16 +274,18 @@ fn print_error(error: &anyhow::Error) {
 mod tests {
     use super::*;
 
+    fn parse_line(line: &str) -> Result<CtlArguments, clap::Error> {
+        parse(line.split_whitespace().map(OsString::from).collect())
+    }
+
     #[test]
     fn the_command_line_is_consistent() {
-        use clap::CommandFactory;
-        CtlArguments::command().debug_assert();
+        command_line().debug_assert();
     }
 
     #[test]
     fn every_verb_explains_itself() {
-        use clap::CommandFactory;
-        for verb in CtlArguments::command().get_subcommands() {
+        for verb in command_line().get_subcommands() {
             assert!(verb.get_about().is_some(), "{} has no help", verb.get_name());
             for argument in verb.get_arguments() {
                 assert!(argument.get_help().is_some(), "{} {} has no help", verb.get_name(), argument.get_id());
@@ -245,8 +295,41 @@ mod tests {
 
     #[test]
     fn the_format_may_stand_before_or_after_the_verb() {
-        for line in [["cloudroidctl", "--format", "json", "status"], ["cloudroidctl", "status", "--format", "json"]] {
-            assert_eq!(CtlArguments::try_parse_from(line).expect("valid").format, OutputFormat::Json);
+        for (line, format) in [
+            ("cloudroidctl --format json status", OutputChoice::Json),
+            ("cloudroidctl status --format json", OutputChoice::Json),
+            ("cloudroidctl -o yaml services", OutputChoice::Yaml),
+            ("cloudroidctl services -o wide", OutputChoice::Wide),
+            ("cloudroidctl token list -o json", OutputChoice::Json),
+            ("cloudroidctl services -q", OutputChoice::Name),
+            ("cloudroidctl -q token list", OutputChoice::Name),
+            ("cloudroidctl status", OutputChoice::Table),
+            // Verbs that write a file have had -o for it.
+            ("cloudroidctl record s -o drive.mcap --format json", OutputChoice::Json),
+            ("cloudroidctl -o json recordings get 3 -o drive.mcap", OutputChoice::Json),
+        ] {
+            assert_eq!(parse_line(line).expect(line).format, format, "{line}");
+        }
+        for line in ["cloudroidctl status -q", "cloudroidctl push ./p -o name", "cloudroidctl services -q -o json"] {
+            assert_eq!(parse_line(line).expect_err(line).exit_code(), 2, "{line}");
+        }
+    }
+
+    #[test]
+    fn verbs_are_known_by_the_names_that_others_give_them() {
+        for (line, meant) in [
+            ("cloudroidctl ps", "Servants("),
+            ("cloudroidctl ls", "Services("),
+            ("cloudroidctl list", "Services("),
+            ("cloudroidctl get services", "Services("),
+            ("cloudroidctl --format json get servants", "Servants("),
+            ("cloudroidctl delete service adder", "Rm("),
+            ("cloudroidctl delete adder", "Rm("),
+            ("cloudroidctl deploy ./p", "Push("),
+            ("cloudroidctl version", "Version("),
+        ] {
+            let verb = format!("{:?}", parse_line(line).expect(line).verb);
+            assert!(verb.starts_with(meant), "{line}: {verb}");
         }
     }
 }

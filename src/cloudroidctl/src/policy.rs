@@ -83,9 +83,5 @@ fn list(rules: &[Rule], format: OutputFormat) -> anyhow::Result<()> {
             if grants.is_empty() { "nothing".into() } else { grants.join(" ") },
         ]);
     }
-    if table.is_empty() {
-        output::line("no rules: robots and deployers have no access; grant it with: cloudroidctl policy allow")
-    } else {
-        table.print()
-    }
+    table.print_list("no rules: robots and deployers have no access; grant it with: cloudroidctl policy allow")
 }

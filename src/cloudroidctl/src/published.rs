@@ -15,18 +15,22 @@ use crate::output::{self, OutputFormat, Table};
 pub struct TopicsArgs {
     /// Id of the servant, or name of a service that has one servant.
     servant: String,
-    /// Number of seconds, with one table each (default: until Ctrl-C).
-    #[arg(short = 'n', long, value_name = "SECONDS")]
-    seconds: Option<usize>,
+    /// Number of tables, one each second (default: until Ctrl-C); like -n of rostopic echo and of top.
+    #[arg(short = 'n', long, alias = "seconds", value_name = "COUNT")]
+    count: Option<usize>,
+    /// One table: --count 1, like --once of ros2 topic echo.
+    #[arg(long, conflicts_with = "count")]
+    once: bool,
 }
 
 impl TopicsArgs {
     /// Sends the request and prints the statistics.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let tables = if self.once { 1 } else { self.count.unwrap_or(usize::MAX) };
         let servant = inside::resolve_servant(client, &self.servant).await?;
         let path = format!("/api/v1/servants/{}/topics", percent_encode(&servant));
         let told = client.get_lines::<PublishedTopics>(&path).await?;
-        let mut told = std::pin::pin!(told.take(self.seconds.unwrap_or(usize::MAX)));
+        let mut told = std::pin::pin!(told.take(tables));
         while let Some(topics) = told.next().await {
             let topics = topics?;
             if format == OutputFormat::Json {

@@ -52,7 +52,7 @@ struct GetRecording {
     output: Option<PathBuf>,
 }
 
-/// Write the last seconds of a servant to a recording now.
+/// Write the last seconds of a servant to a recording now. The daemon must have black boxes on ([black_box] seconds).
 #[derive(Debug, clap::Args)]
 struct TakeRecording {
     /// Id of the servant, or name of a service that has one servant.
@@ -95,15 +95,26 @@ impl ListRecordings {
         let path = format!("/api/v1/recordings?{}", asked.join("&"));
         let all: Vec<Recording> = client.get(&path).await?;
         if all.is_empty() && format == OutputFormat::Table {
-            output::eprint_line(if asked.is_empty() {
-                "no recordings; with seconds in [black_box] of its configuration, the daemon writes one when a \
-                    response comes later than the robot's limit; write one now with: cloudroidctl recordings take \
-                    SERVANT"
+            if asked.is_empty() {
+                // Who may list recordings may not always see the daemon's status.
+                let status = client.get::<api::Status>("/api/v1/status").await;
+                output::eprint_line(describe_none(status.is_ok_and(|status| status.black_box > 0.0)));
             } else {
-                "no recordings of that service and robot; omit --service and --robot to list all"
-            });
+                output::eprint_line("no recordings of that service and robot; omit --service and --robot to list all");
+            }
         }
         list(&all, format)
+    }
+}
+
+/// Returns the message for a daemon without recordings. One is taken only where black boxes are on.
+fn describe_none(is_on: bool) -> &'static str {
+    if is_on {
+        "no recordings; the daemon writes one when a response comes later than the robot's limit; write one now with: \
+            cloudroidctl recordings take SERVANT"
+    } else {
+        "no recordings, and black boxes are off; with seconds in [black_box] of its configuration, the daemon writes \
+            one when a response comes later than the robot's limit"
     }
 }
 
@@ -149,5 +160,5 @@ fn list(all: &[Recording], format: OutputFormat) -> anyhow::Result<()> {
             one.why.clone(),
         ]);
     }
-    table.print()
+    table.print_list("")
 }

@@ -6,7 +6,7 @@ use anyhow::bail;
 use api::rollout::{Arm, Rollout as Shown, RolloutOrder, RolloutState, RolloutTerms, Share};
 
 use crate::client::{DaemonClient, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputFormat, Table, count};
 use crate::wait::WaitFlag;
 
 /// Show the rollout of a service's next revision, promote or abort a canary, or start a rollout of an earlier revision.
@@ -154,15 +154,16 @@ fn next_in_words(rollout: &Shown) -> Vec<String> {
     let mut words = Vec::new();
     if rollout.state == RolloutState::Canary {
         words.push(format!(
-            "rolled back when worse by more than {}, after at least {} requests to each revision",
-            terms.bound, terms.samples
+            "rolled back when worse by more than {}, after at least {} to each revision",
+            terms.bound,
+            count(terms.samples, "request")
         ));
         words.push(match (&rollout.waits, terms.promote_after) {
             (Some(waits), Some(_)) => format!("its promotion is due but waits: {waits}"),
             (_, Some(after)) => format!(
-                "promoted {} after its start, unless it is worse, and after at least {} requests",
+                "promoted {} after its start, unless it is worse, and after at least {}",
                 time(after),
-                terms.samples
+                count(terms.samples, "request")
             ),
             (_, None) => format!("promote it with: cloudroidctl rollout {} promote", rollout.service),
         });

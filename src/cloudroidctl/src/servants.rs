@@ -3,7 +3,7 @@
 use api::{BackOff, Pressure, ResponseTimes, Servant, Size};
 
 use crate::client::DaemonClient;
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputChoice, OutputFormat, Table, count};
 
 /// List the servants: the running containers, each for one robot.
 #[derive(Debug, clap::Args)]
@@ -22,10 +22,7 @@ impl ServantsArgs {
         }
         let mut failing: Vec<BackOff> = client.get("/api/v1/back-offs").await?;
         failing.retain(|one| self.service.as_ref().is_none_or(|it| *it == one.service));
-        if servants.is_empty() && failing.is_empty() {
-            return output::line("no servants (instances); one starts when a robot connects to a service");
-        }
-        let mut table = Table::new(&[
+        let headings = [
             "SERVANT",
             "SERVICE",
             "ROBOT",
@@ -39,7 +36,9 @@ impl ServantsArgs {
             "RESPONSE",
             "LIMITS",
             "REQUESTED",
-        ]);
+        ];
+        let mut table =
+            Table::new(&headings).hide_unless_wide(&["CONNECTIONS", "THROTTLED", "PRESSURE", "LIMITS", "REQUESTED"]);
         for servant in &servants {
             let usage = servant.usage.as_ref();
             table.row([
@@ -58,16 +57,16 @@ impl ServantsArgs {
                 output::terms(servant),
             ]);
         }
-        if !servants.is_empty() {
-            table.print()?;
+        if failing.is_empty() || !servants.is_empty() {
+            table.print_list("no servants (instances); one starts when a robot connects to a service")?;
         }
-        for one in failing {
+        for one in failing.iter().filter(|_| OutputChoice::current() != OutputChoice::Name) {
             output::line(&format!(
-                "{}:{} for {} has failed {} times in a row (last: {}); next start in {}",
+                "{}:{} for {} has failed {} in a row (last: {}); next start in {}",
                 one.service,
                 one.revision,
                 one.robot,
-                one.failures,
+                count(one.failures, "time"),
                 one.reason,
                 output::time_until(one.again),
             ))?;
@@ -100,9 +99,9 @@ fn state(servant: &Servant) -> String {
         .iter()
         .map(|down| {
             format!(
-                "{} failed {} times in a row, next start in {}",
+                "{} failed {} in a row, next start in {}",
                 down.node,
-                down.failures,
+                count(down.failures, "time"),
                 output::time_until(down.again)
             )
         })

@@ -3,23 +3,26 @@
 use api::{Group, ServiceDetail, ServiceSummary, Shared};
 
 use crate::client::{DaemonClient, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputChoice, OutputFormat, Table, count};
 
 /// List the published services, or show one with its interface and revisions.
 #[derive(Debug, clap::Args)]
 pub struct ServicesArgs {
     /// Show only this service, with all details.
-    name: Option<String>,
+    service: Option<String>,
 }
 
 impl ServicesArgs {
     /// Sends the request and prints the services.
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        match self.name {
+        match self.service {
             Some(name) => {
                 let service: ServiceDetail = client.get(&format!("/api/v1/services/{}", percent_encode(&name))).await?;
                 match format {
                     OutputFormat::Json => output::json(&service),
+                    OutputFormat::Table if OutputChoice::current() == OutputChoice::Name => {
+                        output::line(&service.summary.name)
+                    }
                     OutputFormat::Table => show(&service),
                 }
             }
@@ -35,10 +38,8 @@ impl ServicesArgs {
 }
 
 fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
-    if services.is_empty() {
-        return output::line("no services; publish one with: cloudroidctl push PATH, or push --apt NAME");
-    }
-    let mut table = Table::new(&["SERVICE", "REVISION", "PUBLISHED", "SERVANTS", "LIMITS", "ADDRESS"]);
+    let headings = ["SERVICE", "REVISION", "PUBLISHED", "SERVANTS", "LIMITS", "ADDRESS"];
+    let mut table = Table::new(&headings).hide_unless_wide(&["LIMITS"]);
     for service in services {
         table.row([
             service.name.clone(),
@@ -49,7 +50,7 @@ fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
             service.address.clone(),
         ]);
     }
-    table.print()
+    table.print_list("no services; publish one with: cloudroidctl push PATH, or push --apt NAME")
 }
 
 /// Prints the details of a service. Also used at the end of a push.
@@ -127,7 +128,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
 }
 
 fn shared_in_words(shared: &Shared) -> String {
-    let mut words = format!("robots share {} to {} servants", shared.min, shared.max);
+    let mut words = format!("robots share {} to {}", shared.min, count(shared.max, "servant"));
     if shared.replicas > 1 {
         words += &format!(", {} per call", shared.replicas);
     } else if shared.idempotent {
@@ -141,9 +142,11 @@ fn group_in_words(group: &Group) -> String {
     let ready = group.servants.iter().filter(|one| one.ready && !one.retiring).count();
     let under_way: usize = group.servants.iter().map(|one| one.under_way).sum();
     let mut words = format!(
-        "revision {revision}: {robots} robots, {ready} of {} servants ready; {under_way} requests in progress, \
-            {waiting} waiting; {answered} answered, {failed} failed, {asked_again} retried",
-        group.servants.len()
+        "revision {revision}: {}, {ready} of {} ready; {} in progress, {waiting} waiting; {answered} answered, \
+            {failed} failed, {asked_again} retried",
+        count(*robots, "robot"),
+        count(group.servants.len(), "servant"),
+        count(under_way, "request"),
     );
     if *wasted > 0 {
         words += &format!("; {wasted} of {} answers unused", answered + wasted);

@@ -7,7 +7,7 @@ use futures_util::StreamExt;
 use hyper::Method;
 
 use crate::client::{self, DaemonClient, json_body, percent_encode};
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputFormat, Table, count};
 
 /// Number of fields that are printed for each topic, service and action.
 const FIELDS: usize = 8;
@@ -111,7 +111,7 @@ fn print(found: &Found) -> anyhow::Result<()> {
     for note in &found.not_compared {
         let times = match note.count {
             0 => String::new(),
-            count => format!(" ({count} times)"),
+            times => format!(" ({})", count(times, "time")),
         };
         output::line(&format!("  {}: {}{times}", note.what, note.why))?;
     }
@@ -121,8 +121,14 @@ fn print(found: &Found) -> anyhow::Result<()> {
 fn summary(found: &Found) -> [String; 2] {
     [
         format!(
-            "revision {} of {} beside revision {}, with {} requests of robot {} in {:.1} s ({})",
-            found.candidate, found.service, found.revision, found.given, found.robot, found.seconds, found.ended
+            "revision {} of {} beside revision {}, with {} of robot {} in {:.1} s ({})",
+            found.candidate,
+            found.service,
+            found.revision,
+            count(found.given, "request"),
+            found.robot,
+            found.seconds,
+            found.ended
         ),
         format!("{}: {}", found.verdict, found.why),
     ]
@@ -159,8 +165,12 @@ fn fields(found: &Found, row: &Compared) -> Vec<String> {
             name => name,
         };
         lines.push(format!(
-            "  {name}, in {} answers: {} of revision {}, {} of revision {}",
-            field.answers, field.present, found.revision, field.candidate, found.candidate
+            "  {name}, in {}: {} of revision {}, {} of revision {}",
+            count(field.answers, "answer"),
+            field.present,
+            found.revision,
+            field.candidate,
+            found.candidate
         ));
     }
     let more = row.fields.len().saturating_sub(FIELDS);

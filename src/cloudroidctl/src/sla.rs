@@ -211,17 +211,14 @@ fn list(service: &str, rows: &[Row], format: OutputFormat) -> anyhow::Result<()>
     if format == OutputFormat::Json {
         return output::json(&rows);
     }
-    if rows.is_empty() {
-        return output::line(&format!(
-            "the SLA table of {service} is empty: every robot gets the service's own limits; add an entry with: \
-                cloudroidctl sla set {service} --rrt 100ms --cpus 1.5"
-        ));
-    }
     let mut table = Table::new(&HEADINGS);
     for row in rows {
         table.row(cells(row));
     }
-    table.print()
+    table.print_list(&format!(
+        "the SLA table of {service} is empty: every robot gets the service's own limits; add an entry with: \
+            cloudroidctl sla set {service} --rrt 100ms --cpus 1.5"
+    ))
 }
 
 /// Returns a sentence about what the robot gets.

@@ -3,7 +3,7 @@
 use api::{Pressure, Size};
 
 use crate::client::DaemonClient;
-use crate::output::{self, OutputFormat};
+use crate::output::{self, OutputFormat, count};
 use crate::wait::WaitFlag;
 
 /// Show the status of the daemon: its address, its load and its problems. With --wait, waits until it answers.
@@ -48,8 +48,11 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         (
             "servants",
             format!(
-                "{} with {} connections; {} warm containers, {} of them with running nodes",
-                status.servants, status.connections, status.warm_pool, status.warm_nodes
+                "{} with {}; {}, {} of them with running nodes",
+                status.servants,
+                count(status.connections, "connection"),
+                count(status.warm_pool, "warm container"),
+                status.warm_nodes
             ),
         ),
         (

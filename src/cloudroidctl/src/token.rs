@@ -150,11 +150,7 @@ fn list(tokens: &[Token], format: OutputFormat) -> anyhow::Result<()> {
             state(token),
         ]);
     }
-    if table.is_empty() {
-        output::line("no tokens; create one with: cloudroidctl token create NAME --role ROLE")
-    } else {
-        table.print()
-    }
+    table.print_list("no tokens; create one with: cloudroidctl token create NAME --role ROLE")
 }
 
 fn state(token: &Token) -> String {

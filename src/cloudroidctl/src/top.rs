@@ -11,7 +11,7 @@ use crossterm::{cursor, execute, queue, style, terminal};
 use futures_util::StreamExt;
 
 use crate::client::DaemonClient;
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputFormat, Table, count};
 use crate::stream::{LiveState, LiveStream};
 
 /// Show servants and their resource usage, updated live. Keys: q quits; c, m, r and n sort by cores, memory, response
@@ -169,8 +169,8 @@ fn compare(by: SortKey, a: &Served, b: &Served) -> Ordering {
 fn machine_line(of: &api::stream::Machine) -> String {
     let room = &of.status.capacity;
     format!(
-        "{} servants; {:.2} of {} cores used, {:.2} reserved; {} of {} of memory reserved; {} waiting",
-        of.status.servants,
+        "{}; {:.2} of {} cores used, {:.2} reserved; {} of {} of memory reserved; {} waiting",
+        count(of.status.servants, "servant"),
         of.cores,
         of.host_cores,
         room.cpus_reserved,

@@ -9,7 +9,7 @@ use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
 use crate::client::{self, DaemonClient};
-use crate::output::{self, OutputFormat, Table};
+use crate::output::{self, OutputFormat, Table, count};
 use crate::push::PushArgs;
 
 /// Try a package on a recording or an image: show its answers and response times, and suggest T_desire and T_max.
@@ -89,13 +89,17 @@ fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
     }
     let Some(rrt) = trial.rrt else {
         return output::line(&format!(
-            "none of {} requests was answered: check whether an input or a parameter is missing",
-            trial.requests
+            "none of {} was answered: check whether an input or a parameter is missing",
+            count(trial.requests, "request")
         ));
     };
     output::line(&format!(
-        "{} of {} requests answered; response times p50 {:.1} ms, p90 {:.1} ms, max {:.1} ms",
-        trial.answered, trial.requests, rrt.p50, rrt.p90, rrt.max
+        "{} of {} answered; response times p50 {:.1} ms, p90 {:.1} ms, max {:.1} ms",
+        trial.answered,
+        count(trial.requests, "request"),
+        rrt.p50,
+        rrt.p90,
+        rrt.max
     ))?;
     output::line(&format!(
         "initial values: desire = {:.3}, max = {:.3} (seconds; add the robot's network round trip)",

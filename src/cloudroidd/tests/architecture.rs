@@ -305,6 +305,27 @@ fn sources(directory: &Path, into: &mut Vec<PathBuf>) {
     }
 }
 
+/// Events are filtered by kinds that `api` lists: one that it lacks could not be asked for by name.
+#[test]
+fn every_recorded_kind_of_event_is_listed() {
+    let mut files = Vec::new();
+    for directory in members().keys() {
+        sources(&root().join(directory).join("src"), &mut files);
+    }
+    let mut recorded = BTreeSet::new();
+    for file in files {
+        let text = std::fs::read_to_string(&file).expect("readable");
+        for call in ["journal.info(", "journal.warning(", "journal.error("] {
+            let after = text.split(call).skip(1).filter_map(|after| after.trim_start().strip_prefix('"'));
+            recorded.extend(after.filter_map(|kind| Some(kind.split_once('"')?.0.to_owned())));
+        }
+    }
+    assert!(recorded.len() > 20, "{recorded:?}");
+    for kind in recorded {
+        assert!(api::EVENT_KINDS.contains(&kind.as_str()), "api::EVENT_KINDS and docs/operators.md lack {kind}");
+    }
+}
+
 /// The code that serde derives for an untagged enum keeps a copy of its input: a recursive one keeps a copy for each
 /// level, so that a short nested text takes all memory. Such a type must be read by a visitor, as
 /// `ros::bus::ParamValue` is.

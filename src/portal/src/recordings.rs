@@ -108,13 +108,13 @@ pub async fn write_recording(app: &Arc<App>, handle: &Handle, why: &str) -> Resu
     }
     let left_out = match frozen.left_out {
         0 => String::new(),
-        many => format!("; {many} messages so far did not fit (memory in [black_box])"),
+        many => format!("; so far {} did not fit (memory in [black_box])", api::count(many, "message")),
     };
     let words = format!(
-        "recording {}: the last {:.1} s ({} messages), because {why}{left_out}",
+        "recording {}: the last {:.1} s ({}), because {why}{left_out}",
         record.id,
         frozen.span.as_secs_f64(),
-        record.messages
+        api::count(record.messages, "message")
     );
     let journal = app.choreographer.journal();
     journal.info(RECORDED, &words, &event_subject(handle));

@@ -181,6 +181,7 @@ pub async fn status(app: &App) -> Result<Status, Error> {
         warm_nodes,
         connections: servants.iter().map(|servant| servant.connections()).sum(),
         usage,
+        black_box: app.options.black_box.span.as_secs_f64(),
         warnings: app
             .machine
             .warnings

@@ -275,6 +275,7 @@ export interface FieldDifference {
 }
 
 export interface Fit {
+  at_present_use?: UseForecast;
   beyond_cpus: number;
   beyond_memory: Size;
   costs: Cost[];
@@ -1028,6 +1029,7 @@ export interface Stated {
 }
 
 export interface Status {
+  black_box: number;
   capacity: Capacity;
   certificate?: string;
   connections: number;
@@ -1134,6 +1136,12 @@ export interface Usage {
   pids: number;
   pressure?: Pressure;
   throttled_usec: number;
+}
+
+export interface UseForecast {
+  cpus?: number;
+  more?: number;
+  unused_cpus: number;
 }
 
 export type Verdict =

@@ -40,7 +40,7 @@ pub enum AdmissionError {
         free: Amount,
     },
     /// The queue is full.
-    #[error("this machine is full and {waiting} robots are already waiting")]
+    #[error("this machine is full, with {} already waiting", api::count(*waiting, "robot"))]
     QueueFull {
         /// Number of waiting robots.
         waiting: usize,

@@ -92,6 +92,25 @@ pub fn fit((wanted, priority): (Amount, i32), book: &AdmissionLedger, cores: u64
     }
 }
 
+/// Forecast for servants whose promise of cores tells nothing of their use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UseForecast {
+    /// Cores in thousandths that a servant of the service uses, on average.
+    pub uses: u64,
+    /// Number of such servants for which the unused cores suffice, and what can be promised.
+    pub more: u64,
+}
+
+/// Predicts how many more servants would find the `cores` (thousandths) that the present ones `of_service` use on
+/// average, if all servants together use `used`; `most` is the number that fit by their promises. `None` if none is
+/// there or they use nothing: nothing follows from that.
+pub fn forecast_by_use(of_service: &[u64], used: u64, cores: u64, most: Option<u64>) -> Option<UseForecast> {
+    let sum: u64 = of_service.iter().sum();
+    let uses = sum.checked_div(of_service.len() as u64)?;
+    let more = cores.saturating_sub(used).checked_div(uses)?;
+    Some(UseForecast { uses, more: most.map_or(more, |most| most.min(more)) })
+}
+
 /// Returns the costs of the servants that would lose something.
 fn neighbour_costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<NeighbourCost> {
     let claim = |other: &Neighbour<'_>| Claim {
@@ -219,6 +238,19 @@ mod tests {
         let others = [neighbour("small", 0.0, 100, None)];
         let fit = fit((Amount::new(1.0, 0), 0), &book(0.0, None), 4000, &others);
         assert_eq!(fit.costs, []);
+    }
+
+    #[test]
+    fn what_servants_use_tells_how_many_more_find_it() {
+        let forecast = |of_service: &[u64], used, most| {
+            let found = forecast_by_use(of_service, used, 4000, most);
+            found.map(|found| (found.uses, found.more))
+        };
+        assert_eq!(forecast(&[300, 500], 1000, None), Some((400, 7)));
+        assert_eq!(forecast(&[300, 500], 1000, Some(2)), Some((400, 2)), "their memory is promised");
+        assert_eq!(forecast(&[2500, 2500], 5000, None), Some((2500, 0)), "all is used");
+        assert_eq!(forecast(&[], 1000, None), None);
+        assert_eq!(forecast(&[0, 0], 0, None), None);
     }
 
     proptest! {

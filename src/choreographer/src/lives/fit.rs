@@ -11,7 +11,7 @@ use super::controller::{read_usage, response_goal, usage_rates};
 use super::warm_facts;
 use crate::decide::Amount;
 use crate::decide::controller::{MeasuredTimes, ResponseGoal};
-use crate::decide::fit::{Fit, Neighbour, fit};
+use crate::decide::fit::{Fit, Neighbour, fit, forecast_by_use};
 use crate::{Choreographer, Error};
 
 /// Duration of sampling the usage of others.
@@ -46,6 +46,7 @@ impl Choreographer {
         let of_service = of_robots.filter(|handle| handle.service() == service);
         let group = of_service.clone().filter(|handle| !handle.is_ending());
         let group = shared.then(|| group.count() as u64);
+        let used_by_service: Vec<u64> = of_service.clone().filter_map(|handle| uses.get(&handle.id).copied()).collect();
         let measured = of_service.filter_map(|handle| inner.recent.p95(&handle.id, now));
         let expected = expected.or_else(|| expected_from_others(service, measured));
         let book = inner.admission.ledger();
@@ -59,6 +60,10 @@ impl Choreographer {
             Some(1..) => Fit::NOTHING,
             _ => fit((wanted, priority), &book, cores, &others),
         };
+        let used: u64 = uses.values().sum();
+        let by_use = forecast_by_use(&used_by_service, used, cores, fit.more);
+        let unused = cores.saturating_sub(used);
+        let has_cores = shared || asked.promised_limits().cpus.is_some();
         let cores = |millicpus: u64| millicpus as f64 / 1000.0;
         let (waiting, free) = (book.waiting_count(), book.capacity().minus(book.promised_total()));
         let costs = fit.costs.into_iter().filter_map(|cost| {
@@ -92,6 +97,11 @@ impl Choreographer {
             more: fit.more,
             beyond_cpus: fit.beyond.cpus(),
             beyond_memory: api::Size(fit.beyond.memory),
+            at_present_use: (!has_cores).then(|| api::UseForecast {
+                unused_cpus: cores(unused),
+                cpus: by_use.map(|found| cores(found.uses)),
+                more: by_use.map(|found| found.more),
+            }),
             expected,
             shared: group,
         })

@@ -37,9 +37,14 @@ impl Choreographer {
         // One change at a time: the promise, the limits in force and the stored limits must agree.
         let _turn = handle.lock_limits().await;
         let before = handle.limit_sources();
-        let after = LimitSources { set: change.or(before.set), ..before };
+        let after = LimitSources { set: change.or(before.set), ..before.clone() };
         let inner = &self.inner;
         let set = after.set;
+        let [has, wanted] = [&before, &after].map(|sources| inner.promised_amount(&sources.promised_limits()));
+        if !wanted.fits(has) {
+            // More than the whole machine is no matter of waiting.
+            inner.admission.ledger().check(wanted)?;
+        }
         let in_force = inner.resize(handle, with_default_weight(change), after).await?;
         inner.state.set_servant_limits(id, &set)?;
         let message = format!("servant {id}: limits changed to {in_force}");

@@ -183,6 +183,11 @@ async fn what_the_operator_sets_stays_whatever_the_robot_states() {
     let memory = api::Size(64 << 20);
     assert_eq!(enforced_limits(&daemon, &again).await, (Some(0.75), Some(memory)));
     assert_eq!(daemon.admission().snapshot().1, Amount::new(0.75, memory.0));
+    // There are two cores: waiting would not help.
+    let beyond = api::Limits { cpus: Some(5.0), ..api::Limits::default() };
+    let refused = daemon.set_limits(&id, beyond).await;
+    assert!(matches!(refused, Err(Error::Full(AdmissionError::TooBig { .. }))), "{refused:?}");
+    assert_eq!(daemon.admission().snapshot().1, Amount::new(0.75, memory.0));
 }
 
 #[tokio::test(start_paused = true)]

@@ -204,7 +204,9 @@ fn choreographer_next_step(error: &choreographer::Error) -> String {
     use choreographer::Error as C;
     match error {
         C::UnknownServant { .. } => "list them with: cloudroidctl servants".into(),
-        C::Full(AdmissionError::TooBig { .. }) => "push it again with smaller --cpus and --memory".into(),
+        C::Full(AdmissionError::TooBig { .. }) => {
+            "pass smaller --cpus and --memory; cloudroidctl status shows what this machine has".into()
+        }
         C::Terms(untenable) => terms_next_step(untenable),
         C::NotResized { reason, .. } => match &**reason {
             ResizeError::Untenable(untenable) => terms_next_step(untenable),

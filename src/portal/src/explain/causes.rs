@@ -1,7 +1,7 @@
 //! Derives causes from what is known of a robot, and what to do about each.
 
 use api::explain::{Cause, Link, Served, Weight};
-use api::{Event, Phase};
+use api::{Event, Phase, count};
 
 /// Thresholds above which a share or difference is reported.
 const THROTTLED: f64 = 0.05;
@@ -27,9 +27,10 @@ pub(super) fn find_causes(
     for one in failing {
         let left = one.again.saturating_sub(store::now()).div_ceil(1000);
         let what = format!(
-            "its servants of {} failed {} times in a row (the last one {}); the next start is in {left} s at the \
-                earliest",
-            one.service, one.failures, one.reason
+            "its servants of {} failed {} in a row (the last one {}); the next start is in {left} s at the earliest",
+            one.service,
+            count(one.failures, "time"),
+            one.reason
         );
         let next = format!("cloudroidctl events; push {} again when it is fixed", one.service);
         say(Weight::Blocks, what, next);
@@ -92,7 +93,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
         let left = down.again.saturating_sub(store::now()).div_ceil(1000);
         say(
             Weight::Blocks,
-            format!("{} of {id} failed {} times in a row and restarts in {left} s", down.node, down.failures),
+            format!("{} of {id} failed {} in a row and restarts in {left} s", down.node, count(down.failures, "time")),
             format!("cloudroidctl logs {id}"),
         );
     }
@@ -144,7 +145,7 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
     if servant.dropped > 0 {
         say(
             Weight::Hint,
-            format!("{} messages of {id} were dropped because a subscriber was slow", servant.dropped),
+            format!("dropped of {id} because a subscriber was slow: {}", count(servant.dropped, "message")),
             "lower the rate of the subscribed topics, or compress them".to_owned(),
         );
     }
@@ -222,7 +223,11 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
         let (part, next) = blame(served, link);
         say(
             Weight::Slows,
-            format!("{} of the last {} requests of {node} exceeded T_max{max}{part}", link.late, link.requests),
+            format!(
+                "{} of the last {} of {node} exceeded T_max{max}{part}",
+                link.late,
+                count(link.requests, "request")
+            ),
             next,
         );
     }
@@ -230,7 +235,11 @@ fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, St
         let q = link.satisfaction.map_or_else(String::new, |q| format!(", Q is {q:.1}"));
         say(
             Weight::Hint,
-            format!("the local original answered {} of the last {} requests of {node}{q}", link.local, link.requests),
+            format!(
+                "the local original answered {} of the last {} of {node}{q}",
+                link.local,
+                count(link.requests, "request")
+            ),
             match link.fallback_after {
                 Some(_) => "it takes over while the link is down, and stops automatically when it is back".to_owned(),
                 None => "it stops automatically when the cloud meets T_max again".to_owned(),

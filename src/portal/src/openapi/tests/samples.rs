@@ -22,7 +22,7 @@ use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor, Event,
     Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, NodeDown, Phase, Pressure, Problem,
     PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Shadow, ShadowEvent,
-    ShadowOptions, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, Volume,
+    ShadowOptions, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, UseForecast, Volume,
 };
 use serde_json::Value;
 
@@ -397,6 +397,7 @@ fn status() -> Status {
         warm_nodes: 1,
         connections: 1,
         usage: usage(),
+        black_box: 10.5,
         warnings: one_text("x"),
     }
 }
@@ -559,16 +560,26 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         more: Some(1),
         beyond_cpus: 0.5,
         beyond_memory: Size(1),
+        at_present_use: Some(UseForecast { unused_cpus: 1.5, cpus: Some(0.5), more: Some(3) }),
         expected: Some(Expected { rrt: 0.1, from: "x".into() }),
         shared: Some(1),
     };
-    let bare = Fit { stalled: None, never: None, more: None, expected: None, shared: None, ..fits.clone() };
+    let bare = Fit {
+        stalled: None,
+        never: None,
+        more: None,
+        at_present_use: Some(UseForecast { unused_cpus: 1.5, cpus: None, more: None }),
+        expected: None,
+        shared: None,
+        ..fits.clone()
+    };
     let mut samples = vec![
         sample("ShadowOptions", shadow_options()),
         sample("ShadowOptions", ShadowOptions::default()),
         sample("CalibrationOptions", calibration_options()),
         sample("CalibrationOptions", CalibrationOptions::default()),
         sample("Fit", fits),
+        sample("Fit", Fit { at_present_use: None, ..bare.clone() }),
         sample("Fit", bare),
         sample("NewRule", new_rule()),
         sample("NewToken", new_token()),
