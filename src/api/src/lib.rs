@@ -49,7 +49,8 @@ pub use problem::Problem;
 pub use push::{PushEvent, PushOptions};
 pub use rollout::Rollout;
 pub use servant::{
-    BackOff, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms, TopicDrops,
+    BackOff, KeptLog, LogLevel, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms,
+    TopicDrops,
 };
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use shadow::{Shadow, ShadowEvent, ShadowOptions};

@@ -21,6 +21,7 @@ mod inside;
 mod limits;
 mod logs;
 mod manual;
+mod moment;
 mod output;
 mod pair;
 mod policy;
