@@ -35,6 +35,7 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
     let memory = machine["figures"]["memory"].as_array().context("memory")?;
     ensure!(memory.iter().any(|one| one.as_f64() > Some(1e6)), "{machine:#}");
 
+    robot.call("/add_two", json!({"a": -2, "b": 0}))?;
     // After a kill and restart the history is still available, also for a servant that has ended.
     robot.leave()?;
     daemon.kill()?;
@@ -51,6 +52,23 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
     ))?;
     ensure!(none[0]["figures"]["time"] == json!([]), "{none:#}");
 
+    // So is what it printed, after another restart.
+    daemon.kill()?;
+    let daemon = setup.start()?;
+    let deployer = daemon.deployer();
+    deployer.run(&["logs", "adder_py"])?.expect_failure(&["it was stopped: cloudroidctl logs --previous adder_py"])?;
+    for name in ["adder_py", "r1", id] {
+        let log = deployer.run(&["logs", name, "--previous", "--since", "12h", "-t"])?.expect_success()?;
+        let warning = log.stdout.lines().find(|line| line.contains("the sum is negative: -2"));
+        // Date and time, as far as they are surely the same.
+        ensure!(warning.is_some_and(|line| line.starts_with("20") && line.contains("Z /adder | ")), "{}", log.output());
+    }
+    let log = deployer.run(&["logs", id, "--since", "2100-01-01"])?.expect_success()?;
+    ensure!(log.stdout.is_empty(), "{}", log.output());
+    let log = deployer.run(&["--format", "json", "logs", id])?.expect_success()?;
+    let warning = log.stdout.lines().find(|line| line.contains("the sum is negative: -2"));
+    ensure!(warning.is_some_and(|line| line.contains("\"level\":\"warn\"")), "{}", log.output());
+
     // Principals see the history that they may see.
     let viewer = ["looks", "--role", "viewer", "--service", "adder*"];
     let viewer = create_token(&daemon, &viewer)?;
@@ -66,8 +84,12 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
         ensure!(status == 200 && seen.len() == count, "{status} {body}");
         let (status, body) = asks("/api/v1/history/servants?servant=")?;
         ensure!((status, &*body) == (200, "[]"), "{status} {body}");
-        let (status, body) = asks("/api/v1/history/machine")?;
-        ensure!(status == 403, "{status} {body}");
+        let (status, body) = asks("/api/v1/logs")?;
+        ensure!((status, &*body) == (200, "[]"), "{status} {body}");
+        for refused in ["/api/v1/history/machine", &*format!("/api/v1/servants/{id}/logs")] {
+            let (status, body) = asks(refused)?;
+            ensure!(status == 403, "{status} {body}");
+        }
     }
     // Invalid requests are refused with the name of the error.
     let admin = create_token(&daemon, &["boss", "--role", "admin"])?;
@@ -79,5 +101,10 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
         let (status, body) = daemon.request("GET", &path, &[("Authorization", &bearer)])?;
         ensure!(status == 400 && body.contains(words), "{asked}: {status} {body}");
     }
+    // Whoever pushes a service of this name next finds nothing of it.
+    ensure!(daemon.home.join("ended").join(id).is_dir());
+    daemon.deployer().run(&["rm", "adder_py"])?.expect_success()?;
+    ensure!(!daemon.home.join("ended").join(id).exists());
+    daemon.deployer().run(&["logs", id, "--previous"])?.expect_failure(&["no log of an ended servant"])?;
     Ok(())
 }

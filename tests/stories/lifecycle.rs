@@ -164,6 +164,14 @@ fn expect_inactive_refused(daemon: &Daemon, arguments: &[&str]) -> Verdict {
         let message = event["message"].to_string();
         event["kind"] == "lifecycle-refused" && words.iter().all(|word| message.contains(word))
     })?;
+    // Its log is all that is left of it. The line was printed on standard error, as every line of ROS 2.
+    let previous = ["--format", "json", "logs", "refused", "--previous"];
+    support::wait_until("the log of the refused servant", || {
+        let log = daemon.deployer().run(&previous)?;
+        let closed = log.stdout.lines().find(|line| line.contains("the post is closed"));
+        let is_error = closed.is_some_and(|line| line.contains("\"level\":\"error\""));
+        Ok(if is_error { Ok(()) } else { Err(log.output()) })
+    })?;
     // It is not published either.
     let again = [&["--name", "closed"], arguments].concat();
     let pushed = daemon.deployer().push(SERVICE, &again)?;

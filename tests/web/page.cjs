@@ -1161,6 +1161,13 @@ const STEPS = {
     await visitor.page.waitForFunction(median);
     await visitor.sees('is ready for rover');
     await visitor.judges('servant-ended');
+    // So is what it printed.
+    await visitor.sees('Reason: it was stopped');
+    await visitor.clicks('Log', 'link');
+    await visitor.sees('the servant has ended');
+    await visitor.sees('the sum is negative');
+    await visitor.page.waitForSelector('.log .ansi-yellow');
+    await visitor.judges('log-ended');
     await visitor.opens('#/servants');
     await visitor.sees('serves no robot');
     await visitor.judges('servants-none');

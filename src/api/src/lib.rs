@@ -54,7 +54,8 @@ pub use push::{PushEvent, PushOptions};
 pub use pushes::{PushCount, PushState, PushStatus};
 pub use rollout::Rollout;
 pub use servant::{
-    BackOff, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms, TopicDrops,
+    BackOff, KeptLog, LogLevel, LogLine, NodeDown, NodeStage, Phase, ResponseTimes, Servant, Stopped, Stream, Terms,
+    TopicDrops,
 };
 pub use service::{Node, Revision, Rollback, ServiceDetail, ServiceSummary};
 pub use shadow::{Shadow, ShadowEvent, ShadowOptions};

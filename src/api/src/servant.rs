@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::Millis;
 use crate::dictionary::Row;
 use crate::limits::{Limits, Usage};
+use crate::size::Size;
 use crate::sla::Stated;
 
 /// Phase of a servant's life cycle; see the state machine in the choreographer.
@@ -260,6 +261,52 @@ pub struct LogLine {
     pub node: String,
     /// Stream that the line was printed to.
     pub stream: Stream,
+    /// Severity, if the line is in the console format of ROS 1 or ROS 2.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub level: Option<LogLevel>,
     /// The line, without its line terminator.
     pub line: String,
+}
+
+/// Severity of a line of a log, as ROS names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum LogLevel {
+    /// Details for developers.
+    Debug,
+    /// Normal operation.
+    Info,
+    /// Something unexpected, which the node copes with.
+    Warn,
+    /// Something that the node cannot do.
+    Error,
+    /// The node cannot go on.
+    Fatal,
+}
+
+/// An ended servant whose log is kept for a while, to be read like that of a running one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct KeptLog {
+    /// Id of the servant; its log is at `GET /api/v1/servants/ID/logs`.
+    pub servant: String,
+    /// Name of the service.
+    pub service: String,
+    /// Revision that the servant was started from.
+    pub revision: u64,
+    /// Name of the robot.
+    pub robot: String,
+    /// Time when the servant was requested.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
+    pub created: Millis,
+    /// Time when the servant ended.
+    #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
+    pub ended: Millis,
+    /// True if the servant failed, false if it was ended.
+    pub failed: bool,
+    /// Reason of the end.
+    pub reason: String,
+    /// Size of the log's files in bytes.
+    pub bytes: Size,
 }

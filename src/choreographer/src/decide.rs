@@ -28,6 +28,7 @@
 //! | [`warm_pool`] | how many containers each service has in advance, which of them have nodes, which end |
 //! | [`forecast`] | how many robots are about to ask |
 //! | [`adoption`] | the fate of a container that an earlier daemon left |
+//! | [`quota`] | which files are removed for a new one, where services share a quota |
 //!
 //! A decision made under the choreographer's lock, or the admission queue's, is recorded under the same lock.
 
@@ -48,6 +49,7 @@ pub(crate) mod lifetime;
 pub(crate) mod measured;
 pub(crate) mod nodes;
 pub(crate) mod placement;
+pub(crate) mod quota;
 pub(crate) mod requests;
 pub(crate) mod rollout;
 pub(crate) mod shadow;

@@ -63,6 +63,7 @@ pub use decide::admission::{AdmissionError, Position};
 pub use decide::back_off::seconds;
 pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, RowError, check as check_row};
+pub use decide::quota::{Quota, QuotaFile, find_files_to_evict};
 pub use decide::terms::{Cap, CapSource, TermsError};
 pub use error::{Error, ResizeError, with_last_log_line};
 pub use lives::Choreographer;
@@ -75,7 +76,7 @@ pub use lives::recent::AnsweredRequest;
 pub use lives::rollouts::check_terms;
 pub use lives::waiting::{Admission, Permit, QueueStanding};
 pub use memory::{Memory, MemoryOptions};
-pub use options::{ClassOptions, DEFAULT_CLASS, HungPolicy, Options};
+pub use options::{ClassOptions, DEFAULT_CLASS, HungPolicy, KeptLogOptions, Options};
 pub use request::ServantRequest;
 pub use shown::usage;
 pub use tracer::{RequestTracer, TracedServant};
@@ -127,6 +128,7 @@ impl Choreographer {
             back_offs: BackOffs::default(),
             rollouts: Arc::default(),
             incomplete: Mutex::default(),
+            kept_logs: Default::default(),
             ending: AtomicBool::new(false),
             refusals: Mutex::default(),
         };
@@ -291,12 +293,13 @@ impl Choreographer {
         warm_pool::end_all(&self.inner).await;
     }
 
-    /// Starts watching the machine, moving cores if configured, and resizing servants by the size of their robots'
-    /// messages and by the clients that have left; returns at once.
+    /// Starts watching the machine, moving cores if configured, resizing servants by the size of their robots' messages
+    /// and by the clients that have left, and removing old logs of ended servants; returns at once.
     pub fn keep_watch(&self) {
         tokio::spawn(lives::controller::watch(Arc::clone(&self.inner)));
         tokio::spawn(lives::measuring::watch(Arc::clone(&self.inner)));
         tokio::spawn(lives::leaving::watch(Arc::clone(&self.inner)));
+        tokio::spawn(lives::kept_logs::watch(Arc::clone(&self.inner)));
     }
 
     /// Returns how often cores were moved.

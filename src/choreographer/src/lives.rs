@@ -12,6 +12,7 @@ mod fit;
 pub(crate) mod group;
 pub(crate) mod handle;
 pub(crate) mod hung;
+pub(crate) mod kept_logs;
 pub(crate) mod lease;
 pub(crate) mod leaving;
 mod lifetime;
@@ -50,6 +51,7 @@ use crate::memory::SharedMemory;
 use crate::options::Options;
 use crate::{Error, ServantRequest};
 use back_off::BackOffs;
+use kept_logs::KeptLogs;
 use recent::RecentRequests;
 use rollouts::Rollouts;
 use shared_group::Groups;
@@ -83,6 +85,7 @@ pub(crate) struct ChoreographerInner {
     pub(crate) rollouts: Arc<Rollouts>,
     /// Images whose nodes did not register all of their interface within the full start time.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
+    pub(crate) kept_logs: KeptLogs,
     pub(crate) ending: AtomicBool,
     /// Recently reported refusals.
     pub(crate) refusals: Mutex<RefusalLog>,

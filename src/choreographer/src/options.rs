@@ -5,6 +5,7 @@ use std::time::Duration;
 use api::{Caps, Limits, Sla};
 use bridge::BridgeOptions;
 
+use crate::decide::quota::Quota;
 use crate::memory::MemoryOptions;
 use crate::tracer::RequestTracer;
 
@@ -57,8 +58,19 @@ pub struct Options {
     pub bridge: BridgeOptions,
     /// Limits on the memory held for clients and servants.
     pub memory: MemoryOptions,
+    /// Which logs of ended servants are kept.
+    pub kept_logs: KeptLogOptions,
     /// Makes traces of robots' requests.
     pub tracer: Option<Arc<dyn RequestTracer>>,
+}
+
+/// Which logs of ended servants are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct KeptLogOptions {
+    /// Time for which a log is kept after the end of its servant; zero keeps none.
+    pub age: Duration,
+    /// Largest number and size of all logs together.
+    pub quota: Quota,
 }
 
 /// Name of the class of robots that name none, if it is configured.

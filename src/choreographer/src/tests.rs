@@ -50,6 +50,7 @@ fn options() -> Options {
         hung_after: 10.0,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions { daemon: memory, client: memory, servant: memory, unfinished: Duration::from_secs(300) },
+        kept_logs: KeptLogOptions { age: Duration::from_secs(3600), quota: Quota { files: 100, bytes: 1 << 20 } },
         tracer: None,
     }
 }

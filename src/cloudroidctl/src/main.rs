@@ -27,6 +27,7 @@ mod inside;
 mod limits;
 mod logs;
 mod manual;
+mod moment;
 mod output;
 mod pair;
 mod policy;

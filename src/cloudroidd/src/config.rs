@@ -7,6 +7,7 @@ mod black_box;
 mod capacity;
 mod class;
 mod doubts;
+mod logs;
 mod memory;
 mod oidc;
 mod options;
@@ -42,6 +43,7 @@ pub use archives::ArchivesConfig;
 pub use black_box::BlackBoxConfig;
 pub use capacity::{CapacityConfig, Controller};
 pub use class::ClassConfig;
+pub use logs::LogsConfig;
 pub use memory::MemoryConfig;
 pub use people::PeopleConfig;
 pub use telemetry::TelemetryConfig;
@@ -106,6 +108,8 @@ pub struct Config {
     pub telemetry: Option<TelemetryConfig>,
     /// Recording of the last seconds of servants, kept for when something goes wrong.
     pub black_box: BlackBoxConfig,
+    /// Logs that are kept of ended servants.
+    pub logs: LogsConfig,
     /// Limits of pushes.
     pub push: PushConfig,
     /// Grants beyond a container that pushes may ask for.
@@ -166,6 +170,7 @@ impl Default for Config {
             memory: MemoryConfig::default(),
             telemetry: None,
             black_box: BlackBoxConfig::default(),
+            logs: LogsConfig::default(),
             push: PushConfig::default(),
             allow: Allow::default(),
         }
@@ -224,6 +229,7 @@ impl Config {
         }
         reach::egress::validate(&self.allow.egress).context("egress in [allow] of the configuration")?;
         self.black_box.check(self.memory.servant).context("[black_box] of the configuration")?;
+        self.logs.check().context("[logs] of the configuration")?;
         if let Some(telemetry) = &self.telemetry {
             telemetry.check(cfg!(feature = "otel")).context("[telemetry] of the configuration")?;
         }
@@ -288,6 +294,7 @@ mod tests {
         let servant = ServantConfig { scratch: Some(Size(512 << 20)), ..ServantConfig::default() };
         assert_eq!(written.servant, servant);
         assert_eq!(written.portal, PortalConfig::default());
+        assert_eq!(written.logs, LogsConfig::default());
         let memory = MemoryConfig { daemon: Some(Size(1 << 30)), ..MemoryConfig::default() };
         assert_eq!(written.memory, memory);
         assert_eq!(written.push, PushConfig { cpus: Some(2.0), memory: Some(Size(4 << 30)), ..PushConfig::default() });

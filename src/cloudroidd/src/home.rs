@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock
-//! servants/<id>/  build/<push>/  logs/  recordings/
+//! servants/<id>/  ended/<id>/  build/<push>/  logs/  recordings/
 //! ```
 //!
 //! No other user can enter it (docs/adr/033).
@@ -91,7 +91,7 @@ impl Home {
         private::make_directory(&path).map_err(io_error("create the directory", &path))?;
         let lock = lock(&path, &mut || std::thread::sleep(PAUSE))?;
         let home = Home { path, _lock: lock };
-        for name in ["images", "layers", "run", "servants", "build", "logs"] {
+        for name in ["images", "layers", "run", "servants", "ended", "build", "logs"] {
             let directory = home.path.join(name);
             private::make_directory(&directory).map_err(io_error("create the directory", &directory))?;
         }
@@ -111,6 +111,7 @@ impl Home {
         closed("images", 3, &nothing)?;
         closed("definitions", 1, &nothing)?;
         closed("logs", 1, &nothing)?;
+        closed("ended", 2, &nothing)?;
         closed("run", 1, &nothing)?;
         closed("tls", 1, &nothing)?;
         closed("layers", 0, &nothing)?;
@@ -199,8 +200,8 @@ pub fn sweep_builds(half_made: &[PathBuf]) {
 }
 
 /// Directories that a daemon, or a new file system, makes in a home.
-const DIRECTORIES: [&str; 10] =
-    ["images", "layers", "run", "servants", "build", "logs", "tls", "definitions", "cache", "lost+found"];
+const DIRECTORIES: [&str; 11] =
+    ["images", "layers", "run", "servants", "ended", "build", "logs", "tls", "definitions", "cache", "lost+found"];
 
 /// Returns whether a directory is used by a daemon only: it belongs to this user and contains no other directories.
 fn is_exclusive(path: &Path) -> std::io::Result<bool> {
@@ -367,6 +368,7 @@ mod tests {
             "servants/s1/spec.json",
             "servants/s1/log.jsonl",
             "servants/s1/log.jsonl.1",
+            "ended/s0/log.jsonl",
             "servants/s1/skeleton/etc/hosts",
             "layers/0b/usr/lib/thing",
             "build/p1/tree/source.cpp",

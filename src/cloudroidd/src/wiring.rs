@@ -161,6 +161,7 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
     let init = doctor::find_init().context("cloudroid-init is not beside cloudroidd")?;
     let servants = home.path().join("servants");
     let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
+    engine.kept_logs_dir = home.path().join("ended");
     engine.default_limits = config.limits;
     engine.shim_limits =
         api::Limits { cpus: Some(config.memory.shim_cpus), memory: Some(config.memory.shim), ..api::Limits::default() };

@@ -101,6 +101,13 @@ fn check_service(app: &App, caller: &Caller, action: AccessAction, service: &str
 }
 
 fn check_servant(app: &App, caller: &Caller, action: AccessAction, id: &str) -> Result<(), Error> {
+    // The log is what remains of a servant that has ended.
+    if action == AccessAction::Logs
+        && let Some(ended) = app.choreographer.kept_log(id)
+    {
+        let may = caller.is_allowed_for_robot(app, action, &ended.service, &ended.robot);
+        return conceal_missing(caller, action, Ok(may), format_args!("servant {id}"));
+    }
     let handle = app.choreographer.servant(id);
     let may = handle.map(|handle| caller.is_allowed_for_robot(app, action, handle.service(), &handle.robot));
     conceal_missing(caller, action, may.map_err(Error::from), format_args!("servant {id}"))

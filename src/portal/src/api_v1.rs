@@ -6,13 +6,9 @@ use access::{AccessAction, AccessObject};
 use api::{Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
-use axum::response::Response;
 use axum::{Extension, Json};
-use futures_util::StreamExt;
 use reach::{Material, Picture};
 use serde::Deserialize;
-use servant::engine::LogStart;
-use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
 use super::audit::AuditObject;
@@ -20,14 +16,9 @@ use super::body::{BufferedBody, LARGEST_WORDS, read_body, read_recording};
 use crate::app::App;
 use crate::caller::Caller;
 use crate::errors::Error;
-use crate::json::{JsonResult, json_lines};
+use crate::json::JsonResult;
 use crate::query::{Query, query_pairs};
 use crate::{recordings, views};
-
-/// Default number of log lines.
-const LOG_LINES: usize = 10_000;
-/// Estimated overhead of a log line in bytes, besides its text.
-const LOG_LINE: usize = 150;
 
 /// `/healthz`.
 pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
@@ -115,6 +106,7 @@ pub async fn remove_service(State(app): State<Arc<App>>, Path(name): Path<String
             let stopped = app.pusher.remove(&name).await?;
             // The next service of this name may belong to somebody else.
             recordings::forget_service(&app, &name).await?;
+            app.choreographer.forget_logs(&name).await;
             Ok(Json(Stopped { stopped }))
         }
     };
@@ -314,49 +306,4 @@ pub async fn stop_servants(
     }
     let chosen = |handle: &choreographer::Handle| of.service.as_ref().is_none_or(|service| handle.service() == service);
     Ok(Json(Stopped { stopped: app.choreographer.stop("it was stopped", chosen).await }))
-}
-
-/// Query of a log.
-#[derive(Debug, Deserialize, IntoParams)]
-pub struct LogQuery {
-    /// Keep the response open and send new lines as they come.
-    #[serde(default)]
-    follow: bool,
-    /// Number of lines from the end of the log (default: 10000).
-    tail: Option<usize>,
-}
-
-/// Output of a servant's nodes, as JSON lines.
-pub async fn logs(
-    State(app): State<Arc<App>>,
-    Path(id): Path<String>,
-    Query(part): Query<LogQuery>,
-    Extension(caller): Extension<Caller>,
-) -> Result<Response, Error> {
-    let handle = app.choreographer.servant(&id)?;
-    handle.check_container()?;
-    let Some(container) = handle.container() else {
-        return Ok(json_lines(futures_util::stream::empty::<api::LogLine>()));
-    };
-    let count = part.tail.unwrap_or(LOG_LINES);
-    // A slow reader keeps files open and lines in memory for that long.
-    let place = app.live.acquire_slot(&caller)?;
-    if part.follow {
-        let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
-        let printed = printed.map(move |line| {
-            let _held = &place;
-            views::log_line(line)
-        });
-        // A follower must not keep the daemon from stopping.
-        let ending = caller.wait_for_end(&app, handle.service());
-        return Ok(json_lines(printed.take_until(ending)));
-    }
-    let past = container.logs(count, None).await;
-    let budget = app.choreographer.memory().client(&caller.peer.budget_name(None));
-    let held = budget.take(past.iter().map(|line| line.line.len() + LOG_LINE).sum())?;
-    let past = futures_util::stream::iter(past).map(move |line| {
-        let _held = (&place, &held);
-        views::log_line(line)
-    });
-    Ok(json_lines(past))
 }

@@ -34,6 +34,8 @@ mod headers;
 mod history;
 mod inside;
 mod json;
+mod log_levels;
+mod logs;
 mod looks;
 mod machines;
 mod metrics;

@@ -12,7 +12,7 @@ use axum::extract::{Path, State};
 use axum::http::{HeaderValue, header};
 use axum::response::Response;
 use axum::{Extension, Json};
-use choreographer::Handle;
+use choreographer::{Handle, Quota, QuotaFile, find_files_to_evict};
 use futures_util::StreamExt;
 use recording::RecordingWriter;
 use serde::Deserialize;
@@ -147,31 +147,14 @@ async fn admit_recording(app: &App, handle: &Handle, record: &RecordingRecord) -
     Ok(app.state.add_recording(record)?)
 }
 
-/// Returns the files to remove for a new one. `known` lists the existing files, newest first. The service that uses
-/// most, including the new file, loses its oldest; so a service cannot drive out the files of those that use less,
-/// however many it produces.
+/// Returns the files to remove for a new one. `known` lists the existing files, newest first.
 fn files_to_evict(known: &[RecordingRecord], new: &RecordingRecord, options: &BlackBoxOptions) -> Vec<u64> {
-    let mut left: Vec<&RecordingRecord> = known.iter().collect();
-    let mut gone = Vec::new();
-    loop {
-        let sum: u64 = left.iter().map(|one| one.bytes).sum();
-        let many = left.len() >= options.files;
-        if !many && sum.saturating_add(new.bytes) <= options.disk {
-            return gone;
-        }
-        let taken = |service: &str| {
-            let all = left.iter().copied().chain([new]);
-            all.filter(|one| one.service == service).map(|one| if many { 1 } else { one.bytes }).sum::<u64>()
-        };
-        // Of equals, the new file's own service.
-        let most =
-            left.iter().map(|one| one.service.as_str()).max_by_key(|service| (taken(service), *service == new.service));
-        let oldest = left.iter().rposition(|one| Some(&*one.service) == most);
-        let Some(oldest) = oldest else {
-            return gone;
-        };
-        gone.push(left.remove(oldest).id);
+    fn file(one: &RecordingRecord) -> QuotaFile<'_> {
+        QuotaFile { owner: "", service: &one.service, bytes: one.bytes }
     }
+    let files: Vec<QuotaFile<'_>> = known.iter().map(file).collect();
+    let quota = Quota { files: options.files, bytes: options.disk };
+    find_files_to_evict(&files, file(new), quota).into_iter().map(|place| known[place].id).collect()
 }
 
 fn directory(app: &App) -> PathBuf {
@@ -400,62 +383,11 @@ pub async fn run_to_end<T: Send + 'static>(
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use access::Grant;
     use futures_util::FutureExt;
     use tokio::sync::Notify;
 
     use super::*;
-
-    fn record(id: u64, service: &str, bytes: u64) -> RecordingRecord {
-        RecordingRecord {
-            id,
-            service: service.to_owned(),
-            robot: "rover".to_owned(),
-            servant: format!("{service}-1"),
-            time: id,
-            why: "a test".to_owned(),
-            span: 1,
-            messages: 1,
-            bytes,
-            topics: None,
-        }
-    }
-
-    fn options(files: usize, disk: u64) -> BlackBoxOptions {
-        BlackBoxOptions { span: Duration::from_secs(1), memory: 1, topics: Vec::new(), files, disk }
-    }
-
-    #[test]
-    fn the_service_that_takes_most_loses_its_oldest() {
-        let gone = |all: &[(u64, &str, u64)], new: (&str, u64), (files, disk)| {
-            let all: Vec<_> = all.iter().map(|(id, service, bytes)| record(*id, service, *bytes)).collect();
-            files_to_evict(&all, &record(0, new.0, new.1), &options(files, disk))
-        };
-        let all = [(5, "busy", 10), (4, "busy", 10), (3, "busy", 10), (2, "quiet", 25), (1, "quiet", 1)];
-        // There is room.
-        assert_eq!(gone(&all, ("busy", 4), (6, 60)), [] as [u64; 0]);
-        // By number: the busy service has most, whichever is new.
-        assert_eq!(gone(&all, ("busy", 1), (5, 60)), [3]);
-        assert_eq!(gone(&all, ("new", 1), (5, 60)), [3]);
-        assert_eq!(gone(&all, ("quiet", 1), (5, 60)), [1]);
-        // By bytes.
-        assert_eq!(gone(&all, ("busy", 10), (9, 60)), [3]);
-        assert_eq!(gone(&all, ("new", 15), (9, 60)), [3, 1]);
-        // One that needs everything.
-        assert_eq!(gone(&all, ("busy", 40), (9, 60)), [3, 4, 5, 1, 2]);
-        // However often the busy service records, the files of the quiet one stay.
-        let mut known = vec![record(1, "quiet", 10)];
-        for id in 2..50 {
-            let new = record(id, "busy", 10);
-            let gone = files_to_evict(&known, &new, &options(3, 1000));
-            known.retain(|one| !gone.contains(&one.id));
-            known.insert(0, new);
-        }
-        let left: Vec<_> = known.iter().map(|one| one.id).collect();
-        assert_eq!(left, [49, 48, 1]);
-    }
 
     #[test]
     fn a_file_is_had_by_who_may_hear_all_that_is_in_it() {

@@ -16,8 +16,8 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, bases, calibration, dictionary, differences, events, goals, history, inside, machines, metrics,
-    oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs, topics, viewers,
+    App, api_v1, audit, bases, calibration, dictionary, differences, events, goals, history, inside, logs, machines,
+    metrics, oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -297,8 +297,15 @@ pub const ROUTES: &[Route] = &[
     }),
     route("DELETE", "/api/v1/servants/{id}", servant(Operate), || delete(api_v1::stop_servant))
         .with_operation(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
-    route("GET", "/api/v1/servants/{id}/logs", servant(Logs), || get(api_v1::logs)).with_operation(|| {
-        operation("logs", "Output of its nodes.").asks::<api_v1::LogQuery>().streams::<api::LogLine>()
+    route("GET", "/api/v1/servants/{id}/logs", servant(Logs), || get(logs::read)).with_operation(|| {
+        operation("logs", "Output of its nodes, also after its end while the log is kept.")
+            .asks::<logs::LogQuery>()
+            .streams::<api::LogLine>()
+    }),
+    route("GET", "/api/v1/logs", ENTER, || get(logs::list)).with_operation(|| {
+        operation("keptLogs", "Ended servants whose logs are kept, newest first.")
+            .asks::<logs::KeptLogQuery>()
+            .lists::<api::KeptLog>()
     }),
     route("GET", "/api/v1/servants/{id}/inside", servant(See), || get(inside::open_inside)).with_operation(|| {
         operation("inside", "Opens a WebSocket into a servant that speaks rosbridge, besides its robot.")

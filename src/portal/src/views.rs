@@ -8,6 +8,7 @@ use ros::bus::RosVersion;
 
 use crate::app::App;
 use crate::errors::Error;
+use crate::log_levels;
 use choreographer::Handle;
 use store::RevisionRecord;
 
@@ -217,6 +218,7 @@ pub fn log_line(line: servant::engine::LogLine) -> api::LogLine {
             "stderr" => api::Stream::Stderr,
             _ => api::Stream::Stdout,
         },
+        level: log_levels::find_level(&line.line),
         line: line.line,
     }
 }

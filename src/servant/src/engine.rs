@@ -6,7 +6,7 @@ mod unmet;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use api::{Grants, Pressure};
+use api::{Grants, KeptLog, Pressure};
 use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
@@ -191,6 +191,9 @@ pub trait ServantHandle: Send + Sync + 'static {
     async fn logs(&self, last: usize, node: Option<&str>) -> Vec<LogLine>;
     /// Streams every line printed, each exactly once; ends when the container has ended.
     fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine>;
+    /// Ends its processes like [`stop`](Self::stop), which is to be called afterwards, and keeps its log beyond that,
+    /// with `about`; returns `about` with the size of the log. [`Engine::read_kept_log`] reads it.
+    async fn keep_log(&self, about: KeptLog) -> Result<KeptLog, crate::Error>;
     /// Stops it: SIGINT to the nodes, SIGTERM, then SIGKILL to all; returns when nothing is left (process, mount,
     /// cgroup, directory).
     async fn stop(&self) -> Result<(), crate::Error>;
@@ -203,6 +206,8 @@ pub struct EndedServant {
     pub id: String,
     /// Final state; `None` if there is no record of it.
     pub state: Option<ContainerState>,
+    /// Record with which [`Engine::sweep`] keeps its log; `None` if the log is removed with the rest.
+    pub keep: Option<KeptLog>,
 }
 
 /// Servants found from an earlier daemon: each is in one of the three lists.
@@ -224,8 +229,15 @@ pub trait Engine: Send + Sync + 'static {
     /// Finds the servants of an earlier daemon: running ones are adopted, the others reported. Robots wait for it, so
     /// nothing is removed. Fails only if nothing can be examined.
     async fn adopt(&self) -> Result<AdoptedServants, crate::Error>;
-    /// Removes the remains of servants that have ended; returns errors for what could not be removed.
+    /// Removes the remains of servants that have ended, except for the logs to be kept; returns errors for what could
+    /// not be removed or kept.
     async fn sweep(&self, ended: &[EndedServant]) -> Vec<crate::Error>;
+    /// Lists the kept logs of ended servants, in no order, and removes those that a killed daemon left incomplete.
+    async fn kept_logs(&self) -> Result<Vec<KeptLog>, crate::Error>;
+    /// Returns the last lines of a kept log, at most `last`, oldest first; none if there is no such log.
+    async fn read_kept_log(&self, id: &str, last: usize) -> Vec<LogLine>;
+    /// Removes kept logs of the servants with these ids; returns errors for what could not be removed.
+    async fn remove_kept_logs(&self, ids: Vec<String>) -> Vec<crate::Error>;
     /// Refuses grants that are not allowed or do not exist; returns descriptions of what servants will lack of them.
     fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, crate::Error>;
 }

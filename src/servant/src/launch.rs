@@ -5,7 +5,7 @@
 //! | `spec.json` | daemon, before the shim starts | [`LaunchRecord`] |
 //! | `runtime.json` | shim, first thing | [`RuntimeRecord`]: what to end and remove if the shim cannot |
 //! | `shim.sock` | shim | socket for daemons |
-//! | `log.jsonl`, `log.jsonl.1` | shim | output of the nodes |
+//! | `log.jsonl`, `log.jsonl.1` | shim | output of the nodes; moved by the daemon if it is kept |
 //! | `shim.log` | shim | its own error messages |
 //! | `exit.json` | shim, last thing | [`ExitRecord`] |
 //! | `daemon.json` | daemon, while it runs | state for the next daemon ([`LocalServant::save_handover`]) |

@@ -5,7 +5,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
-use api::Grants;
+use api::{Grants, KeptLog};
 
 use async_trait::async_trait;
 use tokio::sync::{Semaphore, oneshot};
@@ -15,10 +15,10 @@ use tracing::Instrument;
 use crate::Error;
 use crate::cgroup::CgroupParent;
 use crate::container::{ContainerSpec, Profile};
-use crate::engine::{AdoptedServants, EndedServant, Engine, ServantHandle};
+use crate::engine::{AdoptedServants, EndedServant, Engine, LogLine, ServantHandle};
 use crate::launch::{self, ExitRecord, RuntimeRecord};
 pub use crate::launch::{GracePeriods, Isolation};
-use crate::logs::DirectoryWatches;
+use crate::logs::{self, DirectoryWatches};
 use crate::quotas::Quotas;
 use crate::spec::{Limits, Size, Spec};
 use crate::uids;
@@ -26,6 +26,7 @@ use crate::uids;
 mod connection;
 pub mod grants;
 mod handle;
+mod kept;
 mod pool;
 mod resources;
 mod start;
@@ -49,6 +50,9 @@ pub const DEFAULT_UID_BASE: u32 = 0x7000_0000;
 pub struct LocalEngineConfig {
     /// Directory with one subdirectory per servant; owned by this engine alone. Absolute.
     pub home_servants_dir: PathBuf,
+    /// Directory of the logs that are kept of ended servants; on the same file system, owned by this engine alone.
+    /// Absolute.
+    pub kept_logs_dir: PathBuf,
     /// Program, with its arguments, that calls [`crate::shim::run`], such as `[/usr/bin/cloudroidd, shim]`.
     pub shim_command: Vec<OsString>,
     /// Path of the static `cloudroid-init`.
@@ -72,10 +76,11 @@ pub struct LocalEngineConfig {
 }
 
 impl LocalEngineConfig {
-    /// Uses defaults for everything else: 1 GiB of memory, 512 processes, unlimited cores; for shims 256 MiB and half a
-    /// core.
+    /// Uses defaults for everything else: logs in `ended` beside the servants, 1 GiB of memory, 512 processes,
+    /// unlimited cores; for shims 256 MiB and half a core.
     pub fn new(home_servants_dir: PathBuf, shim_command: Vec<OsString>, init: PathBuf) -> Self {
         Self {
+            kept_logs_dir: home_servants_dir.with_file_name("ended"),
             home_servants_dir,
             shim_command,
             init,
@@ -222,7 +227,12 @@ impl LocalEngine {
         let Some(pidfd) = runtime.shim.open_pidfd().map_err(Error::call("looking for a shim"))? else {
             return Ok(None);
         };
-        let place = handle::ServantLocation { id, directory, watches: &self.shared.watches };
+        let place = handle::ServantLocation {
+            id,
+            directory,
+            kept_logs: &self.shared.config.kept_logs_dir,
+            watches: &self.shared.watches,
+        };
         match handle::adopt(place, &runtime, pidfd).await {
             Ok(servant) => {
                 self.shared.register(&servant);
@@ -265,6 +275,25 @@ impl Engine for LocalEngine {
     async fn sweep(&self, ended: &[EndedServant]) -> Vec<Error> {
         let (engine, ended) = (self.clone(), ended.to_vec());
         privilege::run(async move { engine.sweep_all(&ended).await }).await
+    }
+
+    async fn kept_logs(&self) -> Result<Vec<KeptLog>, Error> {
+        let config = &self.shared.config;
+        let (kept, servants) = (config.kept_logs_dir.clone(), config.home_servants_dir.clone());
+        let listed = privilege::spawn_blocking(move || kept::list_logs(&kept, &servants)).await;
+        listed.unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
+    }
+
+    async fn read_kept_log(&self, id: &str, last: usize) -> Vec<LogLine> {
+        logs::read_last(self.shared.config.kept_logs_dir.join(id).join(logs::FILE), last, None).await
+    }
+
+    async fn remove_kept_logs(&self, ids: Vec<String>) -> Vec<Error> {
+        let kept = self.shared.config.kept_logs_dir.clone();
+        let removed = privilege::spawn_blocking(move || {
+            ids.iter().filter_map(|id| kept::remove_log(&kept.join(id)).err()).collect()
+        });
+        removed.await.unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
     }
 
     fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, Error> {
@@ -313,23 +342,28 @@ impl LocalEngine {
         }
         let exit: Option<ExitRecord> = launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
         let state = exit.map(|exit| exit.state);
-        Ok(FoundServant::Ended(EndedServant { id, state }))
+        Ok(FoundServant::Ended(EndedServant { id, state, keep: None }))
     }
 
     async fn sweep_all(&self, ended: &[EndedServant]) -> Vec<Error> {
-        let home = &self.shared.config.home_servants_dir;
+        let config = &self.shared.config;
         // Removals that take long do not block others.
         let turns = Arc::new(Semaphore::new(SWEEPS));
         let mut sweeps = JoinSet::new();
         for ended in ended {
-            let (id, directory) = (ended.id.clone(), home.join(&ended.id));
+            let (ended, directory) = (ended.clone(), config.home_servants_dir.join(&ended.id));
+            let kept = config.kept_logs_dir.clone();
             let turns = Arc::clone(&turns);
             sweeps.spawn(async move {
                 let _turn = turns.acquire().await;
-                sweep::sweep(&id, &directory).await
+                let keeping = match ended.keep {
+                    Some(about) => kept::keep_log(&kept, &directory, about).await.map(drop),
+                    None => Ok(()),
+                };
+                [keeping, sweep::sweep(&ended.id, &directory).await]
             });
         }
-        let swept = sweeps.join_all().await;
-        swept.into_iter().filter_map(Result::err).collect()
+        let swept = sweeps.join_all().await.into_iter().flatten();
+        swept.filter_map(Result::err).collect()
     }
 }

@@ -382,7 +382,7 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
         ],
     )?;
     for (who, token) in [("a robot", &tokens.rover), ("a viewer", &tokens.eve)] {
-        let lists = ["services", "servants", "events?limit=1000", "events?service=vault", "back-offs"];
+        let lists = ["services", "servants", "logs", "events?limit=1000", "events?service=vault", "back-offs"];
         let mut lists: Vec<_> =
             lists.into_iter().map(|path| RequestAttempt::new("GET", format!("/api/v1/{path}"), &[200])).collect();
         lists.push(RequestAttempt::new("GET", "/stubs", &[200]));

@@ -364,6 +364,18 @@ export interface Isolation {
   mode: string;
 }
 
+export interface KeptLog {
+  bytes: Size;
+  created: Millis;
+  ended: Millis;
+  failed: boolean;
+  reason: string;
+  revision: number;
+  robot: string;
+  servant: string;
+  service: string;
+}
+
 export type Kind =
   | 'topic'
   | 'service'
@@ -435,7 +447,15 @@ export interface LocalPeriod {
   why: string;
 }
 
+export type LogLevel =
+  | 'debug'
+  | 'info'
+  | 'warn'
+  | 'error'
+  | 'fatal';
+
 export interface LogLine {
+  level?: LogLevel;
   line: string;
   node: string;
   stream: Stream;

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use api::Limits;
+use api::{KeptLog, Limits};
 use servant::engine::{AdoptedServants, ContainerState, EndedServant, ServantHandle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::task::JoinHandle;
@@ -19,6 +19,21 @@ use crate::{Choreographer, Handle};
 /// Returns true if it was kept ready for a robot that had not come.
 fn is_unassigned(record: &ServantRecord) -> bool {
     record.robot == NOBODY
+}
+
+/// Describes a servant that ended while no daemon was running, for its log.
+fn to_kept_log(gone: &ServantRecord, why: &str) -> KeptLog {
+    KeptLog {
+        servant: gone.id.clone(),
+        service: gone.service.clone(),
+        revision: gone.revision,
+        robot: gone.robot.clone(),
+        created: gone.created,
+        ended: store::now(),
+        failed: true,
+        reason: format!("ended while the daemon was not running{why}"),
+        bytes: api::Size(0),
+    }
 }
 
 /// Result of adopting what an earlier daemon left.
@@ -41,7 +56,8 @@ impl Choreographer {
     /// Adopts the servants that an earlier daemon left, and forgets those that are gone.
     pub async fn adopt(&self) -> Result<AdoptionResult, Error> {
         let inner = &self.inner;
-        let AdoptedServants { running, ended, failures } = inner.engine.adopt().await?;
+        let AdoptedServants { running, mut ended, failures } = inner.engine.adopt().await?;
+        inner.load_kept_logs().await;
         for error in &failures {
             self.report_leftover(error);
         }
@@ -77,7 +93,7 @@ impl Choreographer {
                 }
             }
         }
-        self.forget(records, &ended);
+        self.forget(records, &mut ended);
         let whole = self.clone();
         let removal = tokio::spawn(async move {
             let ends = useless.into_iter().map(|useless| whole.end(useless));
@@ -87,6 +103,7 @@ impl Choreographer {
             for error in failures {
                 whole.report_leftover(&error);
             }
+            whole.inner.load_kept_logs().await;
         });
         Ok(AdoptionResult { adopted, removal })
     }
@@ -98,22 +115,28 @@ impl Choreographer {
         journal.warning("servant-leftover", &message, &about);
     }
 
-    /// Forgets servants that are gone, and reports how they ended.
-    fn forget(&self, records: HashMap<String, ServantRecord>, ended: &[EndedServant]) {
+    /// Forgets servants that are gone, reports how they ended, and has their logs kept.
+    fn forget(&self, records: HashMap<String, ServantRecord>, ended: &mut [EndedServant]) {
         let inner = &self.inner;
-        let ends: HashMap<&str, Option<&ContainerState>> =
-            ended.iter().map(|ended| (ended.id.as_str(), ended.state.as_ref())).collect();
+        let mut ends: HashMap<String, &mut EndedServant> =
+            ended.iter_mut().map(|ended| (ended.id.clone(), ended)).collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
             if is_unassigned(&gone) {
                 continue;
             }
-            let why = match ends.get(gone.id.as_str()).copied().flatten() {
+            let end = ends.remove(&gone.id);
+            let why = match end.as_ref().and_then(|end| end.state.as_ref()) {
                 Some(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
                     format!(": {reason}")
                 }
                 _ => String::new(),
             };
+            if let Some(end) = end
+                && !inner.options.kept_logs.age.is_zero()
+            {
+                end.keep = Some(to_kept_log(&gone, &why));
+            }
             inner.journal.warning(
                 "servant-lost",
                 &format!(

@@ -61,11 +61,12 @@ async fn drive(inner: Arc<ChoreographerInner>, handle: Arc<Handle>, mut beginnin
     if let Some(reach) = handle.take_reach() {
         reach.close(&farewell);
     }
-    if let Some(container) = handle.container()
-        && let Err(error) = container.stop().await
-    {
-        let message = format!("cannot clean up servant {}: {error}", handle.id);
-        inner.journal.error("servant-leftover", &message, &handle.event_context());
+    if let Some(container) = handle.container() {
+        inner.keep_log(&handle, &*container).await;
+        if let Err(error) = container.stop().await {
+            let message = format!("cannot clean up servant {}: {error}", handle.id);
+            inner.journal.error("servant-leftover", &message, &handle.event_context());
+        }
     }
     inner.state.remove_servant(&handle.id);
     drop(permit);

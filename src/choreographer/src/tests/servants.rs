@@ -9,6 +9,7 @@ use super::*;
 
 mod ahead;
 mod hung;
+mod kept_logs;
 mod log;
 mod rollouts;
 mod traces;
@@ -329,6 +330,8 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     assert!(left.len() == 1 && left[0].contains("half-made"), "{left:?}");
     let lost = world.event_messages("servant-lost");
     assert!(lost.len() == 1 && lost[0].contains(&ids[1]) && lost[0].ends_with("its node was killed"), "{lost:?}");
+    let log = next.kept_log(&ids[1]).expect("its log is kept");
+    assert!(log.failed && log.reason.ends_with("its node was killed"), "{}", log.reason);
     // The robot finds its servant, and nothing was started for that.
     let lease = next.ensure(ServantRequest::new("greet", "r1")).expect("a lease");
     lease.wait_ready().await.expect("ready");

@@ -43,6 +43,7 @@ impl Config {
                 servant: memory.servant.0,
                 unfinished: memory.unfinished.0,
             },
+            kept_logs: self.logs.options(),
             tracer: None,
         }
     }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use api::KeptLog;
 use async_trait::async_trait;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -17,7 +18,7 @@ use tokio::task::JoinHandle;
 use tracing::Instrument;
 
 use super::connection::{RequestSender, ServantView, ShimRequestError};
-use super::sweep;
+use super::{kept, sweep};
 use crate::Error;
 use crate::cgroup::Cgroup;
 use crate::engine::{ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage};
@@ -40,6 +41,7 @@ const ANSWER: Duration = Duration::from_secs(10);
 pub struct LocalServant {
     id: String,
     directory: PathBuf,
+    kept_logs: PathBuf,
     network: Arc<NetNs>,
     cgroup: Cgroup,
     uid_range: (u32, u32),
@@ -65,6 +67,8 @@ impl Drop for LocalServant {
 pub(super) struct ServantLocation<'a> {
     pub id: &'a str,
     pub directory: &'a Path,
+    /// Directory of the logs of ended servants.
+    pub kept_logs: &'a Path,
     /// Notifies of changes in directories of servants.
     pub watches: &'a Arc<DirectoryWatches>,
 }
@@ -155,6 +159,7 @@ fn connect(
     Ok(Arc::new(LocalServant {
         id: id.to_owned(),
         directory: directory.to_owned(),
+        kept_logs: place.kept_logs.to_owned(),
         network: Arc::new(network),
         cgroup: runtime.cgroup.clone(),
         uid_range: runtime.uid_range,
@@ -276,6 +281,22 @@ impl LocalServant {
             ContainerState::Running => Ok(()),
             _ => Err(self.ended_error()),
         }
+    }
+
+    /// Ends its processes; returns when its log is complete, and open wherever it is followed.
+    async fn end(&self) {
+        // On an error or timeout it is ending, gone, or about to be killed.
+        let _ = tokio::time::timeout(ANSWER, self.request(Command::Stop)).await;
+        let patience = self.grace.interrupt + self.grace.terminate + FINISH;
+        if let Err(error) = wait_for_end(&self.shim, patience).await {
+            tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
+            let shim = self.shim.clone();
+            let _ = privilege::run_sync(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
+            let _ = wait_for_end(&self.shim, FINISH).await;
+        }
+        // Its final messages are read, and its log is opened by its followers, before both are removed.
+        let _ = tokio::time::timeout(ANSWER, wait_until_over(self.known.state.subscribe())).await;
+        let _ = tokio::time::timeout(ANSWER, self.followers.closed()).await;
     }
 
     fn log_path(&self) -> PathBuf {
@@ -433,19 +454,13 @@ impl ServantHandle for LocalServant {
         logs::follow(&self.watches, path, from, wait_until_over(self.state()), guard)
     }
 
+    async fn keep_log(&self, about: KeptLog) -> Result<KeptLog, Error> {
+        self.end().await;
+        kept::keep_log(&self.kept_logs, &self.directory, about).await
+    }
+
     async fn stop(&self) -> Result<(), Error> {
-        // On an error or timeout it is ending, gone, or about to be killed.
-        let _ = tokio::time::timeout(ANSWER, self.request(Command::Stop)).await;
-        let patience = self.grace.interrupt + self.grace.terminate + FINISH;
-        if let Err(error) = wait_for_end(&self.shim, patience).await {
-            tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
-            let shim = self.shim.clone();
-            let _ = privilege::run_sync(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
-            let _ = wait_for_end(&self.shim, FINISH).await;
-        }
-        // Its final messages are read, and its log is opened by its followers, before both are removed.
-        let _ = tokio::time::timeout(ANSWER, wait_until_over(self.known.state.subscribe())).await;
-        let _ = tokio::time::timeout(ANSWER, self.followers.closed()).await;
+        self.end().await;
         sweep::sweep(&self.id, &self.directory).await
     }
 }

@@ -59,7 +59,8 @@ async fn start_in(shared: &EngineShared, spec: ContainerSpec, directory: &Path) 
     send_descriptors(&control, &network, &lock, &launch.spec.mounts)?;
     // The shim holds the lock from here on.
     drop(lock);
-    let place = handle::ServantLocation { id: &launch.spec.id, directory, watches: &shared.watches };
+    let kept_logs = &shared.config.kept_logs_dir;
+    let place = handle::ServantLocation { id: &launch.spec.id, directory, kept_logs, watches: &shared.watches };
     handle::wait_until_running(&launch, place, network, control, shim).await
 }
 

@@ -1,6 +1,7 @@
 //! Output of nodes arrives in the log.
 
-use servant::engine::{LogStart, ServantHandle};
+use api::KeptLog;
+use servant::engine::{Engine, LogStart, ServantHandle};
 
 use crate::support::*;
 
@@ -37,4 +38,34 @@ async fn a_follower_from_now_on_sees_only_what_comes() {
     let seen = lines_until(&mut late, |line| line.line == "1").await;
     assert!(seen.iter().all(|line| line.node == "/late" && line.stream == "stdout"), "{seen:?}");
     world.stop(servant).await;
+}
+
+#[tokio::test]
+async fn a_kept_log_is_read_when_its_servant_is_gone() {
+    let world = World::new();
+    let servant = world.start(spec(vec![node("/talks", &["print", "3"])])).await;
+    assert_eq!(with_timeout(servant.wait_node("/talks")).await.unwrap().code, Some(0));
+    let id = servant.id().to_owned();
+    let about = KeptLog {
+        servant: id.clone(),
+        service: "talks".into(),
+        revision: 1,
+        robot: "rover".into(),
+        created: 1,
+        ended: 2,
+        failed: false,
+        reason: "it was stopped".into(),
+        bytes: api::Size(0),
+    };
+    let kept = with_timeout(servant.keep_log(about)).await.unwrap();
+    assert!(kept.bytes > api::Size(0), "{kept:?}");
+    world.stop(servant).await;
+    let engine = world.restart_engine();
+    assert_eq!(engine.kept_logs().await.unwrap(), [kept]);
+    let lines = engine.read_kept_log(&id, 2).await;
+    assert_eq!(lines.iter().map(|line| &*line.line).collect::<Vec<_>>(), ["1", "2"]);
+    let failures = engine.remove_kept_logs(vec![id.clone()]).await;
+    assert!(failures.is_empty(), "{failures:?}");
+    assert!(engine.read_kept_log(&id, 2).await.is_empty());
+    assert!(engine.kept_logs().await.unwrap().is_empty());
 }

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use api::Grants;
+use api::{Grants, KeptLog};
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use servant::Error;
-use servant::engine::{AdoptedServants, ContainerState, EndedServant, Engine, ServantHandle};
+use servant::engine::{AdoptedServants, ContainerState, EndedServant, Engine, LogLine, ServantHandle};
 use servant::spec::Spec;
 use tokio::runtime::Handle;
 
@@ -34,6 +34,8 @@ pub(crate) struct EngineState {
     started: Mutex<Vec<Spec>>,
     /// Images that cannot be started, each with the reason.
     broken: Mutex<BTreeMap<String, String>>,
+    /// Kept logs of ended servants, by id.
+    kept: Mutex<BTreeMap<String, (KeptLog, Vec<LogLine>)>>,
     /// Ids of servants with leftovers that cannot be removed.
     leftovers: Mutex<Vec<String>>,
     /// Devices, volumes and hosts that may be granted.
@@ -52,6 +54,13 @@ impl EngineState {
     pub(crate) fn forget(&self, id: &str) {
         self.servants.lock().remove(id);
     }
+
+    /// Keeps the lines of a servant's log; returns `about` with their size.
+    pub(crate) fn keep_log(&self, mut about: KeptLog, lines: Vec<LogLine>) -> KeptLog {
+        about.bytes = api::Size(lines.iter().map(|line| line.line.len() as u64).sum());
+        self.kept.lock().insert(about.servant.clone(), (about.clone(), lines));
+        about
+    }
 }
 
 impl Default for MemoryEngine {
@@ -64,6 +73,7 @@ impl Default for MemoryEngine {
                 servants: Mutex::default(),
                 started: Mutex::default(),
                 broken: Mutex::default(),
+                kept: Mutex::default(),
                 leftovers: Mutex::default(),
                 allowed: Mutex::default(),
             }),
@@ -146,18 +156,35 @@ impl Engine for MemoryEngine {
                 adopted.running.push(servant);
                 continue;
             }
-            adopted.ended.push(EndedServant { id: servant.id().to_owned(), state: Some(state) });
+            adopted.ended.push(EndedServant { id: servant.id().to_owned(), state: Some(state), keep: None });
         }
         Ok(adopted)
     }
 
     async fn sweep(&self, ended: &[EndedServant]) -> Vec<Error> {
         for ended in ended {
+            if let (Some(about), Some(servant)) = (&ended.keep, self.world.servant(&ended.id)) {
+                self.world.keep_log(about.clone(), servant.logs(usize::MAX, None).await);
+            }
             self.world.forget(&ended.id);
         }
         let left = |id| Error::LeftOver { id, what: "a cgroup".to_owned() };
         let leftovers = std::mem::take(&mut *self.world.leftovers.lock());
         leftovers.into_iter().map(left).collect()
+    }
+
+    async fn kept_logs(&self) -> Result<Vec<KeptLog>, Error> {
+        Ok(self.world.kept.lock().values().map(|(about, _)| about.clone()).collect())
+    }
+
+    async fn read_kept_log(&self, id: &str, last: usize) -> Vec<LogLine> {
+        let mut lines = self.world.kept.lock().get(id).map(|(_, lines)| lines.clone()).unwrap_or_default();
+        lines.split_off(lines.len().saturating_sub(last))
+    }
+
+    async fn remove_kept_logs(&self, ids: Vec<String>) -> Vec<Error> {
+        self.world.kept.lock().retain(|id, _| !ids.contains(id));
+        Vec::new()
     }
 
     fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, Error> {

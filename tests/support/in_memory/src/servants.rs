@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, SystemTime};
 
+use api::KeptLog;
 use async_trait::async_trait;
 use parking_lot::Mutex;
 use ros::bus::Graph;
@@ -134,6 +135,14 @@ impl MemoryServant {
     async fn wait_until_responsive(&self) {
         let mut stuck = self.stuck.subscribe();
         let _ = stuck.wait_for(|is_stuck| !is_stuck).await;
+    }
+
+    /// Ends it on request, and waits for the tasks of its nodes.
+    async fn wait_until_ended(&self) {
+        self.wait_until_responsive().await;
+        self.end(ContainerState::Stopped { reason: "it was stopped".to_owned() });
+        let mut tasks = self.tasks.subscribe();
+        let _ = tasks.wait_for(|tasks| *tasks == 0).await;
     }
 
     fn check_runs(&self) -> Result<(), Error> {
@@ -396,11 +405,14 @@ impl ServantHandle for MemoryServant {
         receiver
     }
 
+    async fn keep_log(&self, about: KeptLog) -> Result<KeptLog, Error> {
+        self.wait_until_ended().await;
+        let world = self.world.upgrade().ok_or_else(|| self.ended_error())?;
+        Ok(world.keep_log(about, self.log.borrow().clone()))
+    }
+
     async fn stop(&self) -> Result<(), Error> {
-        self.wait_until_responsive().await;
-        self.end(ContainerState::Stopped { reason: "it was stopped".to_owned() });
-        let mut tasks = self.tasks.subscribe();
-        let _ = tasks.wait_for(|tasks| *tasks == 0).await;
+        self.wait_until_ended().await;
         if let Some(world) = self.world.upgrade() {
             world.forget(&self.id);
         }

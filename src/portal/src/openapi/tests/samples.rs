@@ -20,8 +20,8 @@ use api::stream::{Machine, Update};
 use api::trial::{Fed, Heard, Times, Trial};
 use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor, Event,
-    Expected, Fit, Grants, Isolation, Level, Limits, LogLine, Measure, Node, NodeDown, Phase, Pressure, Problem,
-    PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Shadow, ShadowEvent,
+    Expected, Fit, Grants, Isolation, Level, Limits, LogLevel, LogLine, Measure, Node, NodeDown, Phase, Pressure,
+    Problem, PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Shadow, ShadowEvent,
     ShadowOptions, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, UseForecast, Volume,
 };
 use serde_json::Value;
@@ -723,8 +723,10 @@ pub fn samples() -> Vec<(&'static str, Value)> {
     let check = |status, fix| Check { name: "cgroups".into(), status, found: "none".into(), fix };
     let checks = vec![check(CheckStatus::Missing, some_text("mount them")), check(CheckStatus::Ok, None)];
     samples.push(sample("Doctor", Doctor { checks }));
-    for stream in [Stream::Stdout, Stream::Stderr] {
-        let line = LogLine { time: 1, node: "/n".into(), stream, line: "x".into() };
+    let levels = [LogLevel::Debug, LogLevel::Info, LogLevel::Warn, LogLevel::Error, LogLevel::Fatal];
+    for (stream, level) in [(Stream::Stdout, None)].into_iter().chain(levels.map(|level| (Stream::Stderr, Some(level))))
+    {
+        let line = LogLine { time: 1, node: "/n".into(), stream, level, line: "x".into() };
         samples.push(sample("LogLine", line));
     }
     for event in [

@@ -19,6 +19,17 @@ pub(super) fn samples() -> Vec<(&'static str, Value)> {
         messages: 1,
         bytes: api::Size(1),
     };
+    let log = api::KeptLog {
+        servant: "x-1".into(),
+        service: "x".into(),
+        revision: 1,
+        robot: "r".into(),
+        created: 1,
+        ended: 2,
+        failed: true,
+        reason: "x".into(),
+        bytes: api::Size(1),
+    };
     let topic = |latency| PublishedTopic {
         topic: "/x".into(),
         of: "std_msgs/String".into(),
@@ -46,6 +57,7 @@ pub(super) fn samples() -> Vec<(&'static str, Value)> {
     ];
     let mut samples = vec![
         sample("Recording", recording),
+        sample("KeptLog", log),
         sample("PublishedTopics", topics),
         sample("Goal", goal(None, GoalState::Underway, "")),
     ];
