@@ -61,6 +61,7 @@ const MORE: &[(&str, &[u16])] = &[
     ("calibrate", &[409]),
     ("createAccount", &[409]),
     ("createToken", &[409]),
+    ("exec", &[409, 426]),
     ("explainSla", &[422]),
     ("fit", &[422]),
     ("inside", &[409, 426]),

@@ -16,6 +16,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
 use crate::app::App;
+use crate::audit::AuditObject;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::json::json_lines;
@@ -30,6 +31,7 @@ pub async fn push(
     State(app): State<Arc<App>>,
     OriginalUri(uri): OriginalUri,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
 ) -> Response {
     let archive = body.into_data_stream().map_err(io::Error::other).boxed();
@@ -45,15 +47,24 @@ pub async fn push(
             return error.into_response();
         }
     };
+    let pushed = describe_push(&options);
+    about.set(pushed.clone());
     let (sender, receiver) = mpsc::channel(push::EVENTS_AHEAD);
     let last = sender.clone();
     // Owned by the response: if the client disconnects, the push is aborted with it.
     let guard = pusher.start(options, by, archive, sender, |outcome| async move {
-        if let Ok(published) = &outcome {
-            let object = format!("service {}", published.service);
-            app.audit.record(&caller, AccessAction::Deploy, "published", &object, 200);
+        let outcome = outcome.map_err(Error::from);
+        match &outcome {
+            Ok(published) => {
+                let object = format!("service {}", published.service);
+                app.audit.record(&caller, AccessAction::Deploy, "push", &object, 200);
+            }
+            Err(error) => {
+                let (object, status) = (format!("{pushed}: {error}"), error.problem().status);
+                app.audit.record_throttled(&caller, AccessAction::Deploy, "push", &object, status);
+            }
         }
-        let event = match outcome.map_err(Error::from).and_then(|done| done_event(&app, done)) {
+        let event = match outcome.and_then(|done| done_event(&app, done)) {
             Ok(event) => event,
             Err(error) => PushEvent::Error { problem: error.problem() },
         };
@@ -64,6 +75,14 @@ pub async fn push(
         let _ = &guard;
         event
     }))
+}
+
+/// Describes what is pushed, before the service's name is known for certain.
+fn describe_push(options: &PushOptions) -> String {
+    match options.name.as_ref().or(options.apt.as_ref()) {
+        Some(name) => format!("service {name}"),
+        None => "a package".to_owned(),
+    }
 }
 
 /// Returns the permissions of the pushing caller, checked when the service's name is known, which without `--name` is
@@ -106,6 +125,17 @@ fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_push_is_told_by_the_name_of_its_service() {
+        let named = |name: Option<&str>, apt: Option<&str>| {
+            let (name, apt) = (name.map(str::to_owned), apt.map(str::to_owned));
+            describe_push(&PushOptions { name, apt, ..PushOptions::default() })
+        };
+        assert_eq!(named(Some("people"), Some("opencv_apps")), "service people");
+        assert_eq!(named(None, Some("opencv_apps")), "service opencv_apps");
+        assert_eq!(named(None, None), "a package");
+    }
 
     #[test]
     fn options_come_in_the_query() {
