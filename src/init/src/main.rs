@@ -249,8 +249,8 @@ fn exec_supervised(request: &Start<'_>, streams: &[RawFd], report: RawFd) -> (St
 fn supervise(program: libc::pid_t) -> c_int {
     let mut ended = None;
     let mut is_ending = false;
-    // SAFETY: the set is initialised before it is used; `status` and `signal` are valid locations. All signals are
-    // blocked already, so that one that comes before `sigwait` is not missed.
+    // SAFETY: the set is initialised before it is used; `status` and `timeout` are valid locations. All signals are
+    // blocked already, so that one that comes before `sigtimedwait` is not missed.
     unsafe {
         let mut awaited: libc::sigset_t = std::mem::zeroed();
         libc::sigemptyset(&mut awaited);
@@ -269,9 +269,10 @@ fn supervise(program: libc::pid_t) -> c_int {
             if pid < 0 || (is_killing && !kill_children() && ended.is_some()) {
                 break;
             }
-            let mut signal = 0;
-            libc::sigwait(&awaited, &mut signal);
-            if signal == libc::SIGTERM {
+            // The kernel's list of children may lack some while others end, so that it is read again.
+            let timeout = libc::timespec { tv_sec: 0, tv_nsec: 50_000_000 };
+            let timeout = if is_killing { ptr::from_ref(&timeout) } else { ptr::null() };
+            if libc::sigtimedwait(&awaited, ptr::null_mut(), timeout) == libc::SIGTERM {
                 is_ending = true;
                 // Also where the children cannot be listed.
                 libc::kill(-program, libc::SIGKILL);
