@@ -81,7 +81,8 @@ pub async fn push(
 fn describe_push(options: &PushOptions) -> String {
     match options.name.as_ref().or(options.apt.as_ref()) {
         Some(name) => format!("service {name}"),
-        None => "a package".to_owned(),
+        None if options.source.is_empty() => "a package".to_owned(),
+        None => format!("package {}", options.source),
     }
 }
 
@@ -128,13 +129,14 @@ mod tests {
 
     #[test]
     fn a_push_is_told_by_the_name_of_its_service() {
-        let named = |name: Option<&str>, apt: Option<&str>| {
+        let named = |name: Option<&str>, apt: Option<&str>, source: &str| {
             let (name, apt) = (name.map(str::to_owned), apt.map(str::to_owned));
-            describe_push(&PushOptions { name, apt, ..PushOptions::default() })
+            describe_push(&PushOptions { name, apt, source: source.to_owned(), ..PushOptions::default() })
         };
-        assert_eq!(named(Some("people"), Some("opencv_apps")), "service people");
-        assert_eq!(named(None, Some("opencv_apps")), "service opencv_apps");
-        assert_eq!(named(None, None), "a package");
+        assert_eq!(named(Some("people"), Some("opencv_apps"), "x"), "service people");
+        assert_eq!(named(None, Some("opencv_apps"), ""), "service opencv_apps");
+        assert_eq!(named(None, None, "student_vision"), "package student_vision");
+        assert_eq!(named(None, None, ""), "a package");
     }
 
     #[test]
