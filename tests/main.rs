@@ -49,6 +49,8 @@ mod cuts;
 mod described;
 #[path = "stories/eval.rs"]
 mod eval;
+#[path = "stories/exec.rs"]
+mod exec;
 #[path = "stories/failover.rs"]
 mod failover;
 #[path = "stories/fallback.rs"]
@@ -263,6 +265,11 @@ fn main() -> ExitCode {
         stories![eval:
             a_package_is_evaluated_native_against_outsourced,
             what_cannot_be_evaluated_is_said,
+        ],
+        of_both![exec: a_program_runs_as_the_servants_nodes_do],
+        stories![exec:
+            a_shell_at_a_terminal_has_one,
+            who_may_not_is_refused_and_who_may_no_longer_is_ended,
         ],
         of_both![failover:
             a_slow_network_costs_few_requests,

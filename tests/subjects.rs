@@ -25,6 +25,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("cuts", &["link"]),
     ("described", &["api", "portal"]),
     ("eval", &["cloudroidctl"]),
+    ("exec", &["init", "portal", "servant"]),
     ("failover", &["qos"]),
     ("fallback", &["qos"]),
     ("farewells", &["cloudroid-stub"]),

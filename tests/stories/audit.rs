@@ -58,7 +58,9 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     hears("token alice: ")?;
     let eve = create_token(&daemon, &[&["eve", "--role", "viewer"], &scope[..]].concat())?;
     push_adder(&daemon, &alice, &[])?.expect_success()?;
-    hears("published")?;
+    hears(r#""did":"push""#)?;
+    // A push that fails is told by its name, too.
+    push_adder(&daemon, &alice, &["--name", "adder_broken", "--node", "no_such_node"])?.expect_failure(&[])?;
     for _ in 0..3 {
         run_with_token(&daemon, &eve, &["rm", "adder_py"])?.expect_failure(&["may not deploy"])?;
     }
@@ -88,10 +90,15 @@ pub fn who_did_what_is_recorded_and_told_as_it_comes() -> Verdict {
     let pushed = find_record(&records, &[("who", json!("alice (deployer)")), ("object", json!("service adder_py"))])?;
     let from = pushed["from"].as_str().unwrap_or_default();
     ensure!(from.starts_with("127.0.0.1:") && pushed["status"] == 200, "{pushed}");
+    let failed = records.iter().find(|record| {
+        let object = record["object"].as_str().unwrap_or_default();
+        record["did"] == "push" && object.starts_with("service adder_broken: ")
+    });
+    ensure!(failed.is_some_and(|record| record["status"].as_u64() >= Some(400)), "{records:#?}");
     // Repeated refusals are recorded once.
     let refused = [("who", json!("eve (viewer)")), ("status", json!(403))];
     let refused = find_record(&records, &refused)?;
-    ensure!(refused["did"] == "DELETE /api/v1/services/adder_py", "{refused}");
+    ensure!(refused["did"] == "remove" && refused["object"] == "service adder_py", "{refused}");
     let often = records.iter().filter(|record| record["who"] == "eve (viewer)");
     ensure!(often.count() == 1, "{records:#?}");
     let connected = [("who", json!("rover (robot)")), ("action", json!("connect"))];
@@ -179,8 +186,12 @@ pub fn who_was_refused_a_robots_name_and_for_whom_a_proxy_asked_is_recorded() ->
     .into_iter()
     .enumerate()
     {
-        let did = format!("DELETE /api/v1/services/s{number}");
-        let record = find_record(&records, &[("did", json!(did))])?;
+        let object = if number < 7 {
+            format!("service s{number}")
+        } else {
+            format!("a client with a malformed proxy header (/api/v1/services/s{number})")
+        };
+        let record = find_record(&records, &[("did", json!("remove")), ("object", json!(object))])?;
         let told = record["from"].as_str().unwrap_or_default();
         ensure!(told.starts_with(from), "{record}");
         let who = if number < 7 { "eve (viewer)" } else { "a client without a token" };

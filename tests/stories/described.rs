@@ -32,7 +32,7 @@ const NDJSON: &str = "application/x-ndjson";
 /// Schemathesis starts; the last has hundreds of megabytes (see `bases`).
 const APART: &[&str] = &["stream", "followEvents", "openapi", "exportBase"];
 /// Operations that never end for an existing servant or service, or become a WebSocket.
-const ASKED_HERE: &[&str] = &["inside", "shadow", "topics"];
+const ASKED_HERE: &[&str] = &["exec", "inside", "shadow", "topics"];
 /// Operations that remove what the others need: called last, in this order.
 const LAST: &[&str] = &["stopServants", "removeService"];
 /// Operations that do nothing here, with the reason.
@@ -195,6 +195,7 @@ impl ApiScene {
         let options = json!({"revision": 1, "robot": "nobody"}).to_string();
         let shadow = "/api/v1/services/adder_py/shadow";
         self.expect_stream_starts(shadow, NDJSON, &["--data", &options])?;
+        self.daemon.deployer().run(&["exec", servant, "--", "true"])?.expect_success()?;
         let inside = format!("api/v1/servants/{servant}/inside?token={}", self.admin);
         self.daemon.robot(&inside)?.leave()
     }

@@ -71,7 +71,7 @@ pub fn a_group_of_the_provider_is_a_role_here() -> Verdict {
     ensure!((count(&before), count(&after)) == (1, 1), "{before} {after}");
     ensure!(before[0]["id"] != after[0]["id"], "{after}");
     let audited = daemon.deployer().run(&["--format", "json", "audit"])?;
-    for words in ["person oidc:alice", "oidc:alice (admin)", "GET /api/v1/oidc/callback"] {
+    for words in ["person oidc:alice", "oidc:alice (admin)", "sign in by the identity provider"] {
         ensure!(audited.stdout.contains(words), "{words}: {}", audited.stdout);
     }
     secrets.push(SECRET.to_owned());

@@ -483,7 +483,7 @@ const STEPS = {
     await visitor.sees('subscribe:/sums');
     await visitor.judges('access-policy');
     await visitor.clicks('Audit log', 'tab');
-    await visitor.sees('POST /api/v1/tokens');
+    await visitor.sees('create a token');
     await visitor.judges('access-audit');
     await visitor.types('Find', 'no such words');
     await visitor.sees('No matches');

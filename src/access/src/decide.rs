@@ -22,6 +22,8 @@ pub enum AccessAction {
     Deploy,
     /// Stop a service's servants and change their limits.
     Operate,
+    /// Run programs in a service's servants.
+    Exec,
     /// Connect to a service as a robot.
     Connect,
     /// Pair and unpair robots.
@@ -32,7 +34,7 @@ pub enum AccessAction {
 
 impl AccessAction {
     /// All actions.
-    pub const ALL: [AccessAction; 10] = [
+    pub const ALL: [AccessAction; 11] = [
         AccessAction::Enter,
         AccessAction::Look,
         AccessAction::See,
@@ -40,6 +42,7 @@ impl AccessAction {
         AccessAction::Logs,
         AccessAction::Deploy,
         AccessAction::Operate,
+        AccessAction::Exec,
         AccessAction::Connect,
         AccessAction::Pair,
         AccessAction::Administer,
@@ -55,6 +58,7 @@ impl AccessAction {
             AccessAction::Logs => "logs",
             AccessAction::Deploy => "deploy",
             AccessAction::Operate => "operate",
+            AccessAction::Exec => "exec",
             AccessAction::Connect => "connect",
             AccessAction::Pair => "pair",
             AccessAction::Administer => "administer",
@@ -70,6 +74,7 @@ impl AccessAction {
             AccessAction::Logs => "read the logs of",
             AccessAction::Deploy => "deploy",
             AccessAction::Operate => "operate",
+            AccessAction::Exec => "run programs in",
             AccessAction::Connect => "connect to",
             AccessAction::Pair => "pair robots with",
             AccessAction::Administer => "administer",
@@ -148,15 +153,19 @@ fn role_allows(role: Role, principal: &Principal, action: AccessAction, object: 
         (_, AccessAction::Look) => false,
         (Role::Deployer, AccessAction::See) => owned || scoped,
         (Role::Deployer, AccessAction::Deploy) => owned || (!object.exists && scoped),
-        (Role::Deployer, AccessAction::Try | AccessAction::Logs | AccessAction::Operate | AccessAction::Connect) => {
-            owned
-        }
+        (
+            Role::Deployer,
+            AccessAction::Try | AccessAction::Logs | AccessAction::Operate | AccessAction::Exec | AccessAction::Connect,
+        ) => owned,
         (Role::Robot | Role::Viewer, AccessAction::See) => scoped,
         (Role::Robot, AccessAction::Connect) => {
             let own = principal.scope.robot.as_deref();
             scoped && own.is_none_or(|own| object.robot == Some(own))
         }
-        (Role::Robot, AccessAction::Try | AccessAction::Logs | AccessAction::Deploy | AccessAction::Operate) => false,
+        (
+            Role::Robot,
+            AccessAction::Try | AccessAction::Logs | AccessAction::Deploy | AccessAction::Operate | AccessAction::Exec,
+        ) => false,
         (Role::Viewer, _) => false,
     }
 }
@@ -208,6 +217,7 @@ mod tests {
             (Role::Deployer, A::Try, &["own"]),
             (Role::Deployer, A::Logs, &["own"]),
             (Role::Deployer, A::Operate, &["own"]),
+            (Role::Deployer, A::Exec, &["own"]),
             (Role::Deployer, A::Connect, &["own"]),
             (Role::Deployer, A::Deploy, &["own", "new in scope"]),
             (Role::Robot, A::See, &["scope", "new in scope"]),

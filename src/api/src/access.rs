@@ -143,7 +143,7 @@ pub struct Audited {
     pub from: String,
     /// Policy action that the request was checked against.
     pub action: String,
-    /// Request method and path, without the query.
+    /// What was done or tried, in words: of a request, as an order (`stop`, `begin a push`).
     pub did: String,
     /// Object that the request acted on.
     pub object: String,
@@ -153,6 +153,17 @@ pub struct Audited {
     #[serde(default, skip_serializing_if = "is_zero")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub more: u64,
+}
+
+impl Audited {
+    /// Returns the outcome as a word: `done`, `refused` or `failed`.
+    pub fn outcome(&self) -> &'static str {
+        match self.status {
+            401 | 403 => "refused",
+            ..400 => "done",
+            _ => "failed",
+        }
+    }
 }
 
 fn is_zero(number: &u64) -> bool {

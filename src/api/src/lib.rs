@@ -13,6 +13,7 @@ pub mod dictionary;
 pub mod differences;
 pub mod doctor;
 pub mod event;
+pub mod exec;
 pub mod explain;
 pub mod fit;
 pub mod goals;

@@ -16,6 +16,7 @@ mod diff;
 mod doctor;
 mod eval;
 mod events;
+mod exec;
 mod exit;
 mod explain;
 mod export;
@@ -110,6 +111,7 @@ enum CtlCommand {
     Servants(servants::ServantsArgs),
     Top(top::TopArgs),
     Logs(logs::LogsArgs),
+    Exec(exec::ExecArgs),
     Record(record::RecordArgs),
     Replay(replay::ReplayArgs),
     Recordings(recordings::RecordingsArgs),
@@ -194,6 +196,9 @@ fn run_to_end(work: impl Future<Output = anyhow::Result<()>>) -> ExitCode {
         Ok(()) => Exit::Done.into(),
         Err(error) if output::is_closed_pipe(&error) => Exit::Done.into(),
         Err(error) => {
+            if let Some(failed) = error.downcast_ref::<exec::ProgramFailed>() {
+                return ExitCode::from(failed.status);
+            }
             print_error(&error);
             Exit::from_error(&error).into()
         }
@@ -216,6 +221,7 @@ async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
         CtlCommand::Servants(verb) => verb.run(&client, format).await,
         CtlCommand::Top(verb) => verb.run(&client, format).await,
         CtlCommand::Logs(verb) => verb.run(&client, format).await,
+        CtlCommand::Exec(verb) => verb.run(&client).await,
         CtlCommand::Record(verb) => verb.run(&client, format).await,
         CtlCommand::Replay(verb) => verb.run(&client, format).await,
         CtlCommand::Recordings(verb) => verb.run(&client, format).await,

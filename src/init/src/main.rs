@@ -1,5 +1,8 @@
 //! PID 1 of a servant: a static binary without allocations that only starts, signals and reaps processes.
 //!
+//! A program of an exec session, unlike a node, has a fork of init as its parent, which ends when the program and all
+//! its descendants have ended, and kills them on SIGTERM: that is how a session leaves nothing behind.
+//!
 //! Its standard input is the socket to the shim; when that closes, every process of the servant is killed. It keeps no
 //! state: the shim does. It runs with the servant's own seccomp filter, user and limits, which its children inherit;
 //! nothing here could grant them more.
@@ -24,6 +27,12 @@ static mut POINTERS: [*const c_char; MAX_STRINGS] = [ptr::null(); MAX_STRINGS];
 
 /// The socket and the signal descriptor are placed above the standard streams.
 const FIRST_FREE: c_int = 3;
+
+/// More than the highest descriptor of init: those of its socket, its signals and one request.
+const INIT_DESCRIPTORS: c_int = 64;
+
+/// Number of streams of a node: its standard input is /dev/null.
+const NODE_STREAMS: usize = 2;
 
 #[unsafe(no_mangle)]
 extern "C" fn main(_count: c_int, _arguments: *const *const c_char) -> c_int {
@@ -155,7 +164,9 @@ fn handle_request(shim: RawFd) -> bool {
 /// Forks and executes a program; the reply says which step failed, if any.
 fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     let failed = |errno, stage| send_reply(shim, InitReply::Failed { id: request.id, errno, stage }, &[]);
-    if streams.len() != 2 || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS {
+    if !(1..=3).contains(&streams.len())
+        || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS
+    {
         return failed(libc::E2BIG, StartStage::Request);
     }
     let mut report = [-1; 2];
@@ -166,13 +177,12 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     // SAFETY: one thread; the child goes straight to exec or _exit.
     let pid = unsafe { libc::fork() };
     if pid == 0 {
-        let (stage, error) = exec_program(request, streams);
-        let bytes = [stage as u8, error as u8, (error >> 8) as u8];
-        // SAFETY: a live buffer of the length given; then the process ends.
-        unsafe {
-            libc::write(report[1], bytes.as_ptr().cast(), bytes.len());
-            libc::_exit(127);
-        }
+        let failure = if streams.len() == NODE_STREAMS {
+            exec_program(request, streams)
+        } else {
+            exec_supervised(request, streams, report[1])
+        };
+        report_failure(report[1], failure);
     }
     let fork_error = errno();
     let mut bytes = [0_u8; 3];
@@ -201,6 +211,127 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     told
 }
 
+/// Reports a step that failed, and ends the process.
+fn report_failure(report: RawFd, (stage, error): (StartStage, c_int)) -> ! {
+    let bytes = [stage as u8, error as u8, (error >> 8) as u8];
+    // SAFETY: a live buffer of the length given; then the process ends.
+    unsafe {
+        libc::write(report, bytes.as_ptr().cast(), bytes.len());
+        libc::_exit(127);
+    }
+}
+
+/// Executes the program of an exec session in a child of this process, which from then on only supervises it: see
+/// [`supervise`]. Returns only if there is no child.
+fn exec_supervised(request: &Start<'_>, streams: &[RawFd], report: RawFd) -> (StartStage, c_int) {
+    // SAFETY: one thread; the child goes straight to exec or _exit. The descriptors that are closed are those of init:
+    // its copies of the streams would keep a reader from ever seeing the end.
+    unsafe {
+        // Whatever the program leaves behind becomes a child of this process.
+        libc::prctl(libc::PR_SET_CHILD_SUBREAPER, 1);
+        let program = libc::fork();
+        if program < 0 {
+            return (StartStage::Fork, errno());
+        }
+        if program == 0 {
+            report_failure(report, exec_program(request, streams));
+        }
+        for fd in FIRST_FREE..INIT_DESCRIPTORS {
+            libc::close(fd);
+        }
+        libc::_exit(supervise(program));
+    }
+}
+
+/// Waits until the program and all its descendants have ended, and returns its exit status, 128 more than the number of
+/// a signal that killed it. Once it has ended, or on SIGTERM, its descendants are killed, whatever sessions or groups
+/// they have made for themselves.
+fn supervise(program: libc::pid_t) -> c_int {
+    let mut ended = None;
+    let mut is_ending = false;
+    // SAFETY: the set is initialised before it is used; `status` and `timeout` are valid locations. All signals are
+    // blocked already, so that one that comes before `sigtimedwait` is not missed.
+    unsafe {
+        let mut awaited: libc::sigset_t = std::mem::zeroed();
+        libc::sigemptyset(&mut awaited);
+        libc::sigaddset(&mut awaited, libc::SIGCHLD);
+        libc::sigaddset(&mut awaited, libc::SIGTERM);
+        loop {
+            let mut status = 0;
+            let pid = libc::waitpid(-1, &mut status, libc::WNOHANG);
+            if pid == program {
+                ended = Some(status);
+            }
+            if pid > 0 {
+                continue;
+            }
+            let is_killing = is_ending || ended.is_some();
+            if pid < 0 || (is_killing && !kill_children() && ended.is_some()) {
+                break;
+            }
+            // The kernel's list of children may lack some while others end, so that it is read again.
+            let timeout = libc::timespec { tv_sec: 0, tv_nsec: 50_000_000 };
+            let timeout = if is_killing { ptr::from_ref(&timeout) } else { ptr::null() };
+            if libc::sigtimedwait(&awaited, ptr::null_mut(), timeout) == libc::SIGTERM {
+                is_ending = true;
+                // Also where the children cannot be listed.
+                libc::kill(-program, libc::SIGKILL);
+            }
+        }
+    }
+    match ended {
+        Some(status) if libc::WIFEXITED(status) => libc::WEXITSTATUS(status),
+        Some(status) => 128 + libc::WTERMSIG(status),
+        None => BROKEN,
+    }
+}
+
+/// Kills the children of this process; their own children then become this process's. Returns false if the kernel does
+/// not list them (proc(5): it needs CONFIG_PROC_CHILDREN). Of very many some are left for the next call.
+fn kill_children() -> bool {
+    let mut list = [0_u8; 4096];
+    // SAFETY: the path is a literal, the buffer has the given length.
+    let length = unsafe {
+        let fd = libc::open(c"/proc/thread-self/children".as_ptr(), libc::O_RDONLY | libc::O_CLOEXEC);
+        if fd < 0 {
+            return false;
+        }
+        let length = libc::read(fd, list.as_mut_ptr().cast(), list.len());
+        libc::close(fd);
+        length
+    };
+    let mut pid: libc::pid_t = 0;
+    for byte in list.iter().take(usize::try_from(length).unwrap_or(0)) {
+        if byte.is_ascii_digit() {
+            pid = pid.wrapping_mul(10).wrapping_add(libc::pid_t::from(byte - b'0'));
+            continue;
+        }
+        // A space follows each number; without one the number may be cut off.
+        if pid > 1 {
+            // SAFETY: no pointers. It is a child of ours that is not reaped, so the pid is its own.
+            unsafe { libc::kill(pid, libc::SIGKILL) };
+        }
+        pid = 0;
+    }
+    true
+}
+
+/// Makes the descriptors the standard streams: of a node output and error, of an exec session input, output and error,
+/// or one terminal for all three, which becomes the controlling one.
+fn place_streams(streams: &[RawFd]) -> bool {
+    // SAFETY: calls on descriptors only.
+    unsafe {
+        match streams {
+            [out, err] => libc::dup2(*out, 1) >= 0 && libc::dup2(*err, 2) >= 0,
+            [input, out, err] => libc::dup2(*input, 0) >= 0 && libc::dup2(*out, 1) >= 0 && libc::dup2(*err, 2) >= 0,
+            [terminal] => {
+                (0..3).all(|stream| libc::dup2(*terminal, stream) >= 0) && libc::ioctl(0, libc::TIOCSCTTY, 0) == 0
+            }
+            _ => false,
+        }
+    }
+}
+
 /// Executes the program, in the child; returns only on failure.
 fn exec_program(request: &Start<'_>, streams: &[RawFd]) -> (StartStage, c_int) {
     // SAFETY: after fork in a process with one thread. The strings end in zero bytes and their number was checked when
@@ -212,7 +343,7 @@ fn exec_program(request: &Start<'_>, streams: &[RawFd]) -> (StartStage, c_int) {
             libc::signal(signal, libc::SIG_DFL);
         }
         libc::sigprocmask(libc::SIG_SETMASK, &none, ptr::null_mut());
-        if libc::setsid() < 0 || libc::dup2(streams[0], 1) < 0 || libc::dup2(streams[1], 2) < 0 {
+        if libc::setsid() < 0 || !place_streams(streams) {
             return (StartStage::Prepare, errno());
         }
         libc::umask(0o022);

@@ -15,7 +15,7 @@ const EXITED: u8 = 0x83;
 /// A request from the shim to init.
 #[derive(Debug, PartialEq)]
 pub enum InitRequest<'a> {
-    /// Fork and execute a program. Its standard output and error are attached as file descriptors.
+    /// Fork and execute a program. Its standard streams are attached as file descriptors.
     Start(Start<'a>),
     /// Send a signal.
     Signal {

@@ -1,6 +1,6 @@
 //! Tests of the real init as the first process of a pid namespace. Needs root.
 
-use std::io::Read;
+use std::io::{Read, Write};
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 use std::process::{Child, Command, Stdio};
 
@@ -33,7 +33,7 @@ impl Init {
         };
         assert_eq!(set, 0);
         let process = Command::new("unshare")
-            .args(["--pid", "--fork", "--kill-child", INIT])
+            .args(["--pid", "--fork", "--kill-child", "--mount-proc", INIT])
             .stdin(Stdio::from(theirs))
             .spawn()
             .expect("unshare, of util-linux; run this test as root");
@@ -60,17 +60,17 @@ impl Init {
     }
 
     fn run(&self, id: u32, argv: &[&str], directory: &str) -> std::fs::File {
-        let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
-        let environment = ["GREETING=hello".to_owned()];
-        let request = StartRequest { id, directory, argv: &argv, environment: &environment };
-        let mut pipe = [-1; 2];
-        // SAFETY: an array of two for two descriptors.
-        let made = unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) };
-        assert_eq!(made, 0);
-        // SAFETY: just created, owned by nobody else.
-        let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
-        socket::send(self.fd(), &request.encode().unwrap(), &[write.as_raw_fd(), write.as_raw_fd()]).unwrap();
+        let (read, write) = pipe();
+        self.start_with(id, argv, directory, &[&write, &write]);
         read.into()
+    }
+
+    fn start_with(&self, id: u32, argv: &[&str], directory: &str, streams: &[&OwnedFd]) {
+        let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
+        let environment = ["GREETING=hello".to_owned(), "PATH=/usr/bin:/bin".to_owned()];
+        let request = StartRequest { id, directory, argv: &argv, environment: &environment };
+        let streams: Vec<_> = streams.iter().map(|stream| stream.as_raw_fd()).collect();
+        socket::send(self.fd(), &request.encode().unwrap(), &streams).unwrap();
     }
 
     fn expect_started(&self, id: u32) -> i32 {
@@ -86,6 +86,17 @@ impl Init {
             other => panic!("no end of {pid} but {other:?}"),
         }
     }
+}
+
+/// Returns the read end and the write end of a new pipe.
+fn pipe() -> (OwnedFd, OwnedFd) {
+    let mut pipe = [-1; 2];
+    // SAFETY: an array of two for two descriptors.
+    let made = unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) };
+    assert_eq!(made, 0);
+    // SAFETY: just created, owned by nobody else.
+    let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
+    (read, write)
 }
 
 impl Drop for Init {
@@ -146,6 +157,67 @@ fn orphans_are_reaped_and_told() {
     let pid = init.expect_started(1);
     assert_eq!(init.expect_exit(pid), 0);
     assert!(matches!(init.receive().0, InitReply::Exited { status: 0x700, .. }));
+}
+
+/// Leaves processes behind in sessions of their own, which hold the pipe open.
+const LEAVES_CHILDREN: &str = "trap '' TERM HUP; setsid sleep 600 & (setsid sh -c 'sleep 600 & sleep 600' &); echo up;";
+
+#[test]
+fn the_program_of_an_exec_session_reads_its_input_and_leaves_nothing_behind() {
+    let init = Init::start();
+    let ((input, typed), (printed, out)) = (pipe(), pipe());
+    let script = format!("{LEAVES_CHILDREN} cat; exit 5");
+    init.start_with(1, &["/bin/sh", "-c", &script], "/", &[&input, &out, &out]);
+    drop((input, out));
+    let pid = init.expect_started(1);
+    std::fs::File::from(typed).write_all(b"typed\n").unwrap();
+    assert_eq!(init.expect_exit(pid), 5 << 8);
+    let mut text = String::new();
+    std::fs::File::from(printed).read_to_string(&mut text).unwrap();
+    assert_eq!(text, "up\ntyped\n", "and nobody holds the other end");
+}
+
+#[test]
+fn an_exec_session_that_is_ended_is_killed_with_all_that_it_has_started() {
+    let init = Init::start();
+    let ((input, typed), (printed, out)) = (pipe(), pipe());
+    let script = format!("{LEAVES_CHILDREN} sleep 600");
+    init.start_with(1, &["/bin/sh", "-c", &script], "/", &[&input, &out, &out]);
+    drop((input, out));
+    let pid = init.expect_started(1);
+    let mut printed = std::fs::File::from(printed);
+    let mut line = [0; 3];
+    printed.read_exact(&mut line).unwrap();
+    socket::send(init.fd(), &InitRequest::encode_signal(pid, libc::SIGTERM, Scope::Process), &[]).unwrap();
+    assert_eq!(init.expect_exit(pid), (128 + libc::SIGKILL) << 8);
+    let mut text = String::new();
+    printed.read_to_string(&mut text).unwrap();
+    assert_eq!(text, "", "and nobody holds the other end");
+    drop(typed);
+    init.start_with(2, &["/no/such/program"], "/", &[&pipe().0, &pipe().1, &pipe().1]);
+    assert_eq!(init.receive().0, InitReply::Failed { id: 2, errno: libc::ENOENT, stage: StartStage::Execute });
+}
+
+#[test]
+fn a_terminal_is_the_controlling_one() {
+    let init = Init::start();
+    let (mut ours, mut theirs) = (-1, -1);
+    let (name, termios, size) = (std::ptr::null_mut(), std::ptr::null(), std::ptr::null());
+    // SAFETY: two valid locations; nothing else is asked for.
+    let made = unsafe { libc::openpty(&mut ours, &mut theirs, name, termios, size) };
+    assert_eq!(made, 0);
+    // SAFETY: just created, owned by nobody else.
+    let [ours, theirs] = [ours, theirs].map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
+    let script = "trap 'exit 9' INT; test -t 0 && test -t 2 && echo up; while :; do sleep 0.1; done";
+    init.start_with(1, &["/bin/sh", "-c", script], "/", &[&theirs]);
+    let pid = init.expect_started(1);
+    let mut terminal = std::fs::File::from(ours);
+    let mut line = [0; 4];
+    terminal.read_exact(&mut line).unwrap();
+    assert_eq!(&line, b"up\r\n");
+    // Ctrl-C, which the terminal turns into a signal.
+    terminal.write_all(b"\x03").unwrap();
+    assert_eq!(init.expect_exit(pid), 9 << 8);
 }
 
 #[test]

@@ -15,12 +15,12 @@ use crate::audit::{AuditObject, is_recorded};
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::permissions::check_service_known;
-use crate::route_access::{Access, AccessTarget};
+use crate::route_access::{Access, AccessTarget, DescribeRequest};
 use crate::{recordings, stubs};
 
 /// Middleware that passes a request on if its caller may make it.
 pub async fn authorise(
-    State((app, access)): State<(Arc<App>, Access)>,
+    State((app, access, describe)): State<(Arc<App>, Access, DescribeRequest)>,
     params: Result<RawPathParams, RawPathParamsRejection>,
     mut request: Request,
     next: Next,
@@ -63,7 +63,7 @@ pub async fn authorise(
         }
     };
     let method = request.method().clone();
-    let did = format!("{method} {}", request.uri().path());
+    let did = describe(&method, request.uri().path());
     let object = match of {
         AccessTarget::Machine | AccessTarget::Handler => "the server".to_owned(),
         AccessTarget::Service(parameter) => {

@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
+use crate::exec::slots::ExecSlots;
 use crate::inside::connections::InsideConnections;
 use crate::observers::servants::{BlackBoxOptions, Observers};
 use crate::people::identity_provider::IdentityProvider;
@@ -42,6 +43,8 @@ pub struct Options {
     pub isolation: String,
     /// Settings of the servants' black boxes.
     pub black_box: BlackBoxOptions,
+    /// True if programs may be run in servants.
+    pub exec: bool,
 }
 
 /// Results of the checks of the machine at startup.
@@ -103,6 +106,8 @@ pub struct App {
     pub live: LiveSamples,
     /// Connections that look into servants.
     pub inside: InsideConnections,
+    /// Exec sessions.
+    pub execs: ExecSlots,
     /// Observers of servants: black boxes and goal monitors.
     pub observers: Observers,
     /// Start time of the daemon.

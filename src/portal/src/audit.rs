@@ -1,5 +1,5 @@
-//! The audit log: who did what to what from where. It never contains secrets: of a request, only the method and the
-//! path (which consists of names) are recorded, never its query, headers or body.
+//! The audit log: who did what to what from where. It never contains secrets: of a request, only words for what it does
+//! (`crate::routes::words`) and names from its path are recorded, never its query, headers or body.
 
 pub mod records;
 

@@ -162,6 +162,20 @@ pub enum Error {
     /// The servant's ROS is not available yet, or no longer.
     #[error("cannot look into servant {0}: it is starting or ending")]
     NotThereYet(String),
+    /// The servant's container does not run yet, or no longer.
+    #[error("no program can be run in servant {0}: it is starting or ending")]
+    NotRunning(String),
+    /// The configuration allows no programs in servants.
+    #[error("no programs can be run in servants here: the configuration has exec = false")]
+    ExecOff,
+    /// The caller has too many exec sessions.
+    #[error("{who} runs {most} programs in servants already, which is the limit")]
+    TooManyExecs {
+        /// Name of the caller.
+        who: String,
+        /// The limit.
+        most: usize,
+    },
     /// The servant has no black box.
     #[error("servant {0} has no ring-buffer recording")]
     NoBlackBox(String),
@@ -403,6 +417,9 @@ impl Error {
             Error::TooManyStreams { .. } => (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams"),
             Error::TooManyLook { .. } => (S::TOO_MANY_REQUESTS, "too-many-look", "too many connections inside"),
             Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not ready"),
+            Error::NotRunning(_) => (S::CONFLICT, "not-running", "not running"),
+            Error::ExecOff => (S::FORBIDDEN, "exec-off", "not allowed"),
+            Error::TooManyExecs { .. } => (S::TOO_MANY_REQUESTS, "too-many-execs", "too many programs in servants"),
             Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "no ring-buffer recording"),
             Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
             Error::UnknownPush(_) => (S::NOT_FOUND, "unknown-push", "unknown push"),

@@ -34,7 +34,7 @@ use crate::principals::identity::{CallerIdentity, Credential};
 use crate::principals::refusals::CertificateRefusal;
 use crate::query::query_value;
 use crate::registry_clients;
-use crate::route_access::{Access, FindAccess};
+use crate::route_access::{Access, DescribeRequest, FindAccess};
 use crate::tokens;
 
 /// Settings that decide which requests are admitted.
@@ -51,7 +51,7 @@ pub struct AdmissionRules<'a> {
 
 /// Middleware that passes a request on with its [`Caller`], or refuses it.
 pub async fn guard(
-    State((app, find_access)): State<(Arc<App>, FindAccess)>,
+    State((app, find_access, describe)): State<(Arc<App>, FindAccess, DescribeRequest)>,
     mut request: Request,
     next: Next,
 ) -> Response {
@@ -63,10 +63,10 @@ pub async fn guard(
         Err(error) => {
             // The client cannot be determined, so the request is attributed to the proxy.
             let nobody = Caller::new(connection, Principal::nobody(), Credential::Nothing);
-            let did = format!("{} {}", request.method(), request.uri().path());
+            let did = describe(request.method(), request.uri().path());
             let status = error.problem().status;
-            let object = "a client with a malformed proxy header";
-            app.audit.record_throttled(&nobody, AccessAction::Enter, &did, object, status);
+            let object = format!("a client with a malformed proxy header ({})", request.uri().path());
+            app.audit.record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             return error.into_response();
         }
     };
@@ -101,15 +101,15 @@ pub async fn guard(
         Err(error) => {
             if let Error::Foreign { what, next } = &error {
                 log_refusal(peer, what, next);
-                let (method, path) = (request.method(), request.uri().path());
+                let did = describe(request.method(), request.uri().path());
                 let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
-                let (did, status) = (format!("{method} {path}"), error.problem().status);
-                app.audit.record_throttled(&nobody, AccessAction::Enter, &did, what, status);
+                let (object, status) = (format!("{what} ({})", request.uri().path()), error.problem().status);
+                app.audit.record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             }
             if let Error::Uncertified(why) = &error {
                 let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
-                let did = format!("{} {}", request.method(), request.uri().path());
-                let (object, status) = (why.to_string(), error.problem().status);
+                let did = describe(request.method(), request.uri().path());
+                let (object, status) = (format!("{why} ({})", request.uri().path()), error.problem().status);
                 app.audit.record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             }
             error.into_response()

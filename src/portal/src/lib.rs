@@ -26,6 +26,7 @@ mod dictionary;
 mod differences;
 mod errors;
 mod events;
+mod exec;
 mod explain;
 mod goals;
 mod guard;
@@ -69,7 +70,7 @@ mod views;
 
 use std::sync::Arc;
 
-use route_access::FindAccess;
+use route_access::{DescribeRequest, FindAccess};
 
 pub use axum::Router;
 pub use axum::http::Uri;
@@ -78,6 +79,7 @@ pub use ::tls::Fingerprint;
 pub use app::{App, MachineChecks, Options, RobotAuthority};
 pub use audit::Audit;
 pub use connections::{serve_challenges, serve_tcp, serve_unix};
+pub use exec::slots::ExecSlots;
 pub use history::record_history as keep_history;
 pub use inside::connections::InsideConnections;
 pub use observers::run_observers as keep_observers;
@@ -95,15 +97,15 @@ pub use tokens::{TokenError, Tokens};
 /// Builds the router, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
     let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
-        let access = (Arc::clone(&app), route.access);
-        let allowed = axum::middleware::from_fn_with_state(access, allowed::authorise);
+        let row = (Arc::clone(&app), route.access, routes::words::describe_request as DescribeRequest);
+        let allowed = axum::middleware::from_fn_with_state(row, allowed::authorise);
         router.route(route.path, (route.handler)().layer(allowed))
     });
     served
         .fallback(routes::not_found)
         .method_not_allowed_fallback(routes::other_method)
         .layer(axum::middleware::from_fn_with_state(
-            (Arc::clone(&app), routes::find_access as FindAccess),
+            (Arc::clone(&app), routes::find_access as FindAccess, routes::words::describe_request as DescribeRequest),
             guard::guard,
         ))
         .layer(axum::middleware::from_fn(registry_clients::translate_problems))

@@ -64,6 +64,7 @@ const MORE: &[(&str, &[u16])] = &[
     ("cancelPush", &[409]),
     ("createAccount", &[409]),
     ("createToken", &[409]),
+    ("exec", &[409, 426]),
     ("explainSla", &[422]),
     ("exportBase", &[409, 422]),
     ("fit", &[422]),

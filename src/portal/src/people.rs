@@ -112,12 +112,11 @@ fn finish_sign_in(
 /// Signs a person in. The browser always gets a new session.
 pub async fn sign_in(State(app): State<Arc<App>>, Extension(caller): Extension<Caller>, request: Request) -> Response {
     let (head, body) = request.into_parts();
-    let (path, headers) = (head.uri.path(), &head.headers);
-    let signed = try_sign_in(&app, &caller, headers, body).await;
-    let did = format!("{} {path}", head.method);
+    let signed = try_sign_in(&app, &caller, &head.headers, body).await;
+    let did = "sign in";
     match signed {
         Ok((begun, earlier)) => {
-            let (now, cookie) = finish_sign_in(&app, &caller, &begun, earlier, &did, "account");
+            let (now, cookie) = finish_sign_in(&app, &caller, &begun, earlier, did, "account");
             let answer = describe_session(&app, &now, Some(&begun.secret));
             no_store(([(header::SET_COOKIE, cookie)], Json(answer)))
         }
@@ -128,7 +127,7 @@ pub async fn sign_in(State(app): State<Arc<App>>, Extension(caller): Extension<C
                 None => "an unknown account".to_owned(),
             };
             let status = error.problem().status;
-            app.audit.record_throttled(&caller, AccessAction::Enter, &did, &object, status);
+            app.audit.record_throttled(&caller, AccessAction::Enter, did, &object, status);
             no_store(error)
         }
     }
@@ -214,7 +213,7 @@ pub async fn sign_out(
         app.principals.end_session(id)?
     }
     let object = format!("account {name}");
-    app.audit.record(&caller, AccessAction::Enter, "DELETE /api/v1/session", &object, 204);
+    app.audit.record(&caller, AccessAction::Enter, "sign out", &object, 204);
     let cookie = cookies::clear_session(caller.secure);
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
 }

@@ -13,6 +13,7 @@ use futures_util::{FutureExt, StreamExt, TryStreamExt};
 use push::{Deployer, PushResult, ReceptionGuard};
 
 use crate::app::App;
+use crate::audit::AuditObject;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::query::query_value;
@@ -23,6 +24,7 @@ pub async fn push(
     State(app): State<Arc<App>>,
     OriginalUri(uri): OriginalUri,
     Extension(caller): Extension<Caller>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
 ) -> Response {
     let archive = body.into_data_stream().map_err(io::Error::other).boxed();
@@ -38,14 +40,22 @@ pub async fn push(
             return error.into_response();
         }
     };
+    let pushed = describe_push(&options);
+    about.set(pushed.clone());
     let started = pusher.start(options, by, archive, move |outcome| {
-        if let Ok(published) = &outcome
-            && !published.unchanged
-        {
-            let object = format!("service {}", published.service);
-            app.audit.record(&caller, AccessAction::Deploy, "published", &object, 200);
+        let outcome = outcome.map_err(Error::from);
+        match &outcome {
+            Ok(published) => {
+                let unchanged = if published.unchanged { ": unchanged" } else { "" };
+                let object = format!("service {}{unchanged}", published.service);
+                app.audit.record(&caller, AccessAction::Deploy, "push", &object, 200);
+            }
+            Err(error) => {
+                let (object, status) = (format!("{pushed}: {error}"), error.problem().status);
+                app.audit.record_throttled(&caller, AccessAction::Deploy, "push", &object, status);
+            }
         }
-        match outcome.map_err(Error::from).and_then(|done| done_event(&app, done)) {
+        match outcome.and_then(|done| done_event(&app, done)) {
             Ok(event) => event,
             Err(error) => PushEvent::Error { problem: error.problem() },
         }
@@ -54,6 +64,15 @@ pub async fn push(
         // Owned by the response: if the client disconnects while it sends, the push is cancelled.
         Ok(running) => pushes::stream_output(&running, ReceptionGuard::new(Arc::clone(&running))),
         Err(error) => Error::from(error).into_response(),
+    }
+}
+
+/// Describes what is pushed, before the service's name is known for certain.
+fn describe_push(options: &PushOptions) -> String {
+    match options.name.as_ref().or(options.apt.as_ref()) {
+        Some(name) => format!("service {name}"),
+        None if options.source.is_empty() => "a package".to_owned(),
+        None => format!("package {}", options.source),
     }
 }
 
@@ -99,6 +118,18 @@ fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_push_is_told_by_the_name_of_its_service() {
+        let named = |name: Option<&str>, apt: Option<&str>, source: &str| {
+            let (name, apt) = (name.map(str::to_owned), apt.map(str::to_owned));
+            describe_push(&PushOptions { name, apt, source: source.to_owned(), ..PushOptions::default() })
+        };
+        assert_eq!(named(Some("people"), Some("opencv_apps"), "x"), "service people");
+        assert_eq!(named(None, Some("opencv_apps"), ""), "service opencv_apps");
+        assert_eq!(named(None, None, "student_vision"), "package student_vision");
+        assert_eq!(named(None, None, ""), "a package");
+    }
 
     #[test]
     fn options_come_in_the_query() {

@@ -1,6 +1,7 @@
 //! Callers that may use a route, and the object that it is about.
 
 use access::AccessAction;
+use axum::http::Method;
 
 /// Callers that may use a route, where tokens exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,3 +41,14 @@ pub enum AccessTarget {
 
 /// Returns the access of the route that serves a path.
 pub type FindAccess = fn(&str) -> Access;
+
+/// Describes a request, by its method and path, for the audit log.
+pub type DescribeRequest = fn(&Method, &str) -> String;
+
+/// Returns true if a request's path matches a path of the route table.
+pub fn matches_path(pattern: &str, path: &str) -> bool {
+    let mut segments = path.split('/');
+    pattern.split('/').all(|expected| {
+        segments.next().is_some_and(|segment| segment == expected || (expected.starts_with('{') && !segment.is_empty()))
+    }) && segments.next().is_none()
+}

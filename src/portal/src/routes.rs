@@ -3,6 +3,7 @@
 
 #[cfg(test)]
 mod matrix;
+pub mod words;
 
 use ::access::AccessAction;
 use api::access;
@@ -16,15 +17,15 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, bases, calibration, dictionary, differences, events, goals, history, inside, logs, machines,
+    App, api_v1, audit, bases, calibration, dictionary, differences, events, exec, goals, history, inside, logs, machines,
     metrics, oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs, topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
-use crate::route_access::{Access, AccessTarget};
+use crate::route_access::{Access, AccessTarget, matches_path};
 
 use Access::{Code, Connect, May, Read, ReadOrConnect, SignIn};
-use AccessAction::{Deploy, Enter, Logs, Look, Operate, See, Try};
+use AccessAction::{Deploy, Enter, Exec, Logs, Look, Operate, See, Try};
 
 /// Queries open to every principal, within what it may see.
 const ENTER: Access = May(Enter, AccessTarget::Machine);
@@ -108,12 +109,7 @@ impl Route {
 
     /// Returns true if a request's path matches the route.
     fn matches(&self, path: &str) -> bool {
-        let mut segments = path.split('/');
-        self.path.split('/').all(|expected| {
-            segments
-                .next()
-                .is_some_and(|segment| segment == expected || (expected.starts_with('{') && !segment.is_empty()))
-        }) && segments.next().is_none()
+        matches_path(self.path, path)
     }
 }
 
@@ -306,6 +302,14 @@ pub const ROUTES: &[Route] = &[
         operation("keptLogs", "Ended servants whose logs are kept, newest first.")
             .asks::<logs::KeptLogQuery>()
             .lists::<api::KeptLog>()
+    }),
+    route("GET", "/api/v1/servants/{id}/exec", servant(Exec), || get(exec::open_exec)).with_operation(|| {
+        operation(
+            "exec",
+            "Runs a program in a servant and opens a WebSocket of its streams (subprotocol `exec.v1.cloudroid`).",
+        )
+        .asks::<exec::ExecQuery>()
+        .becomes_a_websocket()
     }),
     route("GET", "/api/v1/servants/{id}/inside", servant(See), || get(inside::open_inside)).with_operation(|| {
         operation("inside", "Opens a WebSocket into a servant that speaks rosbridge, besides its robot.")

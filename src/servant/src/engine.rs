@@ -6,11 +6,13 @@ mod unmet;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use api::exec::TerminalSize;
 use api::{Grants, KeptLog, Pressure};
 use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
 
+use crate::exec::{ExecSession, ExecSpec};
 use crate::spec::{Limits, NodeSpec, Spec};
 
 pub use unmet::missing_limits;
@@ -184,6 +186,12 @@ pub trait ServantHandle: Send + Sync + 'static {
     /// says. This holds from now on even if there is nothing to signal.
     async fn end_node(&self, node: &str, signal: i32) -> Result<(), crate::Error> {
         self.signal_node(node, signal).await
+    }
+    /// Runs a program beside the nodes, at a terminal of this size or with separate streams; returns when it is
+    /// executed, or with the reason why it could not be. An engine that cannot do this refuses.
+    async fn exec(&self, _spec: ExecSpec, _terminal: Option<TerminalSize>) -> Result<ExecSession, crate::Error> {
+        let reason = "its engine runs no programs beside its nodes".to_owned();
+        Err(crate::Error::Refused { id: self.id().to_owned(), reason })
     }
     /// Waits for a node to end; returns at once if it has ended already.
     async fn wait_node(&self, node: &str) -> Result<NodeExit, crate::Error>;

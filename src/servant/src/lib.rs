@@ -17,6 +17,7 @@ pub mod cgroup;
 pub mod container;
 pub mod engine;
 mod error;
+pub mod exec;
 mod grant_error;
 pub mod host;
 pub mod idmap;

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::engine::{ContainerState, EnforcedLimits, NodeEvent, NodeExit};
+use crate::exec::ExecSpec;
 use crate::process::ProcessIdentity;
 use crate::spec::{Limits, NodeSpec};
 
@@ -62,6 +63,9 @@ pub enum ShimMessage {
         nodes: BTreeMap<String, NodeStatus>,
         /// Limits in force.
         enforced: EnforcedLimits,
+        /// True if it knows [`Command::Exec`]; shims of earlier versions do not.
+        #[serde(default)]
+        can_exec: bool,
     },
     /// The container's state has changed.
     State {
@@ -128,8 +132,23 @@ pub enum Command {
     },
     /// Change limits.
     SetLimits(Limits),
+    /// Run a program beside the nodes. Attached to the line are the socket of its session and its streams: one
+    /// terminal, or input, output and error. The session ends when either side closes its socket; before the shim does,
+    /// it writes the program's exit status to it (four bytes, little-endian).
+    Exec(ExecSpec),
     /// End the servant. Answered when the stop has begun; the end of the connection tells the rest.
     Stop,
+}
+
+impl Command {
+    /// Returns the number of descriptors attached to the command.
+    pub fn descriptor_count(&self) -> usize {
+        match self {
+            Self::Exec(ExecSpec { terminal: true, .. }) => 2,
+            Self::Exec(_) => 4,
+            Self::StartNode(_) | Self::SignalNode { .. } | Self::SetLimits(_) | Self::Stop => 0,
+        }
+    }
 }
 
 /// Encodes a message as a line.
@@ -163,6 +182,9 @@ mod tests {
         let read: ShimMessage = serde_json::from_str(earlier).unwrap();
         let started = NodeEvent::Started { node: "/a".into() };
         assert!(matches!(read, ShimMessage::Node { event, .. } if event == started));
+        let earlier = r#"{"type":"hello","shim":{"pid":7,"start":9},"state":{"state":"running"},"nodes":{},"enforced":{"cgroup_version":2,"limits":{}}}"#;
+        let hello: ShimMessage = serde_json::from_str(earlier).unwrap();
+        assert!(matches!(hello, ShimMessage::Hello { can_exec: false, .. }), "{hello:?}");
         let request = ShimRequest { id: 3, command: Command::SignalNode { node: "/a".into(), signal: 2, last: true } };
         assert_eq!(serde_json::from_slice::<ShimRequest>(&to_line(&request)).unwrap(), request);
     }

@@ -29,6 +29,7 @@ mod clients;
 mod command_error;
 mod create;
 mod driver;
+mod execs;
 mod input;
 mod link;
 mod nodes;

@@ -4,6 +4,7 @@ use std::ffi::CString;
 use std::io;
 use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 fn check_result(result: libc::c_long) -> io::Result<libc::c_long> {
@@ -123,6 +124,37 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
         Err(error) if matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) => Ok(false),
         Err(error) => Err(error),
     }
+}
+
+/// Opens a new pseudoterminal (pts(4)); returns its master, which does not block, and its slave. The slave is opened
+/// through the master (Linux 4.13), since its path may lead elsewhere in the caller's mount namespace.
+pub(crate) fn open_terminal() -> io::Result<(OwnedFd, OwnedFd)> {
+    let flags = libc::O_NOCTTY | libc::O_NONBLOCK | libc::O_CLOEXEC;
+    let master = std::fs::File::options().read(true).write(true).custom_flags(flags).open("/dev/ptmx")?;
+    let master = OwnedFd::from(master);
+    let unlocked: libc::c_int = 0;
+    // SAFETY: a live integer.
+    check_result(unsafe { libc::ioctl(master.as_raw_fd(), libc::TIOCSPTLCK, &unlocked) }.into())?;
+    // SAFETY: no pointers.
+    let slave =
+        unsafe { libc::ioctl(master.as_raw_fd(), libc::TIOCGPTPEER, libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC) };
+    Ok((master, into_owned_fd(slave.into())?))
+}
+
+/// Sets the size of a terminal in characters (ioctl_tty(2)).
+pub(crate) fn set_terminal_size(terminal: BorrowedFd<'_>, columns: u16, rows: u16) -> io::Result<()> {
+    let size = libc::winsize { ws_row: rows, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 };
+    // SAFETY: a live structure.
+    check_result(unsafe { libc::ioctl(terminal.as_raw_fd(), libc::TIOCSWINSZ, &size) }.into()).map(drop)
+}
+
+/// Returns the columns and rows of a terminal.
+#[cfg(test)]
+pub(crate) fn terminal_size(terminal: BorrowedFd<'_>) -> io::Result<(u16, u16)> {
+    let mut size = libc::winsize { ws_row: 0, ws_col: 0, ws_xpixel: 0, ws_ypixel: 0 };
+    // SAFETY: a live structure.
+    check_result(unsafe { libc::ioctl(terminal.as_raw_fd(), libc::TIOCGWINSZ, &mut size) }.into())?;
+    Ok((size.ws_col, size.ws_row))
 }
 
 /// Returns freed memory of this process to the kernel (malloc_trim(3)).

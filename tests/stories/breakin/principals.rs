@@ -118,6 +118,7 @@ fn read_attempts<'a>(service: &str, image: &str, servant: &str) -> Vec<RequestAt
         format!("/{service}"),
         format!("/{service}/"),
         format!("/api/v1/servants/{servant}"),
+        format!("/api/v1/servants/{servant}/exec"),
         format!("/api/v1/servants/{servant}/inside"),
         format!("/api/v1/servants/{servant}/topics"),
         format!("/api/v1/servants/{servant}/goals"),
@@ -362,8 +363,8 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
     fail("a deployer", &tokens.alice, &kept, publish_attempts())?;
     // A robot sees only its own servant, although it may use the other's service as well.
     let beside = [r2.as_str()];
-    let others =
-        ["", "/logs", "/inside"].map(|path| RequestAttempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
+    let others = ["", "/logs", "/exec", "/inside"]
+        .map(|path| RequestAttempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
     fail("a robot", &tokens.rover, &beside, others.into())?;
     fail(
         "a robot",

@@ -79,6 +79,7 @@ impl Config {
             drain: self.portal.drain.0,
             isolation: self.isolation.to_string(),
             black_box: self.black_box.options(),
+            exec: self.portal.exec,
         }
     }
 }

@@ -26,6 +26,8 @@ pub struct PortalConfig {
     pub handshake: Time,
     /// Time that connections have to end when the daemon ends.
     pub drain: Time,
+    /// Programs may be run in servants by callers with the permission `exec`.
+    pub exec: bool,
 }
 
 /// Representation in JSON of numbers that it cannot express.
@@ -51,6 +53,7 @@ impl Default for PortalConfig {
             non_finite: NonFinite::Null,
             handshake: Time::seconds(10),
             drain: Time::seconds(10),
+            exec: true,
         }
     }
 }

@@ -64,6 +64,15 @@ impl Error {
                          is ready"
                 )
             }
+            Error::NotRunning(id) => {
+                format!("see its state with: cloudroidctl servants; try again when {id} is ready")
+            }
+            Error::ExecOff => {
+                "have an operator set exec = true in [portal] of the configuration; the output of nodes is shown by: \
+                    cloudroidctl logs SERVANT"
+                    .into()
+            }
+            Error::TooManyExecs { .. } => "end one of them (exit, or Ctrl-D), then try again".into(),
             Error::NoBlackBox(_) => {
                 "have an operator set seconds in [black_box] of the configuration (docs/viewers.md); if it is set, \
                     recording begins a second after the servant is ready"

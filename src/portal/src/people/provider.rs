@@ -27,6 +27,9 @@ const NAMED: usize = 20;
 /// Content-Security-Policy of the pages: no scripts, styles or frames.
 const POLICY: &str = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
+/// Words of the audit log for both steps of a sign-in.
+const SIGN_IN: &str = "sign in by the identity provider";
+
 /// Query of a sign-in.
 #[derive(Debug, Deserialize, IntoParams)]
 pub struct LoginQuery {
@@ -65,7 +68,7 @@ pub async fn login(
 ) -> Response {
     match begin_sign_in(&app, &caller, &headers, beginning.again).await {
         Ok(response) => no_store(response),
-        Err(error) => refuse(&app, &caller, &headers, LOGIN, error),
+        Err(error) => refuse(&app, &caller, &headers, error),
     }
 }
 
@@ -105,8 +108,7 @@ pub async fn callback(
 ) -> Response {
     match complete_sign_in(&app, &caller, &uri, &headers).await {
         Ok((begun, earlier)) => {
-            let did = format!("GET {CALLBACK}");
-            let (_, cookie) = finish_sign_in(&app, &caller, &begun, earlier, &did, "person");
+            let (_, cookie) = finish_sign_in(&app, &caller, &begun, earlier, SIGN_IN, "person");
             // Browsers do not send a cookie with SameSite=Strict when another site, such as the provider, has led to
             // the page. So this page reloads from our own site.
             let body = "<meta http-equiv=\"refresh\" content=\"0; url=/\">\n<title>Signed in</title>\n\
@@ -119,7 +121,7 @@ pub async fn callback(
             {
                 app.principals.record_failed_sign_in(caller.peer.ip(), store::now());
             }
-            refuse(&app, &caller, &headers, CALLBACK, error)
+            refuse(&app, &caller, &headers, error)
         }
     }
 }
@@ -170,14 +172,13 @@ fn no_role_error(known: &IdentityProvider, person: &Person) -> Error {
 }
 
 /// Refuses a sign-in, as an HTML page for browsers, and records it.
-fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, path: &str, error: Error) -> Response {
+fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, error: Error) -> Response {
     let problem = error.problem();
     let object = match &error {
         Error::NoRole { who, .. } => format!("person {who}"),
         _ => "a person of the identity provider".to_owned(),
     };
-    let did = format!("GET {path}");
-    app.audit.record_throttled(caller, AccessAction::Enter, &did, &object, problem.status);
+    app.audit.record_throttled(caller, AccessAction::Enter, SIGN_IN, &object, problem.status);
     if let Error::Provider(refused) = &error
         && refused.is_provider_fault()
     {

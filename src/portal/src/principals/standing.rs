@@ -125,7 +125,7 @@ impl Principals {
                 match &*told.borrow_and_update() {
                     ConnectionAccess::Ended(reason) => return reason.clone(),
                     ConnectionAccess::Granted(grants) if whole && !grants.is_everything() => {
-                        return format!("a stub needs all of {service}, but is granted only {grants}");
+                        return format!("this needs all of {service}, but only {grants} is granted");
                     }
                     ConnectionAccess::Granted(_) => {}
                 }

@@ -1,11 +1,13 @@
 //! The daemon's end of a connection to a shim: keeps and passes on the shim's messages, and sends requests.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicI32, Ordering};
+use std::io;
+use std::os::fd::{AsRawFd, OwnedFd, RawFd};
+use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Interest};
 use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
@@ -25,6 +27,7 @@ pub(super) struct ServantView {
     pub(super) state: watch::Sender<ContainerState>,
     /// Host pid of init; 0 if unknown.
     init: AtomicI32,
+    can_exec: AtomicBool,
     pub(super) events: broadcast::Sender<NodeEvent>,
     pub(super) nodes: watch::Sender<BTreeMap<String, NodeStatus>>,
     pub(super) enforced: watch::Sender<EnforcedLimits>,
@@ -45,6 +48,7 @@ impl Default for ServantView {
         Self {
             state: watch::Sender::new(ContainerState::Creating),
             init: AtomicI32::new(0),
+            can_exec: AtomicBool::new(false),
             events: broadcast::Sender::new(EVENTS),
             nodes: watch::Sender::default(),
             enforced: watch::Sender::default(),
@@ -73,7 +77,8 @@ impl ServantView {
 
     fn apply_message(&self, message: ShimMessage) {
         match message {
-            ShimMessage::Hello { state, nodes, enforced, .. } => {
+            ShimMessage::Hello { state, nodes, enforced, can_exec, .. } => {
+                self.can_exec.store(can_exec, Ordering::Release);
                 self.enforced.send_replace(enforced);
                 self.nodes.send_replace(nodes);
                 self.set_state(state);
@@ -108,6 +113,11 @@ impl ServantView {
     /// Returns the host pid of init.
     pub(super) fn init_pid(&self) -> Option<i32> {
         Some(self.init.load(Ordering::Acquire)).filter(|pid| *pid != 0)
+    }
+
+    /// Returns whether the shim can run programs beside the nodes; those of earlier versions cannot.
+    pub(super) fn can_exec(&self) -> bool {
+        self.can_exec.load(Ordering::Acquire)
     }
 
     /// Allocates the id of a request and the channel for its reply.
@@ -151,14 +161,38 @@ impl RequestSender {
     }
 
     pub(super) async fn request(&self, known: &ServantView, command: Command) -> Result<(), ShimRequestError> {
+        self.request_with_descriptors(known, command, Vec::new()).await
+    }
+
+    /// Sends a request with these descriptors attached, and closes them here.
+    pub(super) async fn request_with_descriptors(
+        &self,
+        known: &ServantView,
+        command: Command,
+        descriptors: Vec<OwnedFd>,
+    ) -> Result<(), ShimRequestError> {
         let (id, answer) = known.register_request()?;
         let line = protocol::to_line(&ShimRequest { id, command });
-        self.write.lock().await.write_all(&line).await.map_err(|_| ShimRequestError::Gone)?;
+        self.write_line(&line, &descriptors).await.map_err(|_| ShimRequestError::Gone)?;
+        drop(descriptors);
         match answer.await {
             Ok(None) => Ok(()),
             Ok(Some(reason)) => Err(ShimRequestError::Refused(reason)),
             Err(_) => Err(ShimRequestError::Gone),
         }
+    }
+
+    async fn write_line(&self, line: &[u8], descriptors: &[OwnedFd]) -> io::Result<()> {
+        let mut write = self.write.lock().await;
+        let mut sent = 0;
+        if !descriptors.is_empty() {
+            let descriptors: Vec<RawFd> = descriptors.iter().map(AsRawFd::as_raw_fd).collect();
+            let stream: &UnixStream = write.as_ref();
+            // They arrive with the first of these bytes, even if only some fit into the socket's buffer.
+            let send = || init::socket::send(stream.as_raw_fd(), line, &descriptors);
+            sent = stream.async_io(Interest::WRITABLE, send).await?;
+        }
+        write.write_all(&line[sent..]).await
     }
 
     /// Sends a request, waiting at most `patience` for the reply. The request may still be carried out later.

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use api::KeptLog;
+use api::exec::TerminalSize;
 use async_trait::async_trait;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -22,6 +23,7 @@ use super::{kept, sweep};
 use crate::Error;
 use crate::cgroup::Cgroup;
 use crate::engine::{ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage};
+use crate::exec::{ExecEnds, ExecSession, ExecSpec};
 use crate::launch::{self, ExitRecord, LaunchRecord, RuntimeRecord};
 use crate::local::GracePeriods;
 use crate::logs::{self, DirectoryWatches};
@@ -420,6 +422,25 @@ impl ServantHandle for LocalServant {
 
     async fn end_node(&self, node: &str, signal: i32) -> Result<(), Error> {
         self.send_signal(node, signal, true).await
+    }
+
+    async fn exec(&self, spec: ExecSpec, terminal: Option<TerminalSize>) -> Result<ExecSession, Error> {
+        self.ensure_running()?;
+        if !self.known.can_exec() {
+            let reason = "it was started by an earlier version of the daemon, which could not run programs in it; \
+                          stop it, so that the robot gets a new one"
+                .to_owned();
+            return Err(Error::Refused { id: self.id.clone(), reason });
+        }
+        // Programs run as user 0 of the container.
+        let user = self.uid_range.0;
+        let (ends, theirs) = privilege::run_sync(move || ExecEnds::create(terminal, user))?;
+        let session = ends.register().map_err(Error::call("watching an exec session"))?;
+        let command = Command::Exec(ExecSpec { terminal: terminal.is_some(), ..spec });
+        let asked = self.requests.request_with_descriptors(&self.known, command, theirs);
+        let asked = tokio::time::timeout(ANSWER, asked).await.unwrap_or(Err(ShimRequestError::Silent));
+        asked.map_err(|unfulfilled| self.request_error(unfulfilled))?;
+        Ok(session)
     }
 
     async fn wait_node(&self, node: &str) -> Result<NodeExit, Error> {

@@ -237,8 +237,13 @@ fn record_failure(directory: &Path, cgroup: &Cgroup, shim: ProcessIdentity, cont
     if let Err(error) = launch::write_record(&directory.join(launch::EXIT), &exit) {
         eprintln!("{error}");
     }
-    let hello =
-        ShimMessage::Hello { shim, state: state.into(), nodes: exit.nodes, enforced: EnforcedLimits::default() };
+    let hello = ShimMessage::Hello {
+        shim,
+        state: state.into(),
+        nodes: exit.nodes,
+        enforced: EnforcedLimits::default(),
+        can_exec: false,
+    };
     // If the daemon is gone, exit.json tells the next one.
     let _ = io::Write::write_all(&mut &control, &protocol::to_line(&hello));
 }

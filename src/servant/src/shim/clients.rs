@@ -1,8 +1,11 @@
 //! Connections of daemons: usually one, none while the daemon is not running.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 
-use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
+use init::socket::{self, MAX_FDS};
+use tokio::io::{AsyncWriteExt, Interest};
+use tokio::net::unix::OwnedReadHalf;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -10,6 +13,52 @@ use tokio::task::JoinHandle;
 use super::command_error::CommandError;
 use super::input::ShimEvent;
 use crate::protocol::{self, ShimMessage, ShimRequest};
+
+/// Reads requests, one a line, and the descriptors attached to them.
+struct RequestReader {
+    stream: OwnedReadHalf,
+    read: Vec<u8>,
+    /// Descriptors of the requests in `read`, in their order.
+    attached: VecDeque<OwnedFd>,
+}
+
+impl RequestReader {
+    fn new(stream: OwnedReadHalf) -> Self {
+        Self { stream, read: Vec::new(), attached: VecDeque::new() }
+    }
+
+    /// Returns the next request and its descriptors; `None` when the daemon has disconnected. Lines that are not
+    /// understood are passed over.
+    async fn next(&mut self) -> Option<(ShimRequest, Vec<OwnedFd>)> {
+        loop {
+            while let Some(end) = self.read.iter().position(|byte| *byte == b'\n') {
+                let line: Vec<u8> = self.read.drain(..=end).collect();
+                if let Ok(request) = serde_json::from_slice::<ShimRequest>(&line) {
+                    let count = request.command.descriptor_count().min(self.attached.len());
+                    return Some((request, self.attached.drain(..count).collect()));
+                }
+            }
+            self.receive().await?;
+        }
+    }
+
+    /// Receives more; `None` when the daemon has disconnected.
+    async fn receive(&mut self) -> Option<()> {
+        let stream: &UnixStream = self.stream.as_ref();
+        let mut block = [0; 1024];
+        let receive = || {
+            let mut fds = [-1; MAX_FDS];
+            let (length, count) = socket::receive(stream.as_raw_fd(), &mut block, &mut fds)?;
+            // SAFETY: just received, owned by nobody else.
+            let owned = fds[..count].iter().map(|fd| unsafe { OwnedFd::from_raw_fd(*fd) });
+            Ok((length, owned.collect::<Vec<_>>()))
+        };
+        let (length, fds) = stream.async_io(Interest::READABLE, receive).await.ok()?;
+        self.read.extend_from_slice(&block[..length]);
+        self.attached.extend(fds);
+        (length > 0).then_some(())
+    }
+}
 
 /// All connected daemons.
 pub(super) struct DaemonConnections {
@@ -46,11 +95,9 @@ impl DaemonConnections {
         let (read, mut write) = stream.into_split();
         let inputs = self.inputs.clone();
         tokio::task::spawn_local(async move {
-            let mut lines = BufReader::with_capacity(1024, read).lines();
-            while let Ok(Some(line)) = lines.next_line().await {
-                if let Ok(request) = serde_json::from_str::<ShimRequest>(&line) {
-                    let _ = inputs.send(ShimEvent::Request(id, request));
-                }
+            let mut requests = RequestReader::new(read);
+            while let Some((request, descriptors)) = requests.next().await {
+                let _ = inputs.send(ShimEvent::Request(id, request, descriptors));
             }
             let _ = inputs.send(ShimEvent::Disconnected(id));
         });
@@ -94,5 +141,43 @@ impl DaemonConnections {
             drop(queue);
             let _ = writer.await;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+
+    use crate::exec::ExecSpec;
+    use crate::protocol::Command;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn each_request_gets_the_descriptors_that_were_sent_with_it() {
+        let (daemon, shim) = UnixStream::pair().unwrap();
+        let (read, _write) = shim.into_split();
+        let mut requests = RequestReader::new(read);
+        let files: Vec<File> = (0..6).map(|_| File::open("/dev/null").unwrap()).collect();
+        let fds: Vec<_> = files.iter().map(AsRawFd::as_raw_fd).collect();
+        let exec = |id, terminal| {
+            // Longer than what is read at once.
+            let argv = vec!["x".repeat(4000)];
+            let spec = ExecSpec { argv, environment: BTreeMap::new(), terminal };
+            protocol::to_line(&ShimRequest { id, command: Command::Exec(spec) })
+        };
+        let stop = protocol::to_line(&ShimRequest { id: 1, command: Command::Stop });
+        let unknown = b"{\"id\":9,\"command\":\"of a later version\"}\n".to_vec();
+        for (line, fds) in
+            [(stop, &fds[..0]), (exec(2, false), &fds[..4]), (unknown, &fds[..0]), (exec(3, true), &fds[4..])]
+        {
+            assert_eq!(socket::send(daemon.as_raw_fd(), &line, fds).unwrap(), line.len());
+        }
+        drop(daemon);
+        let mut told = Vec::new();
+        while let Some((request, descriptors)) = requests.next().await {
+            told.push((request.id, descriptors.len()));
+        }
+        assert_eq!(told, [(1, 0), (2, 4), (3, 2)]);
     }
 }

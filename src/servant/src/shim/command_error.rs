@@ -4,6 +4,7 @@ use std::io;
 
 use init::StartStage;
 
+use super::execs::ExecTableError;
 use super::link::LinkError;
 use super::nodes::NodeTableError;
 use crate::Error;
@@ -17,6 +18,8 @@ pub(super) enum CommandError {
     #[error(transparent)]
     Node(#[from] NodeTableError),
     #[error(transparent)]
+    Exec(#[from] ExecTableError),
+    #[error(transparent)]
     Start(#[from] StartError),
     /// The request could not be sent to init.
     #[error(transparent)]
@@ -26,7 +29,7 @@ pub(super) enum CommandError {
     Limits(Vec<String>),
 }
 
-/// Reason why a node could not be started.
+/// Reason why a node, or the program of an exec session, could not be started.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum StartError {
     /// It cannot have its standard streams.

@@ -2,6 +2,7 @@
 
 mod coming_up;
 mod ending;
+mod exec;
 mod node_life;
 
 use std::collections::BTreeMap;
@@ -18,6 +19,7 @@ use super::Resident;
 use super::begin::PreparedShim;
 use super::clients::DaemonConnections;
 use super::command_error::CommandError;
+use super::execs::ExecTable;
 use super::input::{ShimEvent, StopStage};
 use super::link::InitLink;
 use super::nodes::NodeTable;
@@ -33,6 +35,7 @@ struct Driver {
     queue: mpsc::UnboundedReceiver<ShimEvent>,
     clients: DaemonConnections,
     nodes: NodeTable,
+    execs: ExecTable,
     link: InitLink,
     streams: Streams,
     resident: Box<dyn Resident>,
@@ -87,6 +90,7 @@ impl Driver {
         Ok(Self {
             clients,
             nodes: NodeTable::default(),
+            execs: ExecTable::new(inputs.clone()),
             link: InitLink::new(init).map_err(Error::call("watching init's socket"))?,
             streams: Streams::new(log),
             resident,
@@ -124,8 +128,8 @@ impl Driver {
         match input {
             ShimEvent::Connected(stream) => self.clients.add(stream, &self.hello()),
             ShimEvent::Disconnected(client) => self.clients.remove(client),
-            ShimEvent::Request(client, request) => {
-                if let Some(outcome) = self.execute(client, request.id, request.command).await {
+            ShimEvent::Request(client, request, descriptors) => {
+                if let Some(outcome) = self.execute(client, request.id, request.command, descriptors).await {
                     self.clients.answer(client, request.id, outcome);
                 }
             }
@@ -136,6 +140,7 @@ impl Driver {
                     return true;
                 }
             }
+            ShimEvent::ExecLeft(number) => self.end_exec(number).await,
             ShimEvent::Respawn(name) => self.respawn(&name).await,
             ShimEvent::Patience(stage) if self.stopping == Some(stage) => self.next_stage().await,
             ShimEvent::Patience(_) => {}
@@ -145,7 +150,13 @@ impl Driver {
     }
 
     /// Executes a command; returns `None` if the reply comes later.
-    async fn execute(&mut self, client: u64, request: u64, command: Command) -> Option<Result<(), CommandError>> {
+    async fn execute(
+        &mut self,
+        client: u64,
+        request: u64,
+        command: Command,
+        descriptors: Vec<OwnedFd>,
+    ) -> Option<Result<(), CommandError>> {
         match command {
             Command::Stop => {
                 self.stop("stopped").await;
@@ -172,6 +183,13 @@ impl Driver {
                 }
                 Some(self.signal(&node, signal).await)
             }
+            Command::Exec(spec) => match self.start_exec(&spec, descriptors).await {
+                Ok(number) => {
+                    self.waiting.insert(number, (client, request));
+                    None
+                }
+                Err(error) => Some(Err(error)),
+            },
             Command::SetLimits(limits) => {
                 let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();
@@ -212,6 +230,7 @@ impl Driver {
             state: self.snapshot(),
             nodes: self.nodes.statuses(),
             enforced: EnforcedLimits { ..self.begun.enforced.clone() },
+            can_exec: true,
         }
     }
 }

@@ -12,14 +12,16 @@ use crate::protocol::ShimRequest;
 pub(super) enum ShimEvent {
     /// A daemon connected.
     Connected(UnixStream),
-    /// A daemon sent a request.
-    Request(u64, ShimRequest),
+    /// A daemon sent a request, with descriptors attached.
+    Request(u64, ShimRequest, Vec<OwnedFd>),
     /// A daemon disconnected.
     Disconnected(u64),
     /// Init sent a reply.
     Init(InitReply, Option<OwnedFd>),
     /// A child was reaped: init, or a leftover of the creator.
     Reaped(i32, i32),
+    /// The daemon has left an exec session, or it has ended.
+    ExecLeft(u32),
     /// The restart delay of a node is over.
     Respawn(String),
     /// The time of a stage of the stop is over.

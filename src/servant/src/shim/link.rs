@@ -57,10 +57,11 @@ impl InitLink {
         }
     }
 
-    /// Requests the start of a program; `streams` are its standard output and error.
-    pub(super) async fn start(&self, request: &StartRequest<'_>, streams: [RawFd; 2]) -> Result<(), LinkError> {
+    /// Requests the start of a program. Of a node, `streams` are its standard output and error; of an exec session, one
+    /// terminal, or input, output and error.
+    pub(super) async fn start(&self, request: &StartRequest<'_>, streams: &[RawFd]) -> Result<(), LinkError> {
         let bytes = request.encode()?;
-        Ok(self.send(&bytes, &streams).await?)
+        Ok(self.send(&bytes, streams).await?)
     }
 
     /// Requests a signal.

@@ -81,11 +81,17 @@ impl NodeTable {
 
     /// Allocates a number for the start of a node, and returns the spec to start.
     pub(super) fn start(&mut self, name: &str) -> Option<(u32, NodeSpec)> {
-        let node = self.known.get(name).filter(|node| node.inside.is_none())?;
+        let spec = self.known.get(name).filter(|node| node.inside.is_none())?.spec.clone();
+        let number = self.allocate_number();
+        self.starting.insert(number, name.to_owned());
+        Some((number, spec))
+    }
+
+    /// Allocates a number for the start of a program, which may be that of no node.
+    pub(super) fn allocate_number(&mut self) -> u32 {
         let number = self.next;
         self.next = self.next.wrapping_add(1);
-        self.starting.insert(number, name.to_owned());
-        Some((number, node.spec.clone()))
+        number
     }
 
     /// Called when init has executed the program.

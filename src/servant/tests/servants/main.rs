@@ -5,6 +5,7 @@
 
 mod adoption;
 mod builds;
+mod exec;
 mod isolation;
 mod life;
 mod limits;

@@ -596,7 +596,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 who: "alice (deployer)".into(),
                 from: "10.0.0.3:5000".into(),
                 action: "deploy".into(),
-                did: "POST /api/v1/push".into(),
+                did: "begin a push".into(),
                 object: "service adder".into(),
                 status: 200,
                 more: 3,

@@ -95,6 +95,9 @@ impl Driver {
                 self.answer_start(number, Err(error.into()));
             }
         }
+        for number in self.execs.clear() {
+            self.answer_start(number, Err(StartError::InitEnded.into()));
+        }
         let limit = self.memory_limit();
         self.verdict.get_or_insert_with(|| {
             let how = match exit {

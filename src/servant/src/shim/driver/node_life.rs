@@ -41,7 +41,7 @@ impl Driver {
         let request =
             StartRequest { id: number, directory: &spec.directory, argv: &spec.argv, environment: &environment };
         let streams = [out.as_raw_fd(), err.as_raw_fd()];
-        Ok(self.link.start(&request, streams).await?)
+        Ok(self.link.start(&request, &streams).await?)
     }
 
     pub(super) async fn respawn(&mut self, name: &str) {
@@ -54,6 +54,10 @@ impl Driver {
         match reply {
             InitReply::Ready => {}
             InitReply::Started { id, pid } => {
+                if self.execs.on_started(id, pid) {
+                    self.answer_start(id, Ok(()));
+                    return;
+                }
                 // It may be gone already: then its host pid is of no use.
                 let host = fd.as_ref().and_then(process::pid_of).unwrap_or(0);
                 if let Some(event) = self.nodes.on_started(id, pid, host) {
@@ -71,6 +75,7 @@ impl Driver {
             }
             InitReply::Exited { pid, status } => {
                 self.resident.process_exited(pid);
+                self.execs.on_exited(pid, status);
                 let exit = nodes::parse_wait_status(status, self.was_out_of_memory(status));
                 if let Some((event, consequence)) = self.nodes.on_exited(pid, exit.clone()) {
                     self.report_node(event.clone());
@@ -111,6 +116,10 @@ impl Driver {
     }
 
     pub(super) async fn on_start_failed(&mut self, number: u32, error: StartError) {
+        if self.execs.remove_starting(number) {
+            self.answer_start(number, Err(error.into()));
+            return;
+        }
         let reason = error.to_string();
         if let Some((event, consequence)) = self.nodes.on_exec_failed(number, reason.clone()) {
             self.report_node(event.clone());
