@@ -14,6 +14,7 @@ mod events;
 mod exit;
 mod explain;
 mod export;
+mod first_credential;
 mod fit;
 mod goals;
 mod import;

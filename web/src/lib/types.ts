@@ -857,6 +857,7 @@ export interface ServiceDetail extends ServiceSummary {
   interface: Interface;
   nodes: Node[];
   revisions: Revision[];
+  rollout: boolean;
   shared?: Shared;
 }
 
@@ -879,6 +880,7 @@ export interface Session {
   accounts: boolean;
   csrf?: string;
   expires?: Millis;
+  loopback_robots: boolean;
   name?: string;
   needed: boolean;
   provider?: ProviderLink;
@@ -1097,6 +1099,7 @@ export type Weight =
   | 'hint';
 
 export interface Whoami {
+  may: string[];
   name: string;
   robot?: string;
   roles: string[];
