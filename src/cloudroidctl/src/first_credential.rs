@@ -26,12 +26,21 @@ struct OpenRobots {
 impl OpenRobots {
     /// Collects the robots of connected servants; on an open server none of them has a credential.
     fn find(servants: &[Servant]) -> OpenRobots {
+        let connected = servants.iter().filter(|servant| servant.connections > 0);
+        OpenRobots::collect(connected.map(|servant| &*servant.robot))
+    }
+
+    /// Sorts names of robots. `~` and letters is the name of a robot without one; `~PURPOSE-…` is no robot's, but that
+    /// of a servant of a group or of a measurement.
+    fn collect<'a>(names: impl Iterator<Item = &'a str>) -> OpenRobots {
         let mut robots = OpenRobots::default();
-        for servant in servants.iter().filter(|servant| servant.connections > 0) {
-            if servant.robot.starts_with('~') {
-                robots.nameless += 1;
-            } else {
-                robots.named.insert(servant.robot.clone());
+        for name in names {
+            match name.strip_prefix('~') {
+                None => {
+                    robots.named.insert(name.to_owned());
+                }
+                Some(generated) if !generated.contains('-') => robots.nameless += 1,
+                Some(_) => {}
             }
         }
         robots
@@ -120,6 +129,12 @@ mod tests {
         let many: Vec<&str> = many.iter().map(String::as_str).collect();
         let told = robots(&many, 0).describe(false);
         assert!(told.contains("15 robots") && told.contains("r19, 5 more") && !told.contains("r20"), "{told}");
+    }
+
+    #[test]
+    fn a_robot_is_counted_once_and_what_is_none_is_not() {
+        let names = ["r1", "~abc0", "r1", "~group-1-1", "r2"];
+        assert_eq!(OpenRobots::collect(names.into_iter()), robots(&["r1", "r2"], 1));
     }
 
     #[test]

@@ -188,7 +188,7 @@ impl AdmissionRules<'_> {
         headers: &HeaderMap,
     ) -> bool {
         self.loopback_robots
-            && connection.peer.ip().is_loopback()
+            && connection.peer.ip().to_canonical().is_loopback()
             && !connection.forwarded
             && is_upgrade(headers)
             && is_open((self.find_access)(uri.path()), method, uri, headers)

@@ -74,7 +74,7 @@ impl PortalConfig {
     pub(super) fn check(&self, is_behind_proxy: bool) -> anyhow::Result<()> {
         if self.loopback_robots == LoopbackRobots::Allowed && is_behind_proxy {
             bail!(
-                "[portal] of the configuration: with loopback_robots = \"allowed\", whatever a proxy of trusted_proxies \
+                "[portal] of the configuration: with loopback_robots = \"allowed\", what a proxy of trusted_proxies \
                     passes on without saying for whom would need no token; remove one of the two"
             );
         }
