@@ -465,6 +465,7 @@ fn main() -> ExitCode {
             what_robots_may_changes_while_they_are_connected,
             what_was_begun_with_a_token_ends_with_it,
             this_machines_users_see_and_are_robots_and_change_nothing,
+            robots_of_this_machine_stay_where_that_is_allowed,
         ],
         stories![audit:
             who_did_what_is_recorded_and_told_as_it_comes,

@@ -1,6 +1,6 @@
 //! Principals, tokens and the policy: who may do what, and nothing else.
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, ensure};
@@ -360,14 +360,74 @@ pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
         let (status, body) = daemon.request(method, path, &[])?;
         ensure!(status == 403 && body.contains("local (viewer, robot) may not"), "{method} {path}: {status} {body}");
     }
-    // From the first token on everyone needs one, and a client without a token is disconnected.
-    create_token(&daemon, &["root2", "--role", "admin"])?;
+    // From the first token on everyone needs one. At a terminal the deployer is asked first.
+    let create = ["token", "create", "root2", "--role", "admin"];
+    let cut_off = "1 robot that is connected without one is cut off: r1";
+    answer_at_terminal(&daemon, &create, "n")?.expect_failure(&[cut_off, "nothing was created"])?;
+    ensure!(robot.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4, "it was not cut off");
+    // A script is told, and goes on; a client without a token is disconnected.
+    let told = deployer.run(&create)?.expect_success()?;
+    ensure!(told.stderr.contains(cut_off), "{}", told.stderr);
     let close = robot.wait_for_close()?;
     ensure!(u16::from(close.code) == 1008, "{close:?}");
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     deployer.run(&["token", "revoke", "root2"])?.expect_success()?;
     ensure!(daemon.get("/api/v1/services")?.0 == 401, "the door does not open again");
     deployer.run(&["services"])?.expect_success()?;
+    Ok(())
+}
+
+/// Runs `cloudroidctl` at a terminal of its own, and answers its question.
+fn answer_at_terminal(daemon: &Daemon, arguments: &[&str], answer: &str) -> anyhow::Result<CommandOutcome> {
+    let command = format!("{} {}", support::binaries::path("cloudroidctl").display(), arguments.join(" "));
+    let mut child = Command::new("script")
+        .args(["--quiet", "--return", "--command", &command, "/dev/null"])
+        .env("CLOUDROID_HOME", &daemon.home)
+        .env_remove("CLOUDROID_SERVER")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .context("script, which is a part of Debian")?;
+    let mut input = child.stdin.take().context("its standard input")?;
+    input.write_all(format!("{answer}\n").as_bytes())?;
+    drop(input);
+    let output = child.wait_with_output()?;
+    Ok(CommandOutcome {
+        command,
+        status: output.status.code().unwrap_or(-1),
+        stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+    })
+}
+
+pub fn robots_of_this_machine_stay_where_that_is_allowed() -> Verdict {
+    let daemon = world().setup("locals-stay").config("[portal]\nloopback_robots = \"allowed\"\n").start()?;
+    let deployer = daemon.deployer();
+    deployer.push("adder_py", &["--node", "adder.py"])?.expect_success()?;
+    let mut robot = daemon.robot("adder_py?robot=r1")?;
+    ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    let told = deployer.run(&["token", "create", "ann", "--role", "operator"])?.expect_success()?;
+    ensure!(told.stderr.contains("first credential") && !told.stderr.contains("cut off"), "{}", told.stderr);
+    let secret = told.stdout.trim();
+    // Robots work on and come anew; nothing else is open, and a wrong token is one.
+    let mut later = daemon.robot("adder_py?robot=r2")?;
+    for robot in [&mut robot, &mut later] {
+        ensure!(robot.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
+    }
+    for path in ["/api/v1/services", "/api/v1/servants", "/metrics", "/adder_py"] {
+        ensure!(daemon.get(path)?.0 == 401, "{path}");
+    }
+    let url = daemon.url("adder_py?robot=r3&token=wrong-and-long-enough");
+    let Err(refusal) = Robot::try_connect(&url) else { anyhow::bail!("a wrong token was let in") };
+    ensure!(refusal.status == 401, "{refusal}");
+    // A robot's name that a token owns is that token's.
+    let mut owned = daemon.robot(&format!("adder_py?robot=r4&token={secret}"))?;
+    ensure!(owned.call("/add_two", json!({"a": 3, "b": 2}))?["values"]["sum"] == 5);
+    let Err(refusal) = Robot::try_connect(&daemon.url("adder_py?robot=r4")) else {
+        anyhow::bail!("it took a robot's name")
+    };
+    ensure!(refusal.status == 403, "{refusal}");
     Ok(())
 }
 

@@ -115,6 +115,12 @@ impl Principal {
         Principal { name: "local".to_owned(), roles: vec![Role::Viewer, Role::Robot], scope: Scope::everything() }
     }
 
+    /// Creates the principal of this machine's robots where credentials exist and the operator admits robots without
+    /// one: it may act as any robot and views nothing else.
+    pub fn local_robot() -> Principal {
+        Principal { roles: vec![Role::Robot], ..Principal::local() }
+    }
+
     /// Returns the role of a token or a person, which have one; that of a viewer without any.
     pub fn first_role(&self) -> Role {
         self.roles.first().copied().unwrap_or(Role::Viewer)

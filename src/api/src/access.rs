@@ -126,6 +126,11 @@ pub struct Whoami {
     /// Robot that the principal identifies as.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
+    /// Actions that the principal may perform (`docs/access.md`): on the server, and at the service of the query or,
+    /// without one, at a service of its own.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub may: Vec<String>,
 }
 
 /// An audit record (`GET /api/v1/audit`).

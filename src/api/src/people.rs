@@ -42,6 +42,10 @@ pub struct Session {
     pub needed: bool,
     /// True if accounts with passwords exist.
     pub accounts: bool,
+    /// True if robots on the server's machine need no credentials even where authentication is required.
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub loopback_robots: bool,
     /// Identity provider, if one is configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provider: Option<ProviderLink>,

@@ -57,6 +57,10 @@ pub struct ServiceDetail {
     /// Groups of shared servants, by revision.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub groups: Vec<Group>,
+    /// True if the service has or had a rollout (`GET /api/v1/services/NAME/rollout`).
+    #[serde(default)]
+    #[cfg_attr(feature = "schema", schema(required = true))]
+    pub rollout: bool,
 }
 
 /// A published revision.

@@ -5,6 +5,7 @@ mod password;
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 
 use crate::client::{DaemonClient, percent_encode};
+use crate::first_credential::confirm_first_credential;
 use crate::output::{self, OutputFormat, Table};
 use crate::token::parse_patterns;
 
@@ -43,6 +44,9 @@ struct CreateAccount {
     /// Read the password from the first line of standard input.
     #[arg(long)]
     password_stdin: bool,
+    /// Do not ask before the server's first account cuts off robots that have no token.
+    #[arg(long)]
+    yes: bool,
 }
 
 /// List all accounts.
@@ -115,9 +119,12 @@ impl AccountArgs {
     pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.verb {
             AccountCommand::Create(verb) => {
+                let role: access::Role = verb.role.parse()?;
+                let services = parse_patterns(&verb.services)?;
+                confirm_first_credential(client, verb.yes).await?;
                 let new = NewAccount {
-                    role: verb.role.parse()?,
-                    services: parse_patterns(&verb.services)?,
+                    role,
+                    services,
                     password: password::read_password(verb.password_stdin)?,
                     name: verb.name,
                 };

@@ -20,6 +20,7 @@ mod exec;
 mod exit;
 mod explain;
 mod export;
+mod first_credential;
 mod fit;
 mod goals;
 mod help;

@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use api::access::{NewToken, Secret, Token};
 
 use crate::client::{DaemonClient, percent_encode};
+use crate::first_credential::confirm_first_credential;
 use crate::output::{self, OutputFormat, Table};
 
 /// Manage tokens of people and robots: create, list, revoke and rotate them.
@@ -44,6 +45,9 @@ struct CreateToken {
     /// Lifetime of the token, such as 12h or 30d (default: unlimited).
     #[arg(long, value_name = "TIME", value_parser = lifetime)]
     expires: Option<Duration>,
+    /// Do not ask before the server's first token cuts off robots that have none.
+    #[arg(long)]
+    yes: bool,
 }
 
 /// List all tokens, including revoked ones, without their secrets.
@@ -99,6 +103,7 @@ impl TokenArgs {
                     lifetime: verb.expires.map(|length| length.as_secs()),
                     name: verb.name,
                 };
+                confirm_first_credential(client, verb.yes).await?;
                 print_secret(&client.post("/api/v1/tokens", &new).await?, format)
             }
             TokenCommand::List(ListTokens) => {

@@ -35,7 +35,7 @@ use crate::log::LogFormat;
 use crate::machine;
 
 pub use self::oidc::OidcConfig;
-pub use self::portal::{NonFinite, PortalConfig};
+pub use self::portal::{LoopbackRobots, NonFinite, PortalConfig};
 pub use self::push::PushConfig;
 pub use self::servant::{Hung, ServantConfig};
 pub use acme::AcmeConfig;
@@ -243,7 +243,7 @@ impl Config {
             catalogue::names::validate_robot(robot).context("default_robot of the configuration")?;
         }
         self.memory.check().context("[memory] of the configuration")?;
-        self.portal.check()?;
+        self.portal.check(!self.trusted_proxies.is_empty())?;
         Ok(())
     }
 

@@ -35,6 +35,8 @@ pub struct Options {
     pub default_service: Option<String>,
     /// Robot assumed for a plain `ws://host:9090`; if not set, each connection is a robot of its own.
     pub default_robot: Option<String>,
+    /// True if robots on this machine connect without a token even where tokens exist.
+    pub loopback_robots: bool,
     /// Timeout of a request's header and of an awaited `auth` message.
     pub handshake: Duration,
     /// Time that connections get to finish when the daemon stops.

@@ -10,6 +10,9 @@
 //! see everything and may act as any robot; root, at its socket, is an admin. Web pages of other sites must not use
 //! the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS rebinding),
 //! with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
+//!
+//! If the operator allows it (`loopback_robots`), robots on this machine connect without a token even where tokens
+//! exist: handshakes from loopback that pass the same checks.
 
 pub mod elsewhere;
 
@@ -41,6 +44,8 @@ use crate::tokens;
 pub struct AdmissionRules<'a> {
     /// True if the portal is bound to loopback.
     pub loopback: bool,
+    /// True if robots on this machine need no token even where tokens exist.
+    pub loopback_robots: bool,
     /// Recognises credentials.
     pub known: Recogniser<'a>,
     /// Allowed origins besides loopback's.
@@ -74,6 +79,7 @@ pub async fn guard(
     let admitted = app.principals.with_recogniser(|known| {
         let rules = AdmissionRules {
             loopback: app.listen.ip().is_loopback(),
+            loopback_robots: app.options.loopback_robots,
             known,
             origins: &app.options.origins,
             find_access,
@@ -150,11 +156,11 @@ impl AdmissionRules<'_> {
             return admit_user(connection, user);
         }
         let given = find_token(uri, headers);
+        if given.is_none() && self.is_loopback_robot(connection, method, uri, headers) {
+            return Ok(Caller::new(connection, Principal::local_robot(), Credential::Loopback));
+        }
         if self.loopback && self.known.tokens.is_empty() && self.known.stored.is_empty() {
-            elsewhere::check_direct(headers)?;
-            elsewhere::check_host(headers)?;
-            elsewhere::check_origin(headers, self.origins)?;
-            elsewhere::check_not_embedded(headers)?;
+            elsewhere::check_local(headers, self.origins)?;
             let mut caller = Caller::new(connection, Principal::local(), Credential::Nothing);
             // Any token is accepted; it only owns robots' names.
             let token = given.as_deref().map(tokens::hash);
@@ -170,6 +176,24 @@ impl AdmissionRules<'_> {
             }
             None => self.admit_session(connection, method, uri, headers),
         }
+    }
+
+    /// Returns true if the request is the handshake of a robot on this machine that needs no token. A browser with a
+    /// session's cookie is a person's.
+    fn is_loopback_robot(
+        &self,
+        connection: &PortalConnection,
+        method: &Method,
+        uri: &Uri,
+        headers: &HeaderMap,
+    ) -> bool {
+        self.loopback_robots
+            && connection.peer.ip().to_canonical().is_loopback()
+            && !connection.forwarded
+            && is_upgrade(headers)
+            && is_open((self.find_access)(uri.path()), method, uri, headers)
+            && matches!(cookies::session_cookie(connection, headers), Ok(None))
+            && elsewhere::check_local(headers, self.origins).is_ok()
     }
 
     /// Recognises a session cookie if no token was sent; some requests need neither.

@@ -59,6 +59,7 @@ fn describe_session(app: &App, caller: &Caller, secret: Option<&str>) -> Session
         expires,
         needed: !app.principals.has_no_credentials(),
         accounts: app.principals.has_accounts(),
+        loopback_robots: app.options.loopback_robots,
         provider: app.provider.as_ref().map(|provider| provider.link()),
     }
 }

@@ -80,6 +80,24 @@ impl Caller {
         self.check_access(action, &object)
     }
 
+    /// Returns the actions that the caller may perform: on the machine, and at the service or, without one, at a
+    /// service of its own.
+    pub fn permitted_actions(&self, app: &App, service: Option<&str>) -> Vec<AccessAction> {
+        let principal = &self.who.principal;
+        let robot = principal.scope.robot.as_deref();
+        let check = |action: AccessAction| match (action, service) {
+            (AccessAction::Enter | AccessAction::Look | AccessAction::Pair | AccessAction::Administer, _) => {
+                self.check_access(action, &AccessObject::MACHINE)
+            }
+            (_, Some(service)) => self.check_service_access(app, action, service, robot),
+            (_, None) => {
+                let own = AccessObject { robot, ..AccessObject::service("", Some(&principal.name)) };
+                self.check_access(action, &own)
+            }
+        };
+        AccessAction::ALL.into_iter().filter(|action| check(*action).is_ok()).collect()
+    }
+
     /// Checks whether the caller may use a class of the configuration.
     pub fn check_class(&self, class: &str) -> Result<(), Error> {
         if class == DEFAULT || can_use_class(&self.who.principal, class) {

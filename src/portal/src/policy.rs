@@ -6,17 +6,33 @@ use api::access::{NewRule, NewToken, Rule, Secret, Token, Whoami};
 use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::{Extension, Json};
+use serde::Deserialize;
+use utoipa::IntoParams;
 
 use crate::app::App;
 use crate::audit::AuditObject;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::json::{JsonResult, read_json};
+use crate::query::Query;
 
-/// Returns the caller's identity.
-pub async fn whoami(Extension(caller): Extension<Caller>) -> Json<Whoami> {
+/// Query: where the caller wants to act.
+#[derive(Debug, Deserialize, IntoParams)]
+pub struct WhoamiQuery {
+    /// Service at which the actions are performed (default: one that the caller publishes itself).
+    service: Option<String>,
+}
+
+/// Returns the caller's identity and what it may do.
+pub async fn whoami(
+    State(app): State<Arc<App>>,
+    Query(place): Query<WhoamiQuery>,
+    Extension(caller): Extension<Caller>,
+) -> Json<Whoami> {
     let principal = &caller.who.principal;
+    let may = caller.permitted_actions(&app, place.service.as_deref());
     Json(Whoami {
+        may: may.iter().map(|action| action.name().to_owned()).collect(),
         name: principal.name.clone(),
         roles: principal.roles.clone(),
         services: principal.scope.services.clone(),

@@ -360,8 +360,11 @@ pub const ROUTES: &[Route] = &[
     route("GET", "/api/v1/audit", ADMINISTER, || get(audit::records::audit)).with_operation(|| {
         operation("audit", "Audit log, oldest first.").asks::<audit::records::AuditQuery>().streams::<access::Audited>()
     }),
-    route("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
-        .with_operation(|| operation("whoami", "The caller, as the daemon identified it.").answers::<access::Whoami>()),
+    route("GET", "/api/v1/whoami", ENTER, || get(policy::whoami)).with_operation(|| {
+        operation("whoami", "The caller, as the daemon identified it, and what it may do.")
+            .asks::<policy::WhoamiQuery>()
+            .answers::<access::Whoami>()
+    }),
     route("GET", "/api/v1/session", SignIn, || get(people::session))
         .with_operation(|| operation("session", "The current session, if any.").answers::<api::people::Session>()),
     route("POST", "/api/v1/session", SignIn, || post(people::sign_in)).with_operation(|| {

@@ -57,6 +57,7 @@ pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
         interface: interface(current.flavour.ros.ros_version(), &current.interface),
         shared: current.plan.shared,
         groups: app.choreographer.groups(name),
+        rollout: app.choreographer.rollout(name).is_ok(),
     })
 }
 

@@ -11,16 +11,39 @@ export interface Field {
   lines?: number;
 }
 
-/** What is told of every push. */
-export const PARAMETERS: Field = { key: 'params', label: 'Parameters, KEY=VALUE or KEY:=VALUE, one per line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 };
-export const NAME: Field = { key: 'name', label: "Service name (default: the package's)", flag: '--name' };
+/** What is asked of every push, besides the package. */
 export const NODES: Field = { key: 'nodes', label: 'Programs with their arguments, one per line', flag: '--node', example: 'people_detect', lines: 2 };
-export const LAUNCH: Field = { key: 'launch', label: 'Launch file of the package, as for roslaunch', flag: '--launch', example: 'my.launch' };
+export const LAUNCH: Field = { key: 'launch', label: 'Launch file of the package, as for roslaunch or ros2 launch', flag: '--launch', example: 'my.launch' };
+export const NAME: Field = { key: 'name', label: "Service name (default: the package's)", flag: '--name' };
+/** Of launch files alone. */
 export const ARGUMENTS: Field = { key: 'args', label: 'Launch arguments, KEY:=VALUE or KEY=VALUE, one per line', flag: '--arg', lines: 2 };
 
+export interface Group {
+  key: 'ros' | 'build' | 'interface' | 'limits' | 'sla' | 'rollout' | 'sharing' | 'grants';
+  title: string;
+  fields: Field[];
+}
+
 /** What is told of some, by what it is about. */
-export const GROUPS: { title: string; fields: Field[] }[] = [
-  { title: 'Limits of an instance (servant)', fields: [
+export const GROUPS: Group[] = [
+  { key: 'ros', title: 'Parameters, launch arguments and remappings', fields: [
+    { key: 'params', label: 'Parameters, KEY=VALUE or KEY:=VALUE, one per line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 },
+    ARGUMENTS,
+    { key: 'remaps', label: 'Names to remap, FROM:=TO, one per line', flag: '--remap', lines: 2 },
+  ] },
+  { key: 'build', title: 'Base image and dependencies', fields: [
+    { key: 'base', label: "Base image definition, which has ROS 1 or ROS 2 (default: the server's)", flag: '--base' },
+    { key: 'map', label: 'Dependencies mapped by hand, KEY=DEBIAN-PACKAGE, one per line', flag: '--map', lines: 2 },
+    { key: 'with', label: 'Additional Debian or ROS packages, one per line', flag: '--with', lines: 2 },
+    { key: 'packages_up_to', label: 'Packages of the workspace to build, with what they need, one per line (default: what the programs need)', flag: '--packages-up-to', lines: 2 },
+    { key: 'packages_skip', label: 'Packages of the workspace not to build, one per line', flag: '--packages-skip', lines: 2 },
+    { key: 'cmake_args', label: 'Arguments of CMake, one per line', flag: '--cmake-args', example: '-DWITH_QT=OFF', lines: 2 },
+  ] },
+  { key: 'interface', title: 'Topics, services and state', fields: [
+    { key: 'interface', label: 'Additional interface, as TOML or JSON', flag: '--interface', lines: 3 },
+    { key: 'requests', label: 'Which output answers which input, INPUT=OUTPUT, one per line (default: as detected)', flag: '--request', example: '/image=/boxes', lines: 2 },
+  ] },
+  { key: 'limits', title: 'Resource limits of an instance (servant)', fields: [
     { key: 'cpus', label: "CPU limit and reservation, in cores (default: the server's)", flag: '--cpus', example: '1.5' },
     { key: 'cpu_weight', label: 'CPU share under contention, 1 to 10000 (default: 100)', flag: '--cpu-weight', example: '100' },
     { key: 'cpuset', label: 'Cores to run on (default: all)', flag: '--cpuset', example: '0-3,6' },
@@ -30,35 +53,26 @@ export const GROUPS: { title: string; fields: Field[] }[] = [
     { key: 'io_read', label: 'Disk read limit, bytes per second', flag: '--io-read', example: '10M' },
     { key: 'io_write', label: 'Disk write limit, bytes per second', flag: '--io-write', example: '10M' },
   ] },
-  { title: 'What robots may request', fields: [
-    { key: 'max_cpus', label: 'Maximum cores that a robot may request', flag: '--max-cpus', example: '2' },
-    { key: 'max_memory', label: 'Maximum memory that a robot may request', flag: '--max-memory', example: '2G' },
+  { key: 'sla', title: 'Response times and what robots may request (SLA)', fields: [
     { key: 'rrt', label: 'Default target response time (T_desire), for robots that set none', flag: '--rrt', example: '100ms' },
     { key: 'max_rrt', label: 'Default maximum response time (T_max), for robots that set none (default: T_desire)', flag: '--max-rrt', example: '300ms' },
+    { key: 'max_cpus', label: 'Maximum cores that a robot may request', flag: '--max-cpus', example: '2' },
+    { key: 'max_memory', label: 'Maximum memory that a robot may request', flag: '--max-memory', example: '2G' },
   ] },
-  { title: 'Rollout from the previous revision', fields: [
+  { key: 'rollout', title: 'Rollout and canary', fields: [
     { key: 'canary', label: 'Robots served by it first (default: all at once)', flag: '--canary', example: '10%' },
     { key: 'bound', label: 'Allowed regression of a canary (default: 0.1 = 10 %)', flag: '--bound', example: '0.1' },
     { key: 'samples', label: 'Requests to each revision before they are compared (default: 20)', flag: '--samples', example: '20' },
     { key: 'promote_after', label: 'Promote automatically after (default: only by hand)', flag: '--promote-after', example: '30m' },
     { key: 'deadline', label: 'Stop servants of other revisions after (default: when their robots leave)', flag: '--deadline', example: '10m' },
   ] },
-  { title: 'Servants shared by robots', fields: [
+  { key: 'sharing', title: 'Replicas shared by robots', fields: [
     { key: 'min', label: 'Minimum servants (default: 1)', flag: '--min', example: '1' },
     { key: 'max', label: 'Maximum servants (default: 4)', flag: '--max', example: '4' },
     { key: 'replicas', label: 'Servants that work on the same call (default: 1)', flag: '--replicas', example: '2' },
     { key: 'calls', label: 'Concurrent calls per servant (default: 8)', flag: '--calls', example: '8' },
   ] },
-  { title: 'Dependencies and permissions', fields: [
-    { key: 'base', label: "Base image definition (default: the server's)", flag: '--base' },
-    { key: 'remaps', label: 'Names to remap, FROM:=TO, one per line', flag: '--remap', lines: 2 },
-    { key: 'map', label: 'Dependencies mapped by hand, KEY=DEBIAN-PACKAGE, one per line', flag: '--map', lines: 2 },
-    { key: 'with', label: 'Additional Debian or ROS packages, one per line', flag: '--with', lines: 2 },
-    { key: 'packages_up_to', label: 'Packages of the workspace to build, with what they need, one per line (default: what the programs need)', flag: '--packages-up-to', lines: 2 },
-    { key: 'packages_skip', label: 'Packages of the workspace not to build, one per line', flag: '--packages-skip', lines: 2 },
-    { key: 'cmake_args', label: 'Arguments of CMake, one per line', flag: '--cmake-args', example: '-DWITH_QT=OFF', lines: 2 },
-    { key: 'interface', label: 'Additional interface, as TOML or JSON', flag: '--interface', lines: 3 },
-    { key: 'requests', label: 'Which output answers which input, INPUT=OUTPUT, one per line (default: as detected)', flag: '--request', example: '/image=/boxes', lines: 2 },
+  { key: 'grants', title: 'Devices, volumes and network', fields: [
     { key: 'devices', label: 'Devices by CDI name, one per line; where the operator allows them', flag: '--device', example: 'nvidia.com/gpu=0', lines: 2 },
     { key: 'volumes', label: 'Server directories to read, SOURCE:TARGET, one per line; where allowed', flag: '--volume', lines: 2 },
     { key: 'egress', label: 'Hosts to reach, HOST:PORT, one per line; where allowed', flag: '--egress', lines: 2 },

@@ -935,6 +935,7 @@ export interface ServiceDetail extends ServiceSummary {
   interface: Interface;
   nodes: Node[];
   revisions: Revision[];
+  rollout: boolean;
   shared?: Shared;
 }
 
@@ -957,6 +958,7 @@ export interface Session {
   accounts: boolean;
   csrf?: string;
   expires?: Millis;
+  loopback_robots: boolean;
   name?: string;
   needed: boolean;
   provider?: ProviderLink;
@@ -1182,6 +1184,7 @@ export type Weight =
   | 'hint';
 
 export interface Whoami {
+  may: string[];
   name: string;
   robot?: string;
   roles: string[];

@@ -51,5 +51,28 @@ export function limits(of: Limits | undefined): string {
 
 const CLOCK = new Intl.DateTimeFormat('en-GB', { hour: '2-digit', minute: '2-digit', second: '2-digit' });
 const DATE = new Intl.DateTimeFormat('en-GB', { dateStyle: 'medium', timeStyle: 'medium' });
-export const clock = (at: number) => CLOCK.format(at);
+const MINUTE = new Intl.DateTimeFormat('en-GB', { hour: '2-digit', minute: '2-digit' });
+const DAY = new Intl.DateTimeFormat('en-GB', { day: 'numeric', month: 'short' });
+const YEAR = new Intl.DateTimeFormat('en-GB', { day: 'numeric', month: 'short', year: 'numeric' });
+
+// The browser's day, in milliseconds since 1970: looked up again once it is over.
+let [morning, midnight] = [0, 0];
+
+function today(at: number): boolean {
+  const now = Date.now();
+  if (now < morning || now >= midnight) {
+    const day = new Date(now);
+    morning = day.setHours(0, 0, 0, 0);
+    midnight = day.setDate(day.getDate() + 1);
+  }
+  return at >= morning && at < midnight;
+}
+
+const day = (at: number) => (new Date(at).getFullYear() === new Date().getFullYear() ? DAY : YEAR).format(at);
+
+/** A time in full. All times are local. */
 export const date = (at: number) => DATE.format(at);
+/** A time, with the date where it is not today. */
+export const moment = (at: number) => (today(at) ? CLOCK.format(at) : `${day(at)}, ${CLOCK.format(at)}`);
+/** The same for an axis, shorter. */
+export const tick = (at: number) => (today(at) ? CLOCK.format(at) : `${day(at)} ${MINUTE.format(at)}`);

@@ -4,7 +4,7 @@ use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{ClassConfig, Config, Controller, Hung, NonFinite, PushConfig};
+use super::{ClassConfig, Config, Controller, Hung, LoopbackRobots, NonFinite, PushConfig};
 use crate::machine;
 
 /// Default limit of the daemon's memory: one `PART`th (a quarter) of the machine's, and at most `MOST` bytes.
@@ -75,6 +75,7 @@ impl Config {
             proxies: self.proxies().unwrap_or_default(),
             default_service: self.default_service.clone(),
             default_robot: self.default_robot.clone(),
+            loopback_robots: self.portal.loopback_robots == LoopbackRobots::Allowed,
             handshake: self.portal.handshake.0,
             drain: self.portal.drain.0,
             isolation: self.isolation.to_string(),

@@ -28,6 +28,19 @@ pub struct PortalConfig {
     pub drain: Time,
     /// Programs may be run in servants by callers with the permission `exec`.
     pub exec: bool,
+    /// Robots on this machine that show no token, where tokens exist.
+    pub loopback_robots: LoopbackRobots,
+}
+
+/// Handling of robots on this machine that show no token, where tokens or accounts exist.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LoopbackRobots {
+    /// They need a token, as all others do.
+    #[default]
+    Refused,
+    /// They connect without, as they did before the first token.
+    Allowed,
 }
 
 /// Representation in JSON of numbers that it cannot express.
@@ -54,17 +67,42 @@ impl Default for PortalConfig {
             handshake: Time::seconds(10),
             drain: Time::seconds(10),
             exec: true,
+            loopback_robots: LoopbackRobots::default(),
         }
     }
 }
 
 impl PortalConfig {
-    pub(super) fn check(&self) -> anyhow::Result<()> {
+    /// Checks the values; `is_behind_proxy` is true if a proxy in front of the portal is configured.
+    pub(super) fn check(&self, is_behind_proxy: bool) -> anyhow::Result<()> {
+        if self.loopback_robots == LoopbackRobots::Allowed && is_behind_proxy {
+            bail!(
+                "[portal] of the configuration: with loopback_robots = \"allowed\", what a proxy of trusted_proxies \
+                    passes on without saying for whom would need no token; remove one of the two"
+            );
+        }
         if [self.max_encoded, self.max_message, self.max_frame].contains(&Size(0)) {
             bail!(
                 "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
             );
         }
         check_nonzero("[portal] handshake", self.handshake, "10s")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn robots_of_this_machine_are_not_told_from_a_proxys_clients() {
+        for (loopback_robots, is_behind_proxy, is_accepted) in [
+            (LoopbackRobots::Refused, true, true),
+            (LoopbackRobots::Allowed, false, true),
+            (LoopbackRobots::Allowed, true, false),
+        ] {
+            let config = PortalConfig { loopback_robots, ..PortalConfig::default() };
+            assert_eq!(config.check(is_behind_proxy).is_ok(), is_accepted, "{loopback_robots:?} {is_behind_proxy}");
+        }
     }
 }

@@ -8,8 +8,16 @@ use axum::http::{HeaderMap, header};
 use crate::errors::Error;
 use crate::headers::header_text;
 
+/// Refuses requests that are not sent by a program of this machine for itself, nor by a page that may.
+pub fn check_local(headers: &HeaderMap, origins: &[String]) -> Result<(), Error> {
+    check_direct(headers)?;
+    check_host(headers)?;
+    check_origin(headers, origins)?;
+    check_not_embedded(headers)
+}
+
 /// Refuses requests addressed to another host (DNS rebinding).
-pub fn check_host(headers: &HeaderMap) -> Result<(), Error> {
+fn check_host(headers: &HeaderMap) -> Result<(), Error> {
     let host = header_text(headers, header::HOST).unwrap_or_default();
     if is_loopback_host(without_port(host)) {
         return Ok(());
@@ -62,7 +70,7 @@ const FORWARDED: [&str; 6] =
     ["forwarded", "via", "x-forwarded-for", "x-forwarded-host", "x-forwarded-proto", "x-real-ip"];
 
 /// Refuses requests with a proxy's headers: their clients are on other machines, whatever `Host` says.
-pub fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
+fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
         None => Ok(()),
         Some(name) => Err(Error::Foreign {

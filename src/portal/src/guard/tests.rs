@@ -48,6 +48,7 @@ fn on_loopback_nobody_needs_a_token() {
     let rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -72,6 +73,7 @@ fn pages_from_elsewhere_cannot_use_a_portal_on_loopback() {
     let rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -97,6 +99,7 @@ fn pages_from_elsewhere_have_no_answers_as_parts_of_themselves() {
     let rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -141,6 +144,7 @@ fn an_origin_that_a_sandboxed_page_has_is_named_with_what_to_write() {
     let closed = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -163,6 +167,7 @@ fn what_a_proxy_passes_on_needs_tokens() {
     let mut rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -194,6 +199,7 @@ fn without_configured_tokens_any_token_owns_robots_names() {
     let open = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &none,
             stored: &StoredPrincipals::default(),
@@ -213,6 +219,7 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
         let rules = AdmissionRules {
             find_access: crate::routes::find_access,
             loopback,
+            loopback_robots: false,
             known: Recogniser {
                 tokens: &some,
                 stored: &StoredPrincipals::default(),
@@ -243,11 +250,59 @@ fn configured_tokens_are_needed_on_loopback_as_beyond() {
 }
 
 #[test]
+fn robots_of_this_machine_need_no_token_where_they_are_allowed() {
+    let some = tokens();
+    let rules = AdmissionRules {
+        find_access: crate::routes::find_access,
+        loopback: true,
+        loopback_robots: true,
+        known: Recogniser {
+            tokens: &some,
+            stored: &StoredPrincipals::default(),
+            guesses: &Mutex::new(GuessLimiter::default()),
+            lasting: SessionLifetimes::default(),
+        },
+        origins: &[],
+    };
+    let handshake = || request(&rules).with_header("upgrade", "websocket");
+    for path in ["/", "/opencv_apps", "/opencv_apps/?robot=r1"] {
+        let robot = handshake().admit_or_status(path).expect(path);
+        assert_eq!(robot.who.shown, Credential::Loopback, "{path}");
+        assert_eq!(robot.who.principal.roles, [access::Role::Robot], "{path}");
+    }
+    // Nothing else is open, and a token that is sent must be right.
+    for path in ["/api/v1/services", "/metrics", "/opencv_apps", "/stubs"] {
+        assert_eq!(request(&rules).admit_or_status(path), Err(401), "{path}");
+    }
+    assert_eq!(handshake().admit_or_status("/foxglove/s1"), Err(401));
+    assert_eq!(handshake().admit_or_status("/opencv_apps?token=wrong"), Err(401));
+    // What may come from elsewhere can only send auth.
+    for (name, value) in [
+        ("host", "robots.lab.example:9090"),
+        ("origin", "https://evil.example"),
+        ("x-forwarded-for", "203.0.113.7"),
+        ("sec-fetch-site", "cross-site"),
+    ] {
+        let caller = handshake().with_header(name, value).admit_or_status("/opencv_apps").expect(name);
+        assert!(!caller.is_known(), "{name}");
+    }
+    for (peer, forwarded) in [("203.0.113.7:5000", false), ("127.0.0.1:5000", true)] {
+        let peer = ConnectionPeer::Tcp(peer.parse().expect("an address"));
+        let connection = PortalConnection { forwarded, ..PortalConnection::without_tls(peer) };
+        let asked = handshake();
+        let uri = "/opencv_apps".parse().expect("a URI");
+        let caller = rules.admit(&connection, &asked.method, &uri, &asked.headers).expect("may send auth");
+        assert!(!caller.is_known(), "{peer} {forwarded}");
+    }
+}
+
+#[test]
 fn at_the_registry_a_token_is_the_password_of_any_name() {
     let some = tokens();
     let rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: false,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &some,
             stored: &StoredPrincipals::default(),
@@ -284,6 +339,7 @@ fn without_a_token_only_the_page_health_and_handshakes_are_open() {
     let rules = AdmissionRules {
         find_access: crate::routes::find_access,
         loopback: true,
+        loopback_robots: false,
         known: Recogniser {
             tokens: &some,
             stored: &StoredPrincipals::default(),

@@ -11,6 +11,8 @@ use store::{Owner, TokenHash};
 pub enum Credential {
     /// None: a local caller on a machine without any credentials, or an unauthenticated one.
     Nothing,
+    /// None, of a robot on this machine where the operator admits such robots (`loopback_robots`).
+    Loopback,
     /// A token of the configuration.
     Configured,
     /// A token of the database.

@@ -50,7 +50,7 @@ impl Principals {
                 Some(_) => Some("this session has ended".to_owned()),
                 None => Some("this session was ended".to_owned()),
             },
-            Credential::Nothing | Credential::Configured | Credential::User => None,
+            Credential::Nothing | Credential::Loopback | Credential::Configured | Credential::User => None,
         };
         match over {
             Some(reason) => ConnectionAccess::Ended(reason),

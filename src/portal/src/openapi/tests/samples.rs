@@ -280,6 +280,7 @@ fn detail() -> ServiceDetail {
             wasted: 0,
             mean_ms: Some(1.5),
         }],
+        rollout: true,
     }
 }
 
@@ -611,6 +612,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 roles: vec![access::Role::Robot],
                 services: token().services,
                 robot: some_text("r1"),
+                may: one_text("enter"),
             },
         ),
         sample("SignIn", SignIn { name: "alice".into(), password: "x".into() }),
@@ -623,6 +625,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 expires: Some(1),
                 needed: true,
                 accounts: true,
+                loopback_robots: true,
                 provider: Some(ProviderLink { name: "Lab".into(), path: "/x".into() }),
             },
         ),
