@@ -15,6 +15,8 @@ pub enum Compression {
     None,
     /// JSON encoded as a PNG image.
     Png,
+    /// As [`Cbor`](Self::Cbor), with less in images and large clouds: for people who look at them.
+    Preview,
     /// CBOR with typed arrays (RFC 8746).
     Cbor,
     /// The ROS serialization inside CBOR.
@@ -27,6 +29,7 @@ impl Compression {
         match self {
             Compression::None => "none",
             Compression::Png => "png",
+            Compression::Preview => "preview",
             Compression::Cbor => "cbor",
             Compression::CborRaw => "cbor-raw",
         }
@@ -37,11 +40,12 @@ impl Compression {
     }
 
     pub(crate) fn read_optional(fields: &Fields<'_>) -> Result<Option<Self>, Problem> {
-        const EXPECTED: &str = "none, png, cbor or cbor-raw";
+        const EXPECTED: &str = "none, png, preview, cbor or cbor-raw";
         match fields.text("compression", EXPECTED)?.as_deref() {
             None => Ok(None),
             Some("none" | "") => Ok(Some(Compression::None)),
             Some("png") => Ok(Some(Compression::Png)),
+            Some("preview") => Ok(Some(Compression::Preview)),
             Some("cbor") => Ok(Some(Compression::Cbor)),
             Some("cbor-raw") => Ok(Some(Compression::CborRaw)),
             Some(other) => {
@@ -202,8 +206,8 @@ mod tests {
             ("throttle_rate", "-1", "a number of milliseconds, 0 or more,"),
             ("queue_length", "1.5", "a number of messages, 0 or more,"),
             ("fragment_size", "0", "a number of bytes, 1 or more,"),
-            ("compression", "\"zip\"", "none, png, cbor or cbor-raw"),
-            ("compression", "7", "none, png, cbor or cbor-raw"),
+            ("compression", "\"zip\"", "none, png, preview, cbor or cbor-raw"),
+            ("compression", "7", "none, png, preview, cbor or cbor-raw"),
             ("type", "[]", "a message type such as \"std_msgs/String\""),
         ] {
             assert_refused(
