@@ -100,6 +100,17 @@ pub fn wait_for_picture(robot: &mut Robot) -> Verdict {
     }
 }
 
+/// Waits for an image in binary that holds a JPEG in place of its pixels.
+fn wait_for_preview(robot: &mut Robot) -> Verdict {
+    loop {
+        if let Message::Binary(bytes) = robot.next_frame()? {
+            ensure!(bytes.len() < 640 * 480 / 4, "{} bytes", bytes.len());
+            ensure!(bytes.windows(3).any(|three| three == [0xff, 0xd8, 0xff]), "no JPEG in {} bytes", bytes.len());
+            return Ok(());
+        }
+    }
+}
+
 pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
     let mut scene = InsideScene::new("inside", "")?;
     let eve_token = scene.viewer_token("eve", "sights*")?;
@@ -139,6 +150,11 @@ pub fn a_viewer_hears_and_does_nothing_and_an_operator_acts() -> Verdict {
         "queue_length": 1}))?;
     wait_for_picture(&mut pictures)?;
     pictures.leave()?;
+    // For people they are a JPEG within the same message.
+    let mut previews = scene.connect_viewer(&eve_token)?;
+    previews.send(json!({"op": "subscribe", "topic": "/sights/image/rgb8", "compression": "preview"}))?;
+    wait_for_preview(&mut previews)?;
+    previews.leave()?;
     // All other operations are refused.
     eve.send(say("by eve"))?;
     eve.wait_for_status("publish:/sights/say is not granted")?;

@@ -102,6 +102,22 @@ class Visitor {
     assert.fail(`the tabulator does not come to ${name}`);
   }
 
+  // A topic inside a servant, and no other; none where none is named.
+  async looksAt(topic) {
+    await this.page.$$eval('article button', (all) => { for (const one of all) if (one.innerText.startsWith('Close')) one.click(); });
+    if (topic) await this.looksBeside(topic);
+  }
+
+  // A topic beside those that are open.
+  looksBeside(topic) {
+    return this.clicks(topic);
+  }
+
+  // The form by which messages are published on a topic that is open.
+  writesTo(topic) {
+    return this.clicks(`Publish… on ${topic}`);
+  }
+
   opens(hash) {
     return this.page.evaluate((to) => { location.hash = to; }, hash);
   }
@@ -307,7 +323,15 @@ const STEPS = {
     await visitor.signsIn();
     await visitor.sees('Cores reserved');
     await visitor.sees('is ready for rover');
+    // In one sentence.
+    await visitor.sees('1 service, 1 robot served,');
+    await visitor.page.waitForFunction(() => /last push \d+ (s|min) ago/.test(document.querySelector('.status').innerText));
     await visitor.judges('overview');
+    await visitor.clicks('Robot rover', 'link');
+    await visitor.sees('served by 1 instance');
+    await visitor.sees('Not paired');
+    await visitor.drawn('adder_py');
+    await visitor.judges('robot');
 
     await visitor.clicks('Services', 'link');
     await visitor.sees('adder_py');
@@ -419,6 +443,9 @@ const STEPS = {
 
     await visitor.clicks('Events', 'link');
     await visitor.sees('is ready for rover');
+    // Failed pushes of a package are one entry.
+    await visitor.sees('earlier failed push');
+    assert.strictEqual(await visitor.page.$$eval('main li', (all) => all.filter((one) => one.innerText.includes('the push of adder_py')).length), 1);
     await visitor.judges('events');
     await visitor.types('Find', 'no such words');
     await visitor.sees('No matches');
@@ -565,12 +592,14 @@ const STEPS = {
       ['rgb8', RED, BLUE], ['bgr8', RED, BLUE], ['rgba8', RED, BLUE], ['mono8', BLACK, WHITE], ['mono16', BLACK, WHITE],
       ['depth_16UC1', BLACK, WHITE], ['depth_32FC1', BLACK, UNKNOWN],
     ]) {
-      await chooses('Topic', `/sights/image/${encoding}`);
+      await visitor.looksAt(`/sights/image/${encoding}`);
       await visitor.sees('640 × 480');
       await pixel(0.25, 0.5, left);
       await pixel(0.75, 0.5, right);
       if (encoding === 'depth_16UC1') await visitor.sees('0.50 m (black) to 2.50 m (white)');
       if (encoding === 'rgb8') {
+        // Less is sent than is published, until somebody asks for all of it.
+        await visitor.sees('rgb8 as JPEG');
         await visitor.judges('inside-picture');
         // Where the page says that viewers attach, one is greeted.
         const attaches = await page.$eval('a[href^="foxglove:"]', (link) => new URL(link.href).searchParams.get('ds.url'));
@@ -592,16 +621,19 @@ const STEPS = {
           return `${frames / 4} frames and ${(shown() - first) / 4} pictures of 640 × 480 a second\n`;
         });
         writeFileSync(join(pictures, 'inside-picture.txt'), fluid);
+        await visitor.clicks('Full quality', 'checkbox');
+        await visitor.seesNot('rgb8 as JPEG');
+        await pixel(0.25, 0.5, left);
       }
     }
-    await chooses('Topic', '/sights/image/odd');
+    await visitor.looksAt('/sights/image/odd');
     await visitor.sees('pictures of encoding yuv422 are not drawn');
-    await chooses('Topic', '/sights/compressed');
+    await visitor.looksAt('/sights/compressed');
     await visitor.sees('64 × 48, png');
     await pixel(0.25, 0.5, RED);
     await pixel(0.75, 0.5, BLUE);
     // A grid fills the view from the left to the right: the lowest ten of its sixty rows are unknown.
-    await chooses('Topic', '/sights/map');
+    await visitor.looksAt('/sights/map');
     await visitor.sees('100 × 60 cells of 0.05 m: 5 × 3 m; origin (lower left) at -2.5, -1 m of map');
     await pixel(0.25, 0.5, [254, 254, 254]);
     await pixel(0.75, 0.5, BLACK);
@@ -612,7 +644,7 @@ const STEPS = {
     await pixel(0.25, 0.5, BLACK);
     await visitor.clicks('Show all');
     await pixel(0.25, 0.5, [254, 254, 254]);
-    await chooses('Topic', '/sights/scan');
+    await visitor.looksAt('/sights/scan');
     await visitor.sees('361 beams, 121 of them in range');
     await visitor.sees('nearest 2 m, farthest 2 m');
     await visitor.judges('inside-scan');
@@ -625,8 +657,15 @@ const STEPS = {
       return { ahead: at(middle, middle - reach), behind: at(middle, middle + reach * 0.97) };
     });
     assert(red.ahead > 150, JSON.stringify(red));
+    // A number of it over time; and another topic beside it.
+    await page.$eval('article summary', (summary) => summary.click());
+    await visitor.clicks('plot range_max');
+    await visitor.drawn('Plot of /sights/scan');
+    await visitor.looksBeside('/sights/map');
+    await page.waitForFunction(() => document.querySelectorAll('article').length === 2 && document.body.innerText.includes('100 × 60 cells'));
+    await visitor.judges('inside-beside');
     for (const name of ['cloud', 'cloud_big_endian']) {
-      await chooses('Topic', `/sights/${name}`);
+      await visitor.looksAt(`/sights/${name}`);
       await visitor.sees('10000 points in their colours; frame map');
       const halves = await page.waitForFunction(() => {
         const canvas = document.querySelector('figure:not([hidden]) canvas');
@@ -644,7 +683,7 @@ const STEPS = {
     }
     await visitor.clicks('Tilted');
     await visitor.judges('inside-cloud');
-    await chooses('Topic', '');
+    await visitor.looksAt('');
     await visitor.clicks('Show the frames');
     await visitor.sees('base_link');
     await visitor.sees('rotated by 0, 0, 90°');
@@ -709,34 +748,37 @@ const STEPS = {
     await visitor.clicks('Call');
     await page.waitForFunction(() => /answer\s+0 fields/.test(document.body.innerText));
     // What is published goes through its node: by the fields of a text, of a message within a message, and of a list.
-    await chooses('Topic', '/sights/say');
-    await visitor.fills('Publish', 'data', 'by the form');
+    await visitor.looksAt('/sights/say');
+    await visitor.writesTo('/sights/say');
+    await visitor.fills('Publish on /sights/say', 'data', 'by the form');
     await visitor.clicks('Publish');
     await visitor.sees('"by the form"');
-    await chooses('Topic', '/tf');
+    await visitor.looksAt('/tf');
+    await visitor.writesTo('/tf');
     // Messages that come meanwhile may move the button away from under the pointer.
     const added = '::-p-aria([name="transforms[0].child_frame_id"])';
-    for (let tries = 0; tries < 30 && !(await page.$(`form[aria-label="Publish"] ${added}`)); tries += 1) {
+    for (let tries = 0; tries < 30 && !(await page.$(`form[aria-label="Publish on /tf"] ${added}`)); tries += 1) {
       await visitor.clicks('Add to transforms');
-      await page.waitForSelector(`form[aria-label="Publish"] ${added}`, { timeout: 2000 }).catch(() => {});
+      await page.waitForSelector(`form[aria-label="Publish on /tf"] ${added}`, { timeout: 2000 }).catch(() => {});
     }
-    await visitor.fills('Publish', 'transforms[0].child_frame_id', 'held');
-    for (const part of ['header', 'transform', 'rotation']) await page.locator(`form[aria-label="Publish"] details:not([open]) ::-p-text(${part})`).click();
-    await visitor.fills('Publish', 'transforms[0].header.frame_id', 'base_link');
+    await visitor.fills('Publish on /tf', 'transforms[0].child_frame_id', 'held');
+    for (const part of ['header', 'transform', 'rotation']) await page.locator(`form[aria-label="Publish on /tf"] details:not([open]) ::-p-text(${part})`).click();
+    await visitor.fills('Publish on /tf', 'transforms[0].header.frame_id', 'base_link');
     await visitor.clicks('Now as transforms[0].header.stamp');
-    await visitor.fills('Publish', 'transforms[0].transform.rotation.w', '1');
+    await visitor.fills('Publish on /tf', 'transforms[0].transform.rotation.w', '1');
     await visitor.judges('inside-fields');
     await visitor.clicks('Publish');
     await visitor.sees('held');
     // Bytes are a text, and as many as a camera's picture has are not drawn one by one.
-    await chooses('Topic', '/sights/image/odd');
-    await visitor.fills('Publish', 'data', '1 2 0xff');
+    await visitor.looksAt('/sights/image/odd');
+    await visitor.writesTo('/sights/image/odd');
+    await visitor.fills('Publish on /sights/image/odd', 'data', '1 2 0xff');
     await visitor.sees('3 bytes');
-    await otherView('Publish');
-    await json('Publish', 'Message', JSON.stringify({ data: Buffer.alloc(640 * 480 * 3).toString('base64') }));
-    await otherView('Publish');
-    await page.waitForFunction(() => document.querySelector('form[aria-label="Publish"] input[readonly]').value.startsWith('921600 bytes'));
-    await chooses('Topic', '');
+    await otherView('Publish on /sights/image/odd');
+    await json('Publish on /sights/image/odd', 'Message', JSON.stringify({ data: Buffer.alloc(640 * 480 * 3).toString('base64') }));
+    await otherView('Publish on /sights/image/odd');
+    await page.waitForFunction(() => document.querySelector('form[aria-label="Publish on /sights/image/odd"] input[readonly]').value.startsWith('921600 bytes'));
+    await visitor.looksAt('');
     // How much flows on each topic, counted while it is asked for.
     await visitor.clicks('Show rates');
     await page.waitForFunction(() => [...document.querySelectorAll('section[aria-labelledby="topics"] tr')].some((row) => /^\/sights\/scan[^]*\d\s(ms|s)\b/.test(row.innerText)));
@@ -772,13 +814,22 @@ const STEPS = {
     await visitor.opens('#/servants');
     await visitor.clicks('rover', 'link');
     await visitor.clicks('Look inside', 'link');
-    await visitor.chooses('Topic', '/sights/image');
+    await visitor.looksAt('/sights/image');
+    await visitor.sees('640 × 480, rgb8 as JPEG');
+    await visitor.clicks('Full quality', 'checkbox');
     await visitor.sees('640 × 480, rgb8');
-    await visitor.chooses('Topic', '/sights/say');
-    await visitor.fills('Publish', 'x', '1.5');
+    await visitor.seesNot('rgb8 as JPEG');
+    await visitor.looksAt('/sights/scan');
+    await visitor.sees('361 beams, 121 of them in range');
+    await page.$eval('article summary', (summary) => summary.click());
+    await visitor.clicks('plot range_max');
+    await visitor.drawn('Plot of /sights/scan');
+    await visitor.looksAt('/sights/say');
+    await visitor.writesTo('/sights/say');
+    await visitor.fills('Publish on /sights/say', 'x', '1.5');
     await visitor.clicks('Publish');
     await visitor.sees('sent');
-    await visitor.chooses('Topic', '/sights/said');
+    await visitor.looksBeside('/sights/said');
     await visitor.sees('at 1.5 0');
     await visitor.chooses('Service', '/sights/switch');
     const data = await page.waitForSelector('form[aria-label="Call /sights/switch"] ::-p-aria([name="data"][role="checkbox"])');
@@ -788,6 +839,9 @@ const STEPS = {
     // Nobody publishes transforms, and that is no mistake of whoever asks.
     await visitor.clicks('Show the frames');
     await visitor.sees('no transforms yet');
+    await visitor.clicks('Show the parameters');
+    await visitor.clicks('/sights:use_sim_time');
+    await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value === 'false'));
     assert.strictEqual(await page.$('.trouble'), null);
     await visitor.judges('inside-ros2');
   },
@@ -830,12 +884,11 @@ const STEPS = {
     await visitor.opens('#/servants');
     await visitor.clicks('rover', 'link');
     await visitor.clicks('Look inside', 'link');
-    const list = await page.waitForSelector('::-p-aria([name="Topic"][role="combobox"])');
-    await page.waitForFunction((select) => [...select.options].some((option) => option.value === '/sights/say'), {}, list);
-    await list.select('/sights/image/rgb8');
+    await visitor.looksAt('/sights/image/rgb8');
     await visitor.sees('640 × 480, rgb8');
-    await list.select('/sights/say');
-    await visitor.fills('Publish', 'data', 'not for me');
+    await visitor.looksAt('/sights/say');
+    await visitor.writesTo('/sights/say');
+    await visitor.fills('Publish on /sights/say', 'data', 'not for me');
     await visitor.clicks('Publish');
     await visitor.isRefused('publish:/sights/say is not granted');
     await visitor.chooses('Action', '/sights/count');
@@ -946,7 +999,8 @@ const STEPS = {
           cgroup_version: 2, usage: { cpu_usec: 0, memory: random(1e8), pids: 3, oom_kills: 0, throttled_usec: 0 },
           response: { requests: 100, p50_ms: random(50), p95_ms: random(200) }, pids: [], dropped: 0, down: [], hung: [], lifecycle: [],
         },
-        throttled: random(1), cores: random(1), links: [],
+        // One of them is unhappy.
+        throttled: random(1), cores: random(1), links: index ? [] : [{ node: '/adder', up: false, requests: 10, late: 3, local: 0, dropped: 0, drops: [], phases: [] }],
       });
       let [time, event] = [Date.now(), 0];
       window.second = (servants, kind = 'update') => {
@@ -997,6 +1051,10 @@ const STEPS = {
     // What is kept at the most is kept by now: on the other pages less time tells the same.
     await visitor.opens('#/');
     await visitor.sees('Cores reserved');
+    await visitor.sees('100 robots served, 1 of 100 late');
+    await visitor.sees('rover0 at adder: the link of /adder is down');
+    await visitor.sees('88 more instances');
+    await visitor.judges('overview-unhappy');
     await growsBy(300, 'overview');
     await visitor.opens('#/events');
     await page.waitForFunction(() => /the \d+th/.test(document.querySelector('main').innerText));

@@ -344,6 +344,6 @@ impl BridgeClient {
 fn payload_format(compression: Compression) -> Format {
     match compression {
         Compression::None | Compression::Png => Format::Json,
-        Compression::Cbor | Compression::CborRaw => Format::Cbor,
+        Compression::Preview | Compression::Cbor | Compression::CborRaw => Format::Cbor,
     }
 }

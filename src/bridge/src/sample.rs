@@ -126,7 +126,7 @@ pub(crate) struct TopicTypes {
     registry: Arc<Registry>,
     found: Mutex<Vec<(Arc<WireType>, FoundType)>>,
     /// Length of the last encoding of each kind, as a hint for the next.
-    sizes: [AtomicUsize; 3],
+    sizes: [AtomicUsize; 4],
     warm: Mutex<RecentEncodings>,
 }
 
@@ -330,6 +330,7 @@ impl TopicSample {
             Compression::None | Compression::Png => 0,
             Compression::Cbor => 1,
             Compression::CborRaw => 2,
+            Compression::Preview => 3,
         };
         let length = self.bytes.len();
         let last = self.types.sizes[slot].load(Ordering::Relaxed);
@@ -349,10 +350,12 @@ impl TopicSample {
             Compression::CborRaw => {
                 Publish::print_raw(&mut out, topic, (self.received.secs, self.received.nsecs), &self.bytes);
             }
-            Compression::Cbor => {
+            Compression::Cbor | Compression::Preview => {
                 let message_type = self.types.find(&self.wire_type)?;
                 let options = CborOptions { max_bytes, ..CborOptions::default() };
-                let write = |out: &mut Vec<u8>| codec::to_cbor(&message_type, &self.bytes, out, &options);
+                let preview = if compression == Compression::Preview { self.encode_preview() } else { None };
+                let bytes = preview.as_deref().unwrap_or(&self.bytes);
+                let write = |out: &mut Vec<u8>| codec::to_cbor(&message_type, bytes, out, &options);
                 Publish::print_with(&mut out, Format::Cbor, topic, write).map_err(failed)?;
             }
             Compression::None | Compression::Png => {
@@ -371,6 +374,12 @@ impl TopicSample {
         let counted = if frame.is_big() { frame.bytes.len() } else { 0 };
         permit.resize(counted).map_err(full)?;
         Ok(frame)
+    }
+
+    /// Returns a smaller message of the same type for people to look at, if there is one.
+    fn encode_preview(&self) -> Option<Vec<u8>> {
+        let schema = ::codec::Schema::for_type(&self.wire_type.name, self.wire_type.digest.as_str());
+        ::codec::encode_preview(schema, &self.bytes)
     }
 }
 

@@ -48,6 +48,12 @@ pub(crate) fn encode(message: &[u8], layout: &ImageLayout, options: JpegOptions,
     if channels == 4 {
         put_alpha(data, layout, out);
     }
+    encode_pixels(data, layout, options, out)
+}
+
+/// Appends the JPEG of the pixels in `data`, without alpha; `None` if their encoding is not a camera's.
+pub(crate) fn encode_pixels(data: &[u8], layout: &ImageLayout, options: JpegOptions, out: &mut Vec<u8>) -> Option<()> {
+    let channels = channels(layout)?;
     let packed: Vec<u8>;
     let pixels = if layout.row_bytes() == layout.step {
         data

@@ -288,6 +288,8 @@ pub(crate) struct CloudLayout {
     pub(crate) head: usize,
     /// Number of padding bytes behind `is_dense`, which fill the last word.
     pub(crate) tail: usize,
+    /// Offset of the height, which the width follows.
+    pub(crate) size_at: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) point_step: usize,
@@ -307,6 +309,7 @@ impl CloudLayout {
     fn read_fields(mut input: FieldReader<'_>, total: usize) -> Option<Self> {
         input.skip_header()?;
         let height = input.size()?;
+        let size_at = input.bytes_read() - 4;
         let width = input.size()?;
         let count = input.size()?;
         let mut fields = Vec::new();
@@ -330,7 +333,7 @@ impl CloudLayout {
             && point_step > 0
             && width.checked_mul(point_step)? <= row_step
             && row_step.checked_mul(height)? == data;
-        fits.then_some(Self { head, tail, width, height, point_step, row_step, fields })
+        fits.then_some(Self { head, tail, size_at, width, height, point_step, row_step, fields })
     }
 
     fn read_field(input: &mut FieldReader<'_>, fields: &mut Vec<PointField>) -> Option<()> {

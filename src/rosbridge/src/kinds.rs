@@ -206,7 +206,7 @@ kind! {
     /// An encoding.
     OptionalEncoding: Option<Compression>,
     |self, fields, field| {
-        const EXPECTED: &str = "none, png, cbor or cbor-raw";
+        const EXPECTED: &str = "none, png, preview, cbor or cbor-raw";
         let Some(name) = fields.text(field, EXPECTED)? else { return Ok(None) };
         let known = if name.is_empty() { Some(Compression::None) } else { Compression::from_name(&name) };
         known.map(Some).ok_or_else(|| unknown_word_error(field, EXPECTED, &name))

@@ -17,6 +17,8 @@ pub enum Compression {
     None,
     /// JSON encoded as a PNG image.
     Png,
+    /// As [`Cbor`](Self::Cbor), with less in images and large clouds: for people who look at them.
+    Preview,
     /// CBOR with typed arrays (RFC 8746).
     Cbor,
     /// The ROS serialization inside CBOR.
@@ -29,6 +31,7 @@ impl Compression {
         match self {
             Compression::None => "none",
             Compression::Png => "png",
+            Compression::Preview => "preview",
             Compression::Cbor => "cbor",
             Compression::CborRaw => "cbor-raw",
         }
@@ -36,7 +39,13 @@ impl Compression {
 
     /// Converts from the name in the protocol.
     pub(crate) fn from_name(name: &str) -> Option<Self> {
-        let all = [Compression::None, Compression::Png, Compression::Cbor, Compression::CborRaw];
+        let all = [
+            Compression::None,
+            Compression::Png,
+            Compression::Preview,
+            Compression::Cbor,
+            Compression::CborRaw,
+        ];
         all.into_iter().find(|compression| compression.name() == name)
     }
 }
@@ -119,8 +128,8 @@ mod tests {
             ("throttle_rate", "-1", "a number of milliseconds, 0 or more,"),
             ("queue_length", "1.5", "a number of messages, 0 or more,"),
             ("fragment_size", "0", "a number of bytes, 1 or more,"),
-            ("compression", "\"zip\"", "none, png, cbor or cbor-raw"),
-            ("compression", "7", "none, png, cbor or cbor-raw"),
+            ("compression", "\"zip\"", "none, png, preview, cbor or cbor-raw"),
+            ("compression", "7", "none, png, preview, cbor or cbor-raw"),
             ("type", "[]", "a message type such as \"std_msgs/String\""),
         ] {
             assert_refused(

@@ -11,8 +11,11 @@ export interface Definition {
   constvalues?: string[];
 }
 
-/** Names that rosapi of ROS 2 takes from IDL, and those of message definitions. */
-const OF_IDL: { [name: string]: string } = { boolean: 'bool', octet: 'byte', float: 'float32', double: 'float64' };
+/** Names that rosapi of ROS 2 takes from IDL, and those of message definitions. Moments are messages there; the daemon reads either form of them. */
+const OF_IDL: { [name: string]: string } = {
+  boolean: 'bool', octet: 'byte', float: 'float32', double: 'float64', wstring: 'string',
+  'builtin_interfaces/Time': 'time', 'builtin_interfaces/Duration': 'duration',
+};
 
 /** Definitions whose fields have the names of message definitions, whichever ROS they come from. */
 export const plain = (definitions: Definition[]): Definition[] =>

@@ -81,6 +81,9 @@ function scaled({ width, height, encoding, is_bigendian, step, data }: Image, by
   return `: depths of ${metres(least)} m (black) to ${metres(most)} m (white); blue: unknown`;
 }
 
+/** Whether its data are a JPEG of the pixels, as previews are, in place of the pixels. */
+export const isPreview = ({ step, height, data }: Image) => data[0] === 0xff && data[1] === 0xd8 && data.length < step * height;
+
 /** The media type of a sensor_msgs/CompressedImage, by how its bytes begin. Throws an Error in words where a browser cannot show it. */
 export function media(format: string, data: Uint8Array): string {
   if (data[0] === 0xff && data[1] === 0xd8) return 'image/jpeg';

@@ -19,8 +19,8 @@ export interface Goal {
 }
 
 export interface Hearing {
-  /** Binary, for what has many numbers. */
-  binary?: boolean;
+  /** How messages come: `cbor` for what has many numbers, `preview` with less in pictures and clouds. */
+  encoding?: 'none' | 'cbor' | 'preview';
   /** Least time between messages, in milliseconds. */
   pause?: number;
   /** Messages that the daemon keeps for this page; the newest win. */
@@ -101,11 +101,11 @@ export class Rosbridge {
   }
 
   /** Until what is given back is called. At most ten messages a second, the newest, where nothing else is said. */
-  hear(topic: string, hears: Hears, { binary = false, pause = 100, keep = 1 }: Hearing = {}): () => void {
+  hear(topic: string, hears: Hears, { encoding = 'none', pause = 100, keep = 1 }: Hearing = {}): () => void {
     const all = this.#heard.get(topic) ?? new Set();
     this.#heard.set(topic, all.add(hears));
     const id = this.#id();
-    this.#say({ op: 'subscribe', id, topic, throttle_rate: pause, queue_length: keep, compression: binary ? 'cbor' : 'none' });
+    this.#say({ op: 'subscribe', id, topic, throttle_rate: pause, queue_length: keep, compression: encoding });
     return () => {
       all.delete(hears);
       this.#say({ op: 'unsubscribe', id, topic });

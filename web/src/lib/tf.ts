@@ -1,7 +1,7 @@
 // Frames as /tf and /tf_static tell of them: a tree, or what keeps them from being one.
 
 export interface Transform {
-  header: { stamp: { secs: number; nsecs: number }; frame_id: string };
+  header: { frame_id: string };
   child_frame_id: string;
   transform: { translation: { x: number; y: number; z: number }; rotation: { x: number; y: number; z: number; w: number } };
 }
@@ -12,8 +12,6 @@ export interface Frame {
   fixed: boolean;
   /** When it was told of, in milliseconds; the last ones. */
   told: number[];
-  /** Its stamp when it was told last, in seconds. */
-  stamp: number;
   latest: Transform['transform'];
   /** Other parents that it was given within the last ones. */
   others: string[];
@@ -38,8 +36,7 @@ export class Frames {
       this.#named.set(name, named.set(parent, now));
       for (const [other, at] of named) if (now - at > OVER && !fixed) named.delete(other);
       const told = [...(this.frames.get(name)?.told ?? []), now].slice(-KEPT);
-      const stamp = header.stamp.secs + header.stamp.nsecs / 1e9;
-      this.frames.set(name, { name, parent, fixed, told, stamp, latest: transform, others: [...named.keys()].filter((other) => other !== parent) });
+      this.frames.set(name, { name, parent, fixed, told, latest: transform, others: [...named.keys()].filter((other) => other !== parent) });
     }
   }
 

@@ -22,7 +22,7 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
         value["header"]["seq"] = 1.into();
     }
     let bytes = world.message("x_msgs/Place", value.clone());
-    for compression in ["none", "png", "cbor", "cbor-raw"] {
+    for compression in ["none", "png", "preview", "cbor", "cbor-raw"] {
         let mut client = world.client().await;
         client.send(json!({"op": "subscribe", "topic": "/place", "compression": compression})).await;
         client.sync().await;
