@@ -49,10 +49,11 @@ pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Verdict {
     // What is only misspelled is told with the name that is meant.
     let place = tempfile::tempdir()?;
     run(Command::new("cp").arg("-r").arg(binaries::package("adder_py")).arg(place.path()))?.expect_success()?;
-    let manifest = place.path().join("adder_py/package.xml");
+    let package = place.path().join("adder_py");
+    let manifest = package.join("package.xml");
     let text = std::fs::read_to_string(&manifest)?;
     std::fs::write(&manifest, text.replace(">rospy<", ">rsopy<"))?;
-    let push = ["push", path_str(&place.path().join("adder_py")), "--name", "misspelled", "--node", "adder.py"];
+    let push = ["push", path_str(&package), "--name", "misspelled", "--node", "adder.py"];
     daemon.deployer().run(&push)?.expect_failure(&["rsopy (wanted by adder_py); did you mean rospy"])?;
     expect_nothing_left(&daemon, "misspelled")
 }
