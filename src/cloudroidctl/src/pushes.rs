@@ -143,7 +143,8 @@ impl CancelPush {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let number = self.number;
         let push: PushStatus = client.delete(&format!("/api/v1/pushes/{number}")).await?;
-        let mut events = client.get_lines::<PushEvent>(&format!("/api/v1/pushes/{number}/output?follow=true")).await?;
+        let path = format!("/api/v1/pushes/{number}/output?follow=true");
+        let mut events = client.get_lines::<PushEvent>(&path).await?;
         while let Some(event) = events.next().await {
             if let PushEvent::Done { .. } = event? {
                 bail!("push {number} was published before it could be cancelled");
