@@ -156,3 +156,24 @@ fn only_what_may_be_for_want_of_sight_is_tried_again() {
     assert!(!units.misses_something(2, "x.cpp:1:10: fatal error: foo.h: No such file or directory"));
     assert!(units.misses_something(2, "CMake Error: /build/src/src/b_lib/cmake/x.cmake does not exist"));
 }
+
+#[test]
+fn packages_that_are_not_built_affect_no_key() {
+    let lab = UnitsFixture::new(&[("app", ""), ("demo", "")]);
+    let read = || {
+        let pushed = inspect(lab.root.path(), &Variables::for_distribution(1, "noetic")).expect("a workspace");
+        let PushedDirectory::Source(mut workspace) = pushed else {
+            panic!("sources");
+        };
+        workspace.packages.retain(|package| package.manifest.name == "app");
+        workspace.left_out.push("src/demo".into());
+        let place = tempfile::tempdir_in(lab.place.path()).expect("a directory").keep();
+        WorkspaceUnits::read(&workspace, "build".into(), &[], &place).expect("read")
+    };
+    let before = read();
+    assert!(!before.rest.join("src/demo").exists());
+    lab.write("src/demo/src/demo.cpp", "int main() {}");
+    assert_eq!(keys(&before), keys(&read()));
+    lab.write("shared.cmake", "set(A 1)");
+    assert_ne!(keys(&before), keys(&read()));
+}
