@@ -165,7 +165,7 @@ impl Audited {
     pub fn outcome(&self) -> &'static str {
         match self.status {
             401 | 403 => "refused",
-            ..400 => "done",
+            status if status < 400 => "done",
             _ => "failed",
         }
     }
