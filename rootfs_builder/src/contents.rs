@@ -181,11 +181,6 @@ impl Contents {
         fields.map(str::to_owned).collect()
     }
 
-    /// Returns the names of all ROS packages, sorted; a name may be repeated.
-    pub(crate) fn ros_package_names(&self) -> impl Iterator<Item = &str> {
-        self.with_prefix("r").filter_map(|rest| Some(rest.split_once('\t')?.0))
-    }
-
     /// Returns the ROS packages with a part in these Debian packages, each with the first of them.
     pub(crate) fn ros_packages_by_deb(&self, debs: &BTreeSet<&str>) -> BTreeMap<String, String> {
         let mut found = BTreeMap::new();
