@@ -86,7 +86,8 @@ pub fn foxgloves_client_hears_and_an_operators_acts() -> Verdict {
 
 /// Bytes that have arrived of an image which is not read further.
 const SOME: usize = 32 << 10;
-/// More images than are queued for a viewer: 2 of the topic, 16 of all its topics, 2 at its socket, and 4 MB in sockets.
+/// More images than are queued for a viewer: 2 of the topic, 16 of all its topics, 2 at its socket, and 4 MB in the
+/// kernel.
 const MANY: usize = 40;
 
 fn request_pictures(viewer: &mut Robot) -> Verdict {

@@ -5,6 +5,7 @@ mod password;
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 
 use crate::client::{DaemonClient, percent_encode};
+use crate::confirm::YesFlag;
 use crate::first_credential::confirm_first_credential;
 use crate::output::{self, OutputFormat, Table};
 use crate::token::parse_patterns;
@@ -44,9 +45,8 @@ struct CreateAccount {
     /// Read the password from the first line of standard input.
     #[arg(long)]
     password_stdin: bool,
-    /// Do not ask before the server's first account cuts off robots that have no token.
-    #[arg(long)]
-    yes: bool,
+    #[command(flatten)]
+    yes: YesFlag,
 }
 
 /// List all accounts.

@@ -1,20 +1,18 @@
 //! Warning before the first account or token of a server: robots without credentials are cut off by it.
 
 use std::collections::BTreeSet;
-use std::io::{self, BufRead, IsTerminal, Read, Write};
 
 use access::Role;
-use anyhow::{Context, bail};
+use anyhow::bail;
 use api::Servant;
 use api::people::Session;
 
 use crate::client::DaemonClient;
+use crate::confirm::{YesFlag, ask};
 use crate::output;
 
 /// Maximum number of robots that the warning names.
 const NAMED: usize = 10;
-/// Maximum length of an answer in bytes.
-const LONGEST_ANSWER: u64 = 256;
 
 /// Connected robots without credentials.
 #[derive(Debug, Default, PartialEq, Eq)]
@@ -80,9 +78,9 @@ impl OpenRobots {
     }
 }
 
-/// Warns if the server has no credentials yet, and asks at a terminal if robots would be cut off, unless `is_agreed`.
-/// Fails if the answer is no.
-pub async fn confirm_first_credential(client: &DaemonClient, is_agreed: bool) -> anyhow::Result<()> {
+/// Warns if the server has no credentials yet, and asks at a terminal if robots would be cut off. Fails if the answer is
+/// no.
+pub async fn confirm_first_credential(client: &DaemonClient, yes: YesFlag) -> anyhow::Result<()> {
     let session: Session = client.get("/api/v1/session").await?;
     // Others are refused by the request itself.
     if session.needed || session.role != Some(Role::Admin) {
@@ -91,20 +89,11 @@ pub async fn confirm_first_credential(client: &DaemonClient, is_agreed: bool) ->
     let servants: Vec<Servant> = client.get("/api/v1/servants").await?;
     let robots = OpenRobots::find(&servants);
     output::eprint_line(&robots.describe(session.loopback_robots));
-    let is_at_terminal = io::stdin().is_terminal() && io::stderr().is_terminal();
     let cuts_off = robots.count() > 0 && !session.loopback_robots;
-    if is_agreed || !cuts_off || !is_at_terminal || ask()? {
-        Ok(())
-    } else {
-        bail!("nothing was created; repeat the command to go on, with --yes to be asked nothing")
+    if cuts_off && yes.is_to_ask() && !ask("go on?".to_owned()).await? {
+        bail!("nothing was created; repeat the command to go on, with --yes to be asked nothing");
     }
-}
-
-fn ask() -> anyhow::Result<bool> {
-    io::stderr().lock().write_all(b"Go on? [y/N] ").context("cannot ask at the terminal; use --yes")?;
-    let mut answer = String::new();
-    io::stdin().lock().take(LONGEST_ANSWER).read_line(&mut answer).context("cannot read the answer; use --yes")?;
-    Ok(matches!(answer.trim().to_ascii_lowercase().as_str(), "y" | "yes"))
+    Ok(())
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use api::access::{NewToken, Secret, Token};
 
 use crate::client::{DaemonClient, percent_encode};
+use crate::confirm::YesFlag;
 use crate::first_credential::confirm_first_credential;
 use crate::output::{self, OutputFormat, Table};
 
@@ -45,9 +46,8 @@ struct CreateToken {
     /// Lifetime of the token, such as 12h or 30d (default: unlimited).
     #[arg(long, value_name = "TIME", value_parser = lifetime)]
     expires: Option<Duration>,
-    /// Do not ask before the server's first token cuts off robots that have none.
-    #[arg(long)]
-    yes: bool,
+    #[command(flatten)]
+    yes: YesFlag,
 }
 
 /// List all tokens, including revoked ones, without their secrets.

@@ -17,8 +17,9 @@ use std::sync::Arc;
 use utoipa::openapi::Required;
 
 use super::{
-    App, api_v1, audit, bases, calibration, dictionary, differences, events, exec, goals, history, inside, logs, machines,
-    metrics, oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs, topics, viewers,
+    App, api_v1, audit, bases, calibration, dictionary, differences, events, exec, goals, history, inside, logs,
+    machines, metrics, oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs,
+    topics, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};

@@ -39,13 +39,7 @@ impl Compression {
 
     /// Converts from the name in the protocol.
     pub(crate) fn from_name(name: &str) -> Option<Self> {
-        let all = [
-            Compression::None,
-            Compression::Png,
-            Compression::Preview,
-            Compression::Cbor,
-            Compression::CborRaw,
-        ];
+        let all = [Compression::None, Compression::Png, Compression::Preview, Compression::Cbor, Compression::CborRaw];
         all.into_iter().find(|compression| compression.name() == name)
     }
 }

@@ -89,9 +89,11 @@ impl PushSource {
                 let _ = chunks.blocking_send(Err(torn));
             }
         });
-        let frames = futures_util::stream::unfold(received, |mut received| async move {
-            Some((received.recv().await?, received))
-        });
+        let frames =
+            futures_util::stream::unfold(
+                received,
+                |mut received| async move { Some((received.recv().await?, received)) },
+            );
         let body = StreamBody::new(frames.map(|chunk: io::Result<Bytes>| chunk.map(Frame::data)));
         (body.boxed_unsync(), Packing { failure })
     }

@@ -269,7 +269,8 @@ mod tests {
     #[test]
     fn the_newest_file_that_is_sent_counts() {
         let place = tempfile::tempdir().expect("a directory");
-        for (path, seconds) in [("src/p/package.xml", 100), ("src/p/run.py", 200), ("src/p/.git/index", 300), ("build/x", 400)]
+        for (path, seconds) in
+            [("src/p/package.xml", 100), ("src/p/run.py", 200), ("src/p/.git/index", 300), ("build/x", 400)]
         {
             write(place.path(), path, "");
             let file = std::fs::File::options().write(true).open(place.path().join(path)).expect("there");
