@@ -16,7 +16,8 @@ function compressed() {
     name: 'compressed',
     apply: 'build',
     configResolved: (config) => { directory = config.build.outDir; },
-    closeBundle() {
+    // Not at closeBundle, which is called after a failed build, too.
+    writeBundle() {
       let sum = 0;
       for (const name of readdirSync(directory, { recursive: true })) {
         const path = join(directory, name);
