@@ -15,14 +15,15 @@ const GRANTS: [&str; 4] = ["publish", "subscribe", "call", "advertise"];
 /// Returns the operations and the grants that they need from the document, which a unit test compares with the known
 /// operations.
 fn documented_needs() -> anyhow::Result<Vec<(String, String)>> {
-    let (_, table) = DOCUMENT.split_once("| operation | needs |\n").context("the table of operations")?;
+    let (_, table) = DOCUMENT.split_once("| needs | operations |\n").context("the table of operations")?;
     let rows = table.lines().skip(1).take_while(|line| !line.is_empty());
-    let cells = |row: &str| {
-        let mut cells = row.trim_matches('|').split('|');
-        let mut cell = || Some(cells.next()?.trim().trim_matches('`').to_owned());
-        Some((cell()?, cell()?))
-    };
-    let rows: Vec<_> = rows.filter_map(cells).collect();
+    let rows: Vec<(String, String)> = rows
+        .filter_map(|row| row.trim_matches('|').split_once('|'))
+        .flat_map(|(needs, names)| {
+            let names = names.split('`').skip(1).step_by(2);
+            names.map(|name| (name.to_owned(), needs.trim().to_owned()))
+        })
+        .collect();
     ensure!(rows.len() >= 20, "the table was read badly: {rows:?}");
     Ok(rows)
 }

@@ -5,7 +5,9 @@ use serde::{Deserialize, Serialize};
 use crate::Millis;
 
 /// Kinds of events of this version, sorted; docs/operators.md describes them.
-pub const EVENT_KINDS: [&str; 61] = [
+pub const EVENT_KINDS: [&str; 64] = [
+    "base-imported",
+    "base-removed",
     "certificate-not-renewed",
     "certificate-refused",
     "certificate-shown",
@@ -26,6 +28,7 @@ pub const EVENT_KINDS: [&str; 61] = [
     "local-missing",
     "local-other",
     "local-takes-over",
+    "log-not-kept",
     "machine-recovered",
     "machine-stalled",
     "memory-refused",

@@ -164,7 +164,7 @@ fn list(all: &[BaseSummary], format: OutputFormat) -> anyhow::Result<()> {
             one.summary.clone(),
         ]);
     }
-    table.print()
+    table.print_list("no bases")
 }
 
 fn show(base: &BaseDetail, all: bool, format: OutputFormat) -> anyhow::Result<()> {

@@ -19,10 +19,7 @@ const DESCRIPTIONS: usize = 15;
 
 /// Verbs by what they are about. A verb that this version lacks is left out.
 const GROUPS: [(&str, &[&str]); 7] = [
-    (
-        "Services",
-        &["push", "pushes", "services", "rollback", "rollout", "diff", "rm", "export", "import", "bases", "base"],
-    ),
+    ("Services", &["push", "pushes", "services", "rollback", "rollout", "diff", "rm", "export", "import", "bases"]),
     ("Servants and robots", &["servants", "top", "logs", "exec", "set", "stop", "explain", "fit", "events"]),
     ("Topics, actions and recordings", &["topics", "goals", "record", "replay", "recordings"]),
     ("Measuring", &["try", "calibrate", "sla", "eval", "shadow"]),
@@ -34,7 +31,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 /// Options of `push` by what they are about; all others are under Options.
 const SECTIONS: [(&str, &[&str]); 5] = [
     ("What runs", &["launch", "node", "param", "arg", "remap"]),
-    ("Build", &["base", "map", "with", "packages-up-to", "packages-select", "packages-skip", "cmake-args"]),
+    ("Build", &["base", "map", "with", "packages-up-to", "packages-skip", "cmake-args"]),
     ("Interface and requests", &["interface", "request", "stateful", "rrt", "max-rrt"]),
     (
         "Servants",
@@ -64,7 +61,7 @@ const SECTIONS: [(&str, &[&str]); 5] = [
 ];
 
 /// Verbs that list things by name, with `list` of all others.
-const LISTING: [&str; 4] = ["services", "servants", "sessions", "list"];
+const LISTING: [&str; 6] = ["services", "servants", "sessions", "bases", "pushes", "list"];
 
 /// Arranges the help of the whole command line.
 pub fn arrange(command: Command) -> Command {
@@ -164,6 +161,7 @@ mod tests {
             assert_eq!(groups.count(), 1, "{}", verb.get_name());
         }
         let help = whole().render_help().to_string();
+        assert_eq!(help.matches("\n  bases ").count(), 1, "{help}");
         for part in ["Services:\n  push ", "[also: servant, ps]", "Options:\n", "--format", "Exit status:\n  0  done"] {
             assert!(help.contains(part), "{part:?}: {help}");
         }

@@ -165,7 +165,7 @@ fn parse(words: Vec<OsString>) -> Result<CtlArguments, clap::Error> {
         arguments.format = OutputChoice::Name;
     }
     if arguments.format == OutputChoice::Name && !help::is_listing(&matches) {
-        let message = "names are printed by verbs that list: services, servants, and list of others\n";
+        let message = "names are printed by verbs that list: services, servants, bases, pushes, and list of others\n";
         return Err(command_line().error(ErrorKind::ArgumentConflict, message));
     }
     Ok(arguments)

@@ -87,7 +87,7 @@ async fn list(client: &DaemonClient, format: OutputFormat, all: bool) -> anyhow:
             format_step(&push),
         ]);
     }
-    table.print()
+    table.print_list("")
 }
 
 /// Describes where a push is, or why it failed.

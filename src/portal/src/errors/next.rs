@@ -336,7 +336,7 @@ fn terms_next_step(untenable: &TermsError) -> String {
         }
         TermsError::Beyond { .. } => "request less, or ask the operator to raise the cap".into(),
         TermsError::Unmet { service, .. } => format!(
-            "request cpus and memory directly, or ask the deployer to add a row: cloudroidctl sla set {service}"
+            "request cpus and memory directly, or ask the deployer to add an entry: cloudroidctl sla set {service}"
         ),
     }
 }

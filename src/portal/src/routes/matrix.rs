@@ -75,10 +75,19 @@ fn cell(route: &Route, principal: &Principal) -> &'static str {
 fn the_document_has_the_matrix_as_it_is_decided() {
     let columns = columns();
     let names: Vec<&str> = columns.iter().map(|(name, _)| *name).collect();
-    let mut matrix = format!("| method | address | {} |\n|---|---|{}\n", names.join(" | "), "---|".repeat(names.len()));
+    // Addresses for the same callers share a row.
+    let mut rows: Vec<(Vec<&str>, Vec<String>)> = Vec::new();
     for route in ROUTES {
         let cells: Vec<&str> = columns.iter().map(|(_, who)| cell(route, who)).collect();
-        matrix += &format!("| {} | `{}` | {} |\n", route.method, route.path, cells.join(" | "));
+        let address = format!("`{} {}`", route.method, route.path);
+        match rows.iter_mut().find(|(known, _)| *known == cells) {
+            Some((_, addresses)) => addresses.push(address),
+            None => rows.push((cells, vec![address])),
+        }
+    }
+    let mut matrix = format!("| {} | addresses |\n|{}\n", names.join(" | "), "---|".repeat(names.len() + 1));
+    for (cells, addresses) in rows {
+        matrix += &format!("| {} | {} |\n", cells.join(" | "), addresses.join(", "));
     }
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/access.md");
     let document = std::fs::read_to_string(path).expect("docs/access.md");
