@@ -198,7 +198,9 @@ const MOST_SIMILAR: usize = 3;
 /// distribution's own ROS 1, and ROS packages of the base (`there`) and its archive come before others.
 fn similar(archive: &Archive, base: &Base, key: &str, there: &BTreeSet<String>) -> Vec<String> {
     let mut similar = archive.similar(key);
-    let mut known: BTreeSet<String> = base.keys.keys().cloned().collect();
+    // Names of libraries are short and alike: of keys, one slip is enough.
+    let is_near = |name: &&String| spelling::slips(key, name).is_some_and(|slips| slips < 2);
+    let mut known: BTreeSet<String> = base.keys.keys().filter(is_near).cloned().collect();
     if base.ros != Version::Ros1 {
         let is_ros1 = |name: &str| !archive.contents.ros_package(name).is_empty();
         let own = format!("ros-{}-", base.ros_distribution);

@@ -50,8 +50,8 @@ pub struct Fit {
     #[serde(default = "nothing")]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub beyond_memory: Size,
-    /// If no cores are requested for the servant, so that its reservation is only nominal: how many would find enough at
-    /// the present use.
+    /// If no cores are requested for the servant, so that its reservation is only nominal: how many would find enough
+    /// at the present use.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_present_use: Option<UseForecast>,
     /// Expected response time of one more servant, if known.

@@ -34,8 +34,8 @@ impl WaitDeadlines {
     }
 }
 
-/// Returns the nodes registered as subscribers of a topic that are not connected. `bus` itself and an observing node may
-/// be registered, but never connect; nor do subscribers with incompatible quality of service.
+/// Returns the nodes registered as subscribers of a topic that are not connected. `bus` itself and an observing node
+/// may be registered, but never connect; nor do subscribers with incompatible quality of service.
 pub fn find_missing_subscribers(bus: &dyn Bus, topic: &str, matched: &MatchedPeers) -> BTreeSet<NodeAddress> {
     let graph = bus.graph().borrow().clone();
     let Some(nodes) = graph.topics.get(topic) else {

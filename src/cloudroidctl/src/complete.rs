@@ -16,7 +16,7 @@ pub const VERB: &str = "__complete";
 /// Time that the daemon has to answer: a person waits with a key pressed.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// What an argument names.
+/// Kind of thing that an argument names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum NamedThing {
     Service,
@@ -141,6 +141,7 @@ fn thing_of(verb: &Command, argument: &Arg) -> Option<NamedThing> {
         // `eval --robot` is a kind of computer.
         "robot" if verb.get_name() != "eval" => Some(NamedThing::Robot),
         "live" => Some(NamedThing::Robot),
+        "name" if verb.get_name() == "logs" => Some(NamedThing::Servant),
         "kind" => Some(NamedThing::EventKind),
         _ => None,
     }

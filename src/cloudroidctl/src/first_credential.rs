@@ -78,8 +78,8 @@ impl OpenRobots {
     }
 }
 
-/// Warns if the server has no credentials yet, and asks at a terminal if robots would be cut off. Fails if the answer is
-/// no.
+/// Warns if the server has no credentials yet, and asks at a terminal if robots would be cut off. Fails if the answer
+/// is no.
 pub async fn confirm_first_credential(client: &DaemonClient, yes: YesFlag) -> anyhow::Result<()> {
     let session: Session = client.get("/api/v1/session").await?;
     // Others are refused by the request itself.

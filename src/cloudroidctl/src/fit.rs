@@ -127,8 +127,8 @@ fn cores_in_words(fit: &api::Fit) -> String {
     };
     match (forecast.cpus, forecast.more) {
         (Some(cpus), Some(more)) => format!(
-            "\nno cores are requested (--cpus): at the present use of {cpus:.2} cores each, with {:.2} cores unused, {} \
-                would find enough",
+            "\nno cores are requested (--cpus): at the present use of {cpus:.2} cores each, with {:.2} cores unused, \
+                {} would find enough",
             forecast.unused_cpus,
             count(more, "more servant")
         ),

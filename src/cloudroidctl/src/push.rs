@@ -49,9 +49,6 @@ pub struct PushArgs {
     /// Name of the service (default: the package's).
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// Base image definition (default: one that fits the package's ROS).
-    #[arg(long, value_name = "BASE")]
-    base: Option<String>,
     /// Launch file to run, as roslaunch or ros2 launch finds it in the package.
     #[arg(long, value_name = "FILE", conflicts_with = "nodes")]
     launch: Option<String>,
@@ -78,6 +75,9 @@ pub struct PushArgs {
     /// accepts the syntax of stub.toml: '/image -> /boxes by arrival'.
     #[arg(long = "request", value_name = "INPUT=OUTPUT", value_parser = request)]
     requests: Vec<String>,
+    /// Base image definition (default: one that fits the package's ROS).
+    #[arg(long, value_name = "BASE")]
+    base: Option<String>,
     /// Debian package that provides a dependency; may be given several times.
     #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
     map: Vec<(String, String)>,

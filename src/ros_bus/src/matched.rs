@@ -93,8 +93,8 @@ pub struct TopicPeer {
     pub id: PeerId,
     /// True while messages can pass; false if the peer was connected before and, as far as is known, still exists.
     pub connected: bool,
-    /// Offer of the publisher, once known, or request of the subscriber; `None` for subscribers of ROS 1, which are given
-    /// what a publisher latches.
+    /// Offer of the publisher, once known, or request of the subscriber; `None` for subscribers of ROS 1, which are
+    /// given what a publisher latches.
     pub offer: Option<Offer>,
 }
 

@@ -17,9 +17,9 @@ pub(crate) trait Message<'a>: Sized {
     fn write(&self, writer: &mut Writer<'_>);
 }
 
-/// Declares an op: its name, the kind of its id, and the name and kind (see [`kinds`](crate::kinds)) of each field on the
-/// wire, in the order in which they are written. `ignores` lists fields that clients may send and the server does not
-/// use. `id: … => field` states that old clients append the id to that name.
+/// Declares an op: its name, the kind of its id, and the name and kind (see [`kinds`](crate::kinds)) of each field on
+/// the wire, in the order in which they are written. `ignores` lists fields that clients may send and the server does
+/// not use. `id: … => field` states that old clients append the id to that name.
 macro_rules! message {
     (
         $(#[$doc:meta])*

@@ -145,7 +145,11 @@ fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, Stri
     if servant.dropped > 0 {
         say(
             Weight::Hint,
-            format!("dropped of {id} because a subscriber was slow: {}", count(servant.dropped, "message")),
+            format!(
+                "{} of {id} {} dropped because a subscriber was slow",
+                count(servant.dropped, "message"),
+                if servant.dropped == 1 { "was" } else { "were" }
+            ),
             "lower the rate of the subscribed topics, or compress them".to_owned(),
         );
     }

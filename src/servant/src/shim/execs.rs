@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsRawFd, OwnedFd};
 use std::os::unix::net::UnixStream as StdStream;
 
+use nix::sys::socket::MsgFlags;
 use tokio::io::AsyncReadExt;
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
@@ -94,8 +95,10 @@ impl ExecTable {
         };
         // A supervisor returns its program's status; one that was killed itself is told as a shell would.
         let code = if libc::WIFSIGNALED(status) { 128 + libc::WTERMSIG(status) } else { libc::WEXITSTATUS(status) };
-        // Four bytes fit into an empty socket. On an error the daemon has left.
-        let _ = exec.socket.try_write(&code.to_le_bytes());
+        // Four bytes fit into an empty socket. On an error the daemon has left. Tokio would not try before it has seen that
+        // the socket is writable.
+        let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_NOSIGNAL;
+        let _ = nix::sys::socket::send(exec.socket.as_ref().as_raw_fd(), &code.to_le_bytes(), flags);
     }
 
     /// Removes all sessions, because the servant has ended; returns the numbers of those not started yet.
