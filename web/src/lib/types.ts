@@ -674,8 +674,8 @@ export interface PushOptions {
   args?: Record<string, string>;
   base?: string;
   caps?: Caps;
-  created?: number;
   cmake_args?: string[];
+  created?: number;
   grants?: Grants;
   interface?: string;
   launch?: string;

@@ -95,8 +95,8 @@ impl ExecTable {
         };
         // A supervisor returns its program's status; one that was killed itself is told as a shell would.
         let code = if libc::WIFSIGNALED(status) { 128 + libc::WTERMSIG(status) } else { libc::WEXITSTATUS(status) };
-        // Four bytes fit into an empty socket. On an error the daemon has left. Tokio would not try before it has seen that
-        // the socket is writable.
+        // Four bytes fit into an empty socket. On an error the daemon has left. Tokio would not try before it
+        // knows that the socket is writable.
         let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_NOSIGNAL;
         let _ = nix::sys::socket::send(exec.socket.as_ref().as_raw_fd(), &code.to_le_bytes(), flags);
     }
