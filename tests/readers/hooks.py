@@ -56,6 +56,7 @@ QUERIES = {
     "differences": {"from": 1, "to": 1},
     "logs": {"tail": 5},
     "push": {"options": "{}"},
+    "pushOutput": {"follow": "false"},
     "recordings": {"robot": "rover"},
     "servantsHistory": {"robot": "rover"},
     "stopServants": {"service": NAMES["services"][0] if GIVEN["last"] else "nobody"},

@@ -46,6 +46,7 @@ const NOT_DONE: &[(&str, &str)] = &[
     ("oidcCallback", "the same"),
     ("signOut", "a token is no session"),
     ("trial", "the service listens to no topic"),
+    ("cancelPush", "every push has ended"),
     ("importBase", "no base is sent"),
     ("removeBase", "no base was imported"),
 ];
@@ -95,6 +96,7 @@ impl ApiScene {
             names: json!({
                 "services": ["adder_py"],
                 "bases": ["bookworm-ros1"],
+                "pushes": ["1"],
                 "servants": [servant],
                 "robots": ["rover"],
                 "recordings": [recording],
