@@ -1,5 +1,7 @@
 //! The line of a program's output that says why it failed, for the headline of an error.
 
+use foreign::terminal;
+
 /// Maximum length of a headline's part in characters.
 const LONGEST: usize = 240;
 
@@ -53,23 +55,12 @@ fn is_exception(line: &str) -> bool {
 }
 
 fn shorten(line: &str) -> String {
-    let line = without_colours(line);
+    let line = terminal::strip_colours(line);
     let line = line.trim();
     match line.char_indices().nth(LONGEST) {
         Some((end, _)) => format!("{}…", &line[..end]),
         None => line.to_owned(),
     }
-}
-
-/// Removes the colours (`ESC [ … m`) that ROS gives its log.
-fn without_colours(line: &str) -> String {
-    let mut parts = line.split("\u{1b}[");
-    let mut plain = parts.next().unwrap_or_default().to_owned();
-    for part in parts {
-        let numbers = part.trim_start_matches(|c: char| c.is_ascii_digit() || c == ';');
-        plain.push_str(numbers.strip_prefix('m').unwrap_or(part));
-    }
-    plain
 }
 
 #[cfg(test)]

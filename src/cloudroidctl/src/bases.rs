@@ -1,20 +1,15 @@
 //! `bases`: what images are built upon, and moving it to another server.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::PathBuf;
 
-use anyhow::Context;
 use api::Size;
 use api::bases::{BaseDetail, BaseState, BaseSummary};
-use futures_util::StreamExt;
-use http_body_util::BodyStream;
 use hyper::Method;
 
-use crate::client::{self, DaemonClient, empty_body, percent_encode};
+use crate::client::{self, DaemonClient, percent_encode};
 use crate::output::{self, OutputFormat, Table};
 use crate::push;
-use crate::whole::AtomicFile;
 
 /// List bases, what each has, and move one to another server.
 ///
@@ -106,17 +101,7 @@ impl ExportBase {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let target = self.output.unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.name)));
         let path = format!("/api/v1/bases/{}/archive", percent_encode(&self.name));
-        let answer = client.send(Method::GET, &path, empty_body()).await?;
-        let half = AtomicFile::create_beside(&target)?;
-        let mut bytes = 0;
-        let mut parts = BodyStream::new(answer.into_body());
-        while let Some(part) = parts.next().await {
-            let part = part.context("the daemon's response was cut off")?;
-            let part = part.into_data().unwrap_or_default();
-            bytes += part.len() as u64;
-            (&half.file).write_all(&part).with_context(|| half.error_context())?;
-        }
-        half.persist()?;
+        let bytes = client.download(&path, &target).await?;
         match format {
             OutputFormat::Json => output::json(&serde_json::json!({ "path": target, "bytes": bytes })),
             OutputFormat::Table => output::line(&format!("{}: base {}, {}", target.display(), self.name, Size(bytes))),

@@ -1,7 +1,7 @@
 //! HTTP client for the daemon, over TCP, TLS or its Unix socket.
 
 use std::fmt;
-use std::io;
+use std::io::{self, Write};
 use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -28,6 +28,8 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::handshake::client::generate_key;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
+
+use crate::whole::AtomicFile;
 
 const FALLBACK: &str = "127.0.0.1:9090";
 /// Time allowed to establish a connection, and again for the TLS handshake.
@@ -234,6 +236,22 @@ impl DaemonClient {
     pub async fn send(&self, method: Method, path: &str, body: RequestBody) -> anyhow::Result<Response<Incoming>> {
         let request = Request::builder().method(method).uri(path);
         self.dispatch(request.body(body)?).await
+    }
+
+    /// Sends `GET path` and writes the response to a file, which is replaced when the new one is complete; returns its
+    /// size in bytes.
+    pub async fn download(&self, path: &str, target: &Path) -> anyhow::Result<u64> {
+        let answer = self.send(Method::GET, path, empty_body()).await?;
+        let half = AtomicFile::create_beside(target)?;
+        let mut bytes = 0;
+        let mut parts = answer.into_body().into_data_stream();
+        while let Some(part) = parts.next().await {
+            let part = part.context("the daemon's response was cut off")?;
+            bytes += part.len() as u64;
+            (&half.file).write_all(&part).with_context(|| half.error_context())?;
+        }
+        half.persist()?;
+        Ok(bytes)
     }
 
     /// Opens a WebSocket with this subprotocol (RFC 6455, section 4.1).

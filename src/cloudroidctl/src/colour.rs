@@ -11,6 +11,8 @@ pub enum Colour {
     Yellow,
     /// Failed.
     Red,
+    /// Of little interest.
+    Dim,
 }
 
 /// Returns whether colours are written to this stream: a terminal that has them, unless `NO_COLOR` is set
@@ -27,6 +29,7 @@ pub fn paint(text: &str, colour: Colour) -> String {
         Colour::Green => 32,
         Colour::Yellow => 33,
         Colour::Red => 31,
+        Colour::Dim => 2,
     };
     format!("\x1b[{code}m{text}\x1b[0m")
 }

@@ -17,7 +17,7 @@ const NARROWEST: usize = 40;
 /// Column in which the descriptions of verbs begin.
 const DESCRIPTIONS: usize = 15;
 
-/// Verbs by what they are about. A verb that this version lacks is left out.
+/// Verbs by what they are about.
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Services", &["push", "pushes", "services", "rollback", "rollout", "diff", "rm", "export", "import", "bases"]),
     ("Servants and robots", &["servants", "top", "logs", "exec", "set", "stop", "explain", "fit", "events"]),

@@ -1,7 +1,6 @@
 //! `logs`: the output of nodes.
 
 use std::collections::BTreeSet;
-use std::io::IsTerminal;
 
 use anyhow::bail;
 use api::{Clock, KeptLog, LogLevel, LogLine, Problem, Servant};
@@ -10,6 +9,7 @@ use futures_util::{StreamExt, TryStreamExt};
 use hyper::Method;
 
 use crate::client::{self, DaemonClient, empty_body, percent_encode};
+use crate::colour::{self, Colour};
 use crate::moment::{Moment, format_date};
 use crate::output::{self, OutputFormat};
 
@@ -67,7 +67,7 @@ impl LogsArgs {
                 Err(error) => return Err(error),
             }
         }
-        let painted = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|set| set.is_empty());
+        let painted = colour::has_colours(&std::io::stdout());
         let print = |(id, entry): &ServantLine| match format {
             OutputFormat::Json => output::json_line(entry),
             OutputFormat::Table => {
@@ -180,15 +180,15 @@ fn describe_end(ended: &KeptLog) -> String {
 /// Returns the text of a line in the colour of its level, unless it has colours of its own.
 fn paint(entry: &LogLine, painted: bool) -> String {
     let colour = match entry.level {
-        Some(LogLevel::Debug) => "\x1b[2m",
-        Some(LogLevel::Warn) => "\x1b[33m",
-        Some(LogLevel::Error | LogLevel::Fatal) => "\x1b[31m",
-        Some(LogLevel::Info) | None => "",
+        Some(LogLevel::Debug) => Colour::Dim,
+        Some(LogLevel::Warn) => Colour::Yellow,
+        Some(LogLevel::Error | LogLevel::Fatal) => Colour::Red,
+        Some(LogLevel::Info) | None => return entry.line.clone(),
     };
-    if !painted || colour.is_empty() || entry.line.contains('\x1b') {
+    if !painted || entry.line.contains('\x1b') {
         return entry.line.clone();
     }
-    format!("{colour}{}\x1b[0m", entry.line)
+    colour::paint(&entry.line, colour)
 }
 
 #[cfg(test)]

@@ -47,12 +47,12 @@ mod services;
 mod set;
 mod shadow;
 mod sla;
-mod spelling;
 mod stated;
 mod status;
 mod stop;
 mod stream;
 mod stub;
+mod synonyms;
 mod token;
 mod top;
 mod topics;
@@ -159,7 +159,7 @@ fn command_line() -> clap::Command {
 
 /// Parses the words of the command line.
 fn parse(words: Vec<OsString>) -> Result<CtlArguments, clap::Error> {
-    let matches = command_line().try_get_matches_from(spelling::to_own_words(words))?;
+    let matches = command_line().try_get_matches_from(synonyms::to_own_words(words))?;
     let mut arguments = CtlArguments::from_arg_matches(&matches)?;
     if arguments.quiet {
         arguments.format = OutputChoice::Name;

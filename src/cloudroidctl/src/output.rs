@@ -254,8 +254,7 @@ fn span(millis: u64) -> String {
 
 /// Returns whether a time has passed.
 pub fn is_past(time: Millis) -> bool {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    now.is_ok_and(|now| now.as_millis() as Millis >= time)
+    now() >= time
 }
 
 /// Formats the time of day, UTC.

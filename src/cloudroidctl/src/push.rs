@@ -401,7 +401,7 @@ async fn send(
             let (body, packing) = source.into_body();
             (body, Some(packing))
         }
-        None => (archive::empty_body(), None),
+        None => (client::empty_body(), None),
     };
     let response = match client.send(Method::POST, uri, body).await {
         Ok(response) => response,

@@ -1,7 +1,7 @@
 //! `pushes`: pushes that run on the server, and those that ended lately.
 
 use anyhow::bail;
-use api::{Problem, PushEvent, PushState, PushStatus, Size};
+use api::{Problem, PushEvent, PushState, PushStatus};
 use futures_util::StreamExt;
 
 use crate::client::DaemonClient;
@@ -71,10 +71,6 @@ async fn list(client: &DaemonClient, format: OutputFormat, all: bool) -> anyhow:
     if format == OutputFormat::Json {
         return output::json(&pushes);
     }
-    if pushes.is_empty() {
-        output::eprint_line("no pushes that you may see; push a package with: cloudroidctl push PATH");
-        return Ok(());
-    }
     let mut table = Table::new(&["NUMBER", "STATE", "SERVICE", "WHAT", "WHO", "BEGAN", "STEP"]);
     for push in pushes {
         table.row([
@@ -87,7 +83,7 @@ async fn list(client: &DaemonClient, format: OutputFormat, all: bool) -> anyhow:
             format_step(&push),
         ]);
     }
-    table.print_list("")
+    table.print_list("no pushes that you may see; push a package with: cloudroidctl push PATH")
 }
 
 /// Describes where a push is, or why it failed.
@@ -100,18 +96,10 @@ fn format_step(push: &PushStatus) -> String {
     };
     let mut parts = vec![output::age(began)];
     if let Some(count) = &push.progress {
-        parts.push(format_count(&count.unit, count.done, count.total));
+        parts.push(progress::format_count(&count.unit, count.done, count.total));
     }
     let last = push.last_took.map(progress::format_last).unwrap_or_default();
     format!("{}: {}{last}", push.step, parts.join(", "))
-}
-
-fn format_count(unit: &str, done: u64, total: Option<u64>) -> String {
-    let amount = |number| if unit == "bytes" { Size(number).to_string() } else { format!("{number} {unit}") };
-    match total {
-        Some(total) => format!("{done} of {}", amount(total)),
-        None => amount(done),
-    }
 }
 
 impl PushLogs {

@@ -1,18 +1,12 @@
 //! `recordings`: recordings of the last seconds of servants, which the daemon keeps.
 
-use std::io::Write;
 use std::path::PathBuf;
 
-use anyhow::Context;
 use api::recordings::Recording;
-use futures_util::StreamExt;
-use http_body_util::BodyStream;
-use hyper::Method;
 
-use crate::client::{DaemonClient, empty_body, percent_encode};
+use crate::client::{DaemonClient, percent_encode};
 use crate::inside;
 use crate::output::{self, OutputFormat, Table};
-use crate::whole::AtomicFile;
 
 /// Manage ring-buffer recordings: the seconds in servants before their robots waited too long.
 ///
@@ -122,17 +116,7 @@ impl GetRecording {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let target = self.output.unwrap_or_else(|| PathBuf::from(format!("recording-{}.mcap", self.number)));
         let path = format!("/api/v1/recordings/{}", self.number);
-        let answer = client.send(Method::GET, &path, empty_body()).await?;
-        let half = AtomicFile::create_beside(&target)?;
-        let mut bytes = 0;
-        let mut parts = BodyStream::new(answer.into_body());
-        while let Some(part) = parts.next().await {
-            let part = part.context("the daemon's response was cut off")?;
-            let part = part.into_data().unwrap_or_default();
-            bytes += part.len() as u64;
-            (&half.file).write_all(&part).with_context(|| half.error_context())?;
-        }
-        half.persist()?;
+        let bytes = client.download(&path, &target).await?;
         match format {
             OutputFormat::Json => output::json(&serde_json::json!({ "path": target, "bytes": bytes })),
             OutputFormat::Table => output::line(&format!("{} ({})", target.display(), api::Size(bytes))),

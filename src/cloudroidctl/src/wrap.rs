@@ -1,18 +1,10 @@
 //! Breaks lines at spaces, to fit a terminal.
 
+use foreign::terminal;
+
 /// Returns the number of characters that a terminal shows of `text`: colours (`ESC [ … m`) take no room.
 pub fn visible_width(text: &str) -> usize {
-    let mut width = 0;
-    let mut characters = text.chars();
-    while let Some(character) = characters.next() {
-        if character == '\x1b' {
-            // The sequence ends with its first letter.
-            characters.find(char::is_ascii_alphabetic);
-        } else {
-            width += 1;
-        }
-    }
-    width
+    terminal::strip_colours(text).chars().count()
 }
 
 /// Breaks a line at spaces so that no part is wider than `width`, where its words allow; the parts after the first are

@@ -90,7 +90,7 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
         machine,
         live: portal::LiveSamples::default(),
         inside: portal::InsideConnections::default(),
-        execs: portal::ExecSlots::default(),
+        execs: portal::Slots::default(),
         observers: portal::Observers::default(),
         started: store::now(),
         sessions: TaskTracker::new(),

@@ -41,6 +41,23 @@ pub fn escape(text: &str, colours: bool) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
+/// Removes the colours from `text`.
+pub fn strip_colours(text: &str) -> Cow<'_, str> {
+    if !text.contains('\x1b') {
+        return Cow::Borrowed(text);
+    }
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find('\x1b') {
+        let length = colour(&rest[at..]).map_or(0, str::len);
+        // What is no colour stays.
+        out.push_str(&rest[..if length == 0 { at + 1 } else { at }]);
+        rest = &rest[at + length.max(1)..];
+    }
+    out.push_str(rest);
+    Cow::Owned(out)
+}
+
 /// Escapes control characters that JSON allows in its strings as `\u…`; the meaning is the same.
 pub fn escape_json(json: &str) -> Cow<'_, str> {
     if !json.contains(is_dangerous) {
@@ -75,6 +92,18 @@ fn colour(text: &str) -> Option<&str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_colours_are_stripped() {
+        for (text, plain) in [
+            ("plain", "plain"),
+            ("\x1b[0m[ INFO] a\x1b[1;33mb\x1b[0m", "[ INFO] ab"),
+            ("\x1b[2J\x1b[31ma", "\x1b[2Ja"),
+            ("a\x1b[31", "a\x1b[31"),
+        ] {
+            assert_eq!(strip_colours(text), plain);
+        }
+    }
 
     #[test]
     fn a_terminal_is_told_nothing_by_a_log() {

@@ -13,13 +13,13 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
-use crate::exec::slots::ExecSlots;
 use crate::inside::connections::InsideConnections;
 use crate::observers::servants::{BlackBoxOptions, Observers};
 use crate::people::identity_provider::IdentityProvider;
 use crate::people::passwords::Passwords;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
+use crate::slots::Slots;
 use crate::strangers::Strangers;
 use crate::stream::live::LiveSamples;
 use crate::tls::Tls;
@@ -108,8 +108,8 @@ pub struct App {
     pub live: LiveSamples,
     /// Connections that look into servants.
     pub inside: InsideConnections,
-    /// Exec sessions.
-    pub execs: ExecSlots,
+    /// Exec sessions, by the name of their principal.
+    pub execs: Slots<String>,
     /// Observers of servants: black boxes and goal monitors.
     pub observers: Observers,
     /// Start time of the daemon.

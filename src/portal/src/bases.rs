@@ -10,14 +10,11 @@ use axum::extract::{Path, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
 use futures_util::{StreamExt, TryStreamExt};
-use tokio_util::io::ReaderStream;
 
 use crate::app::App;
+use crate::body::stream_file;
 use crate::errors::Error;
 use crate::json::JsonResult;
-
-/// Bytes read from the archive at a time.
-const CHUNK: usize = 256 << 10;
 
 /// Returns all bases.
 pub async fn bases(State(app): State<Arc<App>>) -> JsonResult<Vec<BaseSummary>> {
@@ -37,7 +34,7 @@ pub async fn export(State(app): State<Arc<App>>, Path(name): Path<String>) -> Re
         (header::CONTENT_LENGTH, bytes.to_string()),
         (header::CONTENT_DISPOSITION, format!("attachment; filename=\"{name}.oci.tar\"")),
     ];
-    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
+    let stream = stream_file(file);
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 

@@ -1,10 +1,12 @@
-//! Reads request bodies into memory, within the client's budget and a timeout.
+//! Reads request bodies into memory, within the client's budget and a timeout, and files into those of responses.
 
+use std::fs::File;
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use budget::{Budget, Permit, UNCOUNTED};
 use futures_util::StreamExt;
+use tokio_util::io::ReaderStream;
 
 use crate::app::App;
 use crate::caller::Caller;
@@ -17,6 +19,14 @@ const STEP: usize = 1 << 20;
 const LARGEST_TRIAL: usize = 512 << 20;
 /// Maximum size of other bodies.
 pub const LARGEST_WORDS: usize = 64 << 10;
+
+/// Bytes of a file that are sent at a time.
+const CHUNK: usize = 256 << 10;
+
+/// Returns the content of a file, for the body of a response.
+pub fn stream_file(file: File) -> ReaderStream<tokio::fs::File> {
+    ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK)
+}
 
 /// A body in memory, with its budget permit.
 #[derive(Debug)]

@@ -6,7 +6,6 @@
 
 mod request;
 mod session;
-pub mod slots;
 
 use std::sync::Arc;
 
@@ -29,6 +28,9 @@ use crate::{handshake, headers, robots};
 pub use request::ExecQuery;
 use session::ExecOutcome;
 
+/// Limit on the exec sessions of one principal. A servant has its own limit.
+const MOST: usize = 4;
+
 /// Runs a program in a servant and upgrades to a WebSocket with its streams.
 pub async fn open_exec(
     State(app): State<Arc<App>>,
@@ -49,7 +51,9 @@ pub async fn open_exec(
     check_whole_service(&app, &caller, handle.service())?;
     handle.check_container()?;
     let container = handle.container().ok_or_else(|| Error::NotRunning(id.clone()))?;
-    let slot = app.execs.acquire(&caller.who.principal.name)?;
+    let who = &caller.who.principal.name;
+    let slot = app.execs.acquire(who.clone(), MOST);
+    let slot = slot.ok_or_else(|| Error::TooManyExecs { who: who.clone(), most: MOST })?;
     let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
         return Err(Error::BadRequest("this connection cannot become a WebSocket".to_owned()));
     };

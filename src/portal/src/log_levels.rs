@@ -9,10 +9,12 @@
 //! The stream says nothing: ROS 2 prints everything on standard error.
 
 use api::LogLevel;
+use foreign::terminal;
 
 /// Finds the severity of a line; `None` if it is in no console format of ROS, such as a traceback.
 pub fn find_level(line: &str) -> Option<LogLevel> {
-    let (word, _) = strip_colours(line).strip_prefix('[')?.split_once(']')?;
+    let line = terminal::strip_colours(line);
+    let (word, _) = line.strip_prefix('[')?.split_once(']')?;
     match word.trim_start() {
         "DEBUG" => Some(LogLevel::Debug),
         "INFO" => Some(LogLevel::Info),
@@ -21,17 +23,6 @@ pub fn find_level(line: &str) -> Option<LogLevel> {
         "FATAL" | "CRITICAL" => Some(LogLevel::Fatal),
         _ => None,
     }
-}
-
-/// Removes the colours (SGR, `ESC [ … m`) that a line begins with.
-fn strip_colours(mut line: &str) -> &str {
-    while let Some(colour) = line.strip_prefix("\x1b[") {
-        match colour.split_once('m') {
-            Some((codes, rest)) if codes.bytes().all(|code| code.is_ascii_digit() || code == b';') => line = rest,
-            _ => break,
-        }
-    }
-    line
 }
 
 #[cfg(test)]

@@ -8,16 +8,15 @@ use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use serde_json::json;
-use tokio_util::io::ReaderStream;
 
 use crate::app::App;
+use crate::body::stream_file;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::registry_clients::error_response;
 
 const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api-version");
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
-const CHUNK: usize = 256 << 10;
 
 /// `/v2/`: confirms that this is a registry.
 pub async fn version() -> Response {
@@ -103,7 +102,7 @@ pub async fn blob(
     let Some(blob) = found else {
         return Ok(not_found("BLOB_UNKNOWN", &format!("there is no blob {digest}")));
     };
-    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(blob.file), CHUNK);
+    let stream = stream_file(blob.file);
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
         (header::CONTENT_LENGTH, blob.size.to_string()),

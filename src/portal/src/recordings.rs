@@ -17,11 +17,11 @@ use futures_util::StreamExt;
 use recording::RecordingWriter;
 use serde::Deserialize;
 use store::{NewEvent, RecordingRecord};
-use tokio_util::io::ReaderStream;
 use tokio_util::task::TaskTracker;
 use utoipa::IntoParams;
 
 use crate::app::App;
+use crate::body::stream_file;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::inside::{self, InsideTarget};
@@ -37,8 +37,6 @@ const HALF: &str = "half.mcap";
 const RECORDED: &str = "recorded";
 /// Event kind: a recording could not be written.
 pub const NOT_RECORDED: &str = "not-recorded";
-/// Bytes of a file sent at a time.
-const CHUNK: usize = 256 << 10;
 
 /// Query: which recordings.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -324,7 +322,7 @@ pub async fn file(
     });
     // The file may have been removed by hand.
     let (file, size) = opened.await.map_err(|_| Error::UnknownRecording(number.clone()))?;
-    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
+    let stream = stream_file(file);
     // The download is cut off when the caller's credential becomes invalid.
     let ended = {
         let (app, service) = (Arc::clone(&app), record.service.clone());

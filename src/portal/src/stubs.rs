@@ -13,15 +13,13 @@ use catalogue::stubs::{self, StubPrograms};
 use package::stub::Portal;
 use serde::Deserialize;
 use tokio::sync::Semaphore;
-use tokio_util::io::ReaderStream;
 
 use crate::app::App;
+use crate::body::stream_file;
 use crate::caller::{Caller, ConnectionPeer};
 use crate::errors::Error;
 use crate::query::Query;
 
-/// Bytes read from the archive at a time.
-const CHUNK: usize = 64 << 10;
 /// Limit on the archives packed at once: each holds its files in memory meanwhile, and occupies a core.
 static PACKING: Semaphore = Semaphore::const_new(2);
 
@@ -90,7 +88,7 @@ pub async fn archive(
         (header::HeaderName::from_static(ARCHITECTURE), architecture.to_owned()),
         (header::HeaderName::from_static(SIGNATURE), sign::to_single_line(&archive.signature)),
     ];
-    let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(archive.file), CHUNK);
+    let stream = stream_file(archive.file);
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 

@@ -16,7 +16,7 @@ use tracing::Instrument;
 use super::deployer::Deployer;
 use super::reporter::Reporter;
 use super::running::RunningPush;
-use super::{Archive, EVENTS_AHEAD, Error, OptionsError, Pusher, receive, shared, spelling};
+use super::{Archive, EVENTS_AHEAD, Error, OptionsError, Pusher, option_check, receive, shared};
 
 /// Result of a push.
 #[derive(Debug)]
@@ -128,7 +128,7 @@ impl Pusher {
         }
         check_caps(options)?;
         check_sla(options)?;
-        spelling::check_options(options)?;
+        option_check::check_options(options)?;
         options.parse_requests().map_err(OptionsError::RequestPair)?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;

@@ -229,7 +229,7 @@ impl PushOutput {
         let first = self.kept.partition_point(|one| one.number < *seen);
         let mut events = Vec::with_capacity(self.kept.len() - first + 2);
         if self.removed_to > *seen {
-            events.push(PushEvent::Log { line: "(earlier lines are no longer kept)".to_owned() });
+            events.push(removal_mark());
         }
         events.extend(self.kept.iter().skip(first).map(|one| one.event.clone()));
         events.extend(self.progress.iter().filter(|latest| latest.number >= *seen).map(|latest| latest.event.clone()));
@@ -246,7 +246,7 @@ impl PushOutput {
             let line = to_line(&one.event);
             bytes += line.len();
             if bytes > STORED {
-                lines.push(to_line(&PushEvent::Log { line: "(earlier lines are no longer kept)".to_owned() }));
+                lines.push(to_line(&removal_mark()));
                 break;
             }
             lines.push(line);
@@ -258,6 +258,11 @@ impl PushOutput {
         }
         text
     }
+}
+
+/// Returns the line in place of those that were removed.
+fn removal_mark() -> PushEvent {
+    PushEvent::Log { line: "(earlier lines are no longer kept)".to_owned() }
 }
 
 /// Returns true if the step waits for others, so that its duration says nothing about the next push.

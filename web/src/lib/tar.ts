@@ -1,13 +1,11 @@
 // A tar archive (POSIX pax) of a folder that a browser was given, as a Blob: nothing is copied into memory.
 
-import { unignored } from './ignore';
-
 export interface Entry { path: string; file: File }
 
 /** Directories that hold nothing of a package, as `cloudroidctl push` leaves them out. */
 const LEFT_OUT = new Set(['.git', '.hg', '.svn', '.catkin_tools', '__pycache__']);
-/** Beside `src` of a workspace: what catkin made of it. */
-const MADE_BY_CATKIN = new Set(['build', 'devel', 'install', 'logs', 'build_isolated']);
+/** Beside `src` of a workspace: what catkin or colcon made of it. */
+const MADE_OF_IT = new Set(['build', 'devel', 'install', 'log', 'logs', 'build_isolated']);
 const BLOCK = 512;
 const utf8 = new TextEncoder();
 
@@ -17,7 +15,7 @@ export function chosen(all: Entry[]): Entry[] {
   return all
     .filter(({ path }) => {
       const segments = path.split('/');
-      return !segments.some((one) => LEFT_OUT.has(one)) && !(workspace && MADE_BY_CATKIN.has(segments[0] ?? ''));
+      return !segments.some((one) => LEFT_OUT.has(one)) && !(workspace && MADE_OF_IT.has(segments[0] ?? ''));
     })
     .sort((a, b) => (a.path < b.path ? -1 : 1));
 }
@@ -60,10 +58,10 @@ async function isProgram(file: File): Promise<boolean> {
   return (one === 0x23 && two === 0x21) || (one === 0x7f && two === 0x45 && three === 0x4c && four === 0x46);
 }
 
-/** The archive of a folder's files, without those that its `.cloudroidignore` files leave out. */
+/** The archive of a folder's files. */
 export async function tar(entries: Entry[]): Promise<Blob> {
   const parts: BlobPart[] = [];
-  for (const { path, file } of await unignored(entries)) {
+  for (const { path, file } of entries) {
     const name = utf8.encode(path);
     if (name.length > 100) parts.push(...(longName(name) as BlobPart[]));
     parts.push(header(name, file.size, (await isProgram(file)) ? 0o755 : 0o644, '0') as BlobPart, file, filled(file.size) as BlobPart);

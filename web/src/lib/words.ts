@@ -1,5 +1,5 @@
 // Figures in words.
-import type { Limits } from './types';
+import type { Limits, PushCount } from './types';
 
 const UNITS = ['B', 'kB', 'MB', 'GB', 'TB'];
 
@@ -36,6 +36,12 @@ export const percent = (share: number) => `${Math.round(share * 100)}\u00a0%`;
 
 export function count(what: number, word: string): string {
   return `${what} ${word}${what === 1 ? '' : 's'}`;
+}
+
+/** How far something is. */
+export function progress({ unit, done, total }: PushCount): string {
+  const amount = (value: number) => (unit === 'bytes' ? size(value) : String(value));
+  return `${amount(done)}${total ? ` of ${amount(total)}` : ''}${unit === 'bytes' ? '' : ` ${unit}`}`;
 }
 
 export function limits(of: Limits | undefined): string {

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use futures_util::StreamExt;
-use http_body_util::{BodyExt, Full, StreamBody};
+use http_body_util::{BodyExt, StreamBody};
 use hyper::body::Frame;
 use tokio::sync::mpsc;
 
@@ -32,11 +32,6 @@ impl Packing {
     pub fn into_error(self) -> Option<anyhow::Error> {
         self.failure.try_recv().ok()
     }
-}
-
-/// Returns an empty body, for `--apt`.
-pub fn empty_body() -> RequestBody {
-    Full::default().map_err(|never| match never {}).boxed_unsync()
 }
 
 /// Content of a push on this machine.

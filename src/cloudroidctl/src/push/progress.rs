@@ -131,13 +131,7 @@ impl PushProgress {
     }
 
     fn progress(&mut self, unit: &str, done: u64, total: Option<u64>) -> anyhow::Result<()> {
-        let amount = |number: u64| {
-            if unit == "bytes" { Size(number).to_string() } else { number.to_string() }
-        };
-        let text = match total {
-            Some(total) => format!("{} of {} {unit}", amount(done), amount(total)),
-            None => format!("{} {unit}", amount(done)),
-        };
+        let text = format_count(unit, done, total);
         match &self.bar {
             Some(bar) => {
                 if let Some(total) = total {
@@ -176,6 +170,17 @@ impl PushProgress {
     }
 }
 
+/// Describes how many units of a step are done.
+pub fn format_count(unit: &str, done: u64, total: Option<u64>) -> String {
+    let is_size = unit == "bytes";
+    let amount = |number: u64| if is_size { Size(number).to_string() } else { number.to_string() };
+    let unit = if is_size { String::new() } else { format!(" {unit}") };
+    match total {
+        Some(total) => format!("{} of {}{unit}", amount(done), amount(total)),
+        None => format!("{}{unit}", amount(done)),
+    }
+}
+
 /// Returns a remark on how long a step took last, in milliseconds; empty if that is not worth a remark.
 pub fn format_last(took: u64) -> String {
     match took {
@@ -193,6 +198,13 @@ impl Drop for PushProgress {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sizes_need_no_unit() {
+        assert_eq!(format_count("packages", 3, Some(9)), "3 of 9 packages");
+        assert_eq!(format_count("bytes", 1 << 20, Some(3 << 20)), format!("{} of {}", Size(1 << 20), Size(3 << 20)));
+        assert_eq!(format_count("bytes", 1 << 20, None), Size(1 << 20).to_string());
+    }
 
     #[test]
     fn only_what_took_a_while_is_remarked() {

@@ -10,7 +10,6 @@
 //! Unknown names are hashed, too, so that the timing does not reveal that they are unknown. But they wait only for
 //! each other: inventing names, from however many addresses, delays nobody who has an account.
 
-use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::Arc;
 
@@ -20,6 +19,7 @@ use parking_lot::Mutex;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::errors::Error;
+use crate::slots::{Slot, Slots};
 
 /// Limit on the passwords of one address, and of one account, that are being hashed or waiting.
 pub const OF_EACH: usize = 4;
@@ -84,9 +84,7 @@ impl HashTurn {
 
 /// Addresses and accounts whose passwords are being hashed or waiting.
 #[derive(Default)]
-pub struct HashSlots {
-    counts: Arc<Mutex<HashMap<SlotOwner, usize>>>,
-}
+pub struct HashSlots(Slots<SlotOwner>);
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum SlotOwner {
@@ -94,44 +92,22 @@ enum SlotOwner {
     Account(String),
 }
 
-/// Slot of one address and one account; released when dropped.
+/// Slots of one address and one account; released when dropped.
 #[derive(Debug)]
 pub struct HashSlot {
-    counts: Arc<Mutex<HashMap<SlotOwner, usize>>>,
-    holders: [SlotOwner; 2],
+    _held: [Slot<SlotOwner>; 2],
 }
 
 impl HashSlots {
     /// Acquires a slot for a password that came from an address for an account, which need not exist.
     pub fn acquire(&self, from: IpAddr, account: &str) -> Result<HashSlot, Error> {
-        let holders = [SlotOwner::Host(from.into()), SlotOwner::Account(account.to_owned())];
-        let mut counts = self.counts.lock();
-        let is_full = |holder| counts.get(holder).is_some_and(|count| *count >= OF_EACH);
-        if holders.iter().any(is_full) {
-            return Err(Error::SignInBusy);
-        }
-        for holder in &holders {
-            *counts.entry(holder.clone()).or_default() += 1;
-        }
-        Ok(HashSlot { counts: Arc::clone(&self.counts), holders })
+        let acquire = |owner| self.0.acquire(owner, OF_EACH).ok_or(Error::SignInBusy);
+        let held = [acquire(SlotOwner::Host(from.into()))?, acquire(SlotOwner::Account(account.to_owned()))?];
+        Ok(HashSlot { _held: held })
     }
 
     #[cfg(test)]
     pub fn is_empty(&self) -> bool {
-        self.counts.lock().is_empty()
-    }
-}
-
-impl Drop for HashSlot {
-    fn drop(&mut self) {
-        let mut counts = self.counts.lock();
-        for holder in &self.holders {
-            if let Some(count) = counts.get_mut(holder) {
-                *count -= 1;
-                if *count == 0 {
-                    counts.remove(holder);
-                }
-            }
-        }
+        self.0.is_empty()
     }
 }

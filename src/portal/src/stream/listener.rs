@@ -9,11 +9,12 @@ use api::stream::Update;
 use axum::response::sse;
 use tokio::sync::watch;
 
-use super::live::{StateSample, StreamSlot};
+use super::live::StateSample;
 use super::sampler::EVENTS;
 use crate::app::App;
 use crate::caller::Caller;
 use crate::events::is_visible;
+use crate::slots::Slot;
 
 /// A listener.
 pub struct Listener {
@@ -22,7 +23,7 @@ pub struct Listener {
     samples: watch::Receiver<Option<Arc<StateSample>>>,
     /// State last sent.
     told: Option<LastSent>,
-    _place: StreamSlot,
+    _place: Slot<String>,
 }
 
 /// The part of a sample that was sent.
@@ -37,7 +38,7 @@ impl Listener {
         app: Arc<App>,
         caller: Caller,
         samples: watch::Receiver<Option<Arc<StateSample>>>,
-        place: StreamSlot,
+        place: Slot<String>,
     ) -> Listener {
         Listener { app, caller, samples, told: None, _place: place }
     }

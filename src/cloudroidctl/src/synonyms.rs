@@ -1,9 +1,9 @@
-//! Spellings of other command lines: `get services`, `delete service NAME`.
+//! Verbs as other command lines spell them: `get services`, `delete service NAME`.
 
 use std::ffi::OsString;
 
 /// Words of others, and the verbs that they mean.
-const SPELLINGS: [(&[&str], &[&str], &str); 4] = [
+const SYNONYMS: [(&[&str], &[&str], &str); 4] = [
     (&["get", "list", "ls", "describe"], &["services", "service"], "services"),
     (&["get", "list", "ls", "describe"], &["servants", "servant"], "servants"),
     (&["delete"], &["services", "service"], "rm"),
@@ -13,7 +13,7 @@ const SPELLINGS: [(&[&str], &[&str], &str); 4] = [
 /// Replaces two words, such as `get services`, by the verb that they mean. Other words stay as they are.
 pub fn to_own_words(mut words: Vec<OsString>) -> Vec<OsString> {
     let found = words.windows(2).enumerate().find_map(|(at, pair)| {
-        let mut spellings = SPELLINGS.iter();
+        let mut spellings = SYNONYMS.iter();
         let spelling = spellings.find(|(verbs, things, _)| is_one_of(&pair[0], verbs) && is_one_of(&pair[1], things));
         spelling.map(|(_, _, verb)| (at, *verb))
     });
