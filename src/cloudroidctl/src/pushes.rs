@@ -150,8 +150,9 @@ fn print(event: &PushEvent) -> anyhow::Result<()> {
         PushEvent::Step { title, .. } => output::line(&format!("== {title}")),
         PushEvent::Log { line } => output::line(&format!("  | {line}")),
         PushEvent::Warning { message } => output::line(&format!("warning: {message}")),
-        PushEvent::Done { service, took, .. } => {
-            output::line(&format!("== published {} in {:.1} s", service.summary.name, *took as f64 / 1000.0))
+        PushEvent::Done { service, took, unchanged, .. } => {
+            let outcome = if *unchanged { "unchanged:" } else { "published" };
+            output::line(&format!("== {outcome} {} in {:.1} s", service.summary.name, *took as f64 / 1000.0))
         }
         PushEvent::Error { problem: Problem { detail, .. } } => output::line(&format!("== failed: {detail}")),
         PushEvent::Accepted { .. } | PushEvent::Progress { .. } => Ok(()),
