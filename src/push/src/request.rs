@@ -270,7 +270,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_push_that_panics_ends_with_an_error() {
-        let ended = catch_panic(async { None.expect("a bug") }).await;
+        let ended = catch_panic(async { panic!("a bug") }).await;
         assert!(matches!(ended, Err::<(), _>(Error::Internal(_))), "{ended:?}");
         assert!(matches!(catch_panic(async { Ok(7) }).await, Ok(7)));
     }
