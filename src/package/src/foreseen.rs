@@ -16,6 +16,7 @@ use ros::bus::RosVersion;
 use rustix::fs::FileType;
 
 use crate::workspace::{Package, Workspace};
+use executables::BuildFileScan;
 
 pub use problems::{SourceProblem, find_problems, has_no_programs};
 
@@ -61,8 +62,8 @@ pub fn lacks_launch_file(workspace: &Workspace, launch: &str, version: RosVersio
         return false;
     };
     let lacks = |package: &Package| {
-        let text = executables::scan_package(&workspace.root, package, version).text;
-        if text.contains("configure_file") || text.contains(name) {
+        let BuildFileScan { text, is_cut, .. } = executables::scan_package(&workspace.root, package, version);
+        if is_cut || text.contains("configure_file") || text.contains(name) {
             return false;
         }
         let mut found = false;

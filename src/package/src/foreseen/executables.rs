@@ -16,6 +16,8 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Maximum depth of `add_subdirectory`, and maximum number of files read.
 const MAX_DEPTH: usize = 8;
 const MAX_FILES: usize = 200;
+/// Size in bytes of the build files of a package after which no further one is read.
+const MAX_TEXT: usize = 4 << 20;
 
 /// Words in a build file that change where executables are installed, or whether they are built.
 const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
@@ -43,6 +45,8 @@ pub(super) struct BuildFileScan {
     pub(super) text: String,
     /// True if launch files may be generated or renamed.
     pub(super) mentions_launch: bool,
+    /// True if there are more build files than are read, which may mention anything.
+    pub(super) is_cut: bool,
 }
 
 /// Scans the build files of a package.
@@ -98,12 +102,18 @@ impl BuildFileReader<'_> {
     /// certain to be executed.
     fn read_cmake_lists(&mut self, directory: &Path, depth: usize) -> bool {
         self.files += 1;
+        // A build file may add any directory again, its own included.
+        if self.files > MAX_FILES || self.shown.text.len() > MAX_TEXT {
+            self.is_unclear = true;
+            self.shown.is_cut = true;
+            return false;
+        }
         let path = self.root.join(directory).join("CMakeLists.txt");
         let text = read::read_text(self.root, &path, MAX_BYTES);
         let Ok(text) = text else {
             return false;
         };
-        if self.files > MAX_FILES || UNCLEAR.iter().any(|word| text.contains(word)) {
+        if UNCLEAR.iter().any(|word| text.contains(word)) {
             self.is_unclear = true;
         }
         let launch = match self.version {
