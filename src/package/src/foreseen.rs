@@ -99,6 +99,9 @@ impl SourceScan {
             self.may_launch_more = true;
             return;
         };
+        // Looked up for each file: a build file may list any number.
+        let [directories, files] =
+            [directories, files].map(|names| names.iter().map(Path::new).collect::<BTreeSet<&Path>>());
         let walked = foreign::walk(&directory, |entry| {
             if entry.kind() == FileType::Directory {
                 return Ok(Visit::Into);
@@ -110,8 +113,7 @@ impl SourceScan {
                     RosVersion::One => name.ends_with(".launch") && scripts::is_shared(path),
                     RosVersion::Two => {
                         LAUNCH_OF_TWO.iter().any(|end| name.ends_with(end))
-                            && (directories.iter().any(|directory| path.starts_with(directory))
-                                || files.iter().any(|file| path == Path::new(file)))
+                            && (files.contains(path) || path.ancestors().any(|above| directories.contains(above)))
                     }
                 };
             if is_installed {

@@ -19,6 +19,10 @@ const MAX_FILES: usize = 200;
 /// Size in bytes of the build files of a package after which no further one is read.
 const MAX_TEXT: usize = 4 << 20;
 
+/// Maximum number of files of a directory `launch` that are searched in a `setup.py`, and maximum size of that in bytes:
+/// for each file all of it is searched.
+const MAX_LAUNCH_FILES: usize = 100;
+const MAX_SETUP: usize = 64 << 10;
 /// Words in a build file that change where executables are installed, or whether they are built.
 const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
 
@@ -253,9 +257,13 @@ impl BuildFileReader<'_> {
             Ok(DirectoryLookup::Directory(launch)) => launch.names().unwrap_or_default(),
             _ => Vec::new(),
         };
-        let names = names.iter().filter_map(|name| name.to_str());
-        let installed = names.filter(|name| installs_launch_file(&setup, name));
-        self.shown.launch_files.extend(installed.map(|name| format!("launch/{name}")));
+        if names.len() > MAX_LAUNCH_FILES || setup.len() > MAX_SETUP {
+            self.shown.mentions_launch = true;
+        } else {
+            let names = names.iter().filter_map(|name| name.to_str());
+            let installed = names.filter(|name| installs_launch_file(&setup, name));
+            self.shown.launch_files.extend(installed.map(|name| format!("launch/{name}")));
+        }
         self.shown.text = setup;
     }
 }

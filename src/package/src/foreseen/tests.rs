@@ -331,3 +331,19 @@ fn names_of_scripts_are_searched_in_a_bounded_number_of_bytes() {
     };
     assert_eq!((found(problems::MAX_SEARCHED), found(3)), (1, 0));
 }
+
+#[test]
+fn many_launch_files_are_not_searched_one_by_one() {
+    let scan = |count: usize| {
+        let place = SourceFixture::new();
+        let setup = "setup(data_files=[('share/p/launch', glob('launch/*.launch.py'))])";
+        place.package("p", "ament_python", "").write("src/p/setup.py", setup);
+        for number in 0..count {
+            place.write(&format!("src/p/launch/n{number}.launch.py"), "");
+        }
+        let scan = place.scan(RosVersion::Two);
+        (scan.launch_files.len(), scan.may_launch_more)
+    };
+    assert_eq!(scan(100).0, 100);
+    assert_eq!(scan(101), (0, true));
+}
