@@ -5,7 +5,8 @@ use package::names;
 
 use super::OptionsError;
 
-/// Maximum number of packages in an option, of nodes (as in an exported service), and of arguments of CMake; maximum length of an argument in bytes.
+/// Maximum number of packages in an option, of nodes (as in an exported service), and of arguments of CMake; maximum
+/// length of an argument in bytes.
 const MOST_PACKAGES: usize = 1000;
 const MOST_NODES: usize = 256;
 const MOST_ARGUMENTS: usize = 64;

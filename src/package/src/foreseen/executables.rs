@@ -19,8 +19,8 @@ const MAX_FILES: usize = 200;
 /// Size in bytes of the build files of a package after which no further one is read.
 const MAX_TEXT: usize = 4 << 20;
 
-/// Maximum number of files of a directory `launch` that are searched in a `setup.py`, and maximum size of that in bytes:
-/// for each file all of it is searched.
+/// Maximum number of files of a directory `launch` that are looked for in a `setup.py`, and maximum size of that in
+/// bytes: for each file all of it is searched.
 const MAX_LAUNCH_FILES: usize = 100;
 const MAX_SETUP: usize = 64 << 10;
 /// Words in a build file that change where executables are installed, or whether they are built.
