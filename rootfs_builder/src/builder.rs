@@ -180,8 +180,12 @@ impl Builder {
                 if let PushedDirectory::Source(workspace) = &pushed {
                     tell_selection(workspace, &left_out, progress).await;
                     ask_what_to_run(request, workspace, &base)?;
-                    for problem in find_source_problems(request, workspace, &base)? {
+                    let problems = find_source_problems(request, workspace, &base)?;
+                    for problem in problems.iter().take(MOST_PROBLEMS) {
                         progress.warn(problem.to_string()).await;
+                    }
+                    if problems.len() > MOST_PROBLEMS {
+                        progress.warn(format!("{} more like these", problems.len() - MOST_PROBLEMS)).await;
                     }
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;
@@ -361,6 +365,8 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
     })
 }
 
+/// Maximum number of mistakes in build files that are named.
+const MOST_PROBLEMS: usize = 20;
 /// Maximum number of packages that are named when they are not built.
 const NAMED: usize = 12;
 

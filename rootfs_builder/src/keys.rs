@@ -150,6 +150,10 @@ fn add_unknown(archive: &Archive, map: &BTreeMap<String, String>, missing: &mut 
     }
 }
 
+/// Maximum number of missing names for which similar ones are searched: each search goes through the whole archive, and
+/// a push may name any number.
+const MOST_SUGGESTIONS: usize = 50;
+
 /// Fails with all missing names, if there are any; `there` are the ROS packages of the base.
 fn refuse_missing(
     archive: &Archive,
@@ -160,16 +164,12 @@ fn refuse_missing(
     if missing.is_empty() {
         return Ok(());
     }
-    Err(Error::Unresolved(
-        missing
-            .into_iter()
-            .map(|(key, by)| Unresolved {
-                similar: similar(archive, base, &key, there),
-                wanted_by: by.into_iter().collect(),
-                key,
-            })
-            .collect(),
-    ))
+    let unresolved = missing.into_iter().enumerate().map(|(number, (key, by))| Unresolved {
+        similar: if number < MOST_SUGGESTIONS { similar(archive, base, &key, there) } else { Vec::new() },
+        wanted_by: by.into_iter().collect(),
+        key,
+    });
+    Err(Error::Unresolved(unresolved.collect()))
 }
 
 /// Returns whether, on a base of ROS 2, a Debian package belongs to the distribution's own ROS 1.
@@ -372,6 +372,19 @@ mod tests {
         assert_eq!(keys, ["libtf-dev", "rclcpp", "tf"]);
         assert!(missing.iter().all(|one| one.similar.is_empty()), "{missing:?}");
         assert!(error.to_string().contains("or push a workspace"), "{error}");
+    }
+
+    #[test]
+    fn of_many_missing_names_the_first_have_suggestions() {
+        let lab = new_ros2_fixture();
+        let there = set(&["cv_bridge"]);
+        let missing = ('a'..='z').flat_map(|a| ('x'..='z').map(move |b| (format!("cv_bridge{a}{b}"), BTreeSet::new())));
+        let error = refuse_missing(&lab.archive, &lab.base, missing.collect(), &there).expect_err("all are missing");
+        let Error::Unresolved(missing) = error else { panic!("{error}") };
+        assert_eq!(missing.len(), 78);
+        let suggested = missing.iter().take_while(|one| one.similar.contains(&"cv_bridge".to_owned()));
+        assert_eq!(suggested.count(), MOST_SUGGESTIONS);
+        assert!(missing[MOST_SUGGESTIONS..].iter().all(|one| one.similar.is_empty()), "{missing:?}");
     }
 
     #[test]

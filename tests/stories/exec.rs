@@ -1,6 +1,7 @@
 //! `cloudroidctl exec`: programs in servants, as their nodes run, for those who may.
 
 use std::io::{Read, Write};
+use std::net::TcpStream;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
@@ -225,6 +226,18 @@ pub fn who_may_not_is_refused_and_who_may_no_longer_is_ended() -> Verdict {
     let object = format!("servant {servant} of robot r1 at service adder_py: echo here");
     wait_for_record(&daemon, "alice (deployer)", "start a program", &object, 101)?;
     wait_for_record(&daemon, "alice (deployer)", "end of a program", &format!("{object}: exit status 0"), 200)?;
+    // Who leaves before the program has started is recorded all the same.
+    let hasty = format!(
+        "GET /api/v1/servants/{servant}/exec?argument=sleep&argument=4716 HTTP/1.1\r\nHost: {address}\r\n\
+            Authorization: Bearer {alice}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+            Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\
+            Sec-WebSocket-Protocol: exec.v1.cloudroid\r\n\r\n",
+        address = daemon.address
+    );
+    TcpStream::connect(&daemon.address)?.write_all(hasty.as_bytes())?;
+    let words = "sleep 4716: killed: the connection ended";
+    wait_for_record(&daemon, "alice (deployer)", "end of a program", words, 200)?;
+    wait_until_gone(&daemon, &servant, "sleep 4716")?;
     // Nobody has more than so many, and the policy can take it away from a running one.
     let server = format!("http://{}", daemon.address);
     let mut sleepers = Vec::new();

@@ -3,6 +3,7 @@
 use std::io::{BufRead, IsTerminal, Write, stderr, stdin};
 
 use anyhow::Context;
+use foreign::terminal;
 
 /// Longest answer that is read, in bytes.
 const LONGEST: u64 = 256;
@@ -28,7 +29,7 @@ pub async fn ask(question: String) -> anyhow::Result<bool> {
         return Ok(false);
     }
     let asking = tokio::task::spawn_blocking(move || -> std::io::Result<String> {
-        eprint!("{question} [y/N] ");
+        eprint!("{}", prompt(&question));
         stderr().flush()?;
         let mut answer = String::new();
         std::io::Read::take(stdin().lock(), LONGEST).read_line(&mut answer)?;
@@ -38,6 +39,11 @@ pub async fn ask(question: String) -> anyhow::Result<bool> {
     Ok(is_yes(&answer))
 }
 
+/// Returns a question as it is printed: without control sequences, since it names what the daemon sent.
+fn prompt(question: &str) -> String {
+    format!("{} [y/N] ", terminal::escape(question, false))
+}
+
 fn is_yes(answer: &str) -> bool {
     ["y", "yes"].contains(&answer.trim().to_lowercase().as_str())
 }
@@ -45,6 +51,12 @@ fn is_yes(answer: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_question_draws_nothing() {
+        let asked = prompt("remove \u{1b}[2Jadder\u{7} with 1 revision?");
+        assert!(!asked.contains(char::is_control) && asked.ends_with("with 1 revision? [y/N] "), "{asked:?}");
+    }
 
     #[test]
     fn only_yes_is_yes() {

@@ -17,8 +17,10 @@ pub fn to_own_words(mut words: Vec<OsString>) -> Vec<OsString> {
         let spelling = spellings.find(|(verbs, things, _)| is_one_of(&pair[0], verbs) && is_one_of(&pair[1], things));
         spelling.map(|(_, _, verb)| (at, *verb))
     });
-    // Only options may stand before a verb: in `push --name get services` these are no verb.
-    let is_verb = |at: usize| at == 1 || words[1].as_encoded_bytes().starts_with(b"-");
+    // Only options and their values may stand before a verb: in `push --name get services` these are no verb, nor are
+    // they in `-q exec SERVANT -- get services`, where they are another program's.
+    let is_option = |at: usize| words[at].as_encoded_bytes().starts_with(b"-") && words[at] != "--";
+    let is_verb = |at: usize| (1..at).all(|before| is_option(before) || is_option(before - 1));
     if let Some((at, verb)) = found.filter(|(at, _)| is_verb(*at)) {
         words.splice(at..at + 2, [OsString::from(verb)]);
     }
@@ -45,6 +47,8 @@ mod tests {
             ("ctl delete servant adder-1", "ctl stop adder-1"),
             ("ctl get", "ctl get"),
             ("ctl push --name get services", "ctl push --name get services"),
+            ("ctl --server s push --name get services", "ctl --server s push --name get services"),
+            ("ctl -o json exec s-1 -- delete service x", "ctl -o json exec s-1 -- delete service x"),
             ("ctl", "ctl"),
         ] {
             let words = line.split(' ').map(OsString::from).collect();

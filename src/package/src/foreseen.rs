@@ -16,6 +16,7 @@ use ros::bus::RosVersion;
 use rustix::fs::FileType;
 
 use crate::workspace::{Package, Workspace};
+use executables::BuildFileScan;
 
 pub use problems::{SourceProblem, find_problems, has_no_programs};
 
@@ -61,8 +62,8 @@ pub fn lacks_launch_file(workspace: &Workspace, launch: &str, version: RosVersio
         return false;
     };
     let lacks = |package: &Package| {
-        let text = executables::scan_package(&workspace.root, package, version).text;
-        if text.contains("configure_file") || text.contains(name) {
+        let BuildFileScan { text, is_cut, .. } = executables::scan_package(&workspace.root, package, version);
+        if is_cut || text.contains("configure_file") || text.contains(name) {
             return false;
         }
         let mut found = false;
@@ -98,6 +99,9 @@ impl SourceScan {
             self.may_launch_more = true;
             return;
         };
+        // Looked up for each file: a build file may list any number.
+        let [directories, files] =
+            [directories, files].map(|names| names.iter().map(Path::new).collect::<BTreeSet<&Path>>());
         let walked = foreign::walk(&directory, |entry| {
             if entry.kind() == FileType::Directory {
                 return Ok(Visit::Into);
@@ -109,8 +113,7 @@ impl SourceScan {
                     RosVersion::One => name.ends_with(".launch") && scripts::is_shared(path),
                     RosVersion::Two => {
                         LAUNCH_OF_TWO.iter().any(|end| name.ends_with(end))
-                            && (directories.iter().any(|directory| path.starts_with(directory))
-                                || files.iter().any(|file| path == Path::new(file)))
+                            && (files.contains(path) || path.ancestors().any(|above| directories.contains(above)))
                     }
                 };
             if is_installed {

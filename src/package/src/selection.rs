@@ -6,7 +6,7 @@
 
 mod mentions;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use foreign::Visit;
 use ros::bus::RosVersion;
@@ -131,10 +131,7 @@ fn select_by_what_runs(
     if packages.len() < 2 {
         return None;
     }
-    let mut roots = BTreeSet::new();
-    for node in query.nodes {
-        roots.extend(packages_of_node(workspace, node, version)?);
-    }
+    let mut roots = packages_of_nodes(workspace, query.nodes, version)?;
     if let Some(launch) = query.launch {
         roots.extend(packages_of_launch_file(workspace, launch)?);
     }
@@ -157,22 +154,50 @@ fn select_by_what_runs(
     }
 }
 
-/// Returns the packages that may be meant by a node: none for a package outside of the workspace, `None` if it is
-/// unknown.
-fn packages_of_node(workspace: &Workspace, node: &str, version: RosVersion) -> Option<Vec<usize>> {
-    let program = node.split_whitespace().next()?;
+/// Returns the packages that may be meant by nodes: none for a package outside of the workspace, `None` if one is
+/// unknown. Each package is read once, however many nodes there are.
+fn packages_of_nodes(workspace: &Workspace, nodes: &[String], version: RosVersion) -> Option<BTreeSet<usize>> {
     let packages = &workspace.packages;
-    if let Some((package, _)) = program.split_once('/') {
-        let found = packages.iter().position(|other| other.manifest.name == package);
-        return Some(found.into_iter().collect());
+    let mut found = BTreeSet::new();
+    // Programs without a package, and whether one has them.
+    let mut programs: BTreeMap<&str, bool> = BTreeMap::new();
+    for node in nodes {
+        let program = node.split_whitespace().next()?;
+        match program.split_once('/') {
+            Some((package, _)) => found.extend(packages.iter().position(|other| other.manifest.name == package)),
+            None => {
+                programs.insert(program, false);
+            }
+        }
     }
-    let has_program = |package: &Package| {
-        foreseen::programs_of(workspace, package, version).contains(program)
-            || has_file(workspace, package, |path, _| path.ends_with(program))
+    if programs.is_empty() {
+        return Some(found);
+    }
+    for (index, package) in packages.iter().enumerate() {
+        let mut names = foreseen::programs_of(workspace, package, version);
+        names.extend(file_names(workspace, package, |name| programs.contains_key(name)));
+        for name in &names {
+            if let Some(is_there) = programs.get_mut(name.as_str()) {
+                *is_there = true;
+                found.insert(index);
+            }
+        }
+    }
+    programs.values().all(|is_there| *is_there).then_some(found)
+}
+
+/// Returns the wanted ones of the names of a package's files; none if they cannot all be read.
+fn file_names(workspace: &Workspace, package: &Package, is_wanted: impl Fn(&str) -> bool) -> BTreeSet<String> {
+    let Ok(directory) = workspace.root.join(&package.path).canonicalize() else {
+        return BTreeSet::new();
     };
-    let found = packages.iter().enumerate().filter(|(_, package)| has_program(package));
-    let found: Vec<usize> = found.map(|(index, _)| index).collect();
-    (!found.is_empty()).then_some(found)
+    let mut names = BTreeSet::new();
+    let walked = foreign::walk(&directory, |entry| {
+        let is_entry = entry.kind() != FileType::Directory && !entry.path.as_os_str().is_empty();
+        names.extend(entry.name().to_str().filter(|name| is_entry && is_wanted(name)).map(str::to_owned));
+        Ok::<_, foreign::Error>(Visit::Into)
+    });
+    if walked.is_ok() { names } else { BTreeSet::new() }
 }
 
 /// Returns the packages with a launch file of this name; `None` if there are none.

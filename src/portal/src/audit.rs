@@ -16,7 +16,8 @@ use tokio::sync::watch;
 use crate::caller::Caller;
 
 /// Maximum length of an object's text, since some contain names chosen by a client.
-const LONGEST: usize = 300;
+pub const LONGEST: usize = 300;
+
 /// Object of an action, set by the handler if the path does not name it.
 #[derive(Debug, Clone, Default)]
 pub struct AuditObject(Arc<OnceLock<String>>);

@@ -16,6 +16,7 @@ use axum::http::StatusCode;
 use axum::response::Response;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use servant::exec::ExecSession;
+use tokio::sync::oneshot;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::Role;
 use tracing::Instrument;
@@ -23,7 +24,7 @@ use tracing::Instrument;
 use crate::app::App;
 use crate::caller::Caller;
 use crate::errors::Error;
-use crate::{handshake, headers, robots};
+use crate::{audit, handshake, headers, robots};
 
 pub use request::ExecQuery;
 use session::ExecOutcome;
@@ -57,22 +58,33 @@ pub async fn open_exec(
     let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
         return Err(Error::BadRequest("this connection cannot become a WebSocket".to_owned()));
     };
-    let command = asked.describe();
-    let object = format!("servant {id} of robot {} at service {}: {command}", handle.robot, handle.service());
-    let started = container.exec(asked.spec(), asked.terminal_size()).await.map_err(|error| match error {
-        servant::Error::Ended { .. } => Error::NotRunning(id.clone()),
-        error => choreographer::Error::from(error).into(),
-    });
-    let status = match &started {
-        Ok(_) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
-        Err(error) => error.problem().status,
-    };
-    app.audit.record(&caller, AccessAction::Exec, "start a program", &object, status);
-    let program = started?;
+    let object =
+        format!("servant {id} of robot {} at service {}: {}", handle.robot, handle.service(), asked.describe());
     let span = handle.span(caller.connection_span().id());
     let service = handle.service().to_owned();
     let sessions = app.sessions.clone();
+    let (answer, answered) = oneshot::channel();
+    // A task of its own: a client that leaves while the program is started can neither keep that out of the audit log
+    // nor tear the request to the shim.
     let serving = async move {
+        let started = container.exec(asked.spec(), asked.terminal_size()).await.map_err(|error| match error {
+            servant::Error::Ended { .. } => Error::NotRunning(id),
+            error => choreographer::Error::from(error).into(),
+        });
+        let status = match &started {
+            Ok(_) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
+            Err(error) => error.problem().status,
+        };
+        app.audit.record(&caller, AccessAction::Exec, "start a program", &object, status);
+        let program = match started {
+            Ok(program) => program,
+            Err(error) => {
+                // The client may have left.
+                let _ = answer.send(Err(error));
+                return;
+            }
+        };
+        let _ = answer.send(Ok(()));
         let outcome = match upgrade.await {
             Ok(upgraded) => serve(&app, &caller, &service, upgraded, program).await,
             Err(error) => {
@@ -81,11 +93,18 @@ pub async fn open_exec(
             }
         };
         drop(slot);
-        let object = format!("{object}: {}", outcome.describe());
+        let object = describe_end(&object, &outcome.describe());
         app.audit.record(&caller, AccessAction::Exec, "end of a program", &object, StatusCode::OK.as_u16());
     };
     sessions.spawn(serving.instrument(span));
+    answered.await.unwrap_or(Err(Error::Internal("starting a program")))?;
     Ok(handshake::switch_protocols(accept, Some(api::exec::PROTOCOL)))
+}
+
+/// Adds its outcome to what is recorded of a program; the command is cut rather than the outcome.
+fn describe_end(object: &str, outcome: &str) -> String {
+    let room = audit::LONGEST.saturating_sub(outcome.chars().count() + 2);
+    format!("{}: {outcome}", object.chars().take(room).collect::<String>())
 }
 
 /// Serves a session for as long as the caller has the permission and the daemon runs.
@@ -119,4 +138,17 @@ fn check_whole_service(app: &App, caller: &Caller, service: &str) -> Result<(), 
         ConnectionAccess::Ended(reason) => reason,
     };
     Err(Error::Forbidden { what })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_command_does_not_hide_its_outcome() {
+        assert_eq!(describe_end("servant s: ls", "exit status 0"), "servant s: ls: exit status 0");
+        let long = describe_end(&"é".repeat(1000), "killed: this token was revoked");
+        assert_eq!(long.chars().count(), audit::LONGEST);
+        assert!(long.starts_with("éé") && long.ends_with("é: killed: this token was revoked"), "{long}");
+    }
 }

@@ -1,9 +1,11 @@
 //! `/api/v1/pushes`: pushes that run and those that ended lately, what they print, and their cancellation.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 
 use access::{AccessAction, AccessObject};
 use api::{NDJSON, PushEvent, PushState, PushStatus};
+use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
@@ -48,11 +50,12 @@ pub async fn output(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let push = find_push(&app, &caller, AccessAction::Logs, &number)?;
+    // A slow reader keeps events in memory for that long.
+    let place = app.live.acquire_slot(&caller)?;
     if let Some(running) = app.pusher.running_push(push.number) {
         if !which.follow {
-            return Ok(json_lines(futures_util::stream::iter(running.output())));
+            return Ok(stream_events(running.output(), place));
         }
-        let place = app.live.acquire_slot(&caller)?;
         let ending = caller.wait_for_end(&app, "");
         return Ok(follow_output(&running, place, ending));
     }
@@ -62,9 +65,19 @@ pub async fn output(
         let next = Some("push it again; what was built is kept".to_owned());
         let lost = push::Error::Failed { message: push.message.unwrap_or_default(), next, log: Vec::new() };
         let last = PushEvent::Error { problem: Error::from(lost).problem() };
-        return Ok(json_lines(futures_util::stream::iter([last])));
+        return Ok(stream_events(vec![last], place));
     }
-    Ok(([(header::CONTENT_TYPE, NDJSON)], stored).into_response())
+    let whole = futures_util::stream::iter([Ok::<_, Infallible>(stored)]).inspect(move |_| {
+        let _held = &place;
+    });
+    Ok(([(header::CONTENT_TYPE, NDJSON)], Body::from_stream(whole)).into_response())
+}
+
+/// Sends events, and holds `place` meanwhile.
+fn stream_events(events: Vec<PushEvent>, place: impl Send + 'static) -> Response {
+    json_lines(futures_util::stream::iter(events).inspect(move |_| {
+        let _held = &place;
+    }))
 }
 
 /// Cancels a running push. It ends, as its output tells, when nothing is left of it.

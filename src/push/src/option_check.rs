@@ -5,8 +5,10 @@ use package::names;
 
 use super::OptionsError;
 
-/// Maximum number of packages in an option, and of arguments of CMake; maximum length of an argument in bytes.
+/// Maximum number of packages in an option, of nodes (as in an exported service), and of arguments of CMake; maximum
+/// length of an argument in bytes.
 const MOST_PACKAGES: usize = 1000;
+const MOST_NODES: usize = 256;
 const MOST_ARGUMENTS: usize = 64;
 const LONGEST_ARGUMENT: usize = 1024;
 /// Variables of CMake that the server sets.
@@ -19,6 +21,9 @@ pub(super) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
     check_keys("launch argument", options.args.keys())?;
     check_packages("--packages-up-to", &options.packages_up_to)?;
     check_packages("--packages-skip", &options.packages_skip)?;
+    if options.nodes.len() > MOST_NODES {
+        return Err(OptionsError::TooMany { option: "--node", most: MOST_NODES });
+    }
     if options.cmake_args.len() > MOST_ARGUMENTS {
         return Err(OptionsError::TooMany { option: "--cmake-args", most: MOST_ARGUMENTS });
     }
@@ -91,6 +96,9 @@ mod tests {
             let refused = cmake(argument).expect_err(argument).to_string();
             assert!(refused.starts_with("--cmake-args "), "{refused}");
         }
+        let nodes = PushOptions { nodes: vec!["a".to_owned(); MOST_NODES + 1], ..PushOptions::default() };
+        let refused = check_options(&nodes).expect_err("too many").to_string();
+        assert_eq!(refused, "--node may be given at most 256 times");
         let skip = PushOptions { packages_skip: vec!["../x".to_owned()], ..PushOptions::default() };
         let refused = check_options(&skip).expect_err("no name").to_string();
         assert!(refused.starts_with("--packages-skip: \"../x\" is not a package name"), "{refused}");

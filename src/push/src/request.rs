@@ -1,12 +1,14 @@
 //! Life cycle of a push: a task that is started, bounded, cancelled as a whole, and reported on.
 
 use std::future::Future;
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use api::{Limits, PushEvent, PushOptions, PushStatus, Sla};
 use catalogue::names;
+use futures_util::FutureExt;
 use rootfs_builder::blocking;
 use store::NewEvent;
 use tokio::sync::mpsc;
@@ -48,7 +50,7 @@ impl Pusher {
         let span = tracing::error_span!(parent: None, "push", service = options.name, id);
         let started = Arc::clone(&running);
         let work = async move {
-            let outcome = pusher.run_and_record(&options, &by, archive, &running).await;
+            let outcome = catch_panic(pusher.run_and_record(&options, &by, archive, &running)).await;
             let failed = outcome.is_err();
             pusher.registry.end(&running, to_last_event(outcome));
             if failed && !pusher.cancel.is_cancelled() {
@@ -188,6 +190,12 @@ impl Pusher {
     }
 }
 
+/// Turns a panic into an error: a push without a last event would run forever for whoever follows or lists it.
+async fn catch_panic<T>(work: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
+    let outcome = AssertUnwindSafe(work).catch_unwind().await;
+    outcome.unwrap_or(Err(Error::Internal("running a push")))
+}
+
 /// Runs the work unless `over` resolves before it begins to publish.
 async fn run_until_revoked<T>(
     work: impl Future<Output = Result<T, Error>>,
@@ -258,6 +266,13 @@ mod tests {
             let outcome = run_until_revoked(work, ended, &publishing).await;
             assert_eq!(outcome.unwrap_or("nothing"), expected);
         }
+    }
+
+    #[tokio::test]
+    async fn a_push_that_panics_ends_with_an_error() {
+        let ended = catch_panic(async { panic!("a bug") }).await;
+        assert!(matches!(ended, Err::<(), _>(Error::Internal(_))), "{ended:?}");
+        assert!(matches!(catch_panic(async { Ok(7) }).await, Ok(7)));
     }
 
     #[test]

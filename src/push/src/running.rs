@@ -22,6 +22,8 @@ const KEPT: usize = 2 << 20;
 const EACH: usize = 64;
 /// Maximum size of the output that is stored when a push has ended, in bytes.
 const STORED: usize = 256 << 10;
+/// Maximum length of the reason of a failure in the list of pushes. The output has all of it.
+const LONGEST_MESSAGE: usize = 1000;
 
 /// A push that runs.
 pub struct RunningPush {
@@ -171,7 +173,9 @@ impl RunningPush {
         let (state, message) = match last {
             PushEvent::Done { .. } => (PushState::Published, None),
             PushEvent::Error { .. } if self.cancel.is_cancelled() => (PushState::Cancelled, None),
-            PushEvent::Error { problem } => (PushState::Failed, Some(problem.detail.clone())),
+            PushEvent::Error { problem } => {
+                (PushState::Failed, Some(problem.detail.chars().take(LONGEST_MESSAGE).collect()))
+            }
             _ => (PushState::Failed, None),
         };
         let output = self.output.lock();
@@ -397,6 +401,10 @@ mod tests {
         assert!(output.len() < STORED + 10_000, "{}", output.len());
         assert!(output.lines().all(|line| serde_json::from_str::<PushEvent>(line).is_ok()));
         assert_eq!((record.state, record.message.as_deref()), (PushState::Failed, Some("it broke")));
+        let detail = "é".repeat(1 << 20);
+        let long = PushEvent::Error { problem: api::Problem { detail, ..api::Problem::default() } };
+        let (record, _) = push.to_record(&long);
+        assert_eq!(record.message.map(|message| message.chars().count()), Some(LONGEST_MESSAGE));
     }
 
     #[test]

@@ -10,6 +10,9 @@ use super::Error;
 /// Name of the unpacked archive in the build directory.
 pub(super) const PUSHED: &str = "pushed";
 
+/// Maximum length of an error's message in bytes: it is stored, logged and listed, and names what the package names.
+const LONGEST: usize = 32 << 10;
+
 /// Converts a build event for the deployer; `None` for those about other pushes, which `forward_events` tells.
 pub(super) fn to_push_event(event: BuildEvent) -> Option<PushEvent> {
     match event {
@@ -34,9 +37,19 @@ pub(super) fn to_push_error(error: &rootfs_builder::Error, home: &Path, source: 
             let cause = cause.map_or_else(String::new, |cause| format!(": {cause}"));
             (format!("the build of {package} failed{cause}"), lines)
         }
-        error => (strip_build_paths(&error.to_string(), home, source), Vec::new()),
+        error => (shorten(strip_build_paths(&error.to_string(), home, source)), Vec::new()),
     };
     Error::Failed { message, next, log }
+}
+
+/// Cuts a text that is too long.
+fn shorten(mut text: String) -> String {
+    if text.len() > LONGEST {
+        let end = (0..=LONGEST).rev().find(|at| text.is_char_boundary(*at));
+        text.truncate(end.unwrap_or(0));
+        text.push('…');
+    }
+    text
 }
 
 /// Replaces paths of the build directory by the deployer's own name for what was pushed (`source`).
@@ -69,6 +82,16 @@ mod tests {
         assert_eq!(told(text, "../torn/"), "../torn/src/a/package.xml, line 4: malformed; see log");
         assert_eq!(told("there is no package.xml in /home/build/push-1/pushed", "."), "there is no package.xml in .");
         assert_eq!(told("nothing to fix", "x"), "nothing to fix");
+    }
+
+    #[test]
+    fn what_a_package_names_does_not_fill_the_database() {
+        let many = rootfs_builder::Error::BaseNotSetUp { base: "é".repeat(LONGEST) };
+        let Error::Failed { message, .. } = to_push_error(&many, Path::new("/home"), "x") else {
+            panic!("it failed");
+        };
+        assert!(message.starts_with("base éé") && message.ends_with("é…"), "{}", message.len());
+        assert!(message.len() <= LONGEST + '…'.len_utf8(), "{}", message.len());
     }
 
     #[test]

@@ -46,8 +46,9 @@ impl State {
         .map(|id| id as u64)
     }
 
-    /// Records the end of a push with its output, and forgets all but the `most` newest pushes, and those that began
-    /// before `since`.
+    /// Records the end of a push with its output. Of those that have ended, forgets the ones that began before `since`
+    /// and, beyond `most` in all, the oldest of whoever has most: nobody drives out the pushes of others by many of
+    /// their own. Those that have not ended stay until `since`, so that they can be found while they run.
     pub fn end_push(&self, ended: &PushRecord, output: &str, most: u32, since: Millis) -> Result<(), Error> {
         self.write(|connection| {
             connection
@@ -66,8 +67,9 @@ impl State {
                 ])?;
             connection
                 .prepare_cached(
-                    "DELETE FROM pushes WHERE id <> ?1 AND (began < ?2
-                     OR id NOT IN (SELECT id FROM pushes ORDER BY id DESC LIMIT ?3))",
+                    "DELETE FROM pushes WHERE id <> ?1 AND (began < ?2 OR ended IS NOT NULL AND id NOT IN
+                     (SELECT id FROM (SELECT id, row_number() OVER (PARTITION BY who ORDER BY id DESC) AS place
+                                      FROM pushes) ORDER BY place, id DESC LIMIT ?3))",
                 )?
                 .execute(params![ended.id as i64, since as i64, most])?;
             Ok(())
@@ -185,10 +187,36 @@ mod tests {
         assert_eq!(state.pushes().expect("read"), [last.clone(), all[2].clone()], "two were too old");
         assert_eq!(state.push_output(last.id).expect("read").as_deref(), Some("{}\n"));
         assert_eq!(state.push_output(all[0].id).expect("read"), None);
+        let earlier = PushRecord { ended: Some(600), state: PushState::Failed, ..all[2].clone() };
+        state.end_push(&earlier, "", 3, 0).expect("written");
+        assert_eq!(state.pushes().expect("read"), [last.clone(), earlier]);
         state.end_push(&last, "", 1, 0).expect("written");
         assert_eq!(state.pushes().expect("read"), std::slice::from_ref(&last));
         // Numbers are not used again.
         assert!(state.add_push(&push("./there", 600)).expect("written") > last.id);
+    }
+
+    #[test]
+    fn nobody_drives_out_the_pushes_of_others_or_one_that_runs() {
+        let (_directory, state) = state();
+        let add = |who: &str, ends: bool| {
+            let mut one = PushRecord { who: who.into(), ..push("./here", 100) };
+            one.id = state.add_push(&one).expect("written");
+            if ends {
+                let ended = PushRecord { ended: Some(200), state: PushState::Failed, ..one.clone() };
+                state.end_push(&ended, "{}\n", 3, 0).expect("written");
+            }
+            one.id
+        };
+        let running = add("bob", false);
+        let quiet = add("ada", true);
+        let busy: Vec<u64> = (0..5).map(|_| add("eve", true)).collect();
+        let kept: Vec<u64> = state.pushes().expect("read").into_iter().map(|one| one.id).collect();
+        assert_eq!(kept, [busy[4], quiet, running]);
+        // One that a killed daemon left goes with its age.
+        let last = PushRecord { id: busy[4], ended: Some(300), ..push("./here", 300) };
+        state.end_push(&last, "", 3, 150).expect("written");
+        assert_eq!(state.pushes().expect("read").len(), 1);
     }
 
     #[test]

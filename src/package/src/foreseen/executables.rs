@@ -16,7 +16,13 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Maximum depth of `add_subdirectory`, and maximum number of files read.
 const MAX_DEPTH: usize = 8;
 const MAX_FILES: usize = 200;
+/// Size in bytes of the build files of a package after which no further one is read.
+const MAX_TEXT: usize = 4 << 20;
 
+/// Maximum number of files of a directory `launch` that are looked for in a `setup.py`, and maximum size of that in
+/// bytes: for each file all of it is searched.
+const MAX_LAUNCH_FILES: usize = 100;
+const MAX_SETUP: usize = 64 << 10;
 /// Words in a build file that change where executables are installed, or whether they are built.
 const UNCLEAR: [&str; 3] = ["RUNTIME_OUTPUT_DIRECTORY", "OUTPUT_NAME", "EXCLUDE_FROM_ALL"];
 
@@ -43,6 +49,8 @@ pub(super) struct BuildFileScan {
     pub(super) text: String,
     /// True if launch files may be generated or renamed.
     pub(super) mentions_launch: bool,
+    /// True if there are more build files than are read, which may mention anything.
+    pub(super) is_cut: bool,
 }
 
 /// Scans the build files of a package.
@@ -98,12 +106,18 @@ impl BuildFileReader<'_> {
     /// certain to be executed.
     fn read_cmake_lists(&mut self, directory: &Path, depth: usize) -> bool {
         self.files += 1;
+        // A build file may add any directory again, its own included.
+        if self.files > MAX_FILES || self.shown.text.len() > MAX_TEXT {
+            self.is_unclear = true;
+            self.shown.is_cut = true;
+            return false;
+        }
         let path = self.root.join(directory).join("CMakeLists.txt");
         let text = read::read_text(self.root, &path, MAX_BYTES);
         let Ok(text) = text else {
             return false;
         };
-        if self.files > MAX_FILES || UNCLEAR.iter().any(|word| text.contains(word)) {
+        if UNCLEAR.iter().any(|word| text.contains(word)) {
             self.is_unclear = true;
         }
         let launch = match self.version {
@@ -243,9 +257,13 @@ impl BuildFileReader<'_> {
             Ok(DirectoryLookup::Directory(launch)) => launch.names().unwrap_or_default(),
             _ => Vec::new(),
         };
-        let names = names.iter().filter_map(|name| name.to_str());
-        let installed = names.filter(|name| installs_launch_file(&setup, name));
-        self.shown.launch_files.extend(installed.map(|name| format!("launch/{name}")));
+        if names.len() > MAX_LAUNCH_FILES || setup.len() > MAX_SETUP {
+            self.shown.mentions_launch = true;
+        } else {
+            let names = names.iter().filter_map(|name| name.to_str());
+            let installed = names.filter(|name| installs_launch_file(&setup, name));
+            self.shown.launch_files.extend(installed.map(|name| format!("launch/{name}")));
+        }
         self.shown.text = setup;
     }
 }

@@ -9,6 +9,8 @@ use crate::workspace::{Package, Workspace};
 
 /// Maximum size of a `setup.cfg` in bytes.
 const MAX_BYTES: u64 = 1 << 20;
+/// Maximum number of bytes in which names of scripts are searched, in all packages; further scripts are passed over.
+pub(super) const MAX_SEARCHED: usize = 1 << 30;
 /// Words of build files by which a package may have programs.
 const WAYS: [&str; 6] =
     ["add_executable", "PROGRAMS", "register_node", "ament_auto", "add_subdirectory", "install_python"];
@@ -70,12 +72,13 @@ pub enum SourceProblem {
 
 /// Returns the mistakes in a workspace, in the order of its packages. Unreadable files are ignored. Blocking.
 pub fn find_problems(workspace: &Workspace, version: RosVersion) -> Vec<SourceProblem> {
+    let mut left = MAX_SEARCHED;
     let all = workspace.packages.iter();
     all.flat_map(|package| {
         if package.manifest.build_type == "ament_python" {
             find_python_problem(workspace, package).into_iter().collect()
         } else {
-            find_forgotten_scripts(workspace, package, version)
+            find_forgotten_scripts(workspace, package, version, &mut left)
         }
     })
     // Beside other packages it may be a library for them.
@@ -93,7 +96,7 @@ pub fn has_no_programs(workspace: &Workspace, version: RosVersion) -> bool {
             return problem.is_some();
         }
         let scan = executables::scan_package(&workspace.root, package, version);
-        !scan.text.is_empty() && !WAYS.iter().any(|word| scan.text.contains(word))
+        !scan.is_cut && !scan.text.is_empty() && !WAYS.iter().any(|word| scan.text.contains(word))
     };
     version == RosVersion::Two && workspace.packages.iter().all(is_without) && mistakes > 0
 }
@@ -120,10 +123,16 @@ fn find_python_problem(workspace: &Workspace, package: &Package) -> Option<Sourc
         .then(|| SourceProblem::NoSetupCfg { package: name, programs: programs.join(", ") })
 }
 
-fn find_forgotten_scripts(workspace: &Workspace, package: &Package, version: RosVersion) -> Vec<SourceProblem> {
-    let BuildFileScan { mut text, .. } = executables::scan_package(&workspace.root, package, version);
+/// Returns the scripts that no build file installs; `left` bytes may be searched.
+pub(super) fn find_forgotten_scripts(
+    workspace: &Workspace,
+    package: &Package,
+    version: RosVersion,
+    left: &mut usize,
+) -> Vec<SourceProblem> {
+    let BuildFileScan { mut text, is_cut, .. } = executables::scan_package(&workspace.root, package, version);
     // Scripts may be listed by a pattern.
-    if text.is_empty() || text.contains("GLOB") {
+    if is_cut || text.is_empty() || text.contains("GLOB") {
         return Vec::new();
     }
     // catkin also installs the scripts of a setup.py.
@@ -132,6 +141,11 @@ fn find_forgotten_scripts(workspace: &Workspace, package: &Package, version: Ros
     let tree = foreign::Tree::open(&workspace.root);
     let found = scripts::find_scripts(&workspace.root.join(&package.path)).into_iter();
     let forgotten = found.filter(|script| {
+        // Each of the three searches below goes through the whole text.
+        let Some(rest) = left.checked_sub(3 * text.len()) else {
+            return false;
+        };
+        *left = rest;
         let directory = script.path.parent().and_then(|parent| parent.to_str()).unwrap_or_default();
         let is_named = script.name().is_some_and(|name| text.contains(name));
         // A whole directory may be installed, or files by a variable; at the top there is only the package's own.

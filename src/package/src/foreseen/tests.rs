@@ -307,3 +307,43 @@ fn of_ros_2_mistakes_that_leave_no_program_are_told() {
     let (problems, _) = place.problems(RosVersion::Two);
     assert!(problems[0].contains("add install(PROGRAMS scripts/b.py DESTINATION lib/${PROJECT_NAME})"), "{problems:?}");
 }
+
+#[test]
+fn a_build_file_that_adds_itself_is_read_a_bounded_number_of_times() {
+    let place = SourceFixture::new();
+    let adding = format!("catkin_package()\nadd_executable(a a.cpp)\n{}", "add_subdirectory(.)\n".repeat(1000));
+    place.package("looping", "catkin", &adding);
+    place.write("src/looping/scripts/wtf.py", "#!/usr/bin/env python\n");
+    let workspace = place.workspace(RosVersion::One);
+    let scan = executables::scan_package(&workspace.root, &workspace.packages[0], RosVersion::One);
+    assert!(scan.is_cut && scan.programs.is_empty());
+    // What was not read may mention anything.
+    assert!(!lacks_launch_file(&workspace, "any.launch", RosVersion::One));
+    assert_eq!(find_problems(&workspace, RosVersion::One), []);
+}
+
+#[test]
+fn names_of_scripts_are_searched_in_a_bounded_number_of_bytes() {
+    let place = ros1_package("");
+    let workspace = place.workspace(RosVersion::One);
+    let found = |mut left: usize| {
+        problems::find_forgotten_scripts(&workspace, &workspace.packages[0], RosVersion::One, &mut left).len()
+    };
+    assert_eq!((found(problems::MAX_SEARCHED), found(3)), (1, 0));
+}
+
+#[test]
+fn many_launch_files_are_not_searched_one_by_one() {
+    let scan = |count: usize| {
+        let place = SourceFixture::new();
+        let setup = "setup(data_files=[('share/p/launch', glob('launch/*.launch.py'))])";
+        place.package("p", "ament_python", "").write("src/p/setup.py", setup);
+        for number in 0..count {
+            place.write(&format!("src/p/launch/n{number}.launch.py"), "");
+        }
+        let scan = place.scan(RosVersion::Two);
+        (scan.launch_files.len(), scan.may_launch_more)
+    };
+    assert_eq!(scan(100).0, 100);
+    assert_eq!(scan(101), (0, true));
+}

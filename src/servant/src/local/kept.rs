@@ -37,7 +37,11 @@ fn keep_log_blocking(kept: &Path, directory: &Path, mut about: KeptLog) -> Resul
         bytes += fs::metadata(&to).map_or(0, |data| data.len());
     }
     about.bytes = Size(bytes);
-    launch::write_record(&target.join(ABOUT), &about)?;
+    if let Err(error) = launch::write_record(&target.join(ABOUT), &about) {
+        // Without its record it would count for no quota, and take the space that is missing.
+        let _ = remove_log(&target);
+        return Err(error);
+    }
     Ok(about)
 }
 
@@ -110,6 +114,17 @@ mod tests {
         remove_log(&kept.join("s-1")).expect("removed");
         remove_log(&kept.join("s-1")).expect("nothing to remove");
         assert_eq!(list_logs(&kept, &servants).expect("readable"), []);
+    }
+
+    #[test]
+    fn a_log_whose_record_cannot_be_written_takes_no_space() {
+        let home = tempfile::tempdir().expect("a directory");
+        let (kept, servant) = (home.path().join("ended"), home.path().join("servants/s-1"));
+        fs::create_dir_all(&servant).expect("made");
+        fs::write(servant.join("log.jsonl"), "new\n").expect("written");
+        fs::create_dir_all(kept.join("s-1/about.json/full")).expect("made");
+        keep_log_blocking(&kept, &servant, about("s-1")).expect_err("a directory is in the way");
+        assert!(!kept.join("s-1").exists());
     }
 
     #[test]
