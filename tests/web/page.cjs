@@ -299,7 +299,7 @@ const STEPS = {
     await visitor.sees('Interface found');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
     // The earlier ones are listed, and what they printed can be read.
-    await visitor.sees('Log of push');
+    await visitor.sees('of push 2');
     await visitor.judges('deploy');
     const answered = visitor.page.waitForResponse((answer) => answer.url().endsWith('/stubs/adder_py.tar.gz'));
     await visitor.clicks('Download the stub');

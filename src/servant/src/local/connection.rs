@@ -28,6 +28,8 @@ pub(super) struct ServantView {
     /// Host pid of init; 0 if unknown.
     init: AtomicI32,
     can_exec: AtomicBool,
+    /// True once the container has run, even if it has ended since.
+    has_run: AtomicBool,
     pub(super) events: broadcast::Sender<NodeEvent>,
     pub(super) nodes: watch::Sender<BTreeMap<String, NodeStatus>>,
     pub(super) enforced: watch::Sender<EnforcedLimits>,
@@ -49,6 +51,7 @@ impl Default for ServantView {
             state: watch::Sender::new(ContainerState::Creating),
             init: AtomicI32::new(0),
             can_exec: AtomicBool::new(false),
+            has_run: AtomicBool::new(false),
             events: broadcast::Sender::new(EVENTS),
             nodes: watch::Sender::default(),
             enforced: watch::Sender::default(),
@@ -107,7 +110,15 @@ impl ServantView {
         if let Some(pid) = told.init_pid {
             self.init.store(pid, Ordering::Release);
         }
+        if told.state == ContainerState::Running {
+            self.has_run.store(true, Ordering::Release);
+        }
         self.state.send_replace(told.state);
+    }
+
+    /// Returns whether the container has run, even if it has ended since.
+    pub(super) fn has_run(&self) -> bool {
+        self.has_run.load(Ordering::Acquire)
     }
 
     /// Returns the host pid of init.

@@ -104,6 +104,8 @@ pub(super) async fn wait_until_running(
     let reached = state.borrow().clone();
     match reached {
         ContainerState::Running => Ok(servant),
+        // Its node has done its work already, and it ends as it would have a moment later.
+        ContainerState::Stopped { .. } | ContainerState::Failed { .. } if servant.known.has_run() => Ok(servant),
         ContainerState::Creating => Err(ended()),
         ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
             Err(Error::Start { id: id.to_owned(), reason })
