@@ -223,15 +223,16 @@ pub fn a_shared_service_is_compared_at_one_robots_calls_and_goals() -> Verdict {
 fn compare_calls_and_goals(home: &str, more: &[&str]) -> Verdict {
     let daemon = world().setup(home).start()?;
     let arguments = [&["--node", "sharer"], more].concat();
-    let pushes = || {
-        let pushed = daemon.deployer().push("sharer_cpp", &arguments)?;
+    let pushes = |more: &[&str]| {
+        let pushed = daemon.deployer().push("sharer_cpp", &[&arguments, more].concat())?;
         pushed.expect_success()
     };
-    pushes()?;
+    pushes(&[])?;
     let mut robot = daemon.robot("sharer_cpp?robot=r1")?;
     let work = json!({"who": "r1", "seconds": 0.0});
     robot.call("/work", work)?;
-    pushes()?;
+    // Otherwise it would be unchanged.
+    pushes(&["--pids", "500"])?;
     let comparing = Comparison::start(&daemon, &["sharer_cpp", "2", "--requests", "3"])?;
     for number in 0..2 {
         let work = json!({"who": format!("r1 {number}"), "seconds": 0.05});
