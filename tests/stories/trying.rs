@@ -114,7 +114,7 @@ pub fn a_robot_is_explained() -> Verdict {
     for words in [
         "BLOCKS  /teller subscribes to /teller/say, which no node on the robot publishes",
         "remap it to the intended topic: /teller/say:=/THE/TOPIC",
-        "of teller_py (revision 1): ready, 1 connections",
+        "of teller_py (revision 1): ready, 1 connection",
         "/teller: link up, round trip ",
     ] {
         ensure!(screen.contains(words), "{words}: {screen}");
