@@ -39,7 +39,11 @@ fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
 
 /// Waits until the next node has registered and waits for its `2`.
 fn wait_until_registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
-    let mut node = models.accept()?.0;
+    models.set_nonblocking(true)?;
+    let mut node = support::wait_until("a node that fetches its model", || {
+        Ok(models.accept().map(|(node, _)| node).map_err(|error| error.to_string()))
+    })?;
+    node.set_nonblocking(false)?;
     node.write_all(b"1")?;
     let mut said = String::new();
     BufReader::new(node.try_clone()?).read_line(&mut said)?;

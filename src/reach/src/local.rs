@@ -76,10 +76,15 @@ impl Opener for LocalOpener {
         // Whoever looks inside first, this bus is not of that connection.
         let (looked_at, span) = (Arc::clone(servant), Span::current());
         let joined = ros::connect(options.ros, sockets, joining);
-        let (bus, recorded) = tokio::join!(joined, recorded);
+        // Nodes may look for a host as the first thing they do.
+        let relayed = async {
+            let recorded = recorded.await;
+            let relays = self.open_relays(&local, &recorded.egress).await;
+            (recorded, relays)
+        };
+        let (bus, (recorded, relays)) = tokio::join!(joined, relayed);
         let bus = bus?;
         let registry = Arc::clone(&recorded.registry);
-        let relays = self.open_relays(&local, &recorded.egress).await;
         let wanted = ComponentPlan::new(recorded.components.clone(), Arc::clone(&registry));
         let endings = ExitNotifier::start(servant.events(), Arc::clone(&bus));
         let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
