@@ -916,7 +916,7 @@ const STEPS = {
     await visitor.sees('cloudroidctl token create NAME --role operator');
     assert.deepStrictEqual(await visitor.pages(), ['Overview', 'Services', 'Robots and servants', 'Events']);
     await visitor.opensKnowing('#/services/adder_py', 'adder_py');
-    await visitor.sees('Revisions');
+    await visitor.sees('Last deploy');
     await visitor.sees('The table is empty');
     await visitor.offersNone(/revision|canary|Remove|Pair|Measure/);
     await visitor.judges('service-viewer');

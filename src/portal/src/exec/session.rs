@@ -74,11 +74,11 @@ pub async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     ending: impl Future<Output = String>,
 ) -> ExecOutcome {
     let ExecSession { input, output, error, mut end } = session;
-    let (mut sink, stream) = socket.split();
+    let (mut sink, mut stream) = socket.split();
     let liveness = Liveness::default();
     let outcome = tokio::select! {
         outcome = send_output(&mut sink, &output, error.as_ref(), &mut end, &liveness) => outcome,
-        () = receive_input(stream, input, &output, &liveness) => ExecOutcome::Left,
+        () = receive_input(&mut stream, input, &output, &liveness) => ExecOutcome::Left,
         reason = ending => ExecOutcome::Stopped(reason),
     };
     let (code, reason) = match &outcome {
@@ -88,13 +88,18 @@ pub async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     };
     let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
     // On an error the client is gone.
-    let _ = tokio::time::timeout(FAREWELL, sink.send(close)).await;
+    let told = tokio::time::timeout(FAREWELL, sink.send(close)).await;
+    if matches!(told, Ok(Ok(()))) && outcome != ExecOutcome::Left {
+        // A connection that is closed with unread input is reset, and with it goes what the client has not read yet.
+        let left = async { while let Some(Ok(_)) = stream.next().await {} };
+        let _ = tokio::time::timeout(FAREWELL, left).await;
+    }
     outcome
 }
 
 /// Passes on what the client sends; returns when it has left.
 async fn receive_input<S: AsyncRead + AsyncWrite + Unpin>(
-    mut stream: SplitStream<WebSocketStream<S>>,
+    stream: &mut SplitStream<WebSocketStream<S>>,
     input: ExecStream,
     terminal: &ExecStream,
     liveness: &Liveness,
