@@ -21,9 +21,10 @@ fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
     let port = models.local_addr()?.port();
     let config = format!("[allow]\negress = [\"127.0.0.1:{port}\"]\n");
     let daemon = world().setup(name).config(&config).start()?;
+    models.set_nonblocking(true)?;
     // During the push the node gets both at once.
     std::thread::scope(|scope| {
-        let serving = scope.spawn(|| models.accept()?.0.write_all(b"12"));
+        let serving = scope.spawn(|| anyhow::Ok(accept(&models)?.write_all(b"12")?));
         daemon
             .deployer()
             .push(
@@ -37,13 +38,18 @@ fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
     Ok((daemon, models))
 }
 
-/// Waits until the next node has registered and waits for its `2`.
-fn wait_until_registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
-    models.set_nonblocking(true)?;
-    let mut node = support::wait_until("a node that fetches its model", || {
+/// Waits for the connection of the next node.
+fn accept(models: &TcpListener) -> anyhow::Result<TcpStream> {
+    let node = support::wait_until("a node that fetches its model", || {
         Ok(models.accept().map(|(node, _)| node).map_err(|error| error.to_string()))
     })?;
     node.set_nonblocking(false)?;
+    Ok(node)
+}
+
+/// Waits until the next node has registered and waits for its `2`.
+fn wait_until_registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
+    let mut node = accept(models)?;
     node.write_all(b"1")?;
     let mut said = String::new();
     BufReader::new(node.try_clone()?).read_line(&mut said)?;

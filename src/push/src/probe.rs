@@ -146,8 +146,6 @@ async fn observe_interface(
     push: &PushOptions,
 ) -> Result<ProbeResult, Error> {
     let failed = |message: String| Error::Failed { message, next: None, log: Vec::new() };
-    let registry = Registry::with_definitions(built.flavour.ros.ros_version(), &built.inventory.definitions)
-        .map_err(|error| failed(format!("invalid message definition in the image: {error}")))?;
     let options = ProbeOptions {
         patience: pusher.options.probe,
         types: push.interface.as_deref().map(supplement::topic_types).unwrap_or_default(),
@@ -166,6 +164,9 @@ async fn observe_interface(
                 looked.map_err(|error| failed(format!("cannot reach the started image: {error}")))?
             }
         };
+        // Not before the way to granted hosts is open: nodes may look for one as the first thing they do.
+        let registry = Registry::with_definitions(built.flavour.ros.ros_version(), &built.inventory.definitions)
+            .map_err(|error| failed(format!("invalid message definition in the image: {error}")))?;
         rootfs_builder::probe::probe(
             &looked.bus,
             &registry,
