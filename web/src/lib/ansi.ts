@@ -18,8 +18,8 @@ const SIXTEEN: Colour[] = [
   [127, 127, 127], [255, 0, 0], [0, 255, 0], [255, 255, 0], [92, 92, 255], [255, 0, 255], [0, 255, 255], [255, 255, 255],
 ];
 /** `--ground` and `--ink` of app.css: light, dark. */
-const GROUND: [Colour, Colour] = [[244, 246, 248], [15, 19, 23]];
-const INK: [Colour, Colour] = [[27, 36, 48], [227, 232, 238]];
+const GROUND: [Colour, Colour] = [[244, 245, 248], [13, 17, 22]];
+const INK: [Colour, Colour] = [[22, 32, 43], [230, 235, 241]];
 /** Of WCAG 2, for text (AA). */
 const CONTRAST = 4.5;
 
