@@ -448,15 +448,15 @@ impl<T> IoContext<T> for io::Result<T> {
 mod tests {
     use super::*;
 
-    fn unresolved(key: &str) -> Unresolved {
+    fn new_unresolved(key: &str) -> Unresolved {
         Unresolved { key: key.to_owned(), wanted_by: vec!["a".into()], similar: Vec::new() }
     }
 
     #[test]
     fn all_that_is_missing_is_named_with_the_next_step() {
         let error = Error::Unresolved(vec![
-            Unresolved { wanted_by: vec!["a".into(), "b".into()], ..unresolved("warp") },
-            Unresolved { similar: vec!["libeigen3-dev".into()], ..unresolved("eigne") },
+            Unresolved { wanted_by: vec!["a".into(), "b".into()], ..new_unresolved("warp") },
+            Unresolved { similar: vec!["libeigen3-dev".into()], ..new_unresolved("eigne") },
         ]);
         let text = error.to_string();
         assert!(text.contains("warp (wanted by a, b)\n"), "{text}");

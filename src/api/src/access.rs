@@ -148,7 +148,7 @@ pub struct Audited {
     pub from: String,
     /// Policy action that the request was checked against.
     pub action: String,
-    /// What was done or tried, in words: of a request, as an order (`stop`, `begin a push`).
+    /// Words for what was done or tried: of a request, as an order (`stop`, `begin a push`).
     pub did: String,
     /// Object that the request acted on.
     pub object: String,

@@ -9,7 +9,7 @@ use crate::size::Size;
 /// Media type of an exported base, a tar archive of an OCI image layout.
 pub const BASE_ARCHIVE: &str = "application/x-tar";
 
-/// Whether the layers of a base are there.
+/// State of the layers of a base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -36,7 +36,7 @@ pub struct BaseSummary {
     pub distribution: String,
     /// Operating system and its release, such as `debian bookworm`.
     pub system: String,
-    /// Whether its layers are there.
+    /// State of its layers.
     pub state: BaseState,
     /// True if the toolchain is there, too, so that sources are compiled without setting it up first.
     pub toolchain: bool,

@@ -54,7 +54,7 @@ pub struct PushStatus {
 pub enum PushState {
     /// It runs, or waits for another push.
     Running,
-    /// Its revision is published.
+    /// The revision is published.
     Published,
     /// It failed, or the daemon ended before it did.
     Failed,

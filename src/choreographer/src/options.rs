@@ -58,13 +58,13 @@ pub struct Options {
     pub bridge: BridgeOptions,
     /// Limits on the memory held for clients and servants.
     pub memory: MemoryOptions,
-    /// Which logs of ended servants are kept.
+    /// Limits on the logs of ended servants.
     pub kept_logs: KeptLogOptions,
     /// Makes traces of robots' requests.
     pub tracer: Option<Arc<dyn RequestTracer>>,
 }
 
-/// Which logs of ended servants are kept.
+/// Limits on the logs of ended servants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct KeptLogOptions {
     /// Time for which a log is kept after the end of its servant; zero keeps none.

@@ -37,7 +37,7 @@ pub struct ExecArgs {
 /// The program ended with another exit status than 0.
 #[derive(Debug)]
 pub struct ProgramFailed {
-    /// Its exit status.
+    /// Exit status of the program.
     pub status: u8,
 }
 

@@ -31,7 +31,7 @@ pub struct LogsArgs {
     /// Number of recent lines of each servant (default: 10000).
     #[arg(short = 'n', long, value_name = "LINES")]
     tail: Option<usize>,
-    /// Of these, only lines since TIME: how long ago, such as 10m, or a time in UTC, such as 2026-11-30T07:00:00Z.
+    /// Print only lines since TIME: how long ago, such as 10m, or a time in UTC, such as 2026-11-30T07:00:00Z.
     #[arg(long, value_name = "TIME", value_parser = Moment::parse)]
     since: Option<Moment>,
     /// Print date and time (UTC) of each line, instead of the time of day.
@@ -213,7 +213,7 @@ mod tests {
         .expect("a servant")
     }
 
-    fn ended(servant: &str, service: &str, robot: &str) -> KeptLog {
+    fn new_kept_log(servant: &str, service: &str, robot: &str) -> KeptLog {
         KeptLog {
             servant: servant.into(),
             service: service.into(),
@@ -230,7 +230,7 @@ mod tests {
     #[test]
     fn a_name_is_a_servants_a_services_or_a_robots() {
         let now = [running("map-2", "map", "rover"), running("see-2", "see", "rover"), running("see-3", "see", "crab")];
-        let then = [ended("map-1", "map", "rover"), ended("old-1", "old", "ship")];
+        let then = [new_kept_log("map-1", "map", "rover"), new_kept_log("old-1", "old", "ship")];
         let current = |name: &str| find_current(name, &now, &then).map_err(|error| error.to_string());
         let ids = |ids: &[&str]| Ok(ids.iter().map(|id| (*id).to_owned()).collect::<Vec<_>>());
         assert_eq!(current("see-3"), ids(&["see-3"]));
@@ -247,10 +247,10 @@ mod tests {
     fn the_previous_one_is_the_last_that_ended() {
         let now = [running("map-3", "map", "rover")];
         let then = [
-            ended("map-2", "map", "crab"),
-            ended("see-2", "see", "rover"),
-            ended("map-1", "map", "rover"),
-            ended("see-1", "see", "rover"),
+            new_kept_log("map-2", "map", "crab"),
+            new_kept_log("see-2", "see", "rover"),
+            new_kept_log("map-1", "map", "rover"),
+            new_kept_log("see-1", "see", "rover"),
         ];
         let previous = |name: &str| find_previous(name, &now, &then).expect(name);
         assert_eq!(previous("map"), ["map-2"]);

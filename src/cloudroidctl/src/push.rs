@@ -237,7 +237,7 @@ impl PushArgs {
             Some(path) => Some(PushSource::open(path).await?),
             None => None,
         };
-        options.created = source.as_ref().and_then(PushSource::created);
+        options.created = source.as_ref().and_then(PushSource::find_creation_time);
         let query = serde_json::to_string(&options)?;
         let uri = format!("/api/v1/push?options={}", percent_encode(&query));
         if uri.len() > LONGEST_QUERY {
@@ -340,7 +340,7 @@ pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
 /// Message for a push that was stopped from here.
 const CANCELLED: &str = "cancelled; nothing was published";
 
-/// What is known of the push that is being sent.
+/// State of the push that is being sent.
 #[derive(Debug, Default)]
 struct SentPush {
     /// Number of the push; 0 while it is unknown.

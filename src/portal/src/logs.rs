@@ -33,7 +33,7 @@ pub struct LogQuery {
     follow: bool,
     /// Number of lines from the end of the log (default: 10000).
     tail: Option<usize>,
-    /// Of these lines, only those printed at this time or later, in milliseconds since 1970-01-01 UTC.
+    /// Earliest time: only lines printed at this time or later, in milliseconds since 1970-01-01 UTC.
     since: Option<u64>,
 }
 

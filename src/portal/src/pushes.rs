@@ -27,7 +27,7 @@ use crate::query::Query;
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub struct PushOutputQuery {
-    /// Whether to follow the output until the push has ended.
+    /// True to follow the output until the push has ended.
     #[serde(default)]
     follow: bool,
 }

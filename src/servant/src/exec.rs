@@ -36,7 +36,7 @@ pub struct ExecSpec {
     /// Variables added to the servant's environment.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,
-    /// Its standard streams are one terminal.
+    /// The standard streams are one terminal.
     #[serde(default)]
     pub terminal: bool,
 }
@@ -44,13 +44,13 @@ pub struct ExecSpec {
 /// A running program and this side's ends of its streams. Dropping it kills the program with all that it has started.
 #[derive(Debug)]
 pub struct ExecSession {
-    /// Its standard input; dropping all copies closes it. Of a terminal, what is typed.
+    /// Standard input; dropping all copies closes it. Of a terminal, what is typed.
     pub input: ExecStream,
-    /// Its standard output; of a terminal, what it shows.
+    /// Standard output; of a terminal, what it shows.
     pub output: ExecStream,
-    /// Its standard error, which a terminal does not tell from its output.
+    /// Standard error, which a terminal does not tell from its output.
     pub error: Option<ExecStream>,
-    /// Its end.
+    /// End of the program.
     pub end: ExecEnd,
 }
 

@@ -59,7 +59,7 @@ impl PushSource {
     /// Returns the time of the newest source in seconds since 1970, or `SOURCE_DATE_EPOCH`
     /// (<https://reproducible-builds.org/specs/source-date-epoch/>), which becomes the creation time of the image: what
     /// is sent has no times. `None` for an archive.
-    pub fn created(&self) -> Option<u64> {
+    pub fn find_creation_time(&self) -> Option<u64> {
         let PushSource::Directory(_, selection) = self else {
             return None;
         };

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, IsTerminal, Write};
 
-/// What becomes of an interrupted push.
+/// Answer to the question what becomes of an interrupted push.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InterruptAnswer {
     /// It is cancelled.

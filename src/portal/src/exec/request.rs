@@ -1,4 +1,4 @@
-//! What a request for an exec session asks for.
+//! Request for an exec session: program, environment and terminal.
 
 use std::collections::BTreeMap;
 

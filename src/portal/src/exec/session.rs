@@ -57,7 +57,7 @@ impl ExecOutcome {
 struct Liveness {
     /// A message has come since the last ping.
     is_heard: AtomicBool,
-    /// Its messages are not read, because the program does not read its input.
+    /// The client's messages are not read, because the program does not read its input.
     is_held: AtomicBool,
 }
 
