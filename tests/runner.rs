@@ -96,7 +96,7 @@ pub fn run(stories: Vec<RunnableStory>, alone: &[&str], limit: Duration) -> Exit
         eprintln!("no story is called {}; --list lists them", arguments.names.join(" or "));
         return ExitCode::FAILURE;
     }
-    if let Err(lack) = machine::prepare() {
+    if let Err(lack) = machine::prepare(stories.len()) {
         eprintln!("the stories cannot be told here: {lack}");
         support::world::end();
         return ExitCode::FAILURE;
@@ -208,8 +208,8 @@ fn run_once(story: &RunnableStory, attempt: usize) -> StoryOutcome {
             eprintln!("nothing is kept of {}: {error}", story.name);
         }
         // A killed daemon leaves servants behind, and the second run should not find anything of the first.
-        for home in telling.homes() {
-            if let Err(error) = claim::end_users(&home) {
+        for place in telling.homes().iter().chain(&telling.directories()) {
+            if let Err(error) = claim::end_users(place) {
                 eprintln!("{}: {error:#}", story.name);
             }
         }

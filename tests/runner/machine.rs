@@ -7,15 +7,17 @@ use nix::mount::{MsFlags, mount, umount};
 use support::world::{self, world};
 use support::{binaries, cable, claim, disk, procfs};
 
-/// Space in bytes that homes take in the directory for temporary files if there is no separate disk.
+/// Maximum space in bytes that homes take in the directory for temporary files if there is no separate disk.
 const ROOM: u64 = 12 << 30;
+/// Space in bytes that the homes of one story take at most.
+const ROOM_PER_STORY: u64 = 2 << 30;
 
-/// Checks the machine, cleans up after killed runs, and mounts a disk for this run. Must be called before this process
-/// has threads.
+/// Checks the machine, cleans up after killed runs, and mounts a disk for this run of so many stories. Must be called
+/// before this process has threads.
 ///
 /// # Errors
 /// If a requirement is not met: what is missing, and what to do.
-pub(super) fn prepare() -> Result<(), String> {
+pub(super) fn prepare(stories: usize) -> Result<(), String> {
     if !nix::unistd::geteuid().is_root() {
         return Err("servants are started by root: sudo make stories".to_owned());
     }
@@ -44,7 +46,7 @@ pub(super) fn prepare() -> Result<(), String> {
             "no disk of their own for the stories' homes, which then are on that of {} and take longer: {error:#}",
             place.display()
         );
-        check_room(place)?;
+        check_room(place, ROOM.min(ROOM_PER_STORY.saturating_mul(stories as u64)))?;
     }
     check_overlay(place)
 }
@@ -76,10 +78,10 @@ fn check_cgroups() -> Result<(), String> {
         .to_owned())
 }
 
-fn check_room(place: &Path) -> Result<(), String> {
+fn check_room(place: &Path, room: u64) -> Result<(), String> {
     let free = disk::free_bytes(place).map_err(|error| format!("{error:#}"))?;
-    if free < ROOM {
-        let (free, room) = (free >> 30, ROOM >> 30);
+    if free < room {
+        let (free, room) = (free >> 30, room >> 30);
         return Err(format!(
             "{} has {free} GB free, and homes take {room} GB: make room there, or name another place by TMPDIR",
             place.display()

@@ -13,7 +13,7 @@ const LONGEST: usize = 20;
 /// Maximum number of characters printed of an error.
 const REASON: usize = 2000;
 
-/// Maximum number of characters in the line about a flaky story.
+/// Maximum number of characters of each end of a reason in the line about a flaky story.
 const LINE: usize = 300;
 
 /// Result of a run.
@@ -83,9 +83,7 @@ impl RunReport {
             patience::busiest()
         );
         for (name, reason) in &self.flaky {
-            let words: Vec<&str> = reason.split_whitespace().collect();
-            let first: String = words.join(" ").chars().take(LINE).collect();
-            println!("FLAKY {name}: {first}");
+            println!("FLAKY {name}: {}", shorten_to_line(reason));
             println!("      kept below {}", evidence_directory(name, 1).display());
             note_flaky(name, reason);
         }
@@ -103,6 +101,18 @@ impl RunReport {
         }
         println!("{} passed, {} failed", self.told.len() - self.failed.len(), self.failed.len());
     }
+}
+
+/// Returns the begin and the end of a reason in one line: it begins with what was done, and ends with what a program said.
+fn shorten_to_line(reason: &str) -> String {
+    let words = reason.split_whitespace().collect::<Vec<&str>>().join(" ");
+    let length = words.chars().count();
+    if length <= 2 * LINE {
+        return words;
+    }
+    let begin: String = words.chars().take(LINE).collect();
+    let end: String = words.chars().skip(length - LINE).collect();
+    format!("{begin} […] {end}")
 }
 
 fn shorten(reason: &str) -> String {

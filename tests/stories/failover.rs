@@ -442,8 +442,9 @@ pub fn a_camera_faster_than_its_node_stops_nobody(ros: RosVersion) -> Verdict {
     }
     // The newest image is always answered.
     scene.wait_for_answer(scene.sent)?;
-    let answered = scene.answers.len();
-    ensure!(answered < pictures as usize / 2, "it answers {answered} of {pictures}: no story of a slow node");
+    // The camera of a slow machine is slow, too.
+    let left_out = (pictures as usize).saturating_sub(scene.answers.len());
+    ensure!(left_out >= 10, "{left_out} of {pictures} are left out: no story of a slow node");
     let stopped = scene.site.next_message_within(&mut commands, MOMENT)?;
     ensure!(stopped.is_none(), "{stopped:?}\n{}", scene.stub.output());
     scene.wait_for_link_value("late", 0.0)

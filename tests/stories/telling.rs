@@ -110,7 +110,7 @@ pub fn what_the_machine_lacks_is_said_in_a_line() -> Verdict {
     let outcome = rehearse_where(&place, &without_loop)?.expect_success()?;
     ensure!(outcome.stdout.contains("no disk of their own for the stories' homes"), "{}", outcome.output());
     let full = "mkdir full; mount -t tmpfs -o size=64M none full; TMPDIR=$PWD/full XDG_CACHE_HOME=$PWD/full \"$@\"";
-    rehearse_where(&place, full)?.expect_failure(&["GB free, and homes take 12 GB: make room there"])?;
+    rehearse_where(&place, full)?.expect_failure(&["GB free, and homes take 2 GB: make room there"])?;
     let on_overlay = format!(
         "{WITHOUT_LOOP}mkdir -p lower upper work over; mount -t overlay -o lowerdir=lower,upperdir=upper,workdir=work \
          none over; TMPDIR=$PWD/over \"$@\""
