@@ -128,13 +128,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a target; those of a message of which only parts are paired in its place.
-    fn list_targets(
-        &mut self,
-        root: &MessageType,
-        path: &mut Path,
-        pairs: &[(Path, Path)],
-        targets: &mut Vec<Target>,
-    ) {
+    fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], targets: &mut Vec<Target>) {
         if let Some((source, target)) = pairs.iter().find(|(_, target)| target == path) {
             targets.push(Target::Paired { source: source.clone(), target: target.clone() });
             return;
@@ -162,13 +156,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a source likewise.
-    fn list_sources(
-        &mut self,
-        root: &MessageType,
-        path: &mut Path,
-        pairs: &[(Path, Path)],
-        sources: &mut Vec<Source>,
-    ) {
+    fn list_sources(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], sources: &mut Vec<Source>) {
         let Some(slot) = Slot::at_path(root, path) else {
             return;
         };
@@ -333,7 +321,9 @@ impl Fills {
         for (index, target) in targets.iter().enumerate() {
             let mut pieces = Vec::new();
             let walked = match target {
-                Target::Alone(shape) => shape.walk(&mut cursor, &mut |width, bytes| add_piece(&mut pieces, width, bytes)),
+                Target::Alone(shape) => {
+                    shape.walk(&mut cursor, &mut |width, bytes| add_piece(&mut pieces, width, bytes))
+                }
                 Target::Paired { target, .. } => match Slot::at_path(message, target) {
                     Some(slot) => shapes.slot(&slot).skip(&mut cursor),
                     None => Ok(()),

@@ -21,6 +21,8 @@ pub(crate) struct Derivation<'a> {
     /// Definitions that win over derived ones.
     known: Option<&'a Registry>,
     to: RosVersion,
+    /// Returns the name of a message's twin.
+    name_of: &'a dyn Fn(&MessageType) -> String,
     /// The definitions collected so far.
     registry: Registry,
     /// Names of the types whose twins are in `registry`.
@@ -28,14 +30,23 @@ pub(crate) struct Derivation<'a> {
 }
 
 impl<'a> Derivation<'a> {
-    pub(crate) fn new(rules: &'a TranslationRules, known: Option<&'a Registry>, to: RosVersion) -> Derivation<'a> {
-        Derivation { rules, known, to, registry: Registry::for_version(to), done: HashSet::new() }
+    pub(crate) fn new(
+        rules: &'a TranslationRules,
+        known: Option<&'a Registry>,
+        to: RosVersion,
+        name_of: &'a dyn Fn(&MessageType) -> String,
+    ) -> Derivation<'a> {
+        Derivation { rules, known, to, name_of, registry: Registry::for_version(to), done: HashSet::new() }
     }
 
     /// Adds the twin of a message, called `twin`, with all messages in it.
     pub(crate) fn add_message(&mut self, original: &MessageType, twin: &str) -> Result<(), NoTwinReason> {
-        if !self.done.insert(original.name().to_owned()) || self.add_given(twin)? {
+        if !self.done.insert(original.name().to_owned()) {
             return Ok(());
+        }
+        if self.add_given(twin)? {
+            // It mentions the twins of most messages in it.
+            return original.fields().iter().try_for_each(|field| self.type_of(&Slot::from_field(field)).map(drop));
         }
         // What every system of a ROS version has.
         if self.registry.message(twin).is_ok() {
@@ -69,10 +80,7 @@ impl<'a> Derivation<'a> {
 
     /// Resolves what was collected. A definition that is given, not derived, may mention messages that the original
     /// does not have; those are given too.
-    pub(crate) fn resolve<T>(
-        &mut self,
-        find: impl Fn(&Registry) -> Result<T, SchemaError>,
-    ) -> Result<T, NoTwinReason> {
+    pub(crate) fn resolve<T>(&mut self, find: impl Fn(&Registry) -> Result<T, SchemaError>) -> Result<T, NoTwinReason> {
         for _ in 0..MAX_MENTIONED {
             match find(&self.registry) {
                 Err(SchemaError::Missing { name, needed_by }) => {
@@ -167,8 +175,7 @@ impl<'a> Derivation<'a> {
                 Some(Stamp::Time) => "time".to_owned(),
                 Some(Stamp::Duration) => "duration".to_owned(),
                 None => {
-                    let from = message.version();
-                    let twin = self.rules.message_name(message.name(), from);
+                    let twin = (self.name_of)(message);
                     self.add_message(message, &twin)?;
                     let TypeName { package, short, .. } = TypeName::parse(&twin);
                     format!("{package}/{short}")
@@ -254,7 +261,8 @@ mod tests {
             (RosVersion::One, "string", " a", None),
         ] {
             let found = constant_line(&constant(type_name, "Aa", value), to);
-            let expected = expected.map(|line| if to == RosVersion::Two { line.replace("Aa", "AA") } else { line.to_owned() });
+            let expected =
+                expected.map(|line| if to == RosVersion::Two { line.replace("Aa", "AA") } else { line.to_owned() });
             assert_eq!(found, expected, "{type_name} {value}");
         }
     }

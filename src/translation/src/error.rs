@@ -16,7 +16,7 @@ pub struct NoTwin {
     /// The ROS that the type belongs to.
     pub version: RosVersion,
     /// The problem.
-    pub reason: NoTwinReason,
+    pub reason: Box<NoTwinReason>,
 }
 
 /// Reasons for which a type has no twin. `one` names a message of ROS 1, `two` the message of ROS 2 that belongs to it.
@@ -38,21 +38,11 @@ pub enum NoTwinReason {
         only_in_two: Vec<String>,
     },
     /// The types of two fields are not converted into each other.
-    #[error("{one_field} of {one} is {one_type} in ROS 1, {two_field} of {two} is {two_type} in ROS 2; change one of them")]
-    FieldType {
-        /// Name of the message in ROS 1.
-        one: String,
-        /// Path of the field there.
-        one_field: String,
-        /// Type of the field there.
-        one_type: String,
-        /// Name of the message in ROS 2.
-        two: String,
-        /// Path of the field there.
-        two_field: String,
-        /// Type of the field there.
-        two_type: String,
-    },
+    #[error("{0}")]
+    FieldType(
+        /// The fields.
+        Box<UnlikeFields>,
+    ),
     /// A rule names a field that does not exist.
     #[error("{rule} names field {path:?}, which {name} does not have; correct the rule")]
     NoSuchField {
@@ -102,6 +92,24 @@ pub enum NoTwinReason {
         /// The problem.
         SchemaError,
     ),
+}
+
+/// Two fields that belong together and whose types are not converted into each other.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{one_field} of {one} is {one_type} in ROS 1, {two_field} of {two} is {two_type} in ROS 2; change one of them")]
+pub struct UnlikeFields {
+    /// Name of the message in ROS 1.
+    pub one: String,
+    /// Path of the field there.
+    pub one_field: String,
+    /// Type of the field there.
+    pub one_type: String,
+    /// Name of the message in ROS 2.
+    pub two: String,
+    /// Path of the field there.
+    pub two_field: String,
+    /// Type of the field there.
+    pub two_type: String,
 }
 
 /// Returns the other ROS version.

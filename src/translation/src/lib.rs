@@ -35,7 +35,7 @@ mod twins;
 #[cfg(test)]
 mod tests;
 
-pub use error::{NoTwin, NoTwinReason, TranslationError};
+pub use error::{NoTwin, NoTwinReason, TranslationError, UnlikeFields};
 pub use rules::{RuleError, TranslationRules};
 pub use translator::MessageTranslator;
 pub use twins::{ActionTwin, MessageTwin, ServiceTwin, TypeTranslations};

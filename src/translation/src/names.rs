@@ -74,9 +74,14 @@ mod tests {
 
     #[test]
     fn fields_are_lower_case_in_ros_2() {
-        for (name, expected) in
-            [("D", "d"), ("frameId", "frame_id"), ("frame_id", "frame_id"), ("a__B_", "a_b"), ("x2Y", "x2_y"), ("URL", "url")]
-        {
+        for (name, expected) in [
+            ("D", "d"),
+            ("frameId", "frame_id"),
+            ("frame_id", "frame_id"),
+            ("a__B_", "a_b"),
+            ("x2Y", "x2_y"),
+            ("URL", "url"),
+        ] {
             assert_eq!(lower_name(name), expected);
         }
     }

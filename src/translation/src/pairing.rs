@@ -9,7 +9,7 @@ use std::collections::HashMap;
 
 use ros_message::schema::{Arity, MessageType, Primitive};
 
-use crate::error::NoTwinReason;
+use crate::error::{NoTwinReason, UnlikeFields};
 use crate::number::Number;
 use crate::rules::{FieldRule, TranslationRules};
 use crate::shape::{Slot, SlotBase};
@@ -54,13 +54,15 @@ impl Pairings {
             let (Some(one_slot), Some(two_slot)) = slots else {
                 continue;
             };
-            let unlike = || NoTwinReason::FieldType {
-                one: one.name().to_owned(),
-                one_field: write_path(one, &pair.one),
-                one_type: one_slot.written(),
-                two: two.name().to_owned(),
-                two_field: write_path(two, &pair.two),
-                two_type: two_slot.written(),
+            let unlike = || {
+                NoTwinReason::FieldType(Box::new(UnlikeFields {
+                    one: one.name().to_owned(),
+                    one_field: write_path(one, &pair.one),
+                    one_type: one_slot.written(),
+                    two: two.name().to_owned(),
+                    two_field: write_path(two, &pair.two),
+                    two_type: two_slot.written(),
+                }))
             };
             match relate(&one_slot, &two_slot).ok_or_else(unlike)? {
                 Relation::Values => {}

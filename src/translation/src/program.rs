@@ -115,8 +115,7 @@ impl Run<'_> {
             }
             Action::Stamp(stamp) => {
                 let (seconds, nanoseconds) = (self.word()?, self.word()?);
-                let ([seconds, nanoseconds], saturated) =
-                    convert_stamp(*stamp, self.from, seconds, nanoseconds);
+                let ([seconds, nanoseconds], saturated) = convert_stamp(*stamp, self.from, seconds, nanoseconds);
                 self.saturated += u64::from(saturated);
                 let mut bytes = [0; 8];
                 bytes[..4].copy_from_slice(&seconds.to_le_bytes());
@@ -215,14 +214,7 @@ impl Run<'_> {
         }
     }
 
-    fn array(
-        &mut self,
-        from: Count,
-        to: Count,
-        min_size: usize,
-        element: &Action,
-        base: usize,
-    ) -> Result<(), Fault> {
+    fn array(&mut self, from: Count, to: Count, min_size: usize, element: &Action, base: usize) -> Result<(), Fault> {
         let found = take_count(&mut self.cursor, from, min_size)?;
         match to {
             Count::Fixed(expected) if found != expected => {

@@ -118,8 +118,10 @@ impl TranslationRules {
             }
             yaml::About::Message { one, two, fields, one_definition, two_definition } => {
                 add_fields(&one, &two, fields);
-                let definitions =
-                    [(RosVersion::One, &one_package, &one, one_definition), (RosVersion::Two, &two_package, &two, two_definition)];
+                let definitions = [
+                    (RosVersion::One, &one_package, &one, one_definition),
+                    (RosVersion::Two, &two_package, &two, two_definition),
+                ];
                 for (version, package, name, definition) in definitions {
                     let name = write_name(version, package, "msg", name);
                     if let Some(definition) = definition {
@@ -160,7 +162,8 @@ impl TranslationRules {
         let to = crate::error::other_version(from);
         if let Some((short, part)) = split_part(parsed).filter(|_| from == RosVersion::Two) {
             let owner = format!("{}/{}/{short}", parsed.package, parsed.kind);
-            let owner = if parsed.kind == "srv" { self.service_name(&owner, from) } else { self.action_name(&owner, from) };
+            let owner =
+                if parsed.kind == "srv" { self.service_name(&owner, from) } else { self.action_name(&owner, from) };
             return format!("{owner}{part}");
         }
         let key = (parsed.package.to_owned(), parsed.short.to_owned());

@@ -62,8 +62,7 @@ mod tests {
     fn durations_are_normalised_only_where_the_numbers_do_not_fit() {
         let (one, two) = (RosVersion::One, RosVersion::Two);
         let duration = |from, seconds: i32, nanoseconds: u32| {
-            let ([seconds, nanoseconds], saturated) =
-                convert_stamp(Stamp::Duration, from, seconds as u32, nanoseconds);
+            let ([seconds, nanoseconds], saturated) = convert_stamp(Stamp::Duration, from, seconds as u32, nanoseconds);
             (seconds as i32, nanoseconds, saturated)
         };
         assert_eq!(duration(one, -3, 7), (-3, 7, false));

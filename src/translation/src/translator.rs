@@ -15,8 +15,8 @@ use crate::fault::Fault;
 use crate::output::Output;
 use crate::program::{Program, Run};
 
-/// Bytes that a message may take beyond what is read and what its definition always has: headers, lengths, padding.
-const LITTLE: usize = 4 << 10;
+/// Bytes that any message may take: elements of an array may have long fields that only the twin has.
+const LITTLE: usize = 64 << 10;
 
 /// Translates serialized messages of one type into those of its twin. Share it by `Arc`.
 #[derive(Debug)]

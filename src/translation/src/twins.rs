@@ -94,7 +94,11 @@ impl<T> Kept<T> {
         }
         // Unlocked: two threads may find the same, and the first one's stays.
         let (version, name, _) = &key;
-        let found = find().map(Arc::new).map_err(|reason| NoTwin { name: name.clone(), version: *version, reason });
+        let found = find().map(Arc::new).map_err(|reason| NoTwin {
+            name: name.clone(),
+            version: *version,
+            reason: Box::new(reason),
+        });
         let mut kept = self.0.lock();
         if kept.len() >= MAX_KEPT {
             kept.clear();
@@ -180,6 +184,12 @@ impl TypeTranslations {
         }
     }
 
+    /// Returns the number of message types whose twins are kept.
+    #[cfg(test)]
+    pub(crate) fn kept_messages(&self) -> usize {
+        self.messages.0.lock().len()
+    }
+
     fn known(&self, version: RosVersion) -> Option<&Registry> {
         match version {
             RosVersion::One => self.known_one.as_deref(),
@@ -193,7 +203,8 @@ impl TypeTranslations {
         let twin = match self.find_known(to, |known| known.message(&name))? {
             Some(known) => known,
             None => {
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to);
+                let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
+                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
                 derivation.add_message(of, &name)?;
                 derivation.resolve(|registry| registry.message(&name))?
             }
@@ -210,7 +221,8 @@ impl TypeTranslations {
             None => {
                 let parts = [(&*of.request, "Request"), (&*of.response, "Response")];
                 let parts = parts.map(|(part, suffix)| (part, part_name(&name, to, suffix)));
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to);
+                let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
+                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
                 derivation.add_parts(&key_of(&name, "srv"), &parts)?;
                 derivation.resolve(|registry| registry.service(&name))?
             }
@@ -236,7 +248,8 @@ impl TypeTranslations {
             None => {
                 let parts = [(&*of.goal, "Goal"), (&*of.result, "Result"), (&*of.feedback, "Feedback")];
                 let parts = parts.map(|(part, suffix)| (part, part_name(&name, to, suffix)));
-                let mut derivation = Derivation::new(&self.rules, self.known(to), to);
+                let name_of = |message: &MessageType| self.message_name(message.name(), message.version());
+                let mut derivation = Derivation::new(&self.rules, self.known(to), to, &name_of);
                 derivation.add_parts(&key_of(&name, "action"), &parts)?;
                 derivation.resolve(|registry| registry.action(&name))?
             }

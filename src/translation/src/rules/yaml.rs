@@ -81,7 +81,12 @@ pub(super) enum About {
         one_definition: Option<String>,
         two_definition: Option<String>,
     },
-    Service { one: String, two: String, request: Option<Fields>, response: Option<Fields> },
+    Service {
+        one: String,
+        two: String,
+        request: Option<Fields>,
+        response: Option<Fields>,
+    },
 }
 
 #[derive(Debug, Deserialize)]
