@@ -1,6 +1,6 @@
 //! Compiles the pairs of two definitions to the programs that carry messages from one to the other.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use ros_message::RosVersion;
@@ -27,6 +27,9 @@ pub(crate) struct Compiler<'a> {
     targets: Shapes,
     programs: HashMap<(String, String), Arc<Program>>,
 }
+
+/// The fields of one side that are paired, with those of the other side.
+type ByPath<'p> = BTreeMap<&'p Path, &'p Path>;
 
 /// A field of the source, in order of serialization.
 struct Source {
@@ -67,29 +70,30 @@ impl<'a> Compiler<'a> {
     }
 
     fn compile(&mut self, source: &MessageType, target: &MessageType) -> Program {
-        let pairs: Vec<(Path, Path)> = match self.from {
-            RosVersion::One => self.pairings.get(source.name(), target.name()).iter().cloned(),
-            RosVersion::Two => self.pairings.get(target.name(), source.name()).iter().cloned(),
-        }
-        .map(|pair| match self.from {
-            RosVersion::One => (pair.one, pair.two),
-            RosVersion::Two => (pair.two, pair.one),
-        })
-        .collect();
-        let mut targets = Vec::new();
-        self.list_targets(target, &mut Path::new(), &pairs, &mut targets);
-        let mut sources = Vec::new();
-        self.list_sources(source, &mut Path::new(), &pairs, &mut sources);
-
-        let order: Vec<&Path> = targets
-            .iter()
-            .filter_map(|target| match target {
-                Target::Paired { source, .. } => Some(source),
-                Target::Alone(_) => None,
+        let pairs = match self.from {
+            RosVersion::One => self.pairings.get(source.name(), target.name()).iter(),
+            RosVersion::Two => self.pairings.get(target.name(), source.name()).iter(),
+        };
+        let pairs: Vec<(&Path, &Path)> = pairs
+            .map(|pair| match self.from {
+                RosVersion::One => (&pair.one, &pair.two),
+                RosVersion::Two => (&pair.two, &pair.one),
             })
             .collect();
-        let paired = sources.iter().filter(|source| source.is_paired).map(|source| &source.path);
-        let is_in_order = paired.eq(order);
+        let mut targets = Vec::new();
+        let by_target = pairs.iter().map(|(source, target)| (*target, *source)).collect();
+        self.list_targets(target, &mut Path::new(), &by_target, &mut targets);
+        let mut sources = Vec::new();
+        let by_source = pairs.iter().copied().collect();
+        self.list_sources(source, &mut Path::new(), &by_source, &mut sources);
+
+        let order = targets.iter().filter_map(|target| match target {
+            Target::Paired { source, .. } => Some(source),
+            Target::Alone(_) => None,
+        });
+        let paired = || sources.iter().filter(|source| source.is_paired).map(|source| &source.path);
+        let is_in_order = paired().eq(order);
+        let places: BTreeMap<&Path, usize> = paired().zip(0..).collect();
         let fills = Fills::new(target, &targets);
         let mut assembly = Assembly::default();
         let mut next_source = 0;
@@ -104,8 +108,7 @@ impl<'a> Compiler<'a> {
                         }
                         next_source += 1;
                     } else {
-                        let mut places = sources.iter().filter(|source| source.is_paired);
-                        let place = places.position(|source| source.path == *from).unwrap_or(0);
+                        let place = places.get(from).copied().unwrap_or_default();
                         assembly.push(Step::new(source, from, Action::Jump(place)));
                     }
                     let slots = (Slot::at_path(source, from), Slot::at_path(target, to));
@@ -129,19 +132,18 @@ impl<'a> Compiler<'a> {
 
     /// Lists the fields of a target; those of a message of which only parts are paired in its place.
     fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], targets: &mut Vec<Target>) {
-        if let Some((source, target)) = pairs.iter().find(|(_, target)| target == path) {
-            targets.push(Target::Paired { source: source.clone(), target: target.clone() });
+        if let Some(source) = pairs.get(path) {
+            targets.push(Target::Paired { source: (*source).clone(), target: path.clone() });
             return;
         }
         let Some(slot) = Slot::at_path(root, path) else {
             return;
         };
-        let has_parts = path.is_empty() || pairs.iter().any(|(_, target)| target.starts_with(path));
         let SlotBase::Message(message) = slot.base else {
             targets.push(Target::Alone(self.targets.slot(&slot)));
             return;
         };
-        if !has_parts {
+        if !has_parts(path, pairs) {
             targets.push(Target::Alone(self.targets.slot(&slot)));
             return;
         }
@@ -160,10 +162,9 @@ impl<'a> Compiler<'a> {
         let Some(slot) = Slot::at_path(root, path) else {
             return;
         };
-        let is_paired = pairs.iter().any(|(source, _)| source == path);
-        let has_parts = path.is_empty() || pairs.iter().any(|(source, _)| source.starts_with(path));
+        let is_paired = pairs.contains_key(path);
         match slot.base {
-            SlotBase::Message(message) if has_parts && !is_paired => {
+            SlotBase::Message(message) if !is_paired && has_parts(path, pairs) => {
                 for index in 0..message.fields().len() {
                     path.push(index);
                     self.list_sources(root, path, pairs, sources);
@@ -234,6 +235,11 @@ impl<'a> Compiler<'a> {
             }
         }
     }
+}
+
+/// Returns true for the message itself, and for a field of which parts are paired.
+fn has_parts(path: &Path, pairs: &ByPath<'_>) -> bool {
+    path.is_empty() || pairs.range(path..).next().is_some_and(|(next, _)| next.starts_with(path))
 }
 
 fn text_form(version: RosVersion, primitive: Primitive) -> TextForm {

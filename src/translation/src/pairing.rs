@@ -5,7 +5,7 @@
 //! same thing under two names, and the messages are no pair. A rule lists all pairs, and what it does not list is left
 //! out. This is how ros1_bridge decides too.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use ros_message::schema::{Arity, MessageType, Primitive};
 
@@ -140,30 +140,30 @@ pub(crate) fn stamp_of_message(message: &MessageType) -> Option<Stamp> {
 }
 
 fn pair_by_name(one: &MessageType, two: &MessageType) -> Result<Vec<Pair>, NoTwinReason> {
-    let mut found: Vec<Option<usize>> =
-        one.fields().iter().map(|field| two.fields().iter().position(|other| other.name == field.name)).collect();
+    let mut by_name: HashMap<&str, usize> = two.fields().iter().map(|field| &*field.name).zip(0..).collect();
+    let mut found: Vec<Option<usize>> = one.fields().iter().map(|field| by_name.remove(&*field.name)).collect();
+    // What nobody claims, capital letters and underscores aside.
     let plain = |name: &str| name.replace('_', "").to_ascii_lowercase();
-    // Only what no other field claims.
-    let left: Vec<usize> = (0..two.fields().len()).filter(|index| !found.contains(&Some(*index))).collect();
-    let mut left_by_name: HashMap<String, Vec<usize>> = HashMap::new();
-    for index in left {
-        left_by_name.entry(plain(&two.fields()[index].name)).or_default().push(index);
+    let mut left: HashMap<String, Vec<usize>> = HashMap::new();
+    for (name, index) in by_name {
+        left.entry(plain(name)).or_default().push(index);
     }
     let mut waiting: HashMap<String, Vec<usize>> = HashMap::new();
     for (index, _) in found.iter().enumerate().filter(|(_, other)| other.is_none()) {
         waiting.entry(plain(&one.fields()[index].name)).or_default().push(index);
     }
     for (name, indices) in waiting {
-        if let ([index], Some([other])) = (&indices[..], left_by_name.get(&name).map(Vec::as_slice)) {
+        if let ([index], Some([other])) = (&indices[..], left.get(&name).map(Vec::as_slice)) {
             found[*index] = Some(*other);
         }
     }
+    let taken: HashSet<usize> = found.iter().copied().flatten().collect();
     let names = |message: &MessageType, is_alone: &dyn Fn(usize) -> bool| -> Vec<String> {
         let fields = message.fields().iter().enumerate();
         fields.filter(|(index, _)| is_alone(*index)).map(|(_, field)| field.name.clone()).collect()
     };
     let only_in_one = names(one, &|index| found[index].is_none());
-    let only_in_two = names(two, &|index| !found.contains(&Some(index)));
+    let only_in_two = names(two, &|index| !taken.contains(&index));
     if !only_in_one.is_empty() && !only_in_two.is_empty() {
         let (one, two) = (one.name().to_owned(), two.name().to_owned());
         return Err(NoTwinReason::Fields { one, two, only_in_one, only_in_two });
