@@ -91,7 +91,7 @@ pub const DECODERS: &[Decoder] = &[
     decoder("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
     decoder("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
     decoder("ros2_definition", definition_2, 64, 64 << 10).with_repeats(DEFINITIONS),
-    decoder("translation_bytes", carry, 48, 128 << 10),
+    decoder("translation_bytes", carry, 48, 256 << 10),
     decoder("rtps_datagram", datagram, 4, LITTLE),
     decoder("rtps_discovery", discovery, 4, LITTLE),
     decoder("codec_zlib", decode_packed, 8, CODEC),

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ros_message::RosVersion::{One, Two};
+use ros_message::codec::CodecErrorKind;
 use ros_message::schema::Base;
 
 use super::property::{Choices, random_message};
@@ -77,7 +78,11 @@ fn check(
         assert_eq!(to_twin.translate(&big).unwrap(), carried, "{original:?}, round {round}");
 
         let bytes = random_message(twin, false, &mut Choices::new(&choices));
-        let carried = from_twin.translate(&bytes).unwrap();
+        let carried = match from_twin.translate(&bytes) {
+            // ROS 1 has no bounds.
+            Err(error) if matches!(error.kind, CodecErrorKind::TooMany { .. }) => continue,
+            carried => carried.unwrap(),
+        };
         ros_message::codec::validate(original, &carried).unwrap();
         if !original.name().ends_with("/Log") {
             assert_eq!(to_twin.translate(&carried).unwrap(), bytes, "{twin:?}, round {round}");

@@ -268,7 +268,7 @@ proptest! {
             prop_assert!(valid || carried.is_err());
             if let Ok(carried) = carried {
                 ros_message::codec::validate(&pair.twin, &carried).unwrap();
-                prop_assert!(carried.len() <= 16 * bytes.len() + 2 * pair.twin.min_size() + (64 << 10) + 4);
+                prop_assert!(carried.len() <= 16 * bytes.len() + 2 * pair.twin.min_size() + (66 << 10));
                 prop_assert!(pair.from_twin.translate(&carried).is_ok() || version == Two);
             }
         }
