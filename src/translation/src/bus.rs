@@ -5,13 +5,16 @@
 //!  robot's ROS              TranslatedBus                 servant's ROS
 //!  twins of types ── graph, messages, calls, loans ── types of its nodes
 //! ```
-//! What has no twin is left out of the graph, and [`TranslatedBus::left_out`] says why. A message that cannot be carried
-//! is dropped and counted; the [`TranslationObserver`] is told of the first one of each topic. A service that fails in
-//! ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response.
+//! What has no twin is left out of the graph, and [`TranslatedBus::left_out`] says why. A message that cannot be
+//! carried is dropped and counted; the [`TranslationObserver`] is told of the first one of each topic. A service that
+//! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response.
 
 mod graph;
 mod lending;
 mod losses;
+#[cfg(test)]
+#[path = "../../../tests/support/memory_bus.rs"]
+mod memory_bus;
 mod services;
 mod state;
 #[cfg(test)]
@@ -42,7 +45,7 @@ pub use losses::{TranslationLosses, TranslationObserver};
 use state::Translation;
 use state::not_translated;
 pub use state::{LeftOut, LeftOutEntry, TranslatedBus};
-use twins::KnownTwins;
+use twins::{KnownTwins, Untranslatable};
 
 impl TranslatedBus {
     /// Creates the bus that robots of the other ROS see in place of `inner`. `registry` has the definitions of the
@@ -88,6 +91,25 @@ impl TranslatedBus {
     pub fn service(&self, of: &ServiceType) -> Option<Arc<ServiceDef>> {
         let twin = self.translation.twins.service_with_twin(of)?;
         Some(Arc::clone(&twin.twin))
+    }
+
+    /// Returns why messages of the servant's type of this name cannot be carried; `None` if they can.
+    pub fn message_problem(&self, type_name: &str) -> Option<String> {
+        let of = WireType::with_name(type_name).with_version(self.translation.servant_version());
+        let twin = self.translation.twins.message(&of);
+        twin.err().map(|reason| reason.to_string())
+    }
+
+    /// Returns why calls of the servant's service type of this name cannot be carried; `None` if they can.
+    pub fn service_problem(&self, type_name: &str) -> Option<String> {
+        let of = ServiceType::new(type_name, Digest::any()).with_version(self.translation.servant_version());
+        let twin = self.translation.twins.service(&of);
+        twin.err().map(|reason| reason.to_string())
+    }
+
+    /// Returns why goals of the servant's action type of this name cannot be carried; `None` if they can.
+    pub fn action_problem(&self, _type_name: &str) -> Option<String> {
+        Some(Untranslatable::Action.to_string())
     }
 
     /// Returns a service of the robot as the servant's nodes see it.

@@ -165,7 +165,7 @@ async fn parameters_that_are_set_before_there_is_a_link_are_paid_for() {
     let budget = Budget::new("servant s1", 1 << 20);
     let options = HubOptions { budget: budget.clone(), ..HubOptions::default() };
     let (hub, _nodes) = hub_with(options).await;
-    let parameters = &hub.parameters;
+    let parameters = &hub.own_view.parameters;
     let text = || Some(ParamValue::String("x".repeat(10_000)));
     for _ in 0..1000 {
         parameters.report_change(&hub, "/again".into(), text());
