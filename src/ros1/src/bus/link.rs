@@ -144,7 +144,7 @@ pub(super) struct PublisherConnection {
     stream: TcpStream,
     frames: FrameReader,
     publisher: PeerId,
-    latching: bool,
+    pub(super) latching: bool,
     pub(super) wire_type: WireType,
 }
 
