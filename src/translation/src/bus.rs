@@ -60,7 +60,7 @@ impl TranslatedBus {
         let translation = Arc::new(Translation {
             inner,
             version,
-            twins: KnownTwins::new(registry, types),
+            twins: KnownTwins::new(registry, types, version),
             losses: LossCounters::new(observer),
             called: Mutex::default(),
         });

@@ -345,7 +345,7 @@ async fn what_cannot_be_carried_is_left_out_or_dropped_with_a_reason() {
 #[test]
 fn a_process_of_ros_2_is_one_node_of_ros_1() {
     let types = Arc::new(TypeTranslations::new(TranslationRules::default()));
-    let twins = KnownTwins::new(definitions(RosVersion::Two), types);
+    let twins = KnownTwins::new(definitions(RosVersion::Two), types, RosVersion::One);
     let topic = |publishers: &[&str], name: &str| ros::bus::TopicNodes {
         type_name: name.to_owned(),
         publishers: publishers.iter().map(ToString::to_string).collect(),
@@ -386,7 +386,7 @@ fn a_process_of_ros_2_is_one_node_of_ros_1() {
 #[test]
 fn names_that_ros_2_does_not_allow_are_named() {
     let types = Arc::new(TypeTranslations::new(TranslationRules::default()));
-    let twins = KnownTwins::new(definitions(RosVersion::One), types);
+    let twins = KnownTwins::new(definitions(RosVersion::One), types, RosVersion::Two);
     let ends = ros::bus::TopicNodes {
         type_name: "std_msgs/String".to_owned(),
         subscribers: vec!["/see".to_owned()],

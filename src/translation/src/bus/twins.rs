@@ -1,16 +1,18 @@
 //! The twins of the types that a servant's nodes use.
 
 use std::collections::HashMap;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Digest, ServiceType, WireType};
+use ros::bus::{Digest, RosVersion, ServiceType, WireType};
 use ros::schema::{MessageType, Registry, SchemaError};
 
 use crate::{MessageTranslator, MessageTwin, NoTwin, ServiceTwin, TypeTranslations};
 
 /// Maximum number of types remembered; beyond it they are found anew.
 const MOST: usize = 4096;
+/// Maximum number of definitions of one name that are remembered.
+const MOST_OF_NAME: usize = 8;
 
 /// Why something of a servant's bus is not shown to a robot of the other ROS.
 #[derive(Debug, thiserror::Error)]
@@ -43,8 +45,8 @@ pub(super) struct KnownTwins {
     types: Arc<TypeTranslations>,
     messages: Mutex<HashMap<String, Vec<Arc<MessageTwin>>>>,
     services: Mutex<HashMap<String, Vec<Arc<ServiceTwin>>>>,
-    /// The image's own services.
-    of_image: OnceLock<Vec<Arc<ServiceTwin>>>,
+    /// ROS version of the twins.
+    version: RosVersion,
 }
 
 /// Adds a twin under its name, unless it is known.
@@ -57,15 +59,26 @@ fn remember<T>(known: &Mutex<HashMap<String, Vec<Arc<T>>>>, name: &str, twin: &A
     if of_name.iter().any(|it| Arc::ptr_eq(it, twin)) {
         return;
     }
-    if of_name.len() >= MOST {
-        of_name.clear();
+    if of_name.len() >= MOST_OF_NAME {
+        of_name.remove(0);
     }
     of_name.push(Arc::clone(twin));
 }
 
+/// Finds a twin of this name.
+fn find_known<T>(
+    known: &Mutex<HashMap<String, Vec<Arc<T>>>>,
+    name: &str,
+    is_it: impl Fn(&Arc<T>) -> bool,
+) -> Option<Arc<T>> {
+    let known = known.lock();
+    known.get(name)?.iter().find(|it| is_it(it)).cloned()
+}
+
 impl KnownTwins {
-    pub(super) fn new(registry: Arc<Registry>, types: Arc<TypeTranslations>) -> Self {
-        Self { registry, types, messages: Mutex::default(), services: Mutex::default(), of_image: OnceLock::new() }
+    /// Creates the twins, of ROS `version`, of the types of an image with the definitions of `registry`.
+    pub(super) fn new(registry: Arc<Registry>, types: Arc<TypeTranslations>, version: RosVersion) -> Self {
+        Self { registry, types, messages: Mutex::default(), services: Mutex::default(), version }
     }
 
     /// Returns the twin of a type of the servant's nodes. The definition is the image's if that is the same type,
@@ -93,26 +106,25 @@ impl KnownTwins {
         Ok(twin)
     }
 
-    /// Returns the known type whose twin has this name and digest.
+    /// Returns the type whose twin has this name and digest, among those that nodes use and those of the image.
     pub(super) fn message_with_twin(&self, twin: &WireType) -> Option<Arc<MessageTwin>> {
-        let messages = self.messages.lock();
-        let mut of_name = messages.get(&twin.name)?.iter();
-        let found = of_name.find(|it| twin.digest.is_compatible_with(&Digest::from(it.twin.digest())));
-        found.cloned()
+        let is_it = |it: &Arc<MessageTwin>| twin.digest.is_compatible_with(&Digest::from(it.twin.digest()));
+        let known = find_known(&self.messages, &twin.name, is_it);
+        known.or_else(|| {
+            let name = self.types.message_name(&twin.name, self.version);
+            let found = self.types.message(&self.registry.message(&name).ok()?).ok()?;
+            (found.twin.name() == twin.name && is_it(&found)).then_some(found)
+        })
     }
 
-    /// Returns the service whose twin is compatible with this type: a known one, otherwise one of the image.
+    /// Returns the service whose twin is compatible with this type, likewise.
     pub(super) fn service_with_twin(&self, twin: &ServiceType) -> Option<Arc<ServiceTwin>> {
-        let is_it = |it: &&Arc<ServiceTwin>| twin.matches(&ServiceType::from_service(&it.twin));
-        let known = self.services.lock().get(&twin.name).and_then(|of_name| of_name.iter().find(is_it).cloned());
-        known.or_else(|| self.services_of_image().iter().find(is_it).cloned())
-    }
-
-    fn services_of_image(&self) -> &[Arc<ServiceTwin>] {
-        self.of_image.get_or_init(|| {
-            let keys = self.registry.keys().into_iter().filter(|key| key.contains("/srv/"));
-            let found = keys.filter_map(|key| self.registry.service(&key).ok());
-            found.filter_map(|service| self.types.service(&service).ok()).collect()
+        let is_it = |it: &Arc<ServiceTwin>| twin.matches(&ServiceType::from_service(&it.twin));
+        let known = find_known(&self.services, &twin.name, is_it);
+        known.or_else(|| {
+            let name = self.types.service_name(&twin.name, self.version);
+            let found = self.types.service(&self.registry.service(&name).ok()?).ok()?;
+            is_it(&found).then_some(found)
         })
     }
 
