@@ -21,12 +21,13 @@ use super::{LinkStatus, mirror, seen};
 use crate::FlowCounts;
 use link::clock::ClockSample;
 use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint};
-use link::drops::{DropCounters, DropReporter, TopicDropCount};
+use link::drops::{Cause, DropCounters, DropReporter, TopicDropCount};
 use link::record::{ReceivedCall, Record};
 use link::session::{CloudSession, SessionHandler, SessionOptions};
 use link::skew::Direction;
 use ros::bus::{BusError, FailureReason};
 use ros::ros2::names;
+use translation::bus::TranslatedBus;
 
 /// Maximum number of topics opened concurrently, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
@@ -174,6 +175,13 @@ impl NodeLink {
     fn local_drops(&self) -> Vec<TopicDropCount> {
         let mut all = self.session.drops();
         all.extend(self.drops.snapshot());
+        let losses = self.view.translated().map(TranslatedBus::losses).unwrap_or_default();
+        let lost = losses.into_iter().filter(|loss| loss.untranslated > 0 && self.has(&loss.name));
+        all.extend(lost.map(|loss| TopicDropCount {
+            topic: loss.name,
+            cause: Cause::Untranslated,
+            count: loss.untranslated,
+        }));
         all
     }
 

@@ -70,7 +70,7 @@ impl TranslationObserver for LossNotifier {
         let Some(hub) = self.hub.upgrade() else {
             return;
         };
-        tracing::warn!(parent: &hub.log_span, name, "{text}");
+        tracing::warn!(parent: &hub.log_span, what = name, "{text}");
         let links: Vec<_> = hub.links.lock().values().cloned().collect();
         // All links of these robots lead to one of them, and it is told once.
         let mut links = links.iter().filter(|link| link.view.bus.version() == self.version);
