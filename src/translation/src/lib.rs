@@ -16,6 +16,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod bus;
 mod compile;
 mod derive;
 mod error;
