@@ -196,37 +196,137 @@ fn cancel_message(id: &str) -> Bytes {
 
 #[cfg(test)]
 mod tests {
+    use super::super::messages::GoalState;
     use super::*;
 
-    struct Nobody;
+    /// What a goal's sender is told.
+    #[derive(Debug, Clone, PartialEq)]
+    enum Told {
+        Waiting,
+        Accepted,
+        Cancelling(bool),
+        Feedback,
+        Ended(Result<GoalOutcome, String>),
+    }
 
-    impl GoalEvents for Nobody {
-        fn on_feedback(&self, _: Bytes) {}
+    #[derive(Default)]
+    struct Sender(Mutex<Vec<Told>>);
 
-        fn on_ended(&self, _: Result<GoalEnd, GoalError>) {}
+    impl Sender {
+        fn told(&self) -> Vec<Told> {
+            std::mem::take(&mut *self.0.lock())
+        }
+    }
+
+    impl GoalEvents for Sender {
+        fn on_waiting(&self) {
+            self.0.lock().push(Told::Waiting);
+        }
+
+        fn on_accepted(&self) {
+            self.0.lock().push(Told::Accepted);
+        }
+
+        fn on_cancel_response(&self, ends: bool) {
+            self.0.lock().push(Told::Cancelling(ends));
+        }
+
+        fn on_feedback(&self, _: Bytes) {
+            self.0.lock().push(Told::Feedback);
+        }
+
+        fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
+            let end = end.map(|end| end.outcome).map_err(|error| error.to_string());
+            self.0.lock().push(Told::Ended(end));
+        }
+    }
+
+    fn state(id: &str, status: ActionlibStatus) -> GoalState {
+        let goal = GoalId { id: id.to_owned(), ..GoalId::default() };
+        GoalState { goal, status, text: String::new() }
+    }
+
+    impl GoalClient {
+        fn send(&self, id: &str) -> Arc<Sender> {
+            let sender = Arc::new(Sender::default());
+            self.begin(id, &[], Arc::clone(&sender) as _);
+            sender
+        }
+
+        fn hear_status(&self, states: &[GoalState]) {
+            assert!(self.on_status(&messages::write_states(Time::default(), states.iter())));
+        }
+
+        fn hear_result(&self, state: &GoalState) {
+            self.on_result(&messages::write_state(Time::default(), state, &[]));
+        }
     }
 
     #[test]
     fn a_status_is_reported_once_whatever_was_missed_before() {
         use ActionlibStatus::*;
-        let nothing = GoalProgress::default();
-        let (waits, accepted, cancels) = (
-            GoalProgress { waits: true, ..nothing },
-            GoalProgress { accepted: true, ..nothing },
-            GoalProgress { cancels: true, ..nothing },
-        );
-        let both = |one: GoalProgress| GoalProgress { cancels: true, ..one };
+        use Told::{Accepted, Cancelling, Waiting};
         for (statuses, expected) in [
-            (vec![Pending, Pending, Active, Preempting, Preempted], vec![waits, nothing, accepted, cancels, nothing]),
-            (vec![Active, Active, Succeeded], vec![accepted, nothing, nothing]),
-            (vec![Recalling, Preempting, Recalled], vec![both(waits), accepted, nothing]),
-            (vec![Preempting, Aborted], vec![both(accepted), nothing]),
-            (vec![Active, Pending], vec![accepted, nothing]),
-            (vec![Rejected, Lost], vec![nothing, nothing]),
+            (vec![Pending, Pending, Active, Preempting, Preempted], vec![Waiting, Accepted, Cancelling(true)]),
+            (vec![Active, Active, Succeeded], vec![Accepted]),
+            (vec![Recalling, Preempting, Recalled], vec![Waiting, Cancelling(true), Accepted]),
+            (vec![Preempting, Aborted], vec![Accepted, Cancelling(true)]),
+            (vec![Active, Pending], vec![Accepted]),
+            (vec![Rejected, Lost], vec![]),
         ] {
-            let mut goal = TrackedGoal::new(Instant::now(), Arc::new(Nobody));
-            let noted: Vec<_> = statuses.iter().map(|status| goal.note_status(*status)).collect();
-            assert_eq!(noted, expected, "{statuses:?}");
+            let client = GoalClient::default();
+            let sender = client.send("one");
+            statuses.iter().for_each(|status| client.hear_status(&[state("one", *status)]));
+            assert_eq!(sender.told(), expected, "{statuses:?}");
+        }
+    }
+
+    #[test]
+    fn each_cancel_is_answered_even_if_others_cancelled_before() {
+        let client = GoalClient::default();
+        let sender = client.send("one");
+        let preempting = [state("one", ActionlibStatus::Preempting)];
+        client.hear_status(&preempting);
+        assert_eq!(sender.told(), [Told::Accepted, Told::Cancelling(true)]);
+        assert!(client.cancel("one").is_some() && client.cancel("two").is_none());
+        client.hear_status(&preempting);
+        client.hear_status(&preempting);
+        assert_eq!(sender.told(), [Told::Cancelling(true)]);
+    }
+
+    #[test]
+    fn feedback_tells_that_a_goal_is_executed_and_a_result_that_it_has_ended() {
+        let client = GoalClient::default();
+        let (one, two) = (client.send("one"), client.send("two"));
+        let feedback = messages::write_state(Time::default(), &state("one", ActionlibStatus::Active), &[]);
+        client.on_feedback(&feedback);
+        client.on_feedback(&feedback);
+        assert_eq!(one.told(), [Told::Accepted, Told::Feedback, Told::Feedback]);
+        // Before any status.
+        client.hear_result(&state("one", ActionlibStatus::Preempted));
+        client.hear_result(&state("two", ActionlibStatus::Rejected));
+        client.hear_status(&[state("one", ActionlibStatus::Preempted), state("two", ActionlibStatus::Rejected)]);
+        client.on_feedback(&feedback);
+        assert_eq!(one.told(), [Told::Ended(Ok(GoalOutcome::Canceled))]);
+        assert_eq!(two.told(), [Told::Ended(Ok(GoalOutcome::Rejected))]);
+    }
+
+    #[test]
+    fn statuses_become_outcomes() {
+        use ActionlibStatus::*;
+        for (status, expected) in [
+            (Succeeded, GoalOutcome::Succeeded),
+            (Preempted, GoalOutcome::Canceled),
+            (Recalled, GoalOutcome::Canceled),
+            (Aborted, GoalOutcome::Aborted),
+            (Rejected, GoalOutcome::Rejected),
+            (Lost, GoalOutcome::Unknown),
+            (Active, GoalOutcome::Unknown),
+        ] {
+            let client = GoalClient::default();
+            let sender = client.send("one");
+            client.hear_result(&state("one", status));
+            assert_eq!(sender.told(), [Told::Ended(Ok(expected))], "{status:?}");
         }
     }
 
@@ -234,9 +334,22 @@ mod tests {
     fn a_goal_that_nobody_took_yet_is_waited_for_longer_than_one_that_was_dropped() {
         let begin = Instant::now();
         let after = |seconds| begin + Duration::from_secs(seconds);
-        let mut goal = TrackedGoal::new(begin, Arc::new(Nobody));
+        let mut goal = TrackedGoal::new(begin, Arc::new(Sender::default()));
         assert!(!goal.is_lost(after(30)) && goal.is_lost(after(61)));
         goal.mark_seen(after(30));
         assert!(!goal.is_lost(after(34)) && goal.is_lost(after(36)));
+    }
+
+    #[test]
+    fn goals_end_with_their_server_and_are_cancelled_when_nobody_waits() {
+        let client = GoalClient::default();
+        let sender = client.send("one");
+        client.end_all(&GoalError::ServerGone("/do".to_owned()));
+        assert_eq!(sender.told(), [Told::Ended(Err("action server /do is gone".to_owned()))]);
+        let sender = client.send("two");
+        let cancels: Vec<_> = client.abandon().iter().filter_map(|cancel| messages::read_cancel(cancel)).collect();
+        assert_eq!(cancels, [GoalId { id: "two".to_owned(), ..GoalId::default() }]);
+        client.hear_result(&state("two", ActionlibStatus::Preempted));
+        assert_eq!(sender.told(), []);
     }
 }
