@@ -363,6 +363,7 @@ fn main() -> ExitCode {
         ],
         of_both![mixed:
             stamps_transforms_and_calls_cross,
+            an_action_is_carried_out_in_the_other_ros,
             a_node_calls_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
             the_robots_own_original_answers_while_the_cable_is_cut,

@@ -6,6 +6,7 @@ use anyhow::{Context, ensure};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{ActionClient, Bus, GoalEnd, GoalError, GoalEvents, GoalOutcome, RosVersion};
+use ros::schema::{ActionDef, Registry};
 use support::Verdict;
 use support::cable::{Cable, NetworkImpairment};
 use support::cutter::Cutter;
@@ -14,13 +15,13 @@ use support::patience::{Deadline, patience};
 use support::site::{NodeProcess, Site};
 use support::world::{StoryService, world};
 
-use crate::crossing::{HOUR, argv, crossing, message_types_for, robot_name, service, wait_until_ready, with_log};
+use crate::crossing::{HOUR, argv, crossing, robot_name, service, wait_until_ready, with_log};
 
 const ACTION: &str = "/crossing/act";
 
 /// Feedback and end of a goal.
 #[derive(Default)]
-struct GoalRecord {
+pub struct GoalRecord {
     steps: Mutex<Vec<i32>>,
     end: Mutex<Option<Result<GoalEnd, GoalError>>>,
 }
@@ -40,9 +41,20 @@ fn last_number(message: &[u8]) -> Option<i32> {
     Some(i32::from_le_bytes(*message.last_chunk()?))
 }
 
+/// Returns the action of the crossing node of ROS `there`, as nodes of ROS `here` know it.
+fn action_type(here: RosVersion, there: RosVersion) -> anyhow::Result<Arc<ActionDef>> {
+    let (package, name, text) = match there {
+        RosVersion::One => ("actionlib", "Test", "int32 goal\n---\nint32 result\n---\nint32 feedback\n"),
+        RosVersion::Two => ("test_msgs", "Fibonacci", "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n"),
+    };
+    let registry = Registry::for_version(here);
+    registry.insert(&format!("{package}/action/{name}"), text)?;
+    Ok(registry.action(&format!("{package}/{name}"))?)
+}
+
 /// An application that sends goals to the crossing node of a stub.
-struct GoalApplication<'a> {
-    client: Box<dyn ActionClient>,
+pub struct GoalApplication<'a> {
+    pub client: Box<dyn ActionClient>,
     ros: RosVersion,
     site: &'a Site,
     stub: &'a NodeProcess,
@@ -50,18 +62,24 @@ struct GoalApplication<'a> {
 
 impl<'a> GoalApplication<'a> {
     fn new(site: &'a Site, app: &Arc<dyn Bus>, stub: &'a NodeProcess) -> anyhow::Result<Self> {
+        Self::for_node_of(site.system.version(), site, app, stub)
+    }
+
+    /// Creates the application for the node of this ROS version, whichever the robot's is.
+    pub fn for_node_of(
+        node: RosVersion,
+        site: &'a Site,
+        app: &Arc<dyn Bus>,
+        stub: &'a NodeProcess,
+    ) -> anyhow::Result<Self> {
         let ros = site.system.version();
-        let action = match ros {
-            RosVersion::One => "actionlib/Test",
-            RosVersion::Two => "test_msgs/action/Fibonacci",
-        };
         let _runtime = site.runtime.enter();
-        let client = app.action_client(ACTION, &message_types_for(ros)?.action(action)?)?;
+        let client = app.action_client(ACTION, &action_type(ros, node)?)?;
         with_log(site.runtime.block_on(client.wait_for_server(patience())).map_err(Into::into), stub)?;
         Ok(Self { client, ros, site, stub })
     }
 
-    fn send(&self, id: &str, steps: u32) -> Arc<GoalRecord> {
+    pub fn send(&self, id: &str, steps: u32) -> Arc<GoalRecord> {
         let _runtime = self.site.runtime.enter();
         let goal = Arc::new(GoalRecord::default());
         let events = Arc::clone(&goal);
@@ -70,7 +88,7 @@ impl<'a> GoalApplication<'a> {
     }
 
     /// Waits until a goal has sent `count` feedbacks.
-    fn wait_for_steps(&self, goal: &GoalRecord, count: usize) -> anyhow::Result<Vec<i32>> {
+    pub fn wait_for_steps(&self, goal: &GoalRecord, count: usize) -> anyhow::Result<Vec<i32>> {
         let steps = support::wait_until(&format!("{count} steps"), || {
             let steps = goal.steps.lock().clone();
             Ok(if steps.len() >= count { Ok(steps) } else { Err(format!("{steps:?}")) })
@@ -81,7 +99,7 @@ impl<'a> GoalApplication<'a> {
     /// Sends goals with `count` steps until all steps of one were reported; returns the number of goals. A result may
     /// overtake the last steps, because it arrives on a connection of its own, and a client with a result gets no
     /// further steps.
-    fn send_until_all_steps(&self, id: &str, count: u32) -> anyhow::Result<usize> {
+    pub fn send_until_all_steps(&self, id: &str, count: u32) -> anyhow::Result<usize> {
         let all: Vec<i32> = (0..i32::try_from(count)?).collect();
         let mut sent = 0;
         support::wait_until("all steps of a goal", || {
@@ -97,7 +115,7 @@ impl<'a> GoalApplication<'a> {
     }
 
     /// Waits for the end of a goal; returns the outcome and the number in its result.
-    fn wait_for_end(&self, goal: &GoalRecord) -> anyhow::Result<(GoalOutcome, i32)> {
+    pub fn wait_for_end(&self, goal: &GoalRecord) -> anyhow::Result<(GoalOutcome, i32)> {
         let end = support::wait_until("the end of a goal", || {
             let end = goal.end.lock().clone();
             Ok(end.ok_or_else(|| format!("{:?}", goal.steps.lock())))

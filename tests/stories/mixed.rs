@@ -2,7 +2,7 @@
 //! robot's nodes and its original are real ones of their ROS.
 
 use anyhow::{Context, ensure};
-use ros::bus::{ParamValue, Publisher, RosVersion};
+use ros::bus::{GoalOutcome, ParamValue, Publisher, RosVersion};
 use support::Verdict;
 use support::cable::Cable;
 use support::daemon::Daemon;
@@ -16,6 +16,7 @@ use support::world::world;
 use crate::calls::{TriggerService, serve_trigger};
 use crate::crossing::{self, advertise, find_type, is_same, point_message, wait_for_answer, with_log};
 use crate::fallback::{MapRobot, SILENT, localiser, wait_for_log};
+use crate::goals::GoalApplication;
 
 const NODE: &str = "/crossing";
 
@@ -114,6 +115,34 @@ pub fn stamps_transforms_and_calls_cross(ros: RosVersion) -> Verdict {
     let mut late = site.subscribe_latched(&newcomer, "/crossing/frames")?;
     let told = with_log(site.next_message(&mut late), &stub)?;
     ensure!(string_text(ros, &told.bytes, 0)? == wanted, "{told:?}");
+    Ok(())
+}
+
+pub fn an_action_is_carried_out_in_the_other_ros(ros: RosVersion) -> Verdict {
+    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let stub = start_crossing(&site, &daemon, "action", &[])?;
+    wait_until_ready(&site, &app, &stub)?;
+    let sender = GoalApplication::for_node_of(other(ros), &site, &app, &stub)?;
+    sender.send_until_all_steps("three", 3)?;
+    // A goal that never ends is cancelled while it is in progress.
+    let long = sender.send("long", 1_000_000);
+    sender.wait_for_steps(&long, 1)?;
+    sender.client.cancel_goal("long");
+    let (outcome, steps) = sender.wait_for_end(&long)?;
+    ensure!(outcome == GoalOutcome::Canceled && steps < 0, "{outcome:?} {steps}\n{}", stub.output());
+    // A simple action server of ROS 1 preempts a goal for a newer one; that of ROS 2 leaves it to its client.
+    let older = sender.send("older", 1_000_000);
+    sender.wait_for_steps(&older, 1)?;
+    let newer = sender.send("newer", 2);
+    if other(ros) == RosVersion::Two {
+        sender.client.cancel_goal("older");
+    }
+    let (outcome, _) = sender.wait_for_end(&older)?;
+    ensure!(outcome == GoalOutcome::Canceled, "{outcome:?}\n{}", stub.output());
+    let end = sender.wait_for_end(&newer)?;
+    ensure!(end == (GoalOutcome::Succeeded, 2), "{end:?}\n{}", stub.output());
     Ok(())
 }
 

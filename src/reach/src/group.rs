@@ -11,9 +11,6 @@
 //! else: no topic, no parameter, no node of another robot. Its rosbridge clients see the deployer's names, its stubs
 //! the names that the nodes would have on the robot. [`shareable`] decides what can be shared.
 
-mod action_ends;
-mod action_parts;
-mod action_topics;
 mod bus;
 pub mod dispatch;
 mod goals;

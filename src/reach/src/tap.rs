@@ -396,6 +396,10 @@ struct TappedEvents {
 }
 
 impl GoalEvents for TappedEvents {
+    fn on_waiting(&self) {
+        self.events.on_waiting();
+    }
+
     fn on_accepted(&self) {
         self.events.on_accepted();
     }

@@ -1,10 +1,21 @@
 //! ROS 1 actions: five topics under one name, as in actionlib (<http://wiki.ros.org/actionlib/DetailedDescription>).
 
+pub mod goal_client;
+pub mod goal_server;
+pub mod goal_topics;
 pub mod messages;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
 
-use ros_bus::{ActionNodes, TopicNodes};
+use ros_bus::{ActionEndpoint, ActionNodes, BusError, TopicNodes, WireType};
+use ros_message::schema::{ActionDef, MessageType, Registry, SchemaError};
+
+/// Interval at which a server publishes the status, as in actionlib; it is also published at each change.
+pub const STATUS_PERIOD: Duration = Duration::from_millis(200);
+/// Queue depth of an action's topics for a slow peer.
+pub(crate) const QUEUE: usize = 100;
 
 /// Last part of the names of an action's topics.
 const PARTS: [&str; 5] = ["goal", "cancel", "status", "feedback", "result"];
@@ -18,6 +29,46 @@ pub fn carries_goal_id(type_name: &str) -> bool {
 /// Returns true if messages of this type make a server start or stop a goal.
 pub fn is_command_type(type_name: &str) -> bool {
     type_name.ends_with("ActionGoal") || type_name == "actionlib_msgs/GoalID"
+}
+
+/// The types of an action's topics.
+#[derive(Debug, Clone)]
+pub struct ActionTopicTypes {
+    pub(crate) goal: Arc<WireType>,
+    pub(crate) cancel: Arc<WireType>,
+    pub(crate) feedback: Arc<WireType>,
+    pub(crate) result: Arc<WireType>,
+    pub(crate) status: Arc<WireType>,
+}
+
+impl ActionTopicTypes {
+    /// Returns those of the action of this name, which an error names.
+    pub fn for_action(action: &str, of: &ActionDef) -> Result<Self, BusError> {
+        let known = Registry::new();
+        let unusable =
+            |error: SchemaError| BusError::Protocol { what: format!("action {action}"), reason: error.to_string() };
+        let of_message = |of: &MessageType| Arc::new(WireType::from_message(of));
+        let common = |name: &str| known.message(name).map(|of| of_message(&of)).map_err(unusable);
+        Ok(Self {
+            goal: of_message(&of.action_goal),
+            cancel: common("actionlib_msgs/GoalID")?,
+            feedback: of_message(&of.action_feedback),
+            result: of_message(&of.action_result),
+            status: common("actionlib_msgs/GoalStatusArray")?,
+        })
+    }
+
+    /// Returns the type of a topic; `None` for the parts of ROS 2's actions that are services.
+    pub fn get(&self, end: ActionEndpoint) -> Option<&Arc<WireType>> {
+        Some(match end {
+            ActionEndpoint::Goal => &self.goal,
+            ActionEndpoint::Cancel => &self.cancel,
+            ActionEndpoint::Feedback => &self.feedback,
+            ActionEndpoint::Result => &self.result,
+            ActionEndpoint::Status => &self.status,
+            ActionEndpoint::SendGoal | ActionEndpoint::CancelGoal | ActionEndpoint::GetResult => return None,
+        })
+    }
 }
 
 /// Finds the actions among these topics.

@@ -14,6 +14,7 @@
 mod client;
 mod goal_id;
 pub mod goal_server;
+pub mod goal_services;
 mod messages;
 mod server;
 #[cfg(test)]

@@ -79,11 +79,16 @@ impl From<BusError> for GoalError {
 }
 
 /// Callbacks for one goal, called in order. Must not block.
+///
+/// Servers of ROS 2 answer a goal and a cancel request. Those of ROS 1 list the goal's status instead, in which both
+/// are seen with a delay, or not at all if the goal ends before.
 pub trait GoalEvents: Send + Sync + 'static {
-    /// The server accepted the goal. Called only where servers answer goals (ROS 2), and not for a rejected goal.
+    /// The goal waits: the server lists it as pending (ROS 1), or no servant of a group is free for it.
+    fn on_waiting(&self) {}
+    /// The server accepted the goal, or lists it as active (ROS 1). Not called for a rejected goal.
     fn on_accepted(&self) {}
-    /// The server answered a cancel request; the argument tells whether it will cancel the goal. Called where
-    /// `on_accepted` is.
+    /// The server answered a cancel request; the argument tells whether it will cancel the goal. Servers of ROS 1 do
+    /// not refuse: it is called once such a server lists the goal as being cancelled, whoever asked for it.
     fn on_cancel_response(&self, _ends: bool) {}
     /// Serialized feedback arrived.
     fn on_feedback(&self, feedback: Bytes);

@@ -16,6 +16,7 @@ use tokio::sync::watch;
 
 use crate::ring::{DropCount, RingItem};
 
+mod action_ends;
 mod actions;
 mod error;
 mod failure_reason;
@@ -38,6 +39,7 @@ mod succession;
 pub mod turns;
 mod types;
 
+pub use action_ends::{ActionEndpoint, action_endpoints, split_action_endpoint};
 pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 pub use error::{BusError, CallFate};
 pub use failure_reason::FailureReason;

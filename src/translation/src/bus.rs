@@ -7,8 +7,10 @@
 //! ```
 //! What has no twin is left out of the graph, and [`TranslatedBus::left_out`] says why. A message that cannot be
 //! carried is dropped and counted; the [`TranslationObserver`] is told of the first one of each topic. A service that
-//! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response.
+//! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response. Of an action only goals,
+//! feedback and results are carried, and its topics or services are made anew.
 
+mod actions;
 mod graph;
 mod lending;
 mod losses;
@@ -26,6 +28,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
@@ -40,21 +43,36 @@ use tracing::Instrument;
 use crate::TypeTranslations;
 use crate::error::other_version;
 
+use actions::ActionEnds;
+use lending::TranslatedLending;
 use losses::LossCounters;
 pub use losses::{TranslationLosses, TranslationObserver};
 use state::Translation;
 use state::not_translated;
-pub use state::{LeftOut, LeftOutEntry, TranslatedBus};
-use twins::{KnownTwins, Untranslatable};
+pub use state::{LeftOut, LeftOutEntry};
+use twins::KnownTwins;
+
+/// A servant's bus as seen by robots of the other ROS version.
+pub struct TranslatedBus {
+    translation: Arc<Translation>,
+    graph: watch::Receiver<Arc<Graph>>,
+    left_out: watch::Receiver<Arc<LeftOut>>,
+    actions: ActionEnds,
+    lending: TranslatedLending,
+    /// Keeps the graph up to date.
+    _following: AbortOnDropHandle<()>,
+}
 
 impl TranslatedBus {
     /// Creates the bus that robots of the other ROS see in place of `inner`. `registry` has the definitions of the
-    /// servant's image. Call it within a Tokio runtime.
+    /// servant's image; goals under way and results kept for robots are charged to `budget`. Call it within a Tokio
+    /// runtime.
     pub fn new(
         inner: Arc<dyn Bus>,
         types: Arc<TypeTranslations>,
         registry: Arc<Registry>,
         observer: Arc<dyn TranslationObserver>,
+        budget: &Budget,
     ) -> Arc<Self> {
         let version = other_version(inner.version());
         let translation = Arc::new(Translation {
@@ -68,7 +86,9 @@ impl TranslatedBus {
         let (graphs, omissions) = (graph.subscribe(), left_out.subscribe());
         let following = graph::follow(Arc::clone(&translation), graph, left_out);
         let following = AbortOnDropHandle::new(tokio::spawn(following.in_current_span()));
-        Arc::new(Self { translation, graph: graphs, left_out: omissions, _following: following })
+        let actions = ActionEnds::new(&translation, budget);
+        let lending = TranslatedLending(Arc::clone(&translation));
+        Arc::new(Self { translation, graph: graphs, left_out: omissions, actions, lending, _following: following })
     }
 
     /// Returns what the robot does not see because it cannot be carried, with the reasons, updated as it changes.
@@ -83,14 +103,18 @@ impl TranslatedBus {
 
     /// Returns the definition of a message type that the robot sees, by name and digest (which may be `*`).
     pub fn message(&self, of: &WireType) -> Option<Arc<MessageType>> {
-        let twin = self.translation.twins.message_with_twin(of)?;
-        Some(Arc::clone(&twin.twin))
+        match self.translation.twins.message_with_twin(of) {
+            Some(twin) => Some(Arc::clone(&twin.twin)),
+            None => self.translation.twins.message_of_action(of),
+        }
     }
 
     /// Returns the definition of a service type that the robot sees.
     pub fn service(&self, of: &ServiceType) -> Option<Arc<ServiceDef>> {
-        let twin = self.translation.twins.service_with_twin(of)?;
-        Some(Arc::clone(&twin.twin))
+        match self.translation.twins.service_with_twin(of) {
+            Some(twin) => Some(Arc::clone(&twin.twin)),
+            None => self.translation.twins.service_of_action(of),
+        }
     }
 
     /// Returns why messages of the servant's type of this name cannot be carried; `None` if they can.
@@ -108,8 +132,9 @@ impl TranslatedBus {
     }
 
     /// Returns why goals of the servant's action type of this name cannot be carried; `None` if they can.
-    pub fn action_problem(&self, _type_name: &str) -> Option<String> {
-        Some(Untranslatable::Action.to_string())
+    pub fn action_problem(&self, type_name: &str) -> Option<String> {
+        let twin = self.translation.twins.action(type_name);
+        twin.err().map(|reason| reason.to_string())
     }
 
     /// Returns a service of the robot as the servant's nodes see it.
@@ -137,11 +162,17 @@ impl Bus for TranslatedBus {
     }
 
     async fn subscribe(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Subscription, BusError> {
-        topics::subscribe(&self.translation, topic, of, qos).await
+        match self.actions.find_topic(topic)? {
+            Some((end, action)) => action.subscribe((end, topic), &of, qos),
+            None => topics::subscribe(&self.translation, topic, of, qos).await,
+        }
     }
 
     async fn advertise(&self, topic: &str, of: WireType, qos: QosProfile) -> Result<Box<dyn Publisher>, BusError> {
-        topics::advertise(&self.translation, topic, &of, qos).await
+        match self.actions.find_topic(topic)? {
+            Some((end, action)) => action.advertise((end, topic), &of),
+            None => topics::advertise(&self.translation, topic, &of, qos).await,
+        }
     }
 
     async fn call_typed(
@@ -151,10 +182,16 @@ impl Bus for TranslatedBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        services::call(&self.translation, service, digest, request, timeout).await
+        match self.actions.find_service(service)? {
+            Some((end, action)) => action.call((end, service), digest, request, timeout).await,
+            None => services::call(&self.translation, service, digest, request, timeout).await,
+        }
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
+        if let Some((end, action)) = self.actions.find_service(service)? {
+            return action.service_type(end, service);
+        }
         let of = self.translation.inner.service_type(service).await?;
         let twin = self.translation.twins.service(&of);
         let twin = twin.map_err(|reason| not_translated(format!("service {service}"), reason))?;
@@ -167,6 +204,9 @@ impl Bus for TranslatedBus {
     }
 
     async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
+        if let Some((end, action)) = self.actions.find_topic(topic)? {
+            return action.offer(end, topic);
+        }
         let Offer { wire_type, latching } = self.translation.inner.topic_offer(topic).await?;
         let twin = self.translation.twins.message(&wire_type);
         let twin = twin.map_err(|reason| not_translated(format!("topic {topic}"), reason))?;
@@ -182,22 +222,22 @@ impl Bus for TranslatedBus {
         services::serve(&self.translation, service, &service_type, handler).await
     }
 
-    fn action_client(&self, _action: &str, _of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
-        Err(BusError::NotOffered("actions of the other ROS"))
+    fn action_client(&self, action: &str, of: &Arc<ActionDef>) -> Result<Box<dyn ActionClient>, BusError> {
+        self.actions.client(action, of)
     }
 
     fn serve_action(
         &self,
-        _action: &str,
-        _of: &Arc<ActionDef>,
-        _handler: Arc<dyn ActionHandler>,
+        action: &str,
+        of: &Arc<ActionDef>,
+        handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError> {
-        Err(BusError::NotOffered("actions of the other ROS"))
+        self.actions.serve(action, of, handler)
     }
 
     fn lending(&self) -> Result<&dyn Lending, BusError> {
         self.translation.inner.lending()?;
-        Ok(self)
+        Ok(&self.lending)
     }
 
     fn publisher_reports(&self) -> Option<&dyn PublisherReports> {
@@ -214,6 +254,7 @@ impl Bus for TranslatedBus {
     }
 
     async fn close(&self) {
+        self.actions.cancel_all();
         self.translation.inner.close().await;
     }
 }

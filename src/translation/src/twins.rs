@@ -41,6 +41,18 @@ pub struct MessageTwin {
     pub from_twin: Arc<MessageTranslator>,
 }
 
+impl MessageTwin {
+    /// Returns the pair with its sides exchanged.
+    pub(crate) fn reverse(&self) -> Self {
+        Self {
+            original: Arc::clone(&self.twin),
+            twin: Arc::clone(&self.original),
+            to_twin: Arc::clone(&self.from_twin),
+            from_twin: Arc::clone(&self.to_twin),
+        }
+    }
+}
+
 /// A service type and its twin in the other ROS.
 #[derive(Debug)]
 pub struct ServiceTwin {

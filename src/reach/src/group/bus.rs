@@ -10,15 +10,14 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, NodeParameters,
-    Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionEndpoint, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
+    NodeParameters, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
+use ros::ros1::actions::goal_topics::GoalTopics;
+use ros::ros2::actions::goal_services::{GoalNotices, GoalServices};
 use ros::schema::{ActionDef, Registry};
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 
-use super::action_ends::ActionEndpoint;
-use super::action_parts::{ActionParts, Notices};
-use super::action_topics::ActionTopics;
 use super::dispatch::RobotNumber;
 use super::goals::GroupClient;
 use super::view::{GroupView, ViewAction, ViewEntry};
@@ -26,6 +25,9 @@ use super::{ServantGroup, node_ends};
 
 /// Description of a request for a parameter in errors.
 const PARAMETER: &str = "a parameter of its nodes";
+
+/// Notices for a robot: name of the node on the robot, and text.
+pub(super) type Notices = mpsc::UnboundedSender<(String, String)>;
 
 /// The bus of one robot.
 pub(super) struct GroupBus {
@@ -44,15 +46,16 @@ pub(super) struct GroupBus {
 /// An action used by its topics and services.
 #[derive(Clone)]
 enum ActionBackend {
-    One(Arc<ActionTopics>),
-    Two(Arc<ActionParts>),
+    One(Arc<GoalTopics<GroupClient>>),
+    Two(Arc<GoalServices<GroupClient>>),
 }
 
 impl ActionBackend {
-    fn cancel_all(&self) {
+    /// Cancels all goals because the robot or its node is gone; they are not followed for long.
+    fn abandon(&self) {
         match self {
-            ActionBackend::One(topics) => topics.cancel_all(),
-            ActionBackend::Two(parts) => parts.cancel_all(),
+            ActionBackend::One(topics) => topics.client().abandon(),
+            ActionBackend::Two(services) => services.client().abandon(),
         }
     }
 }
@@ -68,7 +71,10 @@ impl GroupBus {
     }
 
     /// Returns the action and part to which a service belongs; `None` for a regular service.
-    fn find_action_service(&self, service: &str) -> Result<Option<(ActionEndpoint, Arc<ActionParts>)>, BusError> {
+    fn find_action_service(
+        &self,
+        service: &str,
+    ) -> Result<Option<(ActionEndpoint, Arc<GoalServices<GroupClient>>)>, BusError> {
         let view = self.view();
         let Some((action, end)) = view.find_action_service(service) else {
             return Ok(None);
@@ -89,13 +95,14 @@ impl GroupBus {
         let of = self.registry.action(&action.type_name);
         let of =
             of.map_err(|error| BusError::Protocol { what: format!("action {name}"), reason: error.to_string() })?;
-        let (group, names) = (&self.group, (&**name, &**node));
-        let made = match group.ros {
-            RosVersion::One => {
-                ActionBackend::One(ActionTopics::new(group, self.robot, names, &of, &self.registry, &self.budget)?)
-            }
+        let (names, budget) = ((&**name, &**node), &self.budget);
+        let client = GroupClient::new(&self.group, self.robot, name, &of);
+        let made = match self.group.ros {
+            RosVersion::One => ActionBackend::One(GoalTopics::new(names, &of, client, budget)?),
             RosVersion::Two => {
-                ActionBackend::Two(ActionParts::new(group, self.robot, names, &of, &self.budget, &self.notices)?)
+                let (notices, node) = (self.notices.clone(), node.clone());
+                let notices: GoalNotices = Arc::new(move |text| drop(notices.send((node.clone(), text))));
+                ActionBackend::Two(GoalServices::new(names, &of, client, budget, notices)?)
             }
         };
         actions.insert(key, made.clone());
@@ -131,7 +138,7 @@ impl GroupBus {
         actions.retain(|key, action| {
             let stays = shown(key);
             if !stays {
-                action.cancel_all();
+                action.abandon();
             }
             stays
         });
@@ -146,7 +153,7 @@ impl GroupBus {
 impl Drop for GroupBus {
     /// Goals outlive their senders, or their results would be lost with a connection, but not their robot's place.
     fn drop(&mut self) {
-        self.actions.get_mut().values().for_each(|action| action.cancel_all());
+        self.actions.get_mut().values().for_each(|action| action.abandon());
     }
 }
 
@@ -268,7 +275,10 @@ impl Bus for GroupBus {
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
         Ok(match self.find_topic(topic)? {
-            (end, ActionBackend::One(topics)) => topics.wire_type(end),
+            (end, ActionBackend::One(topics)) => match topics.wire_type(end) {
+                Some(of) => WireType::clone(of),
+                None => return Err(BusError::NoTopic(topic.to_owned())),
+            },
             (end, ActionBackend::Two(parts)) => parts.wire_type(end).clone(),
         })
     }

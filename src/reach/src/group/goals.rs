@@ -28,35 +28,6 @@ const MOST: usize = 256;
 /// Time a node may take to end a goal whose robot is gone. After that its servant gets goals of other robots.
 const GONE: Duration = Duration::from_secs(10);
 
-/// Goal events, including those that only a group has.
-pub(super) trait GroupEvents: GoalEvents {
-    /// No servant is free, so the group keeps the goal until one is.
-    fn on_waiting(&self) {}
-}
-
-/// Adapts plain goal events.
-struct PlainGoalEvents(Arc<dyn GoalEvents>);
-
-impl GoalEvents for PlainGoalEvents {
-    fn on_accepted(&self) {
-        self.0.on_accepted();
-    }
-
-    fn on_cancel_response(&self, ends: bool) {
-        self.0.on_cancel_response(ends);
-    }
-
-    fn on_feedback(&self, feedback: Bytes) {
-        self.0.on_feedback(feedback);
-    }
-
-    fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
-        self.0.on_ended(end);
-    }
-}
-
-impl GroupEvents for PlainGoalEvents {}
-
 /// A client of one action for one robot.
 pub(super) struct GroupClient {
     group: Arc<ServantGroup>,
@@ -78,42 +49,6 @@ impl GroupClient {
             goals: Arc::default(),
             gone: CancellationToken::new(),
         }
-    }
-
-    /// Sends a goal like [`ActionClient::send_goal`], with the events of a group.
-    pub(super) fn send_goal_with_events(&self, id: &str, goal: Bytes, events: Arc<dyn GroupEvents>) {
-        let (wishes, wished) = watch::channel(0);
-        {
-            let mut goals = self.goals.lock();
-            let refused = match goals.len() {
-                _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
-                MOST.. => Some(format!("{MOST} goals of this robot have not ended; wait for one of them")),
-                _ => None,
-            };
-            if let Some(text) = refused {
-                let end =
-                    GoalEnd { outcome: GoalOutcome::Rejected, text, result: default_message(&self.of.result).into() };
-                // In a task, because the sender may hold a lock that the receiver needs.
-                tokio::spawn(async move { events.on_ended(Ok(end)) });
-                return;
-            }
-            goals.insert(id.to_owned(), wishes);
-        }
-        let errand = self.group.begin_request(self.robot, Kind::Goal(Arc::clone(&self.name)));
-        let goal = GroupGoal {
-            // Robots, and nodes of one robot, choose ids independently.
-            id: format!("{}-{id}", errand.ticket),
-            body: goal,
-            name: Arc::clone(&self.name),
-            of: Arc::clone(&self.of),
-            gone: self.gone.clone(),
-        };
-        let (goals, id) = (Arc::clone(&self.goals), id.to_owned());
-        tokio::spawn(async move {
-            let end = goal.follow(errand, wished, &*events).await;
-            goals.lock().remove(&id);
-            events.on_ended(end);
-        });
     }
 
     /// Cancels all goals because nobody waits for them any more; they are not followed for long.
@@ -146,7 +81,38 @@ impl ActionClient for GroupClient {
     }
 
     fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        self.send_goal_with_events(id, goal, Arc::new(PlainGoalEvents(events)));
+        let (wishes, wished) = watch::channel(0);
+        {
+            let mut goals = self.goals.lock();
+            let refused = match goals.len() {
+                _ if goals.contains_key(id) => Some(format!("another goal has the id {id:?}")),
+                MOST.. => Some(format!("{MOST} goals of this robot have not ended; wait for one of them")),
+                _ => None,
+            };
+            if let Some(text) = refused {
+                let end =
+                    GoalEnd { outcome: GoalOutcome::Rejected, text, result: default_message(&self.of.result).into() };
+                // In a task, because the sender may hold a lock that the receiver needs.
+                tokio::spawn(async move { events.on_ended(Ok(end)) });
+                return;
+            }
+            goals.insert(id.to_owned(), wishes);
+        }
+        let errand = self.group.begin_request(self.robot, Kind::Goal(Arc::clone(&self.name)));
+        let goal = GroupGoal {
+            // Robots, and nodes of one robot, choose ids independently.
+            id: format!("{}-{id}", errand.ticket),
+            body: goal,
+            name: Arc::clone(&self.name),
+            of: Arc::clone(&self.of),
+            gone: self.gone.clone(),
+        };
+        let (goals, id) = (Arc::clone(&self.goals), id.to_owned());
+        tokio::spawn(async move {
+            let end = goal.follow(errand, wished, &*events).await;
+            goals.lock().remove(&id);
+            events.on_ended(end);
+        });
     }
 
     fn cancel_goal(&self, id: &str) {
@@ -217,7 +183,7 @@ impl GroupGoal {
         &self,
         mut errand: PendingRequest,
         mut wished: watch::Receiver<u32>,
-        events: &dyn GroupEvents,
+        events: &dyn GoalEvents,
     ) -> Result<GoalEnd, GoalError> {
         let (group, began) = (Arc::clone(&errand.group), Instant::now());
         let (sender, mut said) = mpsc::unbounded_channel::<(Arc<MemberServant>, GoalUpdate)>();
@@ -342,3 +308,6 @@ impl GroupGoal {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -3,11 +3,10 @@
 use std::collections::BTreeMap;
 
 use package::interface::{Interface, Service};
-use ros::bus::{NodeEntities, RosVersion, ServiceType};
+use ros::bus::{ActionEndpoint, NodeEntities, RosVersion, ServiceType};
 use ros::ros2::actions::ActionInterfaces;
 use ros::schema::Registry;
 
-use super::action_ends::ActionEndpoint;
 use super::view::GroupView;
 
 /// Returns the type of a service of the interface, as its server announces it.

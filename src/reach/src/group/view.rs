@@ -3,9 +3,8 @@
 use std::collections::BTreeMap;
 
 use package::interface::Interface;
-use ros::bus::{ActionNodes, Graph, RosVersion, TopicNodes};
+use ros::bus::{ActionEndpoint, ActionNodes, Graph, RosVersion, TopicNodes, action_endpoints};
 
-use super::action_ends::{ActionEndpoint, action_endpoints};
 use super::names::{NameKind, NameResolver};
 
 /// Name of a node that is missing in the interface.

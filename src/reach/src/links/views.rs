@@ -51,7 +51,8 @@ impl Hub {
             let types = Arc::new(types.with_known(registry(), self.bus.version()));
             let observer = Arc::new(LossNotifier { hub: Arc::downgrade(self), version });
             let _span = self.log_span.enter();
-            let bus = TranslatedBus::new(Arc::clone(&self.bus), types, registry(), observer);
+            let budget = &self.options.budget;
+            let bus = TranslatedBus::new(Arc::clone(&self.bus), types, registry(), observer, budget);
             ServantView::new(Arc::clone(&bus) as _, TypeDefinitions::Twins(bus))
         });
         Arc::clone(view)

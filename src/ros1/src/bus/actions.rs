@@ -7,48 +7,36 @@ mod server;
 use std::sync::Arc;
 
 use ros_bus::{BusError, Publisher, QosProfile, Subscription, WireType};
-use ros_message::schema::{ActionDef, MessageType, Registry, SchemaError};
+use ros_message::schema::ActionDef;
 
 use super::{EndpointOwner, Ros1BusState, publications, subscriptions};
+use crate::actions::{ActionTopicTypes, QUEUE};
 
 pub(super) use client::Ros1ActionClient;
 pub(super) use server::Ros1ActionServer;
-
-/// Queue depth for a slow peer.
-const QUEUE: usize = 100;
 
 /// The topics of one action of this node.
 struct ActionTopicSet<'a> {
     bus: &'a Arc<Ros1BusState>,
     name: &'a str,
-    of: &'a ActionDef,
-    goal_id: Arc<MessageType>,
-    states: Arc<MessageType>,
+    types: ActionTopicTypes,
 }
 
 impl<'a> ActionTopicSet<'a> {
-    fn new(bus: &'a Arc<Ros1BusState>, name: &'a str, of: &'a ActionDef) -> Result<Self, BusError> {
-        let known = Registry::new();
-        let unusable =
-            |error: SchemaError| BusError::Protocol { what: format!("action {name}"), reason: error.to_string() };
-        Ok(Self {
-            bus,
-            name,
-            of,
-            goal_id: known.message("actionlib_msgs/GoalID").map_err(unusable)?,
-            states: known.message("actionlib_msgs/GoalStatusArray").map_err(unusable)?,
-        })
+    fn new(bus: &'a Arc<Ros1BusState>, name: &'a str, of: &ActionDef) -> Result<Self, BusError> {
+        Ok(Self { bus, name, types: ActionTopicTypes::for_action(name, of)? })
     }
 
     fn topic(&self, part: &str) -> (String, WireType) {
+        let types = &self.types;
         let of = match part {
-            "goal" => &self.of.action_goal,
-            "cancel" => &self.goal_id,
-            "status" => &self.states,
-            "feedback" => &self.of.action_feedback,
-            _ => &self.of.action_result,
+            "goal" => &types.goal,
+            "cancel" => &types.cancel,
+            "status" => &types.status,
+            "feedback" => &types.feedback,
+            _ => &types.result,
         };
-        (format!("{}/{part}", self.name), WireType::from_message(of))
+        (format!("{}/{part}", self.name), WireType::clone(of))
     }
 
     async fn subscribe(&self, part: &str) -> Result<Subscription, BusError> {

@@ -202,6 +202,11 @@ impl<T: GoalServerTopics> GoalServer<T> {
         GoalId::parse(id).is_some_and(|id| goals.is_under_way(id))
     }
 
+    /// Returns the ids of the goals that have not ended.
+    pub fn under_way(&self) -> Vec<String> {
+        self.goals.lock().under_way().iter().map(GoalId::to_string).collect()
+    }
+
     /// Publishes feedback for a goal; returns false if no goal with this id is active.
     pub fn publish_feedback(&self, id: &str, feedback: &[u8]) -> bool {
         let id = GoalId::parse(id).filter(|id| self.goals.lock().is_under_way(*id));

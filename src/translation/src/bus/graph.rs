@@ -5,7 +5,7 @@
 //! * For a robot of ROS 2 each endpoint announces its type and quality of service. In ROS 1 only the node itself knows
 //!   the type of a service and whether a topic is latched, so it is asked, and shown once it has answered.
 //!
-//! Actions consist of other parts in each ROS and are left out.
+//! Actions consist of other parts in each ROS; `actions` adds them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -15,7 +15,8 @@ use ros::bus::{Graph, NodeEntities, Offer, QosProfile, RosVersion, ServiceType, 
 use ros::ros2::names;
 use tokio::sync::watch;
 
-use super::state::{LeftOut, Translation};
+use super::actions::add_actions;
+use super::state::{LeftOut, TranslatedGraph, Translation};
 use super::twins::{KnownTwins, Untranslatable};
 
 /// Packages of ROS 2 whose services every node provides.
@@ -31,21 +32,6 @@ const FIXED_TRANSFORMS: &str = "/tf_static";
 /// History depth of a publisher of ROS 1, which announces none.
 const DEPTH: usize = 10;
 
-/// A graph for a robot, and what it lacks.
-#[derive(Debug, Default)]
-pub(super) struct TranslatedGraph {
-    pub(super) graph: Graph,
-    pub(super) left_out: LeftOut,
-}
-
-impl TranslatedGraph {
-    fn leave_out<'a>(&mut self, what: String, nodes: impl Iterator<Item = &'a str>, reason: &Untranslatable) {
-        let entry = self.left_out.entry(what).or_default();
-        entry.nodes.extend(nodes.map(str::to_owned));
-        entry.reason = reason.to_string();
-    }
-}
-
 /// Keeps a robot's graph up to date until the servant's bus is closed.
 pub(super) async fn follow(
     translation: Arc<Translation>,
@@ -58,7 +44,7 @@ pub(super) async fn follow(
     loop {
         let now = graphs.borrow_and_update().clone();
         let translated = match translation.version {
-            RosVersion::One => for_ros1(&now, &translation.twins),
+            RosVersion::One => for_ros1(&now, translation.inner.node(), &translation.twins),
             RosVersion::Two => {
                 let topics = now.topics.iter().filter(|(_, ends)| !ends.publishers.is_empty());
                 inquiries.retain(&now.services.keys().collect(), &topics.map(|(topic, _)| topic).collect());
@@ -103,8 +89,8 @@ fn ask_nodes(translation: &Translation, now: &Graph, inquiries: &mut TypeInquiri
     for_ros2(now, bus.node(), &translation.twins, offer, service)
 }
 
-/// Returns the graph of a servant of ROS 2 for a robot of ROS 1.
-pub(super) fn for_ros1(inner: &Graph, twins: &KnownTwins) -> TranslatedGraph {
+/// Returns the graph of a servant of ROS 2 for a robot of ROS 1. `own` is the bus itself.
+pub(super) fn for_ros1(inner: &Graph, own: &str, twins: &KnownTwins) -> TranslatedGraph {
     let mut out = TranslatedGraph::default();
     let owner = |node: &str| inner.process_owner(node).to_owned();
     let owners = |nodes: &[String]| {
@@ -145,10 +131,7 @@ pub(super) fn for_ros1(inner: &Graph, twins: &KnownTwins) -> TranslatedGraph {
             Some(Ok(_)) | None => drop(out.graph.services.insert(service.clone(), owner(server))),
         }
     }
-    for (action, ends) in &inner.actions {
-        let nodes = ends.servers.iter().chain(&ends.clients).map(|node| owner(node)).collect::<Vec<_>>();
-        out.leave_out(format!("action {action}"), nodes.iter().map(String::as_str), &Untranslatable::Action);
-    }
+    add_actions(RosVersion::One, inner, own, twins, &mut out);
     let sought = inner.sought.iter().filter(|(service, _)| !hidden_names::is_hidden(service));
     out.graph.sought = sought.map(|(service, nodes)| (service.clone(), owners(nodes))).collect();
     out.graph.nodes = inner.nodes.iter().map(|(node, address)| (owner(node), address.clone())).collect();
@@ -245,10 +228,6 @@ pub(super) fn for_ros2(
             Err(reason) => out.leave_out(format!("service {service}"), [&**server].into_iter(), &reason),
         }
     }
-    for (action, nodes) in &inner.actions {
-        let has = nodes.servers.iter().chain(&nodes.clients).map(String::as_str);
-        out.leave_out(format!("action {action}"), has, &Untranslatable::Action);
-    }
     out.graph.sought = inner
         .sought
         .iter()
@@ -257,5 +236,6 @@ pub(super) fn for_ros2(
         .collect();
     out.graph.nodes = inner.nodes.clone();
     out.graph.ends = ends;
+    add_actions(RosVersion::Two, inner, own, twins, &mut out);
     out
 }

@@ -6,7 +6,7 @@ use async_trait::async_trait;
 use ros::bus::{BusError, Lender, Lending, LentService, ServiceProvider, ServiceType};
 
 use super::services;
-use super::state::{TranslatedBus, Translation, not_translated};
+use super::state::{Translation, not_translated};
 
 /// Returns a service of the robot as the servant's nodes see it.
 pub(super) fn lend_to_servant(
@@ -20,15 +20,18 @@ pub(super) fn lend_to_servant(
     Ok(LentService { service_type, handler, gone })
 }
 
+/// Lends services of a robot's ROS to nodes of the servant.
+pub(super) struct TranslatedLending(pub(super) Arc<Translation>);
+
 #[async_trait]
-impl Lending for TranslatedBus {
+impl Lending for TranslatedLending {
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
-        let lender = Arc::new(TranslatingLender { lender, translation: Arc::clone(&self.translation) });
-        self.translation.inner.lending()?.lend(lender).await
+        let lender = Arc::new(TranslatingLender { lender, translation: Arc::clone(&self.0) });
+        self.0.inner.lending()?.lend(lender).await
     }
 
     async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
-        let translation = &self.translation;
+        let translation = &self.0;
         let ServiceProvider { node, service_type, label } = translation.inner.lending()?.provider(service).await?;
         let twin = translation.twins.service(&service_type);
         let twin = twin.map_err(|reason| not_translated(format!("service {service}"), reason))?;
@@ -36,7 +39,7 @@ impl Lending for TranslatedBus {
     }
 
     fn set_label(&self, label: &str) {
-        if let Ok(lending) = self.translation.inner.lending() {
+        if let Ok(lending) = self.0.inner.lending() {
             lending.set_label(label);
         }
     }

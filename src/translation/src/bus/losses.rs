@@ -83,6 +83,11 @@ impl LossCounters {
         self.observer.on_loss(service, &text);
     }
 
+    /// Reports something that the robot's ROS has no field for.
+    pub(super) fn report(&self, name: &str, text: &str) {
+        self.observer.on_loss(name, text);
+    }
+
     /// Adds to a counter; returns whether that was the first loss of its kind.
     fn count(&self, name: &str, of: impl Fn(&mut TranslationLosses) -> &mut u64, more: u64) -> bool {
         let mut counts = self.counts.lock();

@@ -5,21 +5,10 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, TopicPeer, WireType};
-use tokio::sync::watch;
-use tokio_util::task::AbortOnDropHandle;
 
 use super::losses::LossCounters;
-use super::twins::KnownTwins;
+use super::twins::{KnownTwins, Untranslatable};
 use crate::ServiceTwin;
-
-/// A servant's bus as seen by robots of the other ROS version.
-pub struct TranslatedBus {
-    pub(super) translation: Arc<Translation>,
-    pub(super) graph: watch::Receiver<Arc<Graph>>,
-    pub(super) left_out: watch::Receiver<Arc<LeftOut>>,
-    /// Keeps the graph up to date.
-    pub(super) _following: AbortOnDropHandle<()>,
-}
 
 /// What the endpoints of a translated bus share.
 pub(super) struct Translation {
@@ -43,6 +32,26 @@ pub struct LeftOutEntry {
     pub nodes: BTreeSet<String>,
     /// The reason, which names the field at fault.
     pub reason: String,
+}
+
+/// A graph for a robot, and what it lacks.
+#[derive(Debug, Default)]
+pub(super) struct TranslatedGraph {
+    pub(super) graph: Graph,
+    pub(super) left_out: LeftOut,
+}
+
+impl TranslatedGraph {
+    pub(super) fn leave_out<'a>(
+        &mut self,
+        what: String,
+        nodes: impl Iterator<Item = &'a str>,
+        reason: &Untranslatable,
+    ) {
+        let entry = self.left_out.entry(what).or_default();
+        entry.nodes.extend(nodes.map(str::to_owned));
+        entry.reason = reason.to_string();
+    }
 }
 
 impl Translation {

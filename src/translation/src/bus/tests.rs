@@ -1,5 +1,7 @@
 //! A robot's bus over servants of the other ROS: nodes of ROS 2 in memory, nodes of ROS 1 at a real Master.
 
+mod actions;
+
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -31,6 +33,7 @@ fn definitions(version: RosVersion) -> Arc<Registry> {
         ("std_srvs/srv/Trigger", "---\nbool success\nstring message"),
         ("geometry_msgs/msg/Point", "float64 x\nfloat64 y\nfloat64 z"),
         ("geometry_msgs/msg/PointStamped", "std_msgs/Header header\nPoint point"),
+        ("x_msgs/action/Count", "int32 order\n---\nint32 sum\n---\nint32 part\n"),
     ] {
         registry.insert(key, text).expect("a definition");
     }
@@ -85,7 +88,8 @@ fn translate(inner: Arc<dyn Bus>) -> (Arc<TranslatedBus>, Arc<RecordedLosses>) {
     let losses = Arc::new(RecordedLosses::default());
     let (version, registry) = (inner.version(), definitions(inner.version()));
     let types = TypeTranslations::new(TranslationRules::default()).with_known(Arc::clone(&registry), version);
-    (TranslatedBus::new(inner, Arc::new(types), registry, Arc::clone(&losses) as _), losses)
+    let budget = Budget::without_limit();
+    (TranslatedBus::new(inner, Arc::new(types), registry, Arc::clone(&losses) as _, &budget), losses)
 }
 
 /// A servant of ROS 2: a robot's bus, and a node.
@@ -371,7 +375,7 @@ fn a_process_of_ros_2_is_one_node_of_ros_1() {
         enclaves: [(mark, ["/see", "/eye"].map(str::to_owned).into())].into(),
         ..Graph::default()
     };
-    let translated = graph::for_ros1(&inner, &twins);
+    let translated = graph::for_ros1(&inner, "/bridge", &twins);
     let graph = translated.graph;
     assert_eq!(graph.topics["/found"].publishers, ["/see"]);
     assert_eq!(graph.topics["/other"].publishers, ["/other"]);

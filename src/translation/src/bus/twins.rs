@@ -4,10 +4,10 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Digest, RosVersion, ServiceType, WireType};
-use ros::schema::{MessageType, Registry, SchemaError};
+use ros::bus::{BusError, Digest, RosVersion, ServiceType, WireType};
+use ros::schema::{ActionDef, MessageType, Registry, SchemaError, ServiceDef};
 
-use crate::{MessageTranslator, MessageTwin, NoTwin, ServiceTwin, TypeTranslations};
+use crate::{ActionTwin, MessageTranslator, MessageTwin, NoTwin, ServiceTwin, TypeTranslations};
 
 /// Maximum number of types remembered; beyond it they are found anew.
 const MOST: usize = 4096;
@@ -34,9 +34,15 @@ pub(super) enum Untranslatable {
     /// The other ROS does not allow the name.
     #[error("ROS 2 does not allow this name: a part of it is empty or begins with a digit; remap it")]
     Name,
-    /// Actions have other parts in the other ROS.
-    #[error("actions are not carried between ROS 1 and ROS 2")]
-    Action,
+    /// A node of the servant is a client of the action.
+    #[error(
+        "no node of the service serves this action, and actions that a robot serves are not carried between ROS 1 and \
+         ROS 2: run the client and the server in the same ROS"
+    )]
+    ActionOfRobot,
+    /// The action cannot be made of parts of the other ROS.
+    #[error(transparent)]
+    Parts(BusError),
 }
 
 /// Types and their twins.
@@ -126,6 +132,69 @@ impl KnownTwins {
             let found = self.types.service(&self.registry.service(&name).ok()?).ok()?;
             is_it(&found).then_some(found)
         })
+    }
+
+    /// Returns the twin of an action type of the servant's nodes, which is defined in its image.
+    pub(super) fn action(&self, type_name: &str) -> Result<Arc<ActionTwin>, Untranslatable> {
+        let original = self.registry.action(type_name);
+        let original =
+            original.map_err(|source| Untranslatable::NoDefinition { name: type_name.to_owned(), source })?;
+        Ok(self.types.action(&original)?)
+    }
+
+    /// Returns the action of the image whose twin has this name.
+    fn action_with_twin(&self, name: &str) -> Option<Arc<ActionTwin>> {
+        let found = self.action(&self.types.action_name(name, self.version)).ok()?;
+        (found.twin.name == name).then_some(found)
+    }
+
+    /// Returns the servant's action to which goals of a robot's type are carried, with the robot's as its twin: the
+    /// image's, otherwise one that is derived from the robot's.
+    pub(super) fn action_for_robot(&self, of: &Arc<ActionDef>) -> Result<Arc<ActionTwin>, Untranslatable> {
+        let known = self.action_with_twin(&of.name);
+        if let Some(known) = known.filter(|known| known.twin.action.digest() == of.action.digest()) {
+            return Ok(known);
+        }
+        let own = self.types.action(of)?;
+        Ok(Arc::new(ActionTwin {
+            original: Arc::clone(&own.twin),
+            twin: Arc::clone(&own.original),
+            goal: Arc::new(own.goal.reverse()),
+            result: Arc::new(own.result.reverse()),
+            feedback: Arc::new(own.feedback.reverse()),
+        }))
+    }
+
+    /// Returns the definition of a message that carries goals, feedback, results or statuses of the image's actions, as
+    /// the robot sees it.
+    pub(super) fn message_of_action(&self, of: &WireType) -> Option<Arc<MessageType>> {
+        let suffixes = match self.version {
+            RosVersion::One => ["ActionGoal", "ActionFeedback", "ActionResult"],
+            RosVersion::Two => ["_SendGoal_Request", "_FeedbackMessage", "_GetResult_Response"],
+        };
+        let action = suffixes.iter().find_map(|suffix| of.name.strip_suffix(suffix));
+        let found = match action {
+            Some(action) => {
+                let twin = self.action_with_twin(action)?;
+                let parts = [&twin.twin.action_goal, &twin.twin.action_feedback, &twin.twin.action_result];
+                parts.into_iter().find(|part| part.name() == of.name).cloned()?
+            }
+            // Every registry has what is common to all actions.
+            None if of.name.starts_with("actionlib_msgs/") || of.name.starts_with("action_msgs/") => {
+                Registry::for_version(self.version).message(&of.name).ok()?
+            }
+            None => return None,
+        };
+        of.digest.is_compatible_with(&Digest::from(found.digest())).then_some(found)
+    }
+
+    /// Returns the definition of a service of the image's actions, as a robot of ROS 2 sees it.
+    pub(super) fn service_of_action(&self, of: &ServiceType) -> Option<Arc<ServiceDef>> {
+        let (action, _) = of.name.rsplit_once('_')?;
+        let twin = self.action_with_twin(action)?;
+        let services = twin.twin.services.as_ref()?;
+        let mut parts = [&services.send_goal, &services.get_result].into_iter();
+        parts.find(|part| of.matches(&ServiceType::from_service(part))).cloned()
     }
 
     /// Returns the servant's type to which messages of a robot's type are carried, and their translator. A type that no

@@ -1,31 +1,20 @@
 //! Goals sent by this node, tracked over actionlib's topics.
 
-use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use parking_lot::Mutex;
-use ros_bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalError, GoalEvents, GoalOutcome, Graph, MatchedPeers, Publisher,
-    Subscription,
-};
-use ros_message::codec::Time;
+use ros_bus::{ActionClient, BusError, CallFate, GoalError, GoalEvents, Graph, MatchedPeers, Publisher, Subscription};
 use ros_message::schema::ActionDef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-use crate::actions::messages::{self, ActionlibStatus, GoalId};
+use crate::actions::goal_client::GoalClient;
 use crate::bus::Ros1BusState;
 use crate::bus::actions::answers::KnownResponders;
 
-/// Time after which a goal that the server no longer lists is lost.
-const LOST_AFTER: Duration = Duration::from_secs(5);
-/// Time after which a goal that the server never listed is lost. It is much longer: actionlib clients wait forever for
-/// that, because a server may be slow, or another one may take the goal in its place.
-const NEVER_TAKEN: Duration = Duration::from_secs(60);
 /// Time for which a cancel waits for a server that has accepted the goal but is not connected to the cancel topic yet.
 const CANCEL_WAITS: Duration = Duration::from_secs(10);
 /// Time without a publisher of results after which the server counts as gone.
@@ -41,7 +30,7 @@ struct ActionlibClientState {
     bus: Arc<Ros1BusState>,
     name: String,
     type_name: String,
-    goals: Mutex<HashMap<String, TrackedGoal>>,
+    goals: GoalClient,
     ends: OnceLock<ActionClientPublishers>,
     answers: KnownResponders,
     state: watch::Sender<State>,
@@ -64,29 +53,6 @@ enum State {
     Failed(GoalError),
 }
 
-struct TrackedGoal {
-    /// Time at which the server last mentioned the goal, or at which it was sent.
-    seen: Instant,
-    /// Time for which the server may leave the goal unmentioned.
-    patience: Duration,
-    events: Arc<dyn GoalEvents>,
-}
-
-impl TrackedGoal {
-    fn new(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
-        Self { seen: now, patience: NEVER_TAKEN, events }
-    }
-
-    fn mark_seen(&mut self, now: Instant) {
-        self.seen = now;
-        self.patience = LOST_AFTER;
-    }
-
-    fn is_lost(&self, now: Instant) -> bool {
-        now.duration_since(self.seen) > self.patience
-    }
-}
-
 /// Subscriptions to what the server publishes.
 struct ActionClientSubscriptions {
     feedback: Subscription,
@@ -101,7 +67,7 @@ impl Ros1ActionClient {
             bus: bus.clone(),
             name: name.to_owned(),
             type_name: of.name.clone(),
-            goals: Mutex::default(),
+            goals: GoalClient::default(),
             ends: OnceLock::new(),
             answers: KnownResponders::default(),
             state: watch::Sender::new(State::Opening),
@@ -124,11 +90,9 @@ impl Drop for Ros1ActionClient {
             task.abort();
         }
         // Nobody needs the goals any longer.
-        let goals = std::mem::take(&mut *self.shared.goals.lock());
+        let cancels = self.shared.goals.abandon();
         if let Some(ends) = self.shared.ends.get() {
-            for id in goals.into_keys() {
-                ends.cancel.publish(cancel_message(&id));
-            }
+            cancels.into_iter().for_each(|cancel| ends.cancel.publish(cancel));
         }
     }
 }
@@ -171,11 +135,7 @@ impl ActionClient for Ros1ActionClient {
         let Some(ends) = self.shared.ends.get() else {
             return events.on_ended(Err(GoalError::NotReady(self.shared.name.clone())));
         };
-        let known = TrackedGoal::new(Instant::now(), events);
-        self.shared.goals.lock().insert(id.to_owned(), known);
-        let stamp = Time::now();
-        let id = GoalId { stamp, id: id.to_owned() };
-        ends.goal.publish(messages::write_goal(stamp, &id, &goal));
+        ends.goal.publish(self.shared.goals.begin(id, &goal, events));
     }
 
     /// Sends the cancel as soon as the server is connected.
@@ -184,27 +144,22 @@ impl ActionClient for Ros1ActionClient {
         let Some(ends) = shared.ends.get() else {
             return;
         };
-        if !shared.goals.lock().contains_key(id) {
+        let Some(cancel) = shared.goals.cancel(id) else {
             return;
-        }
+        };
         let matched = ends.cancel.matched_subscribers();
         if matched.borrow().connected_count() > 0 {
-            return ends.cancel.publish(cancel_message(id));
+            return ends.cancel.publish(cancel);
         }
         let (waiting, id) = (shared.clone(), id.to_owned());
         shared.bus.spawn(async move {
             // Bounded: a server need not subscribe to cancels.
             let _ = timeout(CANCEL_WAITS, ros_bus::wait_for_connected(matched, 1)).await;
-            let under_way = waiting.goals.lock().contains_key(&id);
-            if let Some(ends) = waiting.ends.get().filter(|_| under_way) {
-                ends.cancel.publish(cancel_message(&id));
+            if let Some((ends, cancel)) = waiting.ends.get().zip(waiting.goals.cancel(&id)) {
+                ends.cancel.publish(cancel);
             }
         });
     }
-}
-
-fn cancel_message(id: &str) -> Bytes {
-    messages::write_cancel(&GoalId { stamp: Time::default(), id: id.to_owned() })
 }
 
 impl ActionlibClientState {
@@ -230,8 +185,8 @@ impl ActionlibClientState {
             tokio::select! {
                 // Feedback arrived before the result it belongs to.
                 biased;
-                Some(message) = heard.feedback.messages.recv() => self.on_feedback(&message.bytes),
-                Some(message) = heard.result.messages.recv() => self.on_result(&message.bytes),
+                Some(message) = heard.feedback.messages.recv() => self.goals.on_feedback(&message.bytes),
+                Some(message) = heard.result.messages.recv() => self.goals.on_result(&message.bytes),
                 Some(message) = heard.status.messages.recv() => self.on_status(&message.bytes),
                 else => return self.fail_all(BusError::Closed.into()),
             }
@@ -294,41 +249,10 @@ impl ActionlibClientState {
         }
     }
 
-    fn on_feedback(&self, bytes: &Bytes) {
-        let Some((state, body)) = messages::read_state(bytes) else {
+    fn on_status(&self, message: &[u8]) {
+        if !self.goals.on_status(message) {
             return;
-        };
-        let events = match self.goals.lock().get_mut(&state.goal.id) {
-            Some(goal) => {
-                goal.mark_seen(Instant::now());
-                goal.events.clone()
-            }
-            None => return,
-        };
-        events.on_feedback(body);
-    }
-
-    fn on_result(&self, bytes: &Bytes) {
-        let Some((state, body)) = messages::read_state(bytes) else {
-            return;
-        };
-        let Some(goal) = self.goals.lock().remove(&state.goal.id) else {
-            return;
-        };
-        let outcome = match state.status {
-            ActionlibStatus::Succeeded => GoalOutcome::Succeeded,
-            ActionlibStatus::Preempted | ActionlibStatus::Recalled => GoalOutcome::Canceled,
-            ActionlibStatus::Aborted => GoalOutcome::Aborted,
-            ActionlibStatus::Rejected => GoalOutcome::Rejected,
-            _ => GoalOutcome::Unknown,
-        };
-        goal.events.on_ended(Ok(GoalEnd { outcome, text: state.text, result: body }));
-    }
-
-    fn on_status(&self, bytes: &Bytes) {
-        let Some(states) = messages::read_states(bytes) else {
-            return;
-        };
+        }
         self.state.send_if_modified(|state| {
             let first = matches!(state, State::Open);
             if first {
@@ -336,33 +260,11 @@ impl ActionlibClientState {
             }
             first
         });
-        let now = Instant::now();
-        let mut lost = Vec::new();
-        let mut goals = self.goals.lock();
-        for (id, goal) in goals.iter_mut() {
-            if states.iter().any(|state| state.goal.id == *id) {
-                goal.mark_seen(now);
-            } else if goal.is_lost(now) {
-                lost.push(id.clone());
-            }
-        }
-        let lost: Vec<_> = lost.iter().filter_map(|id| goals.remove(id)).collect();
-        drop(goals);
-        for goal in lost {
-            goal.events.on_ended(Err(GoalError::Forgotten));
-        }
-    }
-
-    fn end_all(&self, reason: &GoalError) {
-        let goals = std::mem::take(&mut *self.goals.lock());
-        for goal in goals.into_values() {
-            goal.events.on_ended(Err(reason.clone()));
-        }
     }
 
     fn fail_all(&self, reason: GoalError) {
         self.state.send_replace(State::Failed(reason.clone()));
-        self.end_all(&reason);
+        self.goals.end_all(&reason);
     }
 }
 
@@ -381,32 +283,9 @@ async fn watch_server(shared: Arc<ActionlibClientState>) {
         if timeout(GONE_AFTER, graph.wait_for(there)).await.is_ok() {
             continue;
         }
-        shared.end_all(&GoalError::ServerGone(shared.name.clone()));
+        shared.goals.end_all(&GoalError::ServerGone(shared.name.clone()));
         if graph.wait_for(there).await.is_err() {
             return;
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    struct Nobody;
-
-    impl GoalEvents for Nobody {
-        fn on_feedback(&self, _: Bytes) {}
-
-        fn on_ended(&self, _: Result<GoalEnd, GoalError>) {}
-    }
-
-    #[test]
-    fn a_goal_that_nobody_took_yet_is_waited_for_longer_than_one_that_was_dropped() {
-        let begin = Instant::now();
-        let after = |seconds| begin + Duration::from_secs(seconds);
-        let mut goal = TrackedGoal::new(begin, Arc::new(Nobody));
-        assert!(!goal.is_lost(after(30)) && goal.is_lost(after(61)));
-        goal.mark_seen(after(30));
-        assert!(!goal.is_lost(after(34)) && goal.is_lost(after(36)));
     }
 }

@@ -1,10 +1,20 @@
-use package::interface::Interface;
-use ros::bus::{ActionHandler, ActionServer, Bus, RosVersion};
-use ros::codec::{from_json, to_json};
-use ros::schema::{MessageType, Registry};
-use serde_json::{Value, json};
+use std::sync::Arc;
+use std::time::Duration;
 
-use super::*;
+use budget::Budget;
+use bytes::Bytes;
+use package::interface::Interface;
+use ros::bus::{
+    ActionHandler, ActionServer, Bus, BusError, FailureReason, GoalEnd, GoalOutcome, QosProfile, RosVersion,
+    Subscription, WireType,
+};
+use ros::codec::{from_json, to_json};
+use ros::schema::{ActionDef, MessageType, Registry};
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+use crate::group::ServantGroup;
 use crate::group::bus::GroupBus;
 use crate::group::dispatch::{GroupLoad, Member, Rules};
 use crate::group::node_ends;

@@ -1,12 +1,15 @@
-//! ROS 2 actions of a group: three services and two topics. To a robot the group looks like one action server that has
-//! only its goals.
+//! An action of ROS 2 that a client of another kind stands behind: to those who use its three services and two topics
+//! it looks like one action server.
 //!
 //! ```text
-//!  send_goal ──▶ GroupClient ─▶ the group      the response is the node's decision; while no servant is free,
-//!                     │                        the goal is accepted but not executed yet
-//!  cancel_goal ─▶ ────┘                        likewise
-//!  get_result, feedback, status ◀── updates about this robot's goals
+//!  send_goal ──▶ ActionClient      a group of servants, an action of the other ROS
+//!                     │            the response is the server's decision; a goal that waits is accepted, but not
+//!                     │            executed yet
+//!  cancel_goal ─▶ ────┘            likewise
+//!  get_result, feedback, status ◀── GoalEvents
 //! ```
+//!
+//! Its users have its own goals only: a cancel of all goals concerns no goal that was sent elsewhere.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -17,43 +20,39 @@ use budget::{Budget, Permit};
 use bytes::Bytes;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
-use ros::bus::{
-    ActionClient, BusError, CallFate, Digest, FailureReason, GoalEnd, GoalError, GoalEvents, GoalOutcome, MatchedPeers,
-    MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType, Subscription, TopicPeer, WireType,
-    message_queue,
+use ros_bus::{
+    ActionClient, ActionEndpoint, BusError, CallFate, Digest, FailureReason, GoalEnd, GoalError, GoalEvents,
+    GoalOutcome, MatchedPeers, MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType, Subscription,
+    TopicPeer, WireType, message_queue,
 };
-use ros::ros2::actions::ActionInterfaces;
-use ros::ros2::actions::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
-use ros::schema::ActionDef;
-use tokio::sync::{mpsc, oneshot, watch};
+use ros_message::schema::ActionDef;
+use tokio::sync::{oneshot, watch};
+use tokio::task::AbortHandle;
 use tokio::time::timeout;
-use tokio_util::task::AbortOnDropHandle;
 
-use super::ServantGroup;
-use super::action_ends::ActionEndpoint;
-use super::dispatch::RobotNumber;
-use super::goals::{GroupClient, GroupEvents};
+use super::ActionInterfaces;
+use super::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
 
-/// Notices for a robot: name of the node on the robot, and text.
-pub(super) type Notices = mpsc::UnboundedSender<(String, String)>;
+/// Receives reasons for which goals were refused or ended, in words for people: ROS 2 has no field for them. Must not
+/// block.
+pub type GoalNotices = Arc<dyn Fn(String) + Send + Sync>;
 
-/// One action of one robot.
-pub(super) struct ActionParts {
+/// The services and topics of one action in front of a client.
+pub struct GoalServices<C> {
     parts: ActionInterfaces,
-    node: PeerId,
-    client: GroupClient,
-    goals: Arc<GoalServer<GoalTopics>>,
+    client: C,
+    goals: Arc<GoalServer<PublishedTopics>>,
     /// Budget for pending goals.
     budget: Budget,
-    /// Cancellations that wait for the node's answer.
+    /// Cancellations that wait for the server's answer.
     canceling: Mutex<HashMap<String, Vec<oneshot::Sender<bool>>>>,
-    notices: Notices,
+    notices: GoalNotices,
     matched: watch::Sender<MatchedPeers>,
-    _forgetting: AbortOnDropHandle<()>,
+    expiring: AbortHandle,
 }
 
 /// Publisher of the feedback and status topics.
-struct GoalTopics {
+struct PublishedTopics {
     node: PeerId,
     feedback: Arc<WireType>,
     status: Arc<WireType>,
@@ -67,7 +66,7 @@ struct Listeners {
     status: Option<SerializedMessage>,
 }
 
-impl GoalTopics {
+impl PublishedTopics {
     fn build_message(&self, of: &Arc<WireType>, bytes: Bytes, latching: bool) -> SerializedMessage {
         SerializedMessage { bytes, wire_type: Arc::clone(of), publisher: self.node.clone(), latching }
     }
@@ -82,7 +81,7 @@ impl Listeners {
     }
 }
 
-impl GoalServerTopics for GoalTopics {
+impl GoalServerTopics for PublishedTopics {
     fn publish_feedback(&self, message: Bytes) {
         let message = self.build_message(&self.feedback, message, false);
         self.state.lock().publish(ActionEndpoint::Feedback, &message);
@@ -96,48 +95,55 @@ impl GoalServerTopics for GoalTopics {
     }
 }
 
-impl ActionParts {
-    pub(super) fn new(
-        group: &Arc<ServantGroup>,
-        robot: RobotNumber,
+impl<C: ActionClient + 'static> GoalServices<C> {
+    /// Creates the services and topics of an action that `node` seems to serve. Goals under way and results kept for
+    /// late requests are charged to `budget`.
+    pub fn new(
         (name, node): (&str, &str),
         of: &Arc<ActionDef>,
+        client: C,
         budget: &Budget,
-        notices: &Notices,
-    ) -> Result<Arc<ActionParts>, BusError> {
+        notices: GoalNotices,
+    ) -> Result<Arc<Self>, BusError> {
         let parts = ActionInterfaces::for_action(name, of)?;
         let node = PeerId::from(node);
-        let published = GoalTopics {
-            node: node.clone(),
+        let peer = TopicPeer { id: node.clone(), connected: true, offer: None };
+        let published = PublishedTopics {
+            node,
             feedback: Arc::new(parts.feedback.1.clone()),
             status: Arc::new(parts.status.1.clone()),
             state: Mutex::default(),
         };
         let goals = GoalServer::new(name, of, published, budget.clone());
-        let forgets = Arc::clone(&goals);
-        let forgetting = tokio::spawn(async move { forgets.expire_results().await });
-        let peer = TopicPeer { id: node.clone(), connected: true, offer: None };
-        Ok(Arc::new(ActionParts {
+        let expires = Arc::clone(&goals);
+        let expiring = tokio::spawn(async move { expires.expire_results().await });
+        Ok(Arc::new(Self {
             parts,
-            node,
-            client: GroupClient::new(group, robot, name, of),
+            client,
             goals,
             budget: budget.clone(),
             canceling: Mutex::default(),
-            notices: notices.clone(),
+            notices,
             matched: watch::Sender::new(MatchedPeers { peers: vec![peer], refused: Vec::new() }),
-            _forgetting: AbortOnDropHandle::new(forgetting),
+            expiring: expiring.abort_handle(),
         }))
     }
 
-    pub(super) fn wire_type(&self, end: ActionEndpoint) -> &WireType {
+    /// Returns the client that executes the goals.
+    pub fn client(&self) -> &C {
+        &self.client
+    }
+
+    /// Returns the type of a topic.
+    pub fn wire_type(&self, end: ActionEndpoint) -> &WireType {
         match end {
             ActionEndpoint::Feedback => &self.parts.feedback.1,
             _ => &self.parts.status.1,
         }
     }
 
-    pub(super) fn service_type(&self, end: ActionEndpoint) -> &ServiceType {
+    /// Returns the type of a service.
+    pub fn service_type(&self, end: ActionEndpoint) -> &ServiceType {
         match end {
             ActionEndpoint::SendGoal => &self.parts.send_goal.1,
             ActionEndpoint::CancelGoal => &self.parts.cancel_goal.1,
@@ -146,7 +152,7 @@ impl ActionParts {
     }
 
     /// Subscribes to a topic with updates about this robot's goals.
-    pub(super) fn subscribe(
+    pub fn subscribe(
         self: &Arc<Self>,
         end: ActionEndpoint,
         of: &WireType,
@@ -177,7 +183,7 @@ impl ActionParts {
     }
 
     /// Calls one of the services.
-    pub(super) async fn call(
+    pub async fn call(
         self: &Arc<Self>,
         (end, name): (ActionEndpoint, &str),
         digest: &Digest,
@@ -203,14 +209,19 @@ impl ActionParts {
         timeout(patience, answer).await.map_err(late)?
     }
 
-    /// Cancels all goals because the robot or its node is gone; they are not followed for long.
-    pub(super) fn cancel_all(&self) {
-        self.client.abandon();
+    /// Cancels all goals.
+    pub fn cancel_all(&self) {
+        self.goals.under_way().iter().for_each(|id| self.client.cancel_goal(id));
+    }
+
+    /// Returns true if a goal has not ended.
+    pub fn has_goals(&self) -> bool {
+        !self.goals.under_way().is_empty()
     }
 
     async fn send_goal(self: &Arc<Self>, name: &str, request: &[u8]) -> Result<Bytes, BusError> {
         let refused = |reason: &dyn Display| {
-            self.notify_robot(&format!("a goal is refused: {reason}"));
+            self.notify(&format!("a goal is refused: {reason}"));
             Ok(goal_server::rejected_response())
         };
         let (begun, goal) = match self.goals.begin(request) {
@@ -226,15 +237,15 @@ impl ActionParts {
         };
         let (answer, answered) = oneshot::channel();
         let id = begun.id();
-        let events = PartsGoalEvents {
+        let events = ServicesGoalEvents {
             // It receives the end of the goal even if nobody subscribes any more.
-            parts: Arc::clone(self),
+            services: Arc::clone(self),
             id: id.clone(),
             begun,
             answer: Mutex::new(Some(answer)),
             permit: Mutex::new(Some(permit)),
         };
-        self.client.send_goal_with_events(&id, goal, Arc::new(events));
+        self.client.send_goal(&id, goal, Arc::new(events));
         match answered.await {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(reason)) => {
@@ -275,18 +286,23 @@ impl ActionParts {
         }
     }
 
-    /// Logs on the robot why a goal ended; ROS 2 has no field for that.
-    fn notify_robot(&self, what: &str) {
-        let text = format!("{what} (action {})", self.goals.name());
-        let _ = self.notices.send((self.node.node().to_owned(), text));
+    /// Reports why a goal was refused or ended.
+    fn notify(&self, what: &str) {
+        (self.notices)(format!("{what} (action {})", self.goals.name()));
+    }
+}
+
+impl<C> Drop for GoalServices<C> {
+    fn drop(&mut self) {
+        self.expiring.abort();
     }
 }
 
 /// Response to the sender of a goal, or the reason why there will be none.
 type GoalAnswer = Result<Bytes, FailureReason>;
 
-struct PartsGoalEvents {
-    parts: Arc<ActionParts>,
+struct ServicesGoalEvents<C> {
+    services: Arc<GoalServices<C>>,
     id: String,
     begun: PendingGoal,
     /// Present until the sender is answered.
@@ -295,7 +311,7 @@ struct PartsGoalEvents {
     permit: Mutex<Option<Permit>>,
 }
 
-impl PartsGoalEvents {
+impl<C> ServicesGoalEvents<C> {
     fn answer_once(&self, answer: impl FnOnce() -> GoalAnswer) {
         if let Some(sender) = self.answer.lock().take() {
             let _ = sender.send(answer());
@@ -303,22 +319,31 @@ impl PartsGoalEvents {
     }
 }
 
-impl GoalEvents for PartsGoalEvents {
+impl<C: ActionClient + 'static> GoalEvents for ServicesGoalEvents<C> {
+    fn on_waiting(&self) {
+        let answer = self.services.goals.accept(&self.begun);
+        self.answer_once(|| Ok(answer));
+    }
+
     fn on_accepted(&self) {
-        let answer = self.parts.goals.answer(&self.begun, true);
+        let answer = self.services.goals.answer(&self.begun, true);
         self.answer_once(|| Ok(answer));
     }
 
     fn on_cancel_response(&self, ends: bool) {
-        self.parts.resolve_cancel(&self.id, ends);
+        self.services.resolve_cancel(&self.id, ends);
     }
 
     fn on_feedback(&self, feedback: Bytes) {
-        self.parts.goals.publish_feedback(&self.id, &feedback);
+        // Only a goal that is executed has feedback, whatever arrives first.
+        if self.answer.lock().is_some() {
+            self.on_accepted();
+        }
+        self.services.goals.publish_feedback(&self.id, &feedback);
     }
 
     fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
-        let goals = &self.parts.goals;
+        let goals = &self.services.goals;
         drop(self.permit.lock().take());
         let outcome = end.as_ref().ok().map(|end| end.outcome);
         let (end, mut why) = match end {
@@ -335,7 +360,7 @@ impl GoalEvents for PartsGoalEvents {
             "its node did not accept it when it was free for it".clone_into(&mut why);
         }
         if !why.is_empty() {
-            self.parts.notify_robot(&format!("goal {} ended: {why}", self.id));
+            self.services.notify(&format!("goal {} ended: {why}", self.id));
         }
         if refused {
             return self.answer_once(|| match outcome {
@@ -344,7 +369,7 @@ impl GoalEvents for PartsGoalEvents {
             });
         }
         goals.end_goal(&self.id, &end);
-        self.parts.resolve_cancel(&self.id, outcome == Some(GoalOutcome::Canceled));
+        self.services.resolve_cancel(&self.id, outcome == Some(GoalOutcome::Canceled));
         // The sender learns of the end from the result.
         self.answer_once(|| Ok(goals.answer(&self.begun, true)));
     }
@@ -352,13 +377,6 @@ impl GoalEvents for PartsGoalEvents {
 
 fn aborted_end() -> GoalEnd {
     GoalEnd { outcome: GoalOutcome::Aborted, text: String::new(), result: Bytes::new() }
-}
-
-impl GroupEvents for PartsGoalEvents {
-    fn on_waiting(&self) {
-        let answer = self.parts.goals.accept(&self.begun);
-        self.answer_once(|| Ok(answer));
-    }
 }
 
 #[cfg(test)]
