@@ -9,6 +9,7 @@
 //! type ── rules: names, definitions ──▶ twin ── pairing: fields ──▶ program: steps ── translate ──▶ bytes of the twin
 //! ```
 
+pub mod bus;
 mod error;
 mod rules;
 mod translator;
