@@ -85,6 +85,8 @@ mod memory;
 mod metrics;
 #[path = "stories/mishaps.rs"]
 mod mishaps;
+#[path = "stories/mixed.rs"]
+mod mixed;
 #[path = "stories/names.rs"]
 mod names;
 #[path = "stories/oidc.rs"]
@@ -358,6 +360,12 @@ fn main() -> ExitCode {
             roslaunch_cannot_tell_the_stub_from_the_original,
             rosrun_gives_the_node_the_name_that_the_original_has,
             a_launch_file_says_what_is_promised,
+        ],
+        of_both![mixed:
+            stamps_transforms_and_calls_cross,
+            a_node_calls_a_robot_of_the_other_ros,
+            simulated_time_is_the_robots,
+            the_robots_own_original_answers_while_the_cable_is_cut,
         ],
         of_both![crossing:
             stamps_mean_the_same_where_clocks_differ,

@@ -43,6 +43,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("memory", &["budget"]),
     ("metrics", &["portal"]),
     ("mishaps", &["cloudroid-stub"]),
+    ("mixed", &["translation"]),
     ("names", &["cloudroid-stub"]),
     ("oidc", &["oidc", "outbound"]),
     ("operations", &["access", "bridge", "rosbridge"]),

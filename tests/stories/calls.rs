@@ -26,7 +26,7 @@ const SECOND: i64 = 1_000_000_000;
 const MEANWHILE: Duration = Duration::from_secs(5);
 
 /// A server of std_srvs/Trigger.
-struct TriggerService {
+pub struct TriggerService {
     ros: RosVersion,
     says: Mutex<Result<String, FailureReason>>,
     /// Number of calls so far.
@@ -36,7 +36,7 @@ struct TriggerService {
 }
 
 impl TriggerService {
-    fn new(ros: RosVersion, says: &str) -> Arc<Self> {
+    pub fn new(ros: RosVersion, says: &str) -> Arc<Self> {
         Arc::new(Self {
             ros,
             says: Mutex::new(Ok(says.to_owned())),
@@ -106,7 +106,7 @@ fn serve(
 }
 
 /// Serves std_srvs/Trigger.
-fn serve_trigger(
+pub fn serve_trigger(
     site: &Site,
     node: &(impl HasBus + ?Sized),
     service: &str,

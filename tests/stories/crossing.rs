@@ -70,7 +70,7 @@ fn type_name(ros: RosVersion, name: &str) -> String {
 }
 
 /// Returns the type of this name.
-fn find_type(ros: RosVersion, name: &str) -> anyhow::Result<Arc<MessageType>> {
+pub fn find_type(ros: RosVersion, name: &str) -> anyhow::Result<Arc<MessageType>> {
     Ok(message_types_for(ros)?.message(&type_name(ros, name))?)
 }
 
@@ -117,14 +117,14 @@ impl MessageBytes {
 }
 
 /// Serializes a geometry_msgs/PointStamped.
-fn point_message(ros: RosVersion, at: i64) -> Bytes {
+pub fn point_message(ros: RosVersion, at: i64) -> Bytes {
     let mut out = MessageLayout::new(ros);
     out.header_at(at, "map").f64(0.0).f64(0.0).f64(0.0).finish()
 }
 
 /// Returns whether two messages are equal except for the first four bytes, which rospy fills in, or which select the
 /// CDR encoding.
-fn is_same(one: &[u8], other: &[u8]) -> bool {
+pub fn is_same(one: &[u8], other: &[u8]) -> bool {
     one.get(4..) == other.get(4..)
 }
 

@@ -21,7 +21,7 @@ use support::world::{LOCALISER, LOCALISER_TWO, StoryService, world};
 /// Duration of a link failure that is over before the original would take over: not a time limit, and so not scaled
 /// with the load.
 const BLIP: Duration = Duration::from_millis(50);
-const SILENT: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 1, jitter: 0, loss: 1.0, limit: 1000 };
+pub const SILENT: NetworkImpairment = NetworkImpairment { rate: 100_000, delay: 1, jitter: 0, loss: 1.0, limit: 1000 };
 
 /// Map of a hall with an interior wall: `#` is a wall.
 const HALL: [&str; 8] =
@@ -29,14 +29,14 @@ const HALL: [&str; 8] =
 const RESOLUTION: f32 = 0.5;
 
 /// A robot with a map server and a laser, and a subscriber to its position.
-struct MapRobot {
+pub struct MapRobot {
     // Fields are in the order in which they must be dropped.
     poses: Subscription,
     scan: Box<dyn Publisher>,
     _map: Box<dyn Publisher>,
     _server: Arc<dyn Bus>,
     node: Arc<dyn Bus>,
-    site: Site,
+    pub site: Site,
     sent: u32,
 }
 
@@ -88,7 +88,7 @@ fn pose_offset(pose: &SerializedMessage) -> usize {
 }
 
 impl MapRobot {
-    fn new(ros: RosVersion) -> anyhow::Result<Self> {
+    pub fn new(ros: RosVersion) -> anyhow::Result<Self> {
         let site = Site::with_ros(ros)?;
         let (server, node) = (site.join("/map_server")?, site.join("/laser")?);
         let advertise = |node: &dyn Bus, topic: &str, latch: bool, of: WireType| {
@@ -141,7 +141,7 @@ impl MapRobot {
     }
 
     /// Publishes scans from a cell until one is answered, and checks the answer.
-    fn expect_localised(&mut self, cell: (usize, usize), stub: &NodeProcess) -> Verdict {
+    pub fn expect_localised(&mut self, cell: (usize, usize), stub: &NodeProcess) -> Verdict {
         let wanted = [cell.0, cell.1].map(|at| (at as f64 + 0.5) * f64::from(RESOLUTION));
         let ros = self.site.system.version();
         let (sent, scans) = (&mut self.sent, &self.scan);
@@ -165,7 +165,7 @@ impl MapRobot {
 }
 
 /// Waits until the stub has logged these words a number of times.
-fn wait_for_log(stub: &NodeProcess, words: &str, times: usize) -> Verdict {
+pub fn wait_for_log(stub: &NodeProcess, words: &str, times: usize) -> Verdict {
     stub.wait_for_output_times(words, times)
 }
 
@@ -333,17 +333,17 @@ pub fn an_untouched_stub_can_be_told_to_leave_the_original_alone(ros: RosVersion
 }
 
 /// A localiser for one version of ROS, and its installation on a robot.
-struct Localiser {
-    service: StoryService,
-    package: &'static str,
-    executable: &'static str,
-    program: &'static str,
-    argv: &'static [&'static str],
+pub struct Localiser {
+    pub service: StoryService,
+    pub package: &'static str,
+    pub executable: &'static str,
+    pub program: &'static str,
+    pub argv: &'static [&'static str],
     /// Environment variable that lists workspaces.
-    workspaces: &'static str,
+    pub workspaces: &'static str,
 }
 
-fn localiser(ros: RosVersion) -> Localiser {
+pub fn localiser(ros: RosVersion) -> Localiser {
     match ros {
         RosVersion::One => Localiser {
             service: LOCALISER,

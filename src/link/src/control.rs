@@ -106,7 +106,9 @@ pub struct NodeLaunch {
     pub package: String,
     /// Executable below the package's libexec directory.
     pub executable: String,
-    /// Arguments, remappings and private parameters. In ROS 1 there is nothing that begins with `__`.
+    /// Arguments, remappings and private parameters. In ROS 1 there is nothing that begins with `__`. A stub that is
+    /// made for a service of the other ROS spells them for the service; ROS 2's spelling is recognized by
+    /// `named_by_argv` or `--ros-args`.
     #[serde(deserialize_with = "bounded::list::<_, _, 4096>")]
     pub argv: Vec<String>,
     /// Set if `argv` contains all node names that the robot assigns; then `name` is the resulting name of the first

@@ -30,6 +30,8 @@ pub enum Cause {
     Gone,
     /// An encoded frame refers to one that was not received.
     Undecodable,
+    /// The other ROS cannot represent it.
+    Untranslated,
     /// A cause introduced by a later version.
     #[serde(other)]
     Other,
@@ -52,6 +54,7 @@ impl Cause {
             Self::Full => "more latched messages and goals waited for the link than fit into its queue (64 MB)",
             Self::Gone => "their publisher was gone before they could be sent",
             Self::Undecodable => "they were encoded relative to a message that was lost",
+            Self::Untranslated => "they cannot be carried to the other ROS",
             Self::Other => "for a reason that this version does not know",
         }
     }

@@ -98,6 +98,8 @@ pub struct RecordedRevision {
     pub components: BTreeMap<String, Vec<Component>>,
     /// Inventory of the image.
     pub inventory: Arc<Inventory>,
+    /// Interface that the push has recorded.
+    pub interface: Arc<Interface>,
     /// Message definitions.
     pub registry: Arc<Registry>,
     /// Granted egress, as `HOST:PORT`.

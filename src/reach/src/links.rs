@@ -10,13 +10,16 @@
 //! ```
 //! A link outlives its connections for a grace period. If several nodes of the servant subscribe to an input, one link
 //! feeds it; what nodes of one servant publish for each other stays inside.
+//!
+//! Robots of the other ROS see the servant's bus translated (`views`); everything else is the same for them.
 
 mod attempts;
+mod carried;
 mod duplicates;
 mod given;
 mod held;
 mod inputs;
-mod inquiries;
+mod launches;
 mod lent;
 mod mirror;
 mod node_link;
@@ -25,7 +28,6 @@ mod nodes;
 mod outputs;
 mod parameters;
 mod requests;
-mod retry;
 mod runs;
 mod seen;
 mod state;
@@ -33,10 +35,11 @@ mod status;
 mod turns;
 mod types;
 mod unsent;
+mod views;
 
 use std::collections::BTreeSet;
 use std::pin::pin;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use budget::Budget;
@@ -50,6 +53,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{OnceCell, watch};
 use tokio::time::timeout;
 use tracing::Instrument;
+use translation::TranslationRules;
 use ws::WebSocket;
 
 use link::control::{FromCloud, Hello, SlaTargets, Welcome};
@@ -63,7 +67,7 @@ use attempts::Attempts;
 pub use nodes::{NodeController, NodeError, StubNode};
 pub use requests::{MeasuredRequest, RequestUpdate};
 pub use state::{Hub, HubOptions};
-use state::{NodeLink, ParameterMirror, RobotMachine};
+use state::{NodeLink, RobotMachine, ServantView};
 pub use status::LinkStatus;
 use turns::NodeTurns;
 
@@ -83,6 +87,7 @@ impl Default for HubOptions {
             warm_up: Duration::from_secs(1),
             budget: Budget::without_limit(),
             unfinished: Duration::from_secs(300),
+            rules: TranslationRules::default(),
         }
     }
 }
@@ -98,6 +103,8 @@ impl Hub {
     ) -> Arc<Self> {
         Arc::new(Self {
             servant: servant.to_owned(),
+            own_view: ServantView::own(&bus, &registry),
+            other_view: OnceLock::new(),
             bus,
             registry,
             nodes,
@@ -106,7 +113,6 @@ impl Hub {
             links: Mutex::default(),
             changes: watch::Sender::new(0),
             turns: NodeTurns::default(),
-            parameters: ParameterMirror::default(),
             lends: OnceCell::new(),
             skew: Skew::default(),
             attempts: Attempts::default(),
@@ -173,7 +179,8 @@ impl Hub {
             };
             return send_refusal(&mut socket, DisconnectReason::Protocol(error)).await;
         }
-        let (link, resumed, turn) = match self.attach(&hello).await {
+        let ignored = launches::adapt_node(&mut hello, self.bus.version());
+        let (link, resumed, turn) = match self.attach(&hello, &ignored).await {
             Ok(attached) => attached,
             Err(refusal) => {
                 tracing::info!("a link was refused: {}", refusal.reason);
@@ -254,16 +261,25 @@ impl Hub {
         lost
     }
 
-    /// Finds or starts the link for a hello. Returns whether it was resumed, and the turn of this connection.
-    async fn attach(self: &Arc<Self>, hello: &Hello) -> Result<(Arc<NodeLink>, bool, u64), LinkRefusal> {
+    /// Finds or starts the link for a hello; the servant's ROS cannot express the arguments in `ignored`. Returns whether
+    /// it was resumed, and the turn of this connection.
+    async fn attach(
+        self: &Arc<Self>,
+        hello: &Hello,
+        ignored: &[String],
+    ) -> Result<(Arc<NodeLink>, bool, u64), LinkRefusal> {
         let node = &hello.node.name;
-        self.check_ros(hello.ros)?;
-        let is_global = match self.bus.version() {
-            RosVersion::One => ros::ros1::names::is_global,
-            RosVersion::Two => ros::ros2::names::is_global,
-        };
-        if !is_global(node) {
-            return Err(LinkRefusal::permanent(format!("{node:?} is not an absolute node name")));
+        let robot = self.check_ros(hello.ros)?;
+        for ros in [robot, self.bus.version()] {
+            let is_global = match ros {
+                RosVersion::One => ros::ros1::names::is_global,
+                RosVersion::Two => ros::ros2::names::is_global,
+            };
+            if !is_global(node) {
+                let ros = ros.number();
+                let reason = format!("{node:?} is not an absolute node name of ROS {ros}: give the node another name");
+                return Err(LinkRefusal::permanent(reason));
+            }
         }
         let _turn = self.turns.acquire(node).await;
         self.check_open()?;
@@ -291,30 +307,36 @@ impl Hub {
             link.kick.send_modify(|kicks| *kicks += 1);
             self.remove_link(&link);
         }
-        self.parameters.watch(self).await;
+        let view = self.view_for(robot);
+        self.check_carried(&view)?;
+        view.parameters.watch(self).await;
         lent::start_lending(self).await;
         let running = self.nodes.is_running(node).await;
         let ours = running && self.is_of_run(node, &hello.run).await;
         if running && !ours {
             self.stop_node(node).await;
         }
-        self.parameters.copy_from_hello(self, hello).await;
+        view.parameters.copy_from_hello(self, hello).await;
+        if robot == RosVersion::Two && view.translated().is_some() {
+            let copied = self.copy_simulated_time(hello).await;
+            copied.map_err(|error| LinkRefusal { reason: error.to_string(), again: true })?;
+        }
         let lines = self.nodes.output_lines(node);
+        let mut not_given = None;
         if !ours {
             self.record_run(node, &hello.run).await;
-            self.nodes
-                .start(&hello.node, &hello.run)
-                .await
-                .map_err(|error| LinkRefusal::permanent(error.to_string()))?;
+            let (launch, left_out) = self.prepare_launch(&view, &hello.node).await;
+            not_given = left_out;
+            self.nodes.start(&launch, &hello.run).await.map_err(|error| LinkRefusal::permanent(error.to_string()))?;
         }
-        let link = NodeLink::start(self, hello, session_options(&hello.sla), lines);
+        let link = NodeLink::start(self, hello, Arc::clone(&view), session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
         // Closed while the node was starting: nobody else would end this link.
         if let Err(refusal) = self.check_open() {
             self.remove_link(&link);
             return Err(refusal);
         }
-        let untold = self.parameters.take_pending();
+        let untold = view.parameters.take_pending();
         if !untold.is_empty() {
             link.session.send_control(&FromCloud::Parameters(untold));
         }
@@ -322,8 +344,17 @@ impl Hub {
             let warning = true;
             link.session.send_control(&FromCloud::Notice { warning, text });
         }
+        if let Some(text) = not_given {
+            link.session.send_control(&FromCloud::Notice { warning: true, text });
+        }
+        if !ignored.is_empty() {
+            let (servant, words) = (self.bus.version().number(), ignored.join(", "));
+            let text =
+                format!("the service uses ROS {servant}, which has no such arguments; they are ignored: {words}");
+            link.session.send_control(&FromCloud::Notice { warning: true, text });
+        }
         // Parameters that the node has set before there was a link.
-        if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {
+        if let Ok(ParamValue::Map(set)) = view.bus.parameter(node).await {
             let set = set.into_iter().map(|(key, value)| (format!("{node}/{key}"), Some(value)));
             link.session.send_control(&FromCloud::Parameters(set.collect()));
         }
@@ -332,20 +363,33 @@ impl Hub {
         Ok((link, false, turn))
     }
 
-    /// Checks the ROS version: a robot with the other one has nothing that the servant's nodes understand. Earlier
-    /// stubs do not announce it; they use ROS 1.
-    fn check_ros(&self, robot: u8) -> Result<(), LinkRefusal> {
-        let (ours, robot) = (self.bus.version().number(), robot.max(1));
-        if ours == robot {
-            return Ok(());
+    /// Returns the robot's ROS version. Earlier stubs do not announce it; they use ROS 1.
+    fn check_ros(&self, robot: u8) -> Result<RosVersion, LinkRefusal> {
+        match robot {
+            0 | 1 => Ok(RosVersion::One),
+            2 => Ok(RosVersion::Two),
+            other => Err(LinkRefusal::permanent(format!(
+                "this robot uses ROS {other}, which this server does not know: update the server"
+            ))),
         }
+    }
+
+    /// Checks that a robot of the other ROS can use anything of the service.
+    fn check_carried(&self, view: &ServantView) -> Result<(), LinkRefusal> {
+        let Some((bus, interface)) = view.translated().zip(self.nodes.interface()) else {
+            return Ok(());
+        };
+        let Some(reason) = carried::find_refusal(bus, interface) else {
+            return Ok(());
+        };
+        let (ours, robot) = (self.bus.version().number(), bus.version().number());
         let service = match self.nodes.service() {
             "" => format!("servant {}", self.servant),
             service => format!("service {service}"),
         };
         Err(LinkRefusal::permanent(format!(
-            "{service} uses ROS {ours}, but this robot uses ROS {robot}, whose messages differ: push the package for \
-                ROS {robot} and install the stub of that service, or start this stub where ROS {ours} is set up"
+            "{service} uses ROS {ours} and this robot ROS {robot}, and {reason}; push the package for ROS {robot}, or \
+                add a rule for its types"
         )))
     }
 

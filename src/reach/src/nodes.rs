@@ -11,6 +11,7 @@ use std::sync::{Arc, Weak};
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use link::control::{Decision, Exit, NodeLaunch};
+use package::interface::Interface;
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use ros::flavour::{Naming, NodeIdentity};
@@ -135,6 +136,10 @@ fn naming_for(recorded: &RecordedRevision, node: &NodeLaunch) -> Naming {
 impl NodeController for LinkedNodes {
     fn service(&self) -> &str {
         &self.recorded.service
+    }
+
+    fn interface(&self) -> Option<&Interface> {
+        Some(&self.recorded.interface)
     }
 
     async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError> {
@@ -288,6 +293,7 @@ mod tests {
             nodes: Vec::new(),
             parameters: Default::default(),
             components: Default::default(),
+            interface: Default::default(),
             inventory: Arc::new(Inventory {
                 programs: [("see", "/opt/mine/lib/vision/see"), ("look.py", "/opt/mine/share/vision/scripts/look.py")]
                     .map(|(name, path)| (name.to_owned(), path.to_owned()))

@@ -13,8 +13,8 @@ use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd, GoalError, GoalEvents,
-    GoalOutcome, Graph, Lending, NodeParameters, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler,
-    ServiceType, Subscription, WireType,
+    GoalOutcome, Graph, Lending, NodeParameters, Offer, Publisher, PublisherReports, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::ros2::names;
 use ros::schema::ActionDef;
@@ -287,6 +287,10 @@ impl Bus for TappedBus {
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
         self.bus.topic_type(topic).await
+    }
+
+    async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
+        self.bus.topic_offer(topic).await
     }
 
     async fn serve(

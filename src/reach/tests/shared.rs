@@ -125,6 +125,7 @@ fn test_revision() -> RecordedRevision {
         nodes: vec![serde_json::from_value(node).unwrap()],
         parameters: Default::default(),
         components: Default::default(),
+        interface: Default::default(),
         inventory: Arc::new(Inventory {
             programs: [("worker".into(), "/opt/lib/works/worker".into())].into(),
             ..Inventory::default()

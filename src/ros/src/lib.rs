@@ -5,7 +5,7 @@
 //! serialized messages are published, received and answered.
 //!
 //! ```text
-//!                    ros      connect, flavour, remaps, plumbing, bag
+//!                    ros      connect, flavour, remaps, spelling, plumbing, bag
 //!                   ╱   ╲
 //!               ros1     ros2      protocols: Master and TCPROS; DDS by the crate rtps
 //!                   ╲   ╱
@@ -19,6 +19,7 @@ mod connect;
 pub mod flavour;
 pub mod plumbing;
 pub mod remaps;
+pub mod spelling;
 
 pub use connect::connect;
 pub use ros_bus as bus;

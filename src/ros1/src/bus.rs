@@ -45,8 +45,8 @@ use parking_lot::Mutex;
 use ros_bus::net::Sockets;
 use ros_bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, JoinOptions, Lending,
-    ParamValue, PeerId, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
-    WireType,
+    Offer, ParamValue, PeerId, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType,
+    Subscription, WireType,
 };
 use ros_message::schema::ActionDef;
 use tokio::runtime::Handle;
@@ -288,6 +288,11 @@ impl Bus for Ros1Bus {
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
+        let offer = self.topic_offer(topic).await?;
+        Ok(WireType::clone(&offer.wire_type))
+    }
+
+    async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
         self.inner.check_name(topic)?;
         topic_type::find(&self.inner, topic).await
     }

@@ -48,6 +48,14 @@ pub enum BusError {
     /// The item is not offered to this robot because it shares the nodes with other robots.
     #[error("{0} is not offered: robots share this service, and can use only its services and actions")]
     NotShared(String),
+    /// The item cannot be carried between the two ROS versions.
+    #[error("{what} is not carried to the other ROS: {reason}")]
+    NotTranslated {
+        /// The topic or service.
+        what: String,
+        /// The reason.
+        reason: String,
+    },
     /// No answer arrived in time.
     #[error("{what} did not answer within {after:?}")]
     Timeout {

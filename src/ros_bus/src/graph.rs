@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::hidden_names::action_part_name;
-use crate::{QosProfile, ServiceType, WireType, enclave_for};
+use crate::{QosProfile, ServiceType, WireType, enclave_for, linked_node};
 
 /// A snapshot of what nodes have registered.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -85,6 +85,12 @@ impl Graph {
         let marked = self.enclave_nodes(node).into_iter().flatten();
         let shared = marked.filter(|other| *other != node && self.is_ambiguous(other));
         shared.cloned().collect()
+    }
+
+    /// Returns the robot's node as which the process of `node` runs in a servant; `node` itself if that is unknown.
+    pub fn process_owner<'a>(&'a self, node: &'a str) -> &'a str {
+        let mut linked = self.enclaves.keys().filter_map(|mark| linked_node(mark));
+        linked.find(|linked| self.is_in_process(linked, node)).unwrap_or(node)
     }
 
     fn enclave_nodes(&self, node: &str) -> Option<&BTreeSet<String>> {
@@ -229,6 +235,8 @@ mod tests {
         assert_eq!(graph.process_nodes("/nose"), named(&["/nose"]));
         assert!(graph.is_in_process("/ears", "/mouth"));
         assert!(!graph.is_in_process("/ears", "/nose") && !graph.is_in_process("/mouth", "/ears"));
+        let owners = ["/ears", "/mouth", "/nose"].map(|node| graph.process_owner(node));
+        assert_eq!(owners, ["/ears", "/ears", "/nose"]);
         let all = graph.merged_endpoints(&nodes);
         // The strongest QoS that is offered, and the weakest that is requested.
         let log = all.publishers["/log"].1;

@@ -46,3 +46,22 @@ pub struct NodeRename {
 pub fn enclave_for(node: &str) -> Option<String> {
     (node.len() <= MAX_MARKED).then(|| format!("{LINKED}{node}"))
 }
+
+/// Returns the name of the robot's node that a process with this enclave runs as; `None` for other enclaves.
+pub fn linked_node(enclave: &str) -> Option<&str> {
+    enclave.strip_prefix(LINKED).filter(|node| node.starts_with('/'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_node_of_an_enclave_is_found_again() {
+        let enclave = enclave_for("/front/see").expect("a short name");
+        assert_eq!(linked_node(&enclave), Some("/front/see"));
+        for other in ["/", "/cloudroid_link", "/cloudroid_linked/see", "/secure/see"] {
+            assert_eq!(linked_node(other), None, "{other}");
+        }
+    }
+}

@@ -22,6 +22,7 @@ mod failure_reason;
 mod graph;
 pub mod hidden_names;
 mod identity;
+mod inquiries;
 mod join;
 mod lending;
 mod matched;
@@ -31,6 +32,7 @@ mod node_parameters;
 mod parameters;
 mod qos;
 mod queue;
+mod retry;
 pub mod ring;
 mod succession;
 pub mod turns;
@@ -40,7 +42,8 @@ pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalError,
 pub use error::{BusError, CallFate};
 pub use failure_reason::FailureReason;
 pub use graph::{ActionNodes, Graph, NodeEntities, NodeNames, ParameterUse, TopicNodes};
-pub use identity::{Naming, NodeIdentity, NodeRename, enclave_for};
+pub use identity::{Naming, NodeIdentity, NodeRename, enclave_for, linked_node};
+pub use inquiries::TypeInquiries;
 pub use join::{JoinOptions, MAX_MESSAGE, UNFINISHED};
 pub use lending::{Lender, Lending, LentService, ServiceProvider};
 pub use matched::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
@@ -54,6 +57,7 @@ pub use parameters::{
 };
 pub use qos::{QosDurability, QosLiveliness, QosProfile, QosReliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
+pub use retry::Retry;
 pub use ros_message::RosVersion;
 pub use succession::{ParticipantPrefix, Succession};
 pub use types::{Digest, ServiceType, WireFormat, WireType};
@@ -172,6 +176,12 @@ pub trait Bus: Send + Sync + 'static {
     /// Returns the type of a topic as declared by its publishers or, without any, by its subscribers; does not
     /// subscribe.
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError>;
+    /// Returns that type, and whether the publisher keeps its last message for late subscribers as far as that is known
+    /// without a subscription: in ROS 1 only the publisher itself announces it.
+    async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
+        let wire_type = Arc::new(self.topic_type(topic).await?);
+        Ok(Offer { wire_type, latching: false })
+    }
     /// Serves a service until the returned guard is dropped.
     async fn serve(
         &self,

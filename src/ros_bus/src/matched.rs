@@ -31,6 +31,12 @@ impl PeerId {
         &self.node
     }
 
+    /// Returns the same endpoint as one of a node with another name.
+    #[must_use]
+    pub fn with_node(&self, node: &str) -> Self {
+        Self::new(node, self.number)
+    }
+
     /// Returns the key used for comparison.
     fn key(&self) -> (&str, u128) {
         let unique = self.number > u128::from(u64::MAX);

@@ -22,8 +22,11 @@ pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
         ready: Notify::new(),
         dropped: Arc::default(),
     });
-    (MessageSender { shared: shared.clone() }, MessageReceiver { shared })
+    (MessageSender { shared: shared.clone() }, MessageReceiver { shared, conversion: None })
 }
+
+/// Converts a message as it is read; `None` leaves it out.
+type Conversion = dyn Fn(SerializedMessage) -> Option<SerializedMessage> + Send + Sync;
 
 struct State {
     ring: Ring<SerializedMessage>,
@@ -72,22 +75,47 @@ impl Drop for MessageSender {
 /// The receiver of a queue; messages arrive in order per publisher.
 pub struct MessageReceiver {
     shared: Arc<MessageQueue>,
+    conversion: Option<Box<Conversion>>,
 }
 
 impl MessageReceiver {
+    /// Makes messages pass through `convert` as they are read, so that dropped ones cost nothing; those for which it
+    /// returns `None` are left out.
+    #[must_use]
+    pub fn with_conversion(
+        mut self,
+        convert: impl Fn(SerializedMessage) -> Option<SerializedMessage> + Send + Sync + 'static,
+    ) -> Self {
+        self.conversion = Some(match self.conversion.take() {
+            Some(earlier) => Box::new(move |message| earlier(message).and_then(&convert)),
+            None => Box::new(convert),
+        });
+        self
+    }
+
+    fn convert(&self, message: SerializedMessage) -> Option<SerializedMessage> {
+        match &self.conversion {
+            Some(conversion) => conversion(message),
+            None => Some(message),
+        }
+    }
+
     /// Returns the next message, or `None` when the subscription has ended and everything was read. Cancel-safe.
     pub async fn recv(&mut self) -> Option<SerializedMessage> {
         loop {
             // A queue that never becomes empty must not starve other tasks.
             tokio::task::consume_budget().await;
-            {
+            let (next, is_over) = {
                 let mut state = self.shared.state.lock();
-                if let Some(message) = state.ring.pop() {
-                    return Some(message);
-                }
-                if state.sender_gone {
-                    return None;
-                }
+                (state.ring.pop(), state.sender_gone)
+            };
+            match next {
+                Some(message) => match self.convert(message) {
+                    Some(message) => return Some(message),
+                    None => continue,
+                },
+                None if is_over => return None,
+                None => {}
             }
             self.shared.ready.notified().await;
         }
@@ -95,7 +123,12 @@ impl MessageReceiver {
 
     /// Returns the next message if one is queued.
     pub fn try_recv(&mut self) -> Option<SerializedMessage> {
-        self.shared.state.lock().ring.pop()
+        loop {
+            let next = self.shared.state.lock().ring.pop()?;
+            if let Some(message) = self.convert(next) {
+                return Some(message);
+            }
+        }
     }
 
     /// Returns the number of queued messages.
@@ -166,6 +199,24 @@ mod tests {
         drop(sender);
         assert!(receiver.recv().await.is_some());
         assert!(receiver.recv().await.is_none());
+    }
+
+    #[tokio::test]
+    async fn messages_are_converted_as_they_are_read_and_some_are_left_out() {
+        let (sender, receiver) = message_queue(8);
+        let of_even = |message: SerializedMessage| (message.bytes[0] % 2 == 0).then_some(message);
+        let with_tail = |message: SerializedMessage| {
+            let bytes = [&message.bytes[..], b"!"].concat().into();
+            Some(SerializedMessage { bytes, ..message })
+        };
+        let mut receiver = receiver.with_conversion(of_even).with_conversion(with_tail);
+        for n in 1..=5u8 {
+            sender.send(message(Bytes::copy_from_slice(&[n])));
+        }
+        drop(sender);
+        assert_eq!(&receiver.recv().await.unwrap().bytes[..], [2, b'!']);
+        assert_eq!(&receiver.try_recv().unwrap().bytes[..], [4, b'!']);
+        assert!(receiver.try_recv().is_none() && receiver.recv().await.is_none());
     }
 
     #[tokio::test]

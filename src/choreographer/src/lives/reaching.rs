@@ -134,6 +134,7 @@ pub(crate) fn recorded_revision(revision: &RevisionRecord, known: RevisionConten
         nodes: plan.nodes.clone(),
         parameters: plan.parameters.clone(),
         components: plan.components.clone(),
+        interface: Arc::new(revision.interface.clone()),
         inventory,
         registry,
         egress: plan.grants.egress.clone(),

@@ -6,6 +6,7 @@ use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use link::control::{Decision, Exit, Hello, NodeLaunch};
+use package::interface::Interface;
 use parking_lot::Mutex;
 use ros::bus::{ParamValue, RosVersion};
 use ros::ros1::names;
@@ -179,6 +180,10 @@ impl NodeController for SharedNodes {
         &self.recorded.service
     }
 
+    fn interface(&self) -> Option<&Interface> {
+        Some(&self.recorded.interface)
+    }
+
     async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), NodeError> {
         let tenant = self.told.tenant().ok_or(NodeError::ServantEnded)?;
         self.told.observer().check_stub(node.revision, &node.image)?;
@@ -290,6 +295,7 @@ mod tests {
             nodes: nodes.expect("nodes"),
             parameters: BTreeMap::from([("/cook/salt".to_owned(), ParamValue::Int(3))]),
             components: Default::default(),
+            interface: Default::default(),
             inventory: Arc::new(Inventory {
                 programs: ["cook", "wash"]
                     .map(|name| (name.to_owned(), format!("/opt/mine/lib/kitchen/{name}")))

@@ -7,16 +7,14 @@ use std::time::Duration;
 use bridge::{WaitDeadlines, find_missing_subscribers, wait_for_subscribers};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Graph, MatchedPeers, Publisher, QosLiveliness, QosProfile, RosVersion, WireType};
+use ros::bus::{Graph, MatchedPeers, Publisher, QosLiveliness, QosProfile, Retry, RosVersion, WireType};
 use ros::ring::{Ring, RingBounds};
 use ros::schema::{MessageType, SchemaError};
 use ros::sizes::SizeCounters;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::given::{Mark, stamp_mark};
-use super::retry::Retry;
-use super::state::Hub;
-use super::types;
+use super::state::{Hub, NodeLink, ServantView};
 use link::clock::now;
 use link::control::InputChannel;
 use link::drops::{Cause, DropCounters};
@@ -57,8 +55,8 @@ enum State {
 
 impl InputChannels {
     /// Registers a channel, because its messages may arrive before it is open.
-    pub(super) fn register(&self, hub: &Hub, input: &InputChannel) {
-        let of = find_definition(hub, input).inspect_err(|error| {
+    pub(super) fn register(&self, hub: &Hub, view: &ServantView, input: &InputChannel) {
+        let of = find_definition(view, input).inspect_err(|error| {
             tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
         });
         let of = of.ok();
@@ -109,16 +107,18 @@ impl InputChannels {
     pub(super) async fn open(
         &self,
         hub: &Arc<Hub>,
-        drops: &DropCounters,
+        link: &NodeLink,
         input: InputChannel,
         (turns, turn): (Arc<Semaphore>, OwnedSemaphorePermit),
     ) {
+        let (bus, drops) = (&*link.view.bus, &link.drops);
         let mut retry = Retry::default();
         let mut turn = Some(turn);
         let publisher: Arc<dyn Publisher> = loop {
-            let of = wire_type(hub, &input);
+            let of = wire_type(&link.view, &input);
+            // For the servant's nodes, whatever the robot's ROS.
             let qos = offered_qos(&input, hub.bus.version(), &hub.bus.graph().borrow());
-            match hub.bus.advertise(&input.topic, of, qos).await {
+            match bus.advertise(&input.topic, of, qos).await {
                 Ok(publisher) => break publisher.into(),
                 Err(error) => {
                     if retry.is_first() {
@@ -139,7 +139,7 @@ impl InputChannels {
             let count = publisher.as_ref().map_or(0, |it| it.dropped_count());
             (count, publisher.is_none())
         });
-        let missing = |matched: &MatchedPeers| find_missing_subscribers(&*hub.bus, &input.topic, matched);
+        let missing = |matched: &MatchedPeers| find_missing_subscribers(bus, &input.topic, matched);
         let deadlines = WaitDeadlines::start(hub.options.warm_up);
         wait_for_subscribers(&mut publisher.matched_subscribers(), deadlines, missing).await;
         let mut channels = self.channels.lock();
@@ -195,18 +195,18 @@ impl InputChannels {
     }
 }
 
-fn wire_type(hub: &Hub, input: &InputChannel) -> WireType {
-    WireType::new(&input.type_name, &input.md5, &input.definition).with_version(hub.bus.version())
+fn wire_type(view: &ServantView, input: &InputChannel) -> WireType {
+    WireType::new(&input.type_name, &input.md5, &input.definition).with_version(view.bus.version())
 }
 
 /// Returns the definition of an input's type. Publishers of ROS 1 announce it; for ROS 2 it is in the image, if that
 /// has the same type.
-fn find_definition(hub: &Hub, input: &InputChannel) -> Result<Arc<MessageType>, SchemaError> {
-    if hub.bus.version() == RosVersion::One {
+fn find_definition(view: &ServantView, input: &InputChannel) -> Result<Arc<MessageType>, SchemaError> {
+    if view.bus.version() == RosVersion::One {
         return MessageType::from_full_text(&input.type_name, &input.definition);
     }
-    let of = wire_type(hub, input);
-    types::find_message(&hub.registry, &of).map_or_else(|| of.schema(), Ok)
+    let of = wire_type(view, input);
+    view.types.find_message(&of).map_or_else(|| of.schema(), Ok)
 }
 
 /// Returns the QoS offered in place of the robot's publisher. In ROS 2 a reliable publisher also satisfies best-effort

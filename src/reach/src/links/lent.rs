@@ -281,8 +281,8 @@ impl Drop for PendingCallGuard<'_> {
 }
 
 fn make_service(hub: &Hub, link: &NodeLink, served: ServiceChannel) -> RobotService {
-    let of = served.service_type(hub.bus.version());
-    let known = types::find_service(&hub.registry, &of);
+    let of = served.service_type(link.view.bus.version());
+    let known = link.view.types.find_service(&of);
     let differs = |skew: &Skew| skew.difference() != 0;
     if known.is_none() && link.skew(hub).is_some_and(differs) {
         link.session.send_control(&FromCloud::Notice {
@@ -349,7 +349,7 @@ impl Lender for HubLender {
         let hub = self.0.upgrade()?;
         let link = hub.route_link(node, |link| link.lent.answers)?;
         let there = link.look_up(service).await?;
-        Some(LentService {
+        let lent = LentService {
             service_type: there.service_type.clone(),
             gone: there.gone.subscribe(),
             handler: Arc::new(RobotServiceHandler {
@@ -357,7 +357,12 @@ impl Lender for HubLender {
                 service: service.to_owned(),
                 of: there.service_type.clone(),
             }),
-        })
+        };
+        match link.view.translated() {
+            // A type that has no counterpart was reported to the robot.
+            Some(bus) => bus.lend_to_servant(service, lent).ok(),
+            None => Some(lent),
+        }
     }
 }
 

@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros::bus::{Digest, ServiceType, WireType};
+use ros::bus::{Digest, ServiceType, TypeInquiries, WireType};
+use translation::bus::LeftOut;
 
-use super::inquiries::TypeInquiries;
 use super::seen::{self, DeclaredType, NodeEndpointSet};
 use super::state::{Hub, NodeLink, NodeService};
 use super::types;
@@ -25,21 +25,35 @@ struct MirrorState {
     graph: Option<Graph>,
     /// Nodes that were warned about.
     warned: BTreeSet<String>,
+    /// Topics, services and actions that were reported as left out.
+    omitted: BTreeSet<String>,
     inquiries: TypeInquiries,
 }
 
 /// Sends every change to the robot until the link ends.
 pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
-    let mut graphs = hub.bus.graph();
+    let mut graphs = link.view.bus.graph();
     let mut changes = hub.changes.subscribe();
+    let mut left_out = link.view.left_out();
     let mut sent = MirrorState::default();
     loop {
         graphs.borrow_and_update();
         changes.borrow_and_update();
+        if let Some(left_out) = &mut left_out {
+            let now = left_out.borrow_and_update().clone();
+            sent.warn_of_omissions(&link, &now);
+        }
         sent.send_changes(&link, &hub).await;
+        let omitted = async {
+            match &mut left_out {
+                Some(left_out) => left_out.changed().await,
+                None => std::future::pending().await,
+            }
+        };
         tokio::select! {
             changed = graphs.changed() => if changed.is_err() { return },
             changed = changes.changed() => if changed.is_err() { return },
+            changed = omitted => if changed.is_err() { return },
             () = sent.inquiries.next() => {}
         }
     }
@@ -47,27 +61,28 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
 
 impl MirrorState {
     async fn send_changes(&mut self, link: &Arc<NodeLink>, hub: &Arc<Hub>) {
-        let graph = hub.bus.graph().borrow().clone();
-        let seen = NodeEndpointSet::from_graph(&graph, &link.node, hub.bus.version());
+        let bus = &link.view.bus;
+        let graph = bus.graph().borrow().clone();
+        let seen = NodeEndpointSet::from_graph(&graph, &link.node, bus.version());
         let listening: BTreeSet<String> = seen.inputs.keys().cloned().collect();
         let before = std::mem::replace(&mut *link.listening.lock(), listening.clone());
         if before != listening {
             hub.notify_changed();
         }
         self.warn_of_shared(link, graph.ambiguous_process_nodes(&link.node));
-        self.inquire(hub, &seen).await;
+        self.inquire(link, &seen).await;
         let mut graph = Graph {
             siblings: hub.siblings(&graph, &link.node),
             nodes: seen::owners(&graph, &link.node),
             ..Graph::default()
         };
         for (topic, declared) in &seen.outputs {
-            let Some(of) = self.output_type(hub, topic, declared) else {
+            let Some(of) = self.output_type(link, topic, declared) else {
                 continue;
             };
             self.send_type(link, &of);
             graph.outputs.push(OutputChannel {
-                channel: self.channel_for(link, hub, topic, &of),
+                channel: self.channel_for(link, topic, &of),
                 topic: topic.clone(),
                 type_name: of.name,
                 md5: of.digest.to_string(),
@@ -75,7 +90,7 @@ impl MirrorState {
             });
         }
         for (topic, declared) in &seen.inputs {
-            let (type_name, md5) = self.input_type(link, hub, declared);
+            let (type_name, md5) = self.input_type(link, declared);
             graph.inputs.push(RequestedInput {
                 topic: topic.clone(),
                 type_name,
@@ -96,17 +111,17 @@ impl MirrorState {
     }
 
     /// Queries types that are not announced and waits a moment for new ones.
-    async fn inquire(&mut self, hub: &Hub, seen: &NodeEndpointSet) {
+    async fn inquire(&mut self, link: &NodeLink, seen: &NodeEndpointSet) {
         let services = seen.services.keys().collect();
         self.inquiries.retain(&services, &seen.outputs.keys().collect());
         let before = self.inquiries.count();
         for (service, told) in &seen.services {
             if told.is_none() {
-                self.inquiries.service(&hub.bus, service);
+                self.inquiries.service(&link.view.bus, service);
             }
         }
         for (topic, declared) in &seen.outputs {
-            self.output_type(hub, topic, declared);
+            self.output_type(link, topic, declared);
         }
         if self.inquiries.count() > before {
             self.inquiries.settle().await;
@@ -114,14 +129,14 @@ impl MirrorState {
     }
 
     /// Returns the type of an output, with its definition if known.
-    fn output_type(&mut self, hub: &Hub, topic: &str, declared: &DeclaredType) -> Option<WireType> {
+    fn output_type(&mut self, link: &NodeLink, topic: &str, declared: &DeclaredType) -> Option<WireType> {
         match declared {
-            DeclaredType::Named(name) => match hub.registry.message(name) {
-                Ok(known) => Some(WireType::from_message(&known)),
+            DeclaredType::Named(name) => match link.view.types.find_message_named(name) {
+                Some(known) => Some(WireType::from_message(&known)),
                 // Only its node knows it.
-                Err(_) => self.inquiries.topic(&hub.bus, topic),
+                None => self.inquiries.topic(&link.view.bus, topic).map(|offer| WireType::clone(&offer.wire_type)),
             },
-            DeclaredType::Told(of, _) => match types::find_message(&hub.registry, of) {
+            DeclaredType::Told(of, _) => match link.view.types.find_message(of) {
                 Some(known) => Some(WireType::from_message(&known)),
                 None => Some(of.clone()),
             },
@@ -145,6 +160,17 @@ impl MirrorState {
         }
     }
 
+    /// Says once of each topic, service and action of the node why the robot does not see it.
+    fn warn_of_omissions(&mut self, link: &NodeLink, left_out: &LeftOut) {
+        let own = left_out.iter().filter(|(_, entry)| entry.nodes.contains(&link.node));
+        for (what, entry) in own {
+            if self.omitted.len() < WARNED && self.omitted.insert(what.clone()) {
+                let text = format!("{what} of {} is not on the robot: {}", link.node, entry.reason);
+                link.session.send_control(&FromCloud::Notice { warning: true, text });
+            }
+        }
+    }
+
     /// Sends a type before its first use.
     fn send_type(&mut self, link: &NodeLink, of: &WireType) {
         let key = (of.name.clone(), of.digest.clone());
@@ -158,16 +184,16 @@ impl MirrorState {
     }
 
     /// Returns name and hash of an input's type.
-    fn input_type(&mut self, link: &NodeLink, hub: &Hub, declared: &DeclaredType) -> (String, String) {
+    fn input_type(&mut self, link: &NodeLink, declared: &DeclaredType) -> (String, String) {
         match declared {
             DeclaredType::Named(name) => {
-                let known = hub.registry.message(name).ok();
+                let known = link.view.types.find_message_named(name);
                 let md5 = known.map_or_else(|| "*".to_owned(), |known| known.md5().to_owned());
                 (name.clone(), md5)
             }
             DeclaredType::Told(of, _) => {
                 // The robot's publishers do not announce definitions, but its end needs them.
-                if let Some(known) = types::find_message(&hub.registry, of) {
+                if let Some(known) = link.view.types.find_message(of) {
                     let definition = known.full_text().into();
                     self.send_type(link, &WireType { definition, ..of.clone() });
                 }
@@ -176,7 +202,7 @@ impl MirrorState {
         }
     }
 
-    fn channel_for(&mut self, link: &NodeLink, hub: &Hub, topic: &str, of: &WireType) -> u32 {
+    fn channel_for(&mut self, link: &NodeLink, topic: &str, of: &WireType) -> u32 {
         if let Some(channel) = self.channels.get(topic) {
             return *channel;
         }
@@ -184,7 +210,7 @@ impl MirrorState {
         self.channels.insert(topic.to_owned(), self.next);
         // The definition of a type that belongs to an action is only in the image.
         let known = of.schema().ok();
-        let known = known.or_else(|| types::find_message(&hub.registry, of));
+        let known = known.or_else(|| link.view.types.find_message(of));
         let stamps = known.map(|of| Stamps::for_type(&of)).unwrap_or_default();
         link.outputs.add(self.next, topic, stamps);
         let schema = codec::Schema::for_type(&of.name, of.digest.as_str());
@@ -207,7 +233,7 @@ impl MirrorState {
         }
         let of = match told {
             Some(told) => told.clone(),
-            None => self.inquiries.service(&hub.bus, name)?,
+            None => self.inquiries.service(&link.view.bus, name)?,
         };
         let channel = match known {
             // The server was found after the client: more is now known about the same type.
@@ -220,7 +246,7 @@ impl MirrorState {
                 self.next
             }
         };
-        let known = types::find_service(&hub.registry, &of);
+        let known = link.view.types.find_service(&of);
         let (request, response) = types::call_stamps(known.as_deref());
         let service = NodeService {
             name: name.to_owned(),

@@ -15,18 +15,19 @@ use super::lent::RobotServices;
 use super::node_time;
 use super::outputs::{ChannelListeners, Outputs};
 use super::requests::{MeasuredRequest, RequestLog};
-use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine};
+use super::state::{HeldRecord, HoldGuard, HoldQueue, Hub, NodeLink, NodeTime, QueuedOrder, RobotMachine, ServantView};
 use super::unsent::UnsentCounter;
 use super::{LinkStatus, mirror, seen};
 use crate::FlowCounts;
 use link::clock::ClockSample;
 use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint};
-use link::drops::{DropCounters, DropReporter, TopicDropCount};
+use link::drops::{Cause, DropCounters, DropReporter, TopicDropCount};
 use link::record::{ReceivedCall, Record};
 use link::session::{CloudSession, SessionHandler, SessionOptions};
 use link::skew::Direction;
 use ros::bus::{BusError, FailureReason};
 use ros::ros2::names;
+use translation::bus::TranslatedBus;
 
 /// Maximum number of topics opened concurrently, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
@@ -39,6 +40,7 @@ impl NodeLink {
     pub(super) fn start(
         hub: &Arc<Hub>,
         hello: &Hello,
+        view: Arc<ServantView>,
         options: SessionOptions,
         mut lines: mpsc::Receiver<(bool, String)>,
     ) -> Arc<Self> {
@@ -48,6 +50,7 @@ impl NodeLink {
         let log_span = tracing::error_span!(parent: &hub.log_span, "node", node = hello.node.name);
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
+            view,
             run: hello.run.clone(),
             machine: RobotMachine::from_hello(hello),
             id,
@@ -120,6 +123,12 @@ impl NodeLink {
         self.listening.lock().contains(topic)
     }
 
+    /// Returns whether the node subscribes to, publishes or serves something of this name.
+    pub(super) fn has(&self, name: &str) -> bool {
+        let serves = || self.services.lock().values().any(|service| service.name == name);
+        self.listens_to(name) || self.outputs.has(name) || serves() || self.lent.has(name)
+    }
+
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
         let (given, left_out) = self.outputs.skipped_inputs();
@@ -166,14 +175,18 @@ impl NodeLink {
     fn local_drops(&self) -> Vec<TopicDropCount> {
         let mut all = self.session.drops();
         all.extend(self.drops.snapshot());
+        let losses = self.view.translated().map(TranslatedBus::losses).unwrap_or_default();
+        let lost = losses.into_iter().filter(|loss| loss.untranslated > 0 && self.has(&loss.name));
+        all.extend(lost.map(|loss| TopicDropCount {
+            topic: loss.name,
+            cause: Cause::Untranslated,
+            count: loss.untranslated,
+        }));
         all
     }
 
     fn missing_services(&self) -> Vec<String> {
-        let Some(hub) = self.hub.upgrade() else {
-            return Vec::new();
-        };
-        let graph = hub.bus.graph();
+        let graph = self.view.bus.graph();
         let graph = graph.borrow();
         let mut sought = seen::unmet_lookups(&graph, &self.node);
         sought.retain(|service| !self.lent.has(service));
@@ -182,10 +195,7 @@ impl NodeLink {
 
     /// Returns the subscribed topics without a publisher. The hub's own publisher counts for what the robot sends.
     fn inputs_without_publisher(&self) -> Vec<String> {
-        let Some(hub) = self.hub.upgrade() else {
-            return Vec::new();
-        };
-        let graph = hub.bus.graph();
+        let graph = self.view.bus.graph();
         let graph = graph.borrow();
         let fed = |topic: &&String| {
             // A topic that is not shown belongs to a ROS 2 action, whose missing server is reported instead.
@@ -215,7 +225,7 @@ impl NodeLink {
             };
             service.sizes.record(&request);
             let request = link.shift_stamps(&hub, Direction::In, &service.request, request);
-            let called = hub.bus.call(&service.name, request, patience).await;
+            let called = link.view.bus.call(&service.name, request, patience).await;
             let called = called.map(|response| link.shift_stamps(&hub, Direction::Out, &service.response, response));
             link.session.answer(
                 id,
@@ -275,7 +285,7 @@ impl NodeLink {
                 let hold = match &told {
                     FromRobot::Open(input) => {
                         if let Some(hub) = self.hub.upgrade() {
-                            self.inputs.register(&hub, input);
+                            self.inputs.register(&hub, &self.view, input);
                         }
                         None
                     }
@@ -338,7 +348,7 @@ async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::Un
                 // A refused channel is retried as long as it is open, and its permit is held for so long.
                 let open = async move {
                     let _held = _held;
-                    link.inputs.open(&hub, &link.drops, input, turns).await;
+                    link.inputs.open(&hub, &link, input, turns).await;
                 };
                 let open = open.in_current_span();
                 opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
@@ -355,7 +365,7 @@ async fn process_orders(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::Un
             FromRobot::Listeners { channel, count, latching } => {
                 link.outputs.set_listeners(&link, &hub, ChannelListeners { channel, count, latching }, hold);
             }
-            FromRobot::Parameters(changes) => hub.parameters.apply_changes(&hub, changes).await,
+            FromRobot::Parameters(changes) => link.view.parameters.apply_changes(&hub, changes).await,
             FromRobot::Requests(requests) => {
                 let news = link.requests.record(requests, link.sla.max, Instant::now());
                 for (request, update) in news {

@@ -4,6 +4,7 @@ use std::sync::Weak;
 
 use async_trait::async_trait;
 use link::control::{Decision, Exit, Hello, NodeLaunch};
+use package::interface::Interface;
 use ros::bus::{FailureReason, ParamValue};
 use tokio::sync::mpsc;
 
@@ -92,6 +93,10 @@ pub trait NodeController: Send + Sync + 'static {
     /// Returns the name of their service; may be empty.
     fn service(&self) -> &str {
         ""
+    }
+    /// Returns the interface of the service as its push has recorded it, if that is known.
+    fn interface(&self) -> Option<&Interface> {
+        None
     }
     /// Starts the node for this run of the robot's; returns once its program runs, or cannot be started.
     async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), NodeError>;

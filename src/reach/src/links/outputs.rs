@@ -6,13 +6,12 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, MatchedPeers, PeerId, QosProfile, Subscription, WireType, wait_for_connected};
+use ros::bus::{Bus, Graph, MatchedPeers, PeerId, QosProfile, Retry, Subscription, WireType, wait_for_connected};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::Instrument;
 
 use super::given::{GivenInputs, Mark, stamp_mark};
-use super::retry::Retry;
 use super::state::{HoldGuard, Hub, NodeLink};
 use link::DeliveryMode;
 use link::clock::now;
@@ -65,6 +64,11 @@ pub(super) struct ChannelListeners {
 }
 
 impl Outputs {
+    /// Returns whether the node publishes this topic.
+    pub(super) fn has(&self, topic: &str) -> bool {
+        self.channels.lock().values().any(|channel| channel.topic == topic)
+    }
+
     /// Adds an output that was announced to the robot.
     pub(super) fn add(&self, channel: u32, topic: &str, stamps: Stamps) {
         let fresh = OutputChannelState { topic: topic.to_owned(), stamps, expected: 0, reading: None };
@@ -131,7 +135,7 @@ impl Outputs {
             }
             (known.topic.clone(), known.stamps.clone())
         };
-        let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
+        let (bus, warm_up) = (Arc::clone(&link.view.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = async move {
             let before = match bus.publisher_reports() {

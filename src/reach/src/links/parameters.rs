@@ -4,8 +4,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ros::bus::{BusError, ParamValue};
+use link::Echoes;
+use parking_lot::Mutex;
+use ros::bus::{Bus, BusError, ParamValue};
 use ros::ros1::own_parameters::is_set_by_master;
+use tokio::sync::OnceCell;
 use tracing::Instrument;
 
 use super::node_time::SIMULATED;
@@ -30,21 +33,28 @@ impl Drop for ParameterMirror {
 }
 
 impl ParameterMirror {
+    pub(super) fn new(bus: Arc<dyn Bus>) -> Self {
+        Self { bus, set: Echoes::default(), untold: Mutex::default(), watching: OnceCell::new() }
+    }
+
     /// Copies all parameters of the robot, then those given by the deployer.
     pub(super) async fn copy_from_hello(&self, hub: &Hub, hello: &Hello) {
+        if self.bus.parameters().is_ok() {
+            let there = match self.bus.parameter("/").await {
+                Ok(ParamValue::Map(there)) => there,
+                _ => BTreeMap::new(),
+            };
+            for (name, value) in &hello.parameters {
+                let value = translate_value(hub, &hello.node, value);
+                if !is_internal(name) && there.get(name) != Some(&value) {
+                    self.set_parameter(format!("/{name}"), value).await;
+                }
+            }
+        }
+        // They are the servant's, whatever the robot's ROS.
         let Ok(parameters) = hub.bus.parameters() else {
             return;
         };
-        let there = match hub.bus.parameter("/").await {
-            Ok(ParamValue::Map(there)) => there,
-            _ => BTreeMap::new(),
-        };
-        for (name, value) in &hello.parameters {
-            let value = translate_value(hub, &hello.node, value);
-            if !is_internal(name) && there.get(name) != Some(&value) {
-                self.set_parameter(hub, format!("/{name}"), value).await;
-            }
-        }
         for (key, value) in hub.nodes.parameters(&hello.node) {
             // Reported to the robot, so that it sees the values that its node really has.
             let _ = parameters.set(&key, value).await;
@@ -58,10 +68,10 @@ impl ParameterMirror {
                 hub.set_simulated(value == Some(ParamValue::Bool(true)));
             }
             match value {
-                Some(value) => self.set_parameter(hub, key, value).await,
+                Some(value) => self.set_parameter(key, value).await,
                 None => {
                     self.set.forget(&key);
-                    if let Ok(parameters) = hub.bus.parameters() {
+                    if let Ok(parameters) = self.bus.parameters() {
                         let _ = parameters.delete(&key).await;
                     }
                 }
@@ -69,9 +79,9 @@ impl ParameterMirror {
         }
     }
 
-    async fn set_parameter(&self, hub: &Hub, key: String, value: ParamValue) {
+    async fn set_parameter(&self, key: String, value: ParamValue) {
         // Without global parameters, ignored settings were reported when the link started.
-        let Ok(parameters) = hub.bus.parameters() else {
+        let Ok(parameters) = self.bus.parameters() else {
             return;
         };
         self.set.expect(&key, &value);
@@ -82,14 +92,14 @@ impl ParameterMirror {
     }
 
     /// Starts reporting parameters set by nodes to robots.
-    pub(super) async fn watch(&self, hub: &Arc<Hub>) {
+    pub(super) async fn watch(self: &Arc<Self>, hub: &Arc<Hub>) {
         let begun = self.watching.get_or_try_init(|| async {
-            let mut changes = hub.bus.parameters()?.watch().await?;
-            let weak = Arc::downgrade(hub);
+            let mut changes = self.bus.parameters()?.watch().await?;
+            let weak = (Arc::downgrade(self), Arc::downgrade(hub));
             let reporting = async move {
                 while let Some((key, value)) = changes.recv().await {
-                    let Some(hub) = weak.upgrade() else { return };
-                    hub.parameters.report_change(&hub, key, value);
+                    let Some((mirror, hub)) = weak.0.upgrade().zip(weak.1.upgrade()) else { return };
+                    mirror.report_change(&hub, key, value);
                 }
             };
             let task = tokio::spawn(reporting.instrument(hub.log_span.clone()));
@@ -109,8 +119,9 @@ impl ParameterMirror {
             return;
         }
         let links = hub.links.lock();
-        let owner = links.values().find(|link| key.starts_with(&link.node));
-        match owner.or_else(|| links.values().next()) {
+        let mut links = links.values().filter(|link| std::ptr::eq(&*link.view.parameters, self));
+        let owner = links.clone().find(|link| key.starts_with(&link.node));
+        match owner.or_else(|| links.next()) {
             Some(link) => link.session.send_control(&FromCloud::Parameters(vec![(key, value)])),
             None => self.keep_change(hub, key, value),
         }
@@ -140,7 +151,7 @@ impl ParameterMirror {
 }
 
 /// Replaces the robot's paths in a value with the servant's.
-fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
+pub(super) fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
     match value {
         ParamValue::String(text) => ParamValue::String(hub.nodes.translate(node, text)),
         ParamValue::List(items) => {

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::AtomicBool;
-use std::sync::{Arc, Weak};
+use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
 use budget::{Budget, Permit};
@@ -21,6 +21,7 @@ use ros::sizes::{InputSizes, SizeCounters};
 use tokio::sync::{OnceCell, mpsc, watch};
 use tokio::task::AbortHandle;
 use tracing::Span;
+use translation::TranslationRules;
 
 use super::attempts::Attempts;
 use super::inputs::InputChannels;
@@ -29,6 +30,7 @@ use super::nodes::NodeController;
 use super::outputs::Outputs;
 use super::requests::RequestLog;
 use super::turns::NodeTurns;
+use super::types::TypeDefinitions;
 use super::unsent::UnsentCounter;
 
 /// Options of a hub.
@@ -44,13 +46,20 @@ pub struct HubOptions {
     pub budget: Budget,
     /// Time after which an incomplete frame ends its connection.
     pub unfinished: Duration,
+    /// Rules for types whose counterparts in the other ROS are not obvious.
+    pub rules: TranslationRules,
 }
 
 /// The links of one servant.
 pub struct Hub {
     pub(super) servant: String,
+    /// The servant's own bus; links use their robot's [`ServantView`].
     pub(super) bus: Arc<dyn Bus>,
     pub(super) registry: Arc<Registry>,
+    /// View of robots with the servant's ROS.
+    pub(super) own_view: Arc<ServantView>,
+    /// View of robots with the other ROS, once there was one.
+    pub(super) other_view: OnceLock<Arc<ServantView>>,
     pub(super) nodes: Arc<dyn NodeController>,
     pub(super) options: HubOptions,
     /// Span of the log about the servant, in which the hub was created.
@@ -60,7 +69,6 @@ pub struct Hub {
     pub(super) changes: watch::Sender<u64>,
     /// Serializes the start and end of links per node.
     pub(super) turns: NodeTurns,
-    pub(super) parameters: ParameterMirror,
     /// Set once services of the robot are being lent.
     pub(super) lends: OnceCell<()>,
     /// Difference between the robot's clock and ours.
@@ -73,9 +81,18 @@ pub struct Hub {
     pub(super) closed: watch::Sender<Option<String>>,
 }
 
+/// The servant as robots of one ROS version see it.
+pub(super) struct ServantView {
+    pub(super) bus: Arc<dyn Bus>,
+    pub(super) types: TypeDefinitions,
+    pub(super) parameters: Arc<ParameterMirror>,
+}
+
 /// A robot's node as seen by the cloud.
 pub(super) struct NodeLink {
     pub(super) node: String,
+    /// The servant in the terms of the robot's ROS.
+    pub(super) view: Arc<ServantView>,
     pub(super) run: String,
     pub(super) machine: RobotMachine,
     /// Session id.
@@ -174,9 +191,10 @@ pub(super) struct RobotMachine {
     pub(super) roscore: String,
 }
 
-/// Synchronization state of the parameters.
-#[derive(Default)]
+/// Synchronization of the parameters that all nodes share.
 pub(super) struct ParameterMirror {
+    /// The bus of the view.
+    pub(super) bus: Arc<dyn Bus>,
     pub(super) set: Echoes,
     /// Changes by nodes before there was a link to report them.
     pub(super) untold: Mutex<BTreeMap<String, PendingChange>>,

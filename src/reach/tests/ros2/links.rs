@@ -379,21 +379,18 @@ async fn who_serves_and_how_it_calls_itself_is_seen() {
 }
 
 #[tokio::test]
-async fn robots_of_ros_1_are_refused_by_name() {
+async fn robots_of_an_unknown_ros_are_refused_and_names_that_ros_2_does_not_allow() {
     let lab = Lab::new();
     let bus = lab.join(NODE).await;
     let hub = hub(bus, Arc::new(RunTracker::default()), &[]);
-    for ros in [0, 1] {
-        let of_one = Hello { ros, ..hello("/see") };
-        let (reason, again) = expect_refusal(&hub, &of_one).await;
-        assert!(!again, "{reason}");
-        for part in ["service vision uses ROS 2", "this robot uses ROS 1", "push"] {
-            assert!(reason.contains(part), "{reason}");
-        }
+    let of_three = Hello { ros: 3, ..hello("/see") };
+    let (reason, again) = expect_refusal(&hub, &of_three).await;
+    assert!(!again && reason.contains("uses ROS 3"), "{reason}");
+    // In ROS 2, each part of a name begins with a letter: whatever the robot's ROS.
+    for ros in [1, 2] {
+        let (reason, _) = expect_refusal(&hub, &Hello { ros, ..hello("/2see") }).await;
+        assert!(reason.contains("not an absolute node name of ROS 2"), "{reason}");
     }
-    // In ROS 2, each part of a name begins with a letter.
-    let (reason, _) = expect_refusal(&hub, &hello("/2see")).await;
-    assert!(reason.contains("not an absolute node name"), "{reason}");
 }
 
 #[tokio::test]

@@ -125,6 +125,7 @@ pub enum CloudRequest {
 struct CloudRequestForwarder {
     graph: watch::Sender<Graph>,
     types: Mutex<HashMap<(String, String), String>>,
+    notices: watch::Sender<Vec<String>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
     answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
     asked: mpsc::UnboundedSender<CloudRequest>,
@@ -143,6 +144,7 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
             Record::Control(FromCloud::Type { name, md5, definition }) => {
                 drop(self.types.lock().insert((name, md5), definition))
             }
+            Record::Control(FromCloud::Notice { text, .. }) => self.notices.send_modify(|all| all.push(text)),
             Record::Control(_) => {}
         }
     }
@@ -177,6 +179,7 @@ impl LinkedRobot {
         let ear = Arc::new(CloudRequestForwarder {
             graph: watch::Sender::default(),
             types: Mutex::default(),
+            notices: watch::Sender::default(),
             heard,
             answers,
             asked: asks,
@@ -200,6 +203,17 @@ impl LinkedRobot {
     pub fn definition(&self, name: &str, md5: &str) -> Option<String> {
         let types = self.ear.types.lock();
         types.get(&(name.to_owned(), md5.to_owned())).cloned()
+    }
+
+    /// Waits until the cloud has said this; returns how often it did.
+    #[allow(dead_code, reason = "not every test that includes this file waits for words")]
+    pub async fn wait_notice(&self, words: &str) -> usize {
+        let mut notices = self.ear.notices.subscribe();
+        let count = |all: &Vec<String>| all.iter().filter(|text| text.contains(words)).count();
+        match timeout(LONG, notices.wait_for(|all| count(all) > 0)).await {
+            Ok(all) => count(&all.expect("the link is there")),
+            Err(_) => panic!("{words}: {:#?}", self.ear.notices.borrow()),
+        }
     }
 
     /// Subscribes to an output on behalf of a node of the robot.

@@ -44,11 +44,6 @@ impl PublisherLink {
         }
     }
 
-    /// Returns the type declared by the publisher, once it was connected.
-    pub(super) fn wire_type(&self) -> Option<Arc<WireType>> {
-        Some(self.offer.lock().as_ref()?.wire_type.clone())
-    }
-
     /// Returns the publisher's offer, once it was connected.
     pub(super) fn offer(&self) -> Option<Offer> {
         self.offer.lock().clone()
@@ -149,7 +144,7 @@ pub(super) struct PublisherConnection {
     stream: TcpStream,
     frames: FrameReader,
     publisher: PeerId,
-    latching: bool,
+    pub(super) latching: bool,
     pub(super) wire_type: WireType,
 }
 

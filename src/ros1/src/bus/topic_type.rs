@@ -1,9 +1,9 @@
-//! Type of a topic, determined from its endpoints.
+//! Type of a topic, determined from its endpoints, and whether its publisher latches.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros_bus::{BusError, Graph, TopicNodes, WireType};
+use ros_bus::{BusError, Graph, Offer, TopicNodes, WireType};
 use tokio::time::timeout;
 
 use super::registrar::Kind;
@@ -14,15 +14,16 @@ const ANSWER: Duration = Duration::from_secs(3);
 
 /// Returns the type from the first source available: what we advertise, a connection of ours, a publisher's header, the
 /// subscribers' requests. If only a name is known (all endpoints accept any md5), the digest is `*`.
-pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<WireType, BusError> {
+pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<Offer, BusError> {
+    let offer = |wire_type, latching| Offer { wire_type: Arc::new(wire_type), latching };
     let ours = bus.publications.lock().get(name).cloned();
-    if let Some((advert, _)) = ours.as_ref().and_then(|topic| topic.advert()) {
-        return Ok(advert);
+    if let Some((advert, latching)) = ours.as_ref().and_then(|topic| topic.advert()) {
+        return Ok(offer(advert, latching));
     }
     let subscribed = bus.subscriptions.lock().get(name).cloned();
     let links = subscribed.map(|topic| topic.links()).unwrap_or_default();
-    if let Some(known) = links.iter().find_map(|link| link.wire_type()) {
-        return Ok(WireType::clone(&known));
+    if let Some(known) = links.iter().find_map(|link| link.offer()) {
+        return Ok(known);
     }
     // A recent registration may not have reached our own graph yet.
     let graph = watcher::fetch(bus).await?;
@@ -34,19 +35,19 @@ pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<WireType
     for uri in publishers.filter_map(|node| graph.nodes.get(node)) {
         match link::connect(bus, name, uri, &WireType::any()).await {
             Ok(connection) if !connection.wire_type.digest.is_any() => {
-                return Ok(connection.wire_type);
+                return Ok(offer(connection.wire_type, connection.latching));
             }
             Ok(_) => {}
             Err(error) => failure = Some(error),
         }
     }
     if let Some(asked) = subscriber_type(bus, name, topic, &graph).await? {
-        return Ok(asked);
+        return Ok(offer(asked, false));
     }
     match failure {
-        _ if topic.type_name != "*" => Ok(WireType::with_name(&topic.type_name)),
+        _ if topic.type_name != "*" => Ok(offer(WireType::with_name(&topic.type_name), false)),
         Some(failure) => Err(failure),
-        None => Ok(WireType::any()),
+        None => Ok(offer(WireType::any(), false)),
     }
 }
 

@@ -24,9 +24,8 @@ use std::sync::Arc;
 
 use budget::Budget;
 use ros::bus::{Bus, BusError, GlobalParameters, NodeParameters, ParameterKind, RosVersion};
-use ros::ros2::arguments::ArgumentError;
 
-pub use launch::{LeftOutArguments, TranslatedLaunch};
+pub use launch::{LeftOutParameters, TranslatedLaunch};
 pub use nodes::NodeParameterView;
 pub use server::ParameterServerView;
 pub use services::ParameterServices;
@@ -65,31 +64,22 @@ impl TranslatedParameters {
         }
     }
 
-    /// Translates what a robot's node of this absolute name is started with. For a servant of ROS 2 the arguments
-    /// include the parameters that stand below the node's name; at a servant of ROS 1 its parameters are set, so they
-    /// stand at the Master before the node starts. `kinds`: types of the node's parameters, as far as they are known.
-    ///
-    /// # Errors
-    /// The arguments are not ones of ROS 2.
-    pub async fn prepare_launch(
+    /// Returns what the robot's node of this absolute name is started with. `argv` is in the spelling of the servant's
+    /// ROS. At a servant of ROS 2 the arguments then include the parameters that stand below the node's name at the
+    /// robot's Master; at a servant of ROS 1 they are to be set before the node starts. `kinds`: types of the node's
+    /// parameters, as far as they are known.
+    pub fn prepare_launch(
         &self,
         node: &str,
         argv: &[String],
         kinds: &BTreeMap<String, ParameterKind>,
-    ) -> Result<TranslatedLaunch, ArgumentError> {
+    ) -> TranslatedLaunch {
         match self {
             Self::Server(server) => {
                 let (private, simulated) = server.launch_parameters(node);
-                Ok(launch::for_ros2(argv, &private, simulated, kinds))
+                launch::for_ros2(argv, &private, simulated, kinds)
             }
-            Self::Nodes(nodes) => {
-                let mut launch = launch::for_ros1(node, argv)?;
-                for (key, error) in nodes.set_before_start(launch.parameters.clone()).await {
-                    launch.parameters.retain(|(other, _)| *other != key);
-                    launch.left_out.add(&format!("parameter {key}"), &error);
-                }
-                Ok(launch)
-            }
+            Self::Nodes(_) => launch::for_ros1(node, argv),
         }
     }
 }

@@ -85,7 +85,7 @@ async fn the_parameter_server_simulates_the_time_of_all_but_no_kept_stamp_is_cha
     wait_shifts(&hub, [false, true]).await;
     for (simulated, wanted) in [(true, [false, false]), (false, [false, true])] {
         let change = (format!("/{SIMULATED}"), Some(ParamValue::Bool(simulated)));
-        hub.parameters.apply_changes(&hub, vec![change]).await;
+        hub.own_view.parameters.apply_changes(&hub, vec![change]).await;
         wait_shifts(&hub, wanted).await;
     }
 }

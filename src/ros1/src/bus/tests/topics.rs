@@ -242,7 +242,11 @@ async fn types_are_asked_of_publishers_and_of_subscribers() {
     let publisher = advertise_text(&one, "/chat", false).await;
     assert_eq!(two.topic_type("/chat").await.unwrap(), text_type("992c"));
     assert_eq!(one.topic_type("/chat").await.unwrap(), text_type("992c"));
+    assert!(!two.topic_offer("/chat").await.unwrap().latching);
     drop(publisher);
+    let latching = advertise_text(&one, "/map", true).await;
+    assert!(two.topic_offer("/map").await.unwrap().latching, "its header says so");
+    drop(latching);
     // A subscriber to any type can only say that.
     let _relay = subscribe_text(&one, "/any").await;
     assert_eq!(two.topic_type("/any").await.unwrap().digest, "*");

@@ -71,21 +71,6 @@ impl NodeParameterView {
         Self { inner, watch: Mutex::default() }
     }
 
-    /// Sets parameters at the Master before their node starts, by key. Returns those that the Master does not take.
-    pub(super) async fn set_before_start(&self, parameters: Vec<(String, ParamValue)>) -> Vec<(String, BusError)> {
-        let mut refused = Vec::new();
-        for (key, value) in parameters {
-            let set = match self.inner.parameters() {
-                Ok(master) => master.set(&key, value).await,
-                Err(error) => Err(error),
-            };
-            if let Err(error) = set {
-                refused.push((key, error));
-            }
-        }
-        refused
-    }
-
     /// Returns the error for a node that does not exist, as a bus of ROS 2 has it.
     fn check_node(&self, node: &str) -> Result<(), BusError> {
         if self.inner.graph().borrow().has_node(node) {

@@ -188,9 +188,10 @@ impl ParameterServerView {
         let changes = values.values.iter().map(|(name, value)| (name.clone(), Some(value.clone()))).collect();
         let answers = match self.change_node(node, changes).await {
             Ok(answers) => answers,
+            // It has just ended, or does not answer: then it is started with them.
             Err(error) => {
-                values.values.iter().for_each(|(name, _)| refused.add(&shown_key(node, name), &error));
-                return;
+                tracing::warn!(node, %error, "parameters of the robot are kept until the node is started again");
+                values.values.iter().map(|_| Ok(())).collect()
             }
         };
         for ((name, value), answer) in values.values.into_iter().zip(answers) {

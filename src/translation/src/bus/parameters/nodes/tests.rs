@@ -260,19 +260,3 @@ async fn a_change_at_the_master_is_an_event_of_the_node() {
     servant.set_at_master("/camera/see/rate", "4").await;
     assert_eq!(again.next().await.expect("an event").changed, [("rate".to_owned(), value("4"))]);
 }
-
-#[tokio::test]
-async fn parameters_stand_at_the_master_before_their_node_starts() {
-    let servant = Servant::start().await;
-    let wide = ParamValue::Int(1 << 40);
-    let parameters = vec![
-        ("/rear/see/gains/p".to_owned(), value("1")),
-        ("/rear/see/wide".to_owned(), wide),
-        ("/use_sim_time".to_owned(), value("true")),
-    ];
-    let refused = servant.view.set_before_start(parameters).await;
-    assert_eq!(refused.iter().map(|(key, _)| &**key).collect::<Vec<_>>(), ["/rear/see/wide"]);
-    let other = join(servant.address, "/rear/see").await;
-    assert_eq!(other.parameter("/rear/see").await.expect("set"), value(r#"{"gains": {"p": 1}}"#));
-    assert_eq!(other.parameter("/use_sim_time").await.expect("set"), value("true"));
-}

@@ -8,20 +8,20 @@ use tokio::time::sleep;
 /// First and longest pause.
 const PAUSES: (Duration, Duration) = (Duration::from_millis(250), Duration::from_secs(10));
 
-/// Exponential backoff.
+/// Exponential backoff of refused operations.
 #[derive(Debug, Default)]
-pub(super) struct Retry {
+pub struct Retry {
     refusals: u32,
 }
 
 impl Retry {
     /// Returns whether nothing was refused before; only the first refusal is logged.
-    pub(super) fn is_first(&self) -> bool {
+    pub fn is_first(&self) -> bool {
         self.refusals == 0
     }
 
     /// Waits until the next attempt is due.
-    pub(super) async fn pause(&mut self) {
+    pub async fn pause(&mut self) {
         let pause = PAUSES.0.saturating_mul(1 << self.refusals.min(16));
         self.refusals += 1;
         sleep(pause.min(PAUSES.1)).await;

@@ -1,15 +1,14 @@
-//! Concurrent queries for types that only a node itself knows (ROS 1): one that hangs does not delay the others, and
-//! failed ones are retried.
+//! Concurrent queries for what only a node itself knows (ROS 1): one that hangs does not delay the others, and failed
+//! ones are retried.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros::bus::{Bus, BusError, ServiceType, WireType};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
-use super::retry::Retry;
+use crate::{Bus, BusError, Offer, Retry, ServiceType};
 
 /// Timeout of one query.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -26,12 +25,12 @@ enum Subject {
 
 enum TypeAnswer {
     Service(ServiceType),
-    Topic(WireType),
+    Topic(Offer),
 }
 
-/// Pending and answered queries.
+/// Pending and answered queries for types of topics and services.
 #[derive(Default)]
-pub(super) struct TypeInquiries {
+pub struct TypeInquiries {
     asking: JoinSet<(Subject, TypeAnswer)>,
     asked: BTreeMap<Subject, AbortHandle>,
     told: BTreeMap<Subject, TypeAnswer>,
@@ -39,15 +38,15 @@ pub(super) struct TypeInquiries {
 
 impl TypeInquiries {
     /// Returns the type of a service if it is known; otherwise it is queried.
-    pub(super) fn service(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<ServiceType> {
+    pub fn service(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<ServiceType> {
         match self.find(bus, Subject::Service(name.to_owned()))? {
             TypeAnswer::Service(of) => Some(of.clone()),
             TypeAnswer::Topic(_) => None,
         }
     }
 
-    /// Returns the type of a topic if it is known; otherwise it is queried.
-    pub(super) fn topic(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<WireType> {
+    /// Returns what the publisher of a topic offers if it is known; otherwise it is queried.
+    pub fn topic(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<Offer> {
         match self.find(bus, Subject::Topic(name.to_owned()))? {
             TypeAnswer::Topic(of) => Some(of.clone()),
             TypeAnswer::Service(_) => None,
@@ -64,12 +63,12 @@ impl TypeInquiries {
     }
 
     /// Returns the number of pending and answered queries.
-    pub(super) fn count(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.asked.len()
     }
 
     /// Forgets queries about services and topics that are gone.
-    pub(super) fn retain(&mut self, services: &BTreeSet<&String>, topics: &BTreeSet<&String>) {
+    pub fn retain(&mut self, services: &BTreeSet<&String>, topics: &BTreeSet<&String>) {
         let is_there = |subject: &Subject| match subject {
             Subject::Service(name) => services.contains(name),
             Subject::Topic(name) => topics.contains(name),
@@ -85,7 +84,7 @@ impl TypeInquiries {
     }
 
     /// Waits for the next relevant answer; forever if nothing is pending.
-    pub(super) async fn next(&mut self) {
+    pub async fn next(&mut self) {
         loop {
             match self.asking.join_next().await {
                 Some(Ok((subject, told))) => {
@@ -102,7 +101,7 @@ impl TypeInquiries {
     }
 
     /// Waits for all pending answers, but only for a moment.
-    pub(super) async fn settle(&mut self) {
+    pub async fn settle(&mut self) {
         let all = async {
             while self.told.len() < self.asked.len() {
                 self.next().await;
@@ -119,7 +118,7 @@ async fn inquire(bus: Arc<dyn Bus>, subject: Subject) -> (Subject, TypeAnswer) {
         let told = async {
             Ok::<_, BusError>(match &subject {
                 Subject::Service(name) => TypeAnswer::Service(bus.service_type(name).await?),
-                Subject::Topic(name) => TypeAnswer::Topic(bus.topic_type(name).await?),
+                Subject::Topic(name) => TypeAnswer::Topic(bus.topic_offer(name).await?),
             })
         };
         match timeout(PATIENCE, told).await {

@@ -1,0 +1,323 @@
+//! Links of robots whose ROS is not the servant's: a simulated robot's end, and a servant of ROS 1 at a real Master or
+//! of ROS 2 in memory.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use link::control::{Exit, Hello, InputChannel, NodeLaunch};
+use package::interface::Interface;
+use parking_lot::Mutex;
+use reach::links::{Hub, HubOptions, NodeController, NodeError};
+use ros::bus::{Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType};
+use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
+use ros::net::HostSockets;
+use ros::ros1::Ros1Bus;
+use ros::ros1::master::{Master, MasterOptions};
+use ros::schema::{MessageType, Registry};
+use serde_json::{Value, json};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+#[allow(dead_code, reason = "not all of its nodes are needed here")]
+#[path = "../../../tests/support/memory_bus.rs"]
+mod memory_bus;
+#[allow(dead_code, reason = "not all that a robot can do is needed here")]
+#[path = "ros2/robot.rs"]
+mod robot;
+
+use memory_bus::MemorySystem;
+use robot::{CloudRequest, LinkedRobot, expect_refusal, find_output, find_service};
+
+/// What the robot's end expects of its surroundings.
+mod lab {
+    /// Only limits the duration of a failing test.
+    pub const LONG: std::time::Duration = std::time::Duration::from_secs(120);
+}
+
+const LONG: Duration = lab::LONG;
+const NODE: &str = "/see";
+
+/// Nodes of a servant, which run in this process.
+#[derive(Default)]
+struct ServantNodes {
+    interface: Option<Interface>,
+    /// The descriptions with which nodes were started.
+    started: Mutex<BTreeMap<String, NodeLaunch>>,
+}
+
+#[async_trait]
+impl NodeController for ServantNodes {
+    fn service(&self) -> &str {
+        "vision"
+    }
+    fn interface(&self) -> Option<&Interface> {
+        self.interface.as_ref()
+    }
+    async fn start(&self, node: &NodeLaunch, _: &str) -> Result<(), NodeError> {
+        self.started.lock().insert(node.name.clone(), node.clone());
+        Ok(())
+    }
+    async fn signal(&self, node: &str, _: i32) -> Result<(), NodeError> {
+        self.started.lock().remove(node);
+        Ok(())
+    }
+    async fn wait_exit(&self, node: &str) -> Exit {
+        if self.is_running(node).await {
+            std::future::pending::<()>().await;
+        }
+        Exit::default()
+    }
+    async fn is_running(&self, node: &str) -> bool {
+        self.started.lock().contains_key(node)
+    }
+    fn parameters(&self, _: &NodeLaunch) -> Vec<(String, ParamValue)> {
+        Vec::new()
+    }
+    fn translate(&self, _: &NodeLaunch, text: &str) -> String {
+        text.to_owned()
+    }
+    fn warn(&self, _: &str, _: &str) {}
+    fn output_lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
+        mpsc::channel(1).1
+    }
+}
+
+/// Returns the definitions of an image.
+fn definitions(version: RosVersion) -> Registry {
+    let registry = Registry::for_version(version);
+    for (key, text) in
+        [("std_msgs/msg/String", "string data"), ("std_srvs/srv/Trigger", "---\nbool success\nstring message")]
+    {
+        registry.insert(key, text).expect("a definition");
+    }
+    registry
+}
+
+fn string(version: RosVersion) -> Arc<MessageType> {
+    definitions(version).message("std_msgs/String").expect("a type")
+}
+
+fn say(version: RosVersion, text: &str) -> Bytes {
+    serialize(&string(version), &json!({ "data": text }))
+}
+
+fn serialize(of: &MessageType, value: &Value) -> Bytes {
+    let mut out = Vec::new();
+    from_json(of, value.to_string().as_bytes(), &mut out, &FillOptions::default()).expect("a message");
+    out.into()
+}
+
+fn parse(of: &MessageType, bytes: &[u8]) -> Value {
+    let mut out = Vec::new();
+    to_json(of, bytes, &mut out, &JsonOptions::default()).expect("a message");
+    serde_json::from_slice(&out).expect("JSON")
+}
+
+/// A servant with a hub, and one of its nodes.
+struct Servant {
+    version: RosVersion,
+    hub: Arc<Hub>,
+    nodes: Arc<ServantNodes>,
+    bus: Arc<dyn Bus>,
+    node: Arc<dyn Bus>,
+}
+
+impl Servant {
+    async fn new(version: RosVersion, interface: Option<Interface>) -> Self {
+        let (bus, node): (Arc<dyn Bus>, Arc<dyn Bus>) = match version {
+            RosVersion::One => {
+                let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+                let address = listener.local_addr().expect("an address");
+                let master = Master::new(MasterOptions::default());
+                tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
+                let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
+                (join("/bridge").await.expect("a bus"), join(NODE).await.expect("a node"))
+            }
+            RosVersion::Two => {
+                let system = Arc::new(MemorySystem::default());
+                (system.join("/bridge"), system.join(NODE))
+            }
+        };
+        let nodes = Arc::new(ServantNodes { interface, ..ServantNodes::default() });
+        let registry = Arc::new(definitions(version));
+        let hub = Hub::new("s", Arc::clone(&bus), registry, Arc::clone(&nodes) as _, HubOptions::default());
+        Self { version, hub, nodes, bus, node }
+    }
+
+    /// Returns the hello of a robot of the other ROS.
+    fn hello(&self) -> Hello {
+        let ros = self.robot().number();
+        Hello { ros, ..robot::hello(NODE) }
+    }
+
+    /// Returns the robot's ROS.
+    fn robot(&self) -> RosVersion {
+        match self.version {
+            RosVersion::One => RosVersion::Two,
+            RosVersion::Two => RosVersion::One,
+        }
+    }
+}
+
+/// A service whose responses have this text.
+struct Telling(RosVersion, &'static str);
+
+#[async_trait]
+impl ServiceHandler for Telling {
+    async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, FailureReason> {
+        let of = definitions(self.0).service("std_srvs/Trigger").expect("a service");
+        Ok(serialize(&of.response, &json!({ "success": true, "message": self.1 })))
+    }
+}
+
+fn input(version: RosVersion, channel: u32, topic: &str, latching: bool) -> InputChannel {
+    let of = WireType::from_message(&string(version));
+    InputChannel {
+        channel,
+        topic: topic.to_owned(),
+        type_name: of.name,
+        md5: of.digest.to_string(),
+        definition: of.definition,
+        latching,
+        ..InputChannel::default()
+    }
+}
+
+async fn topics_and_calls_cross(version: RosVersion) {
+    let servant = Servant::new(version, None).await;
+    let (node, ours, theirs) = (&servant.node, servant.robot(), version);
+    let qos = QosProfile::keep_last(5);
+    let of = || WireType::from_message(&string(theirs));
+    let mut heard = node.subscribe("/image", of(), qos).await.expect("a topic");
+    let found = node.advertise("/found", of(), qos).await.expect("a topic");
+    let map = node.advertise("/map", of(), qos.latching(true)).await.expect("a topic");
+    map.publish(say(theirs, "walls"));
+    let trigger = |version| definitions(version).service("std_srvs/Trigger").expect("a service");
+    let service = ServiceType::from_service(&trigger(theirs));
+    let _serving = node.serve("/see/now", service, Arc::new(Telling(theirs, "noon"))).await.expect("it is served");
+    let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let graph = robot.wait_graph(|graph| {
+        let has = |topic| find_output(graph, topic).is_some();
+        has("/found") && has("/map") && find_service(graph, "/see/now").is_some() && !graph.inputs.is_empty()
+    });
+    let graph = graph.await;
+    // Everything is in the robot's terms, with definitions.
+    let wanted = WireType::from_message(&string(ours));
+    let output = find_output(&graph, "/found").expect("an output");
+    assert_eq!((&output.type_name, output.md5.as_str()), (&wanted.name, wanted.digest.as_str()));
+    let told = graph.inputs.iter().find(|input| input.topic == "/image").expect("an input");
+    assert_eq!((&told.type_name, told.md5.as_str()), (&wanted.name, wanted.digest.as_str()));
+    assert_eq!(robot.definition(&wanted.name, wanted.digest.as_str()).as_deref(), Some(&*wanted.definition));
+    if ours == RosVersion::Two {
+        let latched = |topic| find_output(&graph, topic).and_then(|output| output.qos.clone());
+        assert!(latched("/map").is_some_and(|qos| qos.transient_local), "{graph:#?}");
+        assert!(latched("/found").is_some_and(|qos| !qos.transient_local), "{graph:#?}");
+    }
+    // An input reaches the node, and its answer the robot.
+    robot.listen(output);
+    robot.open_input(input(ours, 1, "/image", false));
+    robot.publish(1, say(ours, "picture"));
+    let message = timeout(LONG, heard.messages.recv()).await.expect("it comes").expect("the topic is there");
+    assert_eq!(message.bytes, say(theirs, "picture"));
+    found.publish(say(theirs, "people"));
+    assert_eq!(robot.next_message().await, (output.channel, say(ours, "people")));
+    // What was latched before the robot subscribed reaches it.
+    let map = find_output(&graph, "/map").expect("an output");
+    robot.listen(map);
+    assert_eq!(robot.next_message().await, (map.channel, say(ours, "walls")));
+    // What the robot latches reaches a node that comes later.
+    robot.open_input(input(ours, 2, "/plan", true));
+    robot.publish(2, say(ours, "left"));
+    let mut late = node.subscribe("/plan", of(), qos.latching(true)).await.expect("a topic");
+    let message = timeout(LONG, late.messages.recv()).await.expect("it comes").expect("the topic is there");
+    assert_eq!(message.bytes, say(theirs, "left"));
+    let served = find_service(&graph, "/see/now").expect("a service");
+    let request = serialize(&trigger(ours).request, &json!({}));
+    let response = robot.call(served, request).await.expect("a response");
+    assert_eq!(parse(&trigger(ours).response, &response)["message"], "noon");
+}
+
+#[tokio::test]
+async fn a_robot_of_ros_1_uses_a_servant_of_ros_2() {
+    topics_and_calls_cross(RosVersion::Two).await;
+}
+
+#[tokio::test]
+async fn a_robot_of_ros_2_uses_a_servant_of_ros_1() {
+    topics_and_calls_cross(RosVersion::One).await;
+}
+
+#[tokio::test]
+async fn a_node_of_ros_1_calls_a_robot_of_ros_2() {
+    let servant = Servant::new(RosVersion::One, None).await;
+    let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let node = Arc::clone(&servant.node);
+    let calling = tokio::spawn(async move { node.call("/robot/secret", Bytes::new(), LONG).await });
+    let asked = robot.next_request().await;
+    assert!(matches!(&asked, CloudRequest::Lookup(service) if service == "/robot/secret"), "{asked:?}");
+    let two = definitions(RosVersion::Two).service("std_srvs/Trigger").expect("a service");
+    robot.send_lent("/robot/secret", Some((7, &ServiceType::from_service(&two))));
+    let CloudRequest::Call(id, 7, _) = robot.next_request().await else {
+        panic!("it is called");
+    };
+    let response = serialize(&two.response, &json!({ "success": true, "message": "42" }));
+    robot.session.answer(id, link::clock::now(), Ok(response));
+    let response = timeout(LONG, calling).await.expect("it ends").expect("no panic").expect("a response");
+    let one = definitions(RosVersion::One).service("std_srvs/Trigger").expect("a service");
+    assert_eq!(parse(&one.response, &response)["message"], "42");
+}
+
+#[tokio::test]
+async fn a_node_is_started_in_the_terms_of_its_ros() {
+    let servant = Servant::new(RosVersion::One, None).await;
+    let mut hello = servant.hello();
+    hello.node.argv =
+        ["--ros-args", "-r", "image:=/left", "-p", "rate:=2", "--log-level", "debug"].map(str::to_owned).into();
+    hello.node.named_by_argv = true;
+    hello.parameters.insert("use_sim_time".to_owned(), ParamValue::Bool(true));
+    let robot = LinkedRobot::connect(&servant.hub, &hello).await;
+    assert_eq!(servant.nodes.started.lock()[NODE].argv, ["image:=/left", "_rate:=2"]);
+    let simulated = servant.bus.parameter("/use_sim_time").await.expect("a parameter");
+    assert_eq!(simulated, ParamValue::Bool(true));
+    assert_eq!(robot.wait_notice("--log-level debug").await, 1);
+}
+
+#[tokio::test]
+async fn what_the_robot_cannot_see_is_said_and_a_service_without_anything_else_is_refused() {
+    let servant = Servant::new(RosVersion::Two, None).await;
+    let unknown = || WireType::with_name("lab_msgs/msg/Brew").with_version(RosVersion::Two);
+    let _brew = servant.node.advertise("/brew", unknown(), QosProfile::keep_last(1)).await.expect("a topic");
+    let robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    assert_eq!(robot.wait_notice("topic /brew of /see is not on the robot").await, 1);
+    let topic = |name: &str, of: &str| json!({ "name": name, "type": of, "direction": "output" });
+    let brew = topic("/brew", "lab_msgs/msg/Brew");
+    for (topics, refused) in
+        [(vec![brew.clone()], true), (vec![brew, topic("/found", "std_msgs/msg/String")], false), (Vec::new(), false)]
+    {
+        let interface = serde_json::from_value(json!({ "topics": topics })).expect("an interface");
+        let servant = Servant::new(RosVersion::Two, Some(interface)).await;
+        if refused {
+            let (reason, again) = expect_refusal(&servant.hub, &servant.hello()).await;
+            assert!(!again && reason.contains("topic /brew: the definition of lab_msgs/msg/Brew"), "{reason}");
+            assert!(servant.nodes.started.lock().is_empty());
+        } else {
+            LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+        }
+        // Robots of the servant's ROS need no counterparts.
+        LinkedRobot::connect(&servant.hub, &robot::hello("/other")).await;
+    }
+}
+
+#[tokio::test]
+async fn one_node_runs_for_robots_of_either_ros() {
+    let servant = Servant::new(RosVersion::Two, None).await;
+    let _first = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    // The same machine starts its node anew, in the other ROS.
+    let second = Hello { run: "another".to_owned(), ..robot::hello(NODE) };
+    let _second = LinkedRobot::connect(&servant.hub, &second).await;
+    let links = servant.hub.status();
+    assert_eq!(links.iter().map(|link| &*link.node).collect::<Vec<_>>(), [NODE]);
+}

@@ -1,0 +1,135 @@
+//! What is lost on the way between two ROSes: messages that cannot be carried, and values that the other ROS cannot
+//! represent. Both are counted, and the first of each is reported.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use parking_lot::Mutex;
+
+use crate::MessageTranslator;
+use crate::TranslationError;
+
+/// Maximum number of topics and services that are counted; a robot can name any number.
+const MOST: usize = 1000;
+
+/// Receives what a translated bus reports to its robot.
+pub trait TranslationObserver: Send + Sync + 'static {
+    /// Called with a text for people when something of a topic or service is lost for the first time, and whenever a
+    /// service fails whose caller cannot be told.
+    fn on_loss(&self, name: &str, text: &str);
+}
+
+/// What was lost of one topic or service so far.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TranslationLosses {
+    /// Name of the topic or service.
+    pub name: String,
+    /// Number of messages, requests and responses that were not carried.
+    pub untranslated: u64,
+    /// Number of values that were replaced by the nearest ones.
+    pub saturated: u64,
+}
+
+/// Counters by topic and service.
+pub(super) struct LossCounters {
+    observer: Arc<dyn TranslationObserver>,
+    counts: Mutex<BTreeMap<String, TranslationLosses>>,
+}
+
+impl LossCounters {
+    pub(super) fn new(observer: Arc<dyn TranslationObserver>) -> Self {
+        Self { observer, counts: Mutex::default() }
+    }
+
+    /// Translates a message of a topic or service, and counts what is lost.
+    pub(super) fn translate(
+        &self,
+        name: &str,
+        by: &MessageTranslator,
+        message: &[u8],
+    ) -> Result<Bytes, TranslationError> {
+        let before = by.saturated();
+        let translated = by.translate(message);
+        let replaced = by.saturated().saturating_sub(before);
+        if replaced > 0 && self.count(name, |counts| &mut counts.saturated, replaced) {
+            let text = format!(
+                "{name}: values that the other ROS cannot represent are replaced by the nearest ones, such as times \
+                 before 1970 or after 2038; they are counted"
+            );
+            self.observer.on_loss(name, &text);
+        }
+        if let Err(error) = &translated {
+            self.record_untranslated(name, error);
+        }
+        translated
+    }
+
+    /// Counts a message that is not carried for this reason.
+    pub(super) fn record_untranslated(&self, name: &str, reason: impl std::fmt::Display) {
+        if self.count(name, |counts| &mut counts.untranslated, 1) {
+            let text =
+                format!("{name}: a message is not carried to the other ROS: {reason}; further ones are only counted");
+            self.observer.on_loss(name, &text);
+        }
+    }
+
+    /// Reports a failed call whose caller gets a default response.
+    pub(super) fn report_failed_call(&self, service: &str, reason: &str) {
+        tracing::warn!(service, reason, "a call has failed; its caller of ROS 2 gets the default response");
+        let text = format!(
+            "{service} has failed: {reason}; its caller gets the default response, because calls of ROS 2 cannot fail"
+        );
+        self.observer.on_loss(service, &text);
+    }
+
+    /// Adds to a counter; returns whether that was the first loss of its kind.
+    fn count(&self, name: &str, of: impl Fn(&mut TranslationLosses) -> &mut u64, more: u64) -> bool {
+        let mut counts = self.counts.lock();
+        if counts.len() >= MOST && !counts.contains_key(name) {
+            return false;
+        }
+        let known = counts.entry(name.to_owned());
+        let known =
+            known.or_insert_with(|| TranslationLosses { name: name.to_owned(), ..TranslationLosses::default() });
+        let counter = of(known);
+        let before = std::mem::replace(counter, counter.saturating_add(more));
+        before == 0
+    }
+
+    /// Returns all counts.
+    pub(super) fn all(&self) -> Vec<TranslationLosses> {
+        self.counts.lock().values().cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Default)]
+    struct Recorded(Mutex<Vec<(String, String)>>);
+
+    impl TranslationObserver for Recorded {
+        fn on_loss(&self, name: &str, text: &str) {
+            self.0.lock().push((name.to_owned(), text.to_owned()));
+        }
+    }
+
+    #[test]
+    fn each_topic_is_reported_once_and_counted_and_no_number_of_them_takes_more_memory() {
+        let recorded = Arc::new(Recorded::default());
+        let losses = LossCounters::new(Arc::clone(&recorded) as _);
+        for _ in 0..3 {
+            losses.record_untranslated("/map", "no such field");
+        }
+        assert_eq!(losses.all()[0].untranslated, 3);
+        let reported = recorded.0.lock().clone();
+        assert!(matches!(&reported[..], [(name, text)] if name == "/map" && text.contains("no such field")));
+        for number in 0..2 * MOST {
+            losses.record_untranslated(&format!("/{number}"), "it is another");
+        }
+        assert_eq!(losses.all().len(), MOST);
+        assert_eq!(recorded.0.lock().len(), MOST);
+    }
+}

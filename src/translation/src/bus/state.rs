@@ -1,0 +1,97 @@
+//! What the parts of a translated bus share.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, ServiceType, TopicPeer, WireType};
+use tokio::sync::watch;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::losses::LossCounters;
+use super::parameters::{ParameterServices, TranslatedParameters};
+use super::twins::KnownTwins;
+use crate::ServiceTwin;
+
+/// A servant's bus as seen by robots of the other ROS version.
+pub struct TranslatedBus {
+    pub(super) translation: Arc<Translation>,
+    pub(super) graph: watch::Receiver<Arc<Graph>>,
+    pub(super) left_out: watch::Receiver<Arc<LeftOut>>,
+    /// Keeps the graph up to date.
+    pub(super) _following: AbortOnDropHandle<()>,
+}
+
+/// What the endpoints of a translated bus share.
+pub(super) struct Translation {
+    /// The servant's bus.
+    pub(super) inner: Arc<dyn Bus>,
+    /// ROS version of the robot.
+    pub(super) version: RosVersion,
+    pub(super) twins: KnownTwins,
+    pub(super) losses: LossCounters,
+    /// The servant's parameters as the robot sees them.
+    pub(super) parameters: TranslatedParameters,
+    /// Types of the services that were called, by name.
+    pub(super) called: Mutex<HashMap<String, Arc<ServiceTwin>>>,
+}
+
+/// What a robot does not see of a servant, by kind and name (`topic /map`).
+pub type LeftOut = BTreeMap<String, LeftOutEntry>;
+
+/// A topic, service or action that is not carried.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LeftOutEntry {
+    /// Nodes that have it, by their names as the robot sees them.
+    pub nodes: BTreeSet<String>,
+    /// The reason, which names the field at fault.
+    pub reason: String,
+}
+
+impl Translation {
+    /// Returns the type of a service about parameters that a node of ROS 1 has for robots of ROS 2.
+    pub(super) fn find_parameter_service(&self, service: &str) -> Option<Result<ServiceType, BusError>> {
+        if self.version == RosVersion::One {
+            return None;
+        }
+        ParameterServices::find_type(&self.inner.graph().borrow(), service)
+    }
+
+    /// Returns the ROS version of the servant.
+    pub(super) fn servant_version(&self) -> RosVersion {
+        self.inner.version()
+    }
+
+    /// Returns a node's endpoint as the robot sees it. In ROS 1 a process is one node, the one that the robot has
+    /// started.
+    pub(super) fn translate_peer(&self, id: &PeerId) -> PeerId {
+        if self.version == RosVersion::Two {
+            return id.clone();
+        }
+        let graph = self.inner.graph();
+        let graph = graph.borrow();
+        let owner = graph.process_owner(id.node());
+        if owner == id.node() { id.clone() } else { id.with_node(owner) }
+    }
+
+    /// Returns the matched endpoints as the robot sees them. An offer whose type has no twin is not shown.
+    pub(super) fn translate_matched(&self, matched: &MatchedPeers) -> MatchedPeers {
+        let offer = |offer: &Offer| {
+            let twin = self.twins.message(&offer.wire_type).ok()?;
+            Some(Offer { wire_type: Arc::new(WireType::from_message(&twin.twin)), latching: offer.latching })
+        };
+        let peers = matched.peers.iter().map(|peer| TopicPeer {
+            id: self.translate_peer(&peer.id),
+            connected: peer.connected,
+            offer: peer.offer.as_ref().and_then(offer),
+        });
+        let mut refused = matched.refused.clone();
+        refused.iter_mut().for_each(|refusal| refusal.peer = self.translate_peer(&refusal.peer));
+        MatchedPeers { peers: peers.collect(), refused }
+    }
+}
+
+/// Returns the error for something of the bus that has no counterpart in the other ROS.
+pub(super) fn not_translated(what: String, reason: impl ToString) -> BusError {
+    BusError::NotTranslated { what, reason: reason.to_string() }
+}

@@ -1,0 +1,198 @@
+//! A robot of one ROS uses a service of the other by a stub, as if both were of the same. The servant's node, the
+//! robot's nodes and its original are real ones of their ROS.
+
+use anyhow::{Context, ensure};
+use ros::bus::{ParamValue, Publisher, RosVersion};
+use support::Verdict;
+use support::cable::Cable;
+use support::daemon::Daemon;
+use support::layout::MessageLayout;
+use support::patience::Deadline;
+use support::ros_system::HasBus;
+use support::site::{NodeProcess, Site, string_text};
+use support::twins::{Twin, call_trigger};
+use support::world::world;
+
+use crate::calls::{TriggerService, serve_trigger};
+use crate::crossing::{self, advertise, find_type, is_same, point_message, wait_for_answer, with_log};
+use crate::fallback::{MapRobot, SILENT, localiser, wait_for_log};
+
+const NODE: &str = "/crossing";
+
+/// Returns the other ROS.
+fn other(ros: RosVersion) -> RosVersion {
+    match ros {
+        RosVersion::One => RosVersion::Two,
+        RosVersion::Two => RosVersion::One,
+    }
+}
+
+/// Returns a robot's name that is unique for its ROS.
+fn robot_name(ros: RosVersion, name: &str) -> String {
+    format!("mixed-{name}-{}", ros.number())
+}
+
+/// Starts a stub of the crossing node of the other ROS, with these further words on its command line.
+fn start_crossing(site: &Site, daemon: &Daemon, name: &str, more: &[&str]) -> anyhow::Result<NodeProcess> {
+    let robot = site.system.version();
+    let (service, executable) = crossing::service(other(robot));
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
+        daemon.address,
+        service.name,
+        robot_name(robot, name)
+    );
+    let named: &[&str] = match robot {
+        RosVersion::One => &["__name:=crossing"],
+        RosVersion::Two => &["--ros-args", "-r", "__node:=crossing"],
+    };
+    site.start_stub_with_config(&toml, service.name, executable, &[named, more].concat())
+}
+
+/// Waits until the stub has registered what the node has, in the robot's ROS.
+fn wait_until_ready(site: &Site, app: &(impl HasBus + ?Sized), stub: &NodeProcess) -> Verdict {
+    let frames = format!("{NODE}/frames");
+    let now = format!("{NODE}/now");
+    let ready = site.wait_for_graph(app, "the node of the other ROS", |graph| match site.system.version() {
+        RosVersion::One => graph.publishes(NODE, &frames) && graph.services.contains_key(&now),
+        RosVersion::Two => graph.ends.get(NODE).is_some_and(|ends| {
+            ends.publishers.contains_key(&frames)
+                && ends.subscribers.contains_key("/tf_static")
+                && ends.services.contains_key(&now)
+        }),
+    });
+    with_log(ready.map(drop), stub)
+}
+
+/// Serializes a tf2_msgs/TFMessage with one transform, which has the current time.
+fn transform(ros: RosVersion, child: &str) -> bytes::Bytes {
+    let mut out = MessageLayout::new(ros);
+    out.u32(1).header_at(link::clock::now(), "map").text(child);
+    for _ in 0..7 {
+        out.f64(0.0);
+    }
+    out.finish()
+}
+
+pub fn stamps_transforms_and_calls_cross(ros: RosVersion) -> Verdict {
+    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let site = Site::with_ros(ros)?;
+    let transforms = find_type(ros, "tf2_msgs/TFMessage")?;
+    // Latched by two publishers before the node exists.
+    let mut fixed = Vec::new();
+    for name in ["base", "laser"] {
+        let node = site.join(&format!("/{name}"))?;
+        let publisher = advertise(&site, &node, "/tf_static", &transforms, true)?;
+        publisher.publish(transform(ros, name));
+        fixed.push((node, publisher));
+    }
+    let app = site.join("/app")?;
+    let stub = start_crossing(&site, &daemon, "all", &[])?;
+    wait_until_ready(&site, &app, &stub)?;
+    // A request and its answer, which has the request's stamp.
+    let stamped = find_type(ros, "geometry_msgs/PointStamped")?;
+    let points = advertise(&site, &app, "/crossing/point", &stamped, false)?;
+    with_log(site.wait_for_subscribers(&*points, 1), &stub)?;
+    let mut seen = site.subscribe(&app, "/crossing/seen")?;
+    let sent = point_message(ros, link::clock::now());
+    let answer = with_log(wait_for_answer(&site, || points.publish(sent.clone()), &mut seen), &stub)?;
+    ensure!(is_same(&answer.bytes, &sent), "{answer:?} is not {sent:?}\n{}", stub.output());
+    let (success, now) = with_log(call_trigger(&site, &app, "/crossing/now"), &stub)?;
+    ensure!(success && now.parse::<u64>().is_ok(), "{now}");
+    // Its answer is latched, and reaches whoever subscribes late.
+    let moving = advertise(&site, &app, "/tf", &transforms, false)?;
+    with_log(site.wait_for_subscribers(&*moving, 1), &stub)?;
+    let wanted = "fixed:base fixed:laser moving:odometry";
+    let mut frames = site.subscribe_latched(&app, "/crossing/frames")?;
+    let say = || {
+        moving.publish(transform(ros, "odometry"));
+        Ok(())
+    };
+    let told = site.ask_until(&mut frames, say, |told| Ok(string_text(ros, &told.bytes, 0)? == wanted));
+    with_log(told.map(drop), &stub)?;
+    let newcomer = site.join("/newcomer")?;
+    let mut late = site.subscribe_latched(&newcomer, "/crossing/frames")?;
+    let told = with_log(site.next_message(&mut late), &stub)?;
+    ensure!(string_text(ros, &told.bytes, 0)? == wanted, "{told:?}");
+    Ok(())
+}
+
+pub fn a_node_calls_a_robot_of_the_other_ros(ros: RosVersion) -> Verdict {
+    let (here, there) = (Twin::caller(ros), Twin::caller(other(ros)));
+    let daemon = world().daemon_with(there.service)?;
+    let site = Site::with_ros(ros)?;
+    let (app, server) = (site.join("/app")?, site.join("/server")?);
+    let secret = TriggerService::new(ros, "42");
+    let _serving = serve_trigger(&site, &server, "/robot/secret", secret)?;
+    let robot = robot_name(ros, "caller");
+    let stub = there.stub(&site, (&daemon.address, &robot), "", &here.argv("crossing", &[]))?;
+    let ask = format!("{NODE}/ask");
+    let ready = site.wait_for_graph(&app, "the node's service", |graph| graph.serves(&ask));
+    with_log(ready.map(drop), &stub)?;
+    let (success, said) = with_log(call_trigger(&site, &app, &ask), &stub)?;
+    ensure!(success && said == "the robot says 42", "{said}\n{}", stub.output());
+    Ok(())
+}
+
+pub fn simulated_time_is_the_robots(ros: RosVersion) -> Verdict {
+    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    // In ROS 1 one parameter applies to all nodes, in ROS 2 each node has its own.
+    let argv: &[&str] = match ros {
+        RosVersion::One => {
+            let parameters = app.parameters()?;
+            site.runtime.block_on(parameters.set("/use_sim_time", ParamValue::Bool(true)))?;
+            &[]
+        }
+        RosVersion::Two => &["-p", "use_sim_time:=true"],
+    };
+    let clock = find_type(ros, "rosgraph_msgs/Clock")?;
+    let clock = advertise(&site, &app, "/clock", &clock, true)?;
+    let simulated = 1_000_000 * 1_000_000_000 + 5;
+    let tick = |clock: &dyn Publisher| clock.publish(MessageLayout::new(ros).time(simulated).finish());
+    tick(&*clock);
+    let stub = start_crossing(&site, &daemon, "simulated", argv)?;
+    wait_until_ready(&site, &app, &stub)?;
+    let deadline = Deadline::begin();
+    loop {
+        let (_, now) = with_log(call_trigger(&site, &app, "/crossing/now"), &stub)?;
+        if now == simulated.to_string() {
+            return Ok(());
+        }
+        let late = || format!("it is {now} in the cloud, and should be {simulated}");
+        with_log(deadline.check(late), &stub)?;
+        tick(&*clock);
+    }
+}
+
+pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -> Verdict {
+    let (own, cloud) = (localiser(ros), localiser(other(ros)));
+    // The original comes from an image of the robot's ROS.
+    world().daemon_with(own.service)?;
+    let daemon = world().daemon_with(cloud.service)?;
+    let cable = Cable::new(&daemon.address)?;
+    let mut robot = MapRobot::new(ros)?;
+    let installed = (cloud.package, cloud.executable);
+    let workspace = robot.site.install_original(&daemon, own.service.name, installed, own.program)?;
+    let workspace = workspace.to_str().context("UTF-8")?;
+    let toml = format!(
+        "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nrequest = \"/scan -> /localiser/pose\"\n",
+        cable.server,
+        cloud.service.name,
+        robot_name(ros, "cut")
+    );
+    let variables = [(own.workspaces, workspace), ("NO_COLOR", "1")];
+    let stub = robot.site.start_stub_with_environment(&variables, &toml, cloud.package, cloud.executable, own.argv)?;
+    wait_for_log(&stub, "linked to", 1)?;
+    // The map was latched before the node of the other ROS existed: without it no scan is answered.
+    robot.expect_localised((2, 4), &stub)?;
+    let (over, back) = ("the local original answers, too why=LinkDown", "the cloud answers alone why=LinkUp");
+    let before = stub.output().matches(over).count();
+    cable.degrade(SILENT)?;
+    wait_for_log(&stub, over, before + 1)?;
+    robot.expect_localised((6, 2), &stub)?;
+    cable.restore()?;
+    wait_for_log(&stub, back, before + 1)?;
+    robot.expect_localised((1, 1), &stub)
+}
