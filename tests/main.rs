@@ -365,6 +365,7 @@ fn main() -> ExitCode {
             stamps_transforms_and_calls_cross,
             a_node_calls_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
+            parameters_of_the_node_are_the_robots,
             the_robots_own_original_answers_while_the_cable_is_cut,
         ],
         of_both![crossing:

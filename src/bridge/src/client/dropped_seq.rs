@@ -7,9 +7,9 @@ use super::decoding::DecodedPayload;
 use super::{BridgeClient, ReplyTarget};
 
 impl BridgeClient {
-    /// Returns the message of a payload. If a `seq` was dropped from it, warns the client that it was, but only once for
-    /// each topic, service or action: clients made for ROS 1 write one into every header. `about` is the kind of name
-    /// and the name, `("topic", "/scan")`.
+    /// Returns the message of a payload. If a `seq` was dropped from it, warns the client, but only once for each topic,
+    /// service or action: clients made for ROS 1 write one into every header. `about` is the kind of name and the name,
+    /// `("topic", "/scan")`.
     pub(super) fn take_decoded(
         &self,
         decoded: DecodedPayload,
@@ -22,8 +22,8 @@ impl BridgeClient {
             let about = format!("{} {}", about.0, about.1);
             if self.mark_seq_reported(&about) {
                 let text = format!(
-                    "{op}: {about}: \"seq\" of a std_msgs/msg/Header was dropped, ROS 2 has no such field; this is said \
-                     once"
+                    "{op}: {about}: \"seq\" of a std_msgs/msg/Header was dropped, ROS 2 has no such field; this is \
+                     said once"
                 );
                 self.warn(reply, &text);
             }

@@ -6,8 +6,8 @@
 //!  robot ROS 1 ── GlobalParameters ▶ ParameterServerView ── NodeParameters ▶ servant ROS 2
 //!  robot ROS 2 ── NodeParameters ▶ NodeParameterView ── GlobalParameters, dynamic_reconfigure ▶ servant ROS 1
 //! ```
-//! What a value of one ROS is in the other stands in [`values`]. What cannot be carried is refused in words, or, where
-//! nobody waits for an answer, left out with a line in the log.
+//! What a value of one ROS is in the other stands in the module `values`. What cannot be carried is refused in words,
+//! or, where nobody waits for an answer, left out with a line in the log.
 
 mod kept;
 mod launch;

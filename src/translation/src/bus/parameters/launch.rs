@@ -91,9 +91,9 @@ enum LeftOutReason {
     TooMany,
 }
 
-/// Returns what a node of ROS 2 is started with: `argv`, which is in the spelling of ROS 2, and before it the parameters
-/// that stand below the node's name at the robot's Master and, if it is known, whether time is simulated. `kinds`: types
-/// of the node's parameters as far as they are known; ROS 1 says `1` where a double is meant.
+/// Returns what a node of ROS 2 is started with: `argv`, which is in the spelling of ROS 2, and before it the
+/// parameters that stand below the node's name at the robot's Master and, if it is known, whether time is simulated.
+/// `kinds`: types of the node's parameters as far as they are known; ROS 1 says `1` where a double is meant.
 pub(super) fn for_ros2(
     argv: &[String],
     private: &Tree,
@@ -162,7 +162,7 @@ fn fit_arguments(argv: &[String], kinds: &BTreeMap<String, ParameterKind>) -> Ve
         match (&part.kind, &part.words[..]) {
             (Kind::Parameter(parameter), [flag, word]) => {
                 let fitted = kinds.get(&to_name(&parameter.name)).and_then(|kind| fit_text(&parameter.value, kind));
-                let (name, _) = word.split_once(":=").unwrap_or((word, ""));
+                let (name, _) = word.split_once(":=").unwrap_or((word.as_str(), ""));
                 let word = fitted.map_or_else(|| word.clone(), |value| format!("{name}:={value}"));
                 words.extend([flag.clone(), word]);
             }

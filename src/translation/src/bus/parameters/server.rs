@@ -6,8 +6,8 @@
 //!  /use_sim_time         kept, and set at every node
 //!  /map_frame            of no node: kept, for the robot's own nodes
 //! ```
-//! A node that runs has the last word on its parameters: what it refuses is not kept, and the reason goes to who has set
-//! it. Nodes declare their parameters, so one that a dictionary does not mention stays, where a Master would delete it.
+//! A node that runs has the last word on its parameters: what it refuses is not kept, and the reason goes to who has
+//! set it. Nodes declare their parameters, so one that a dictionary does not mention stays, where a Master would delete it.
 
 mod changes;
 #[cfg(test)]
@@ -54,6 +54,31 @@ struct PlannedChanges {
     /// Values of no running node.
     kept: Vec<(String, ParamValue)>,
     refused: RefusedParameters,
+}
+
+impl PlannedChanges {
+    /// Adds the values of a key, by where they belong.
+    fn add(&mut self, nodes: &ParameterNodes, key: String, value: ParamValue) {
+        let owner = nodes.owner(&key);
+        if let Some((node, rest)) = owner.filter(|(_, rest)| !rest.is_empty()) {
+            return self.nodes.entry(node.to_owned()).or_default().add(to_name(rest), value);
+        }
+        let is_node = owner.is_some();
+        match value {
+            // A node, or a namespace with nodes.
+            ParamValue::Map(entries) if is_node || !nodes.at_or_below(&key).is_empty() => {
+                for (entry, value) in entries {
+                    let below = canonical(&join(&key, &entry));
+                    if below != key {
+                        self.add(nodes, below, value);
+                    }
+                }
+            }
+            ParamValue::Nil => self.refused.add(&key, &ParameterRefusal::Nil),
+            _ if is_node => self.refused.add(&key, &"it is the name of a node, which has parameters below it"),
+            value => self.kept.push((key, value)),
+        }
+    }
 }
 
 impl ParameterServerView {
@@ -154,29 +179,6 @@ impl ParameterServerView {
         Ok(is_there.then_some(ParamValue::Map(tree)))
     }
 
-    /// Sorts the values of a key by where they belong.
-    fn plan(&self, nodes: &ParameterNodes, key: String, value: ParamValue, into: &mut PlannedChanges) {
-        match nodes.owner(&key) {
-            Some((node, rest)) if !rest.is_empty() => {
-                into.nodes.entry(node.to_owned()).or_default().add(to_name(rest), value);
-            }
-            owner => match value {
-                // A node, or a namespace with nodes.
-                ParamValue::Map(entries) if owner.is_some() || !nodes.at_or_below(&key).is_empty() => {
-                    for (entry, value) in entries {
-                        let below = canonical(&join(&key, &entry));
-                        if below != key {
-                            self.plan(nodes, below, value, into);
-                        }
-                    }
-                }
-                ParamValue::Nil => into.refused.add(&key, &ParameterRefusal::Nil),
-                value if owner.is_none() => into.kept.push((key, value)),
-                _ => into.refused.add(&key, &"it is the name of a node, which has parameters below it"),
-            },
-        }
-    }
-
     /// Sets parameters of a running node.
     async fn set_at_node(&self, node: &str, values: NodeValues, refused: &mut RefusedParameters) {
         for (name, refusal) in &values.refused {
@@ -266,7 +268,7 @@ impl GlobalParameters for ParameterServerView {
             return self.set_sim_time(value).await;
         }
         let mut planned = PlannedChanges::default();
-        self.plan(&self.nodes(), key.clone(), value, &mut planned);
+        planned.add(&self.nodes(), key.clone(), value);
         let PlannedChanges { nodes, kept, mut refused } = planned;
         for (key, value) in kept {
             if let Err(error) = self.keep(&key, value) {

@@ -40,7 +40,7 @@ const SERVICES: [(ParameterService, &str, &str); 6] = [
 fn split_name(name: &str) -> Option<(&str, ParameterService, &'static str)> {
     let (node, end) = name.rsplit_once('/').filter(|(node, _)| !node.is_empty())?;
     let (service, _, of) = SERVICES.iter().find(|(_, name, _)| *name == end)?;
-    Some((node, *service, of))
+    Some((node, *service, *of))
 }
 
 /// The services about the parameters of nodes of ROS 1. They stand in for services that the nodes themselves have under

@@ -17,7 +17,6 @@ const SEE: &str = "/camera/see";
 
 /// A servant of ROS 1 with a real Master and a node, and its parameters as a robot of ROS 2 sees them.
 struct Servant {
-    address: SocketAddr,
     _master: AbortOnDropHandle<()>,
     node: Arc<dyn Bus>,
     bus: Arc<dyn Bus>,
@@ -34,13 +33,8 @@ impl Servant {
         });
         let node = join(address, SEE).await;
         let bus = join(address, "/cloudroid").await;
-        let servant = Self {
-            address,
-            _master: AbortOnDropHandle::new(serving),
-            node,
-            view: NodeParameterView::new(bus.clone()),
-            bus,
-        };
+        let servant =
+            Self { _master: AbortOnDropHandle::new(serving), node, view: NodeParameterView::new(bus.clone()), bus };
         // A node is in the graph once it has registered something.
         servant.node.parameters().expect("a Master").set("/camera/see/rate", value("0.5")).await.expect("a Master");
         servant

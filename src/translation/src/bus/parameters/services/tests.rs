@@ -80,7 +80,8 @@ fn definition(of: &str) -> std::sync::Arc<ServiceDef> {
         (
             "rcl_interfaces/msg/ParameterDescriptor",
             "string name\nuint8 type\nstring description\nstring additional_constraints\nbool read_only false\n\
-             bool dynamic_typing false\nFloatingPointRange[<=1] floating_point_range\nIntegerRange[<=1] integer_range\n",
+             bool dynamic_typing false\nFloatingPointRange[<=1] floating_point_range\n\
+             IntegerRange[<=1] integer_range\n",
         ),
         ("rcl_interfaces/msg/ListParametersResult", "string[] names\nstring[] prefixes\n"),
         ("rcl_interfaces/msg/SetParametersResult", "bool successful\nstring reason\n"),
