@@ -7,7 +7,8 @@
 //!  /map_frame            of no node: kept, for the robot's own nodes
 //! ```
 //! A node that runs has the last word on its parameters: what it refuses is not kept, and the reason goes to who has
-//! set it. Nodes declare their parameters, so one that a dictionary does not mention stays, where a Master would delete it.
+//! set it. Nodes declare their parameters, so one that a dictionary does not mention stays, where a Master would delete
+//! it.
 
 mod changes;
 #[cfg(test)]
