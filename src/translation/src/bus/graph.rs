@@ -170,6 +170,28 @@ fn announced_type(inner: &Graph, topic: &str, ends: &TopicNodes) -> WireType {
     announced.unwrap_or_else(|| WireType::with_name(&ends.type_name).with_version(RosVersion::Two))
 }
 
+/// Adds a topic to its nodes' endpoints. Until it is known whether they latch, publishers are not announced.
+fn announce_topic(
+    ends: &mut BTreeMap<String, NodeEntities>,
+    topic: &str,
+    nodes: &TopicNodes,
+    of: &WireType,
+    latching: Option<bool>,
+) {
+    for node in nodes.publishers.iter().filter(|_| latching.is_some()) {
+        let latching = topic == FIXED_TRANSFORMS || latching == Some(true);
+        let qos = QosProfile::keep_last(if latching { 1 } else { DEPTH }).latching(latching);
+        let publishers = &mut ends.entry(node.clone()).or_default().publishers;
+        publishers.insert(topic.to_owned(), (of.clone(), qos));
+    }
+    for node in &nodes.subscribers {
+        // As in ROS 1: what publishers have latched is given to every subscriber.
+        let qos = QosProfile::keep_last(DEPTH).latching(true);
+        let subscribers = &mut ends.entry(node.clone()).or_default().subscribers;
+        subscribers.insert(topic.to_owned(), (of.clone(), qos));
+    }
+}
+
 /// Returns the graph of a servant of ROS 1 for a robot of ROS 2. `offer` and `service_type` return what the nodes have
 /// answered; `own` is the bus itself, whose endpoints are not asked for.
 pub(super) fn for_ros2(
@@ -202,20 +224,7 @@ pub(super) fn for_ros2(
             Some(Ok(twin)) => {
                 shown.type_name = twin.twin.name().to_owned();
                 let of = WireType { definition: String::new(), ..WireType::from_message(&twin.twin) };
-                let latching = topic == FIXED_TRANSFORMS || offered.as_ref().is_some_and(|offered| offered.latching);
-                // Until it is known whether it latches, a publisher is not announced.
-                let announced = nodes.publishers.iter().filter(|_| offered.is_some());
-                for node in announced {
-                    let qos = QosProfile::keep_last(if latching { 1 } else { DEPTH }).latching(latching);
-                    let publishers = &mut ends.entry(node.clone()).or_default().publishers;
-                    publishers.insert(topic.clone(), (of.clone(), qos));
-                }
-                for node in &nodes.subscribers {
-                    // As in ROS 1: what publishers have latched is given to every subscriber.
-                    let qos = QosProfile::keep_last(DEPTH).latching(true);
-                    let subscribers = &mut ends.entry(node.clone()).or_default().subscribers;
-                    subscribers.insert(topic.clone(), (of.clone(), qos));
-                }
+                announce_topic(&mut ends, topic, nodes, &of, offered.map(|offered| offered.latching));
             }
             Some(Err(reason)) => {
                 let has = nodes.publishers.iter().chain(&nodes.subscribers).map(String::as_str);

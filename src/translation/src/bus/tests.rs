@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use ros::bus::{
-    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, ParamValue, PeerId, Publisher,
-    QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
+    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, ParamValue, PeerId, QosProfile,
+    RosVersion, ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
 };
 use ros::codec::put::CdrWriter;
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};

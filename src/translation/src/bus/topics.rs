@@ -100,6 +100,7 @@ pub(super) async fn advertise(
     qos: QosProfile,
 ) -> Result<Box<dyn Publisher>, BusError> {
     let target = translation.twins.for_robot(of);
+    let target = target.inspect_err(|reason| translation.losses.record_untranslated(topic, reason));
     let (original, translator) = target.map_err(|reason| not_translated(format!("topic {topic}"), reason))?;
     let publisher = translation.inner.advertise(topic, WireType::from_message(&original), qos).await?;
     let (matched, following) = translate_changes(translation, publisher.matched_subscribers());
