@@ -366,6 +366,7 @@ fn main() -> ExitCode {
             an_action_is_carried_out_in_the_other_ros,
             a_node_calls_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
+            parameters_of_the_node_are_the_robots,
             the_robots_own_original_answers_while_the_cable_is_cut,
         ],
         of_both![crossing:

@@ -147,7 +147,7 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
         codec::from_cbor(message, &cbor, &mut from_cbor, &FILL),
     ] {
         match read.map_err(|error| error.kind) {
-            Ok(()) => {}
+            Ok(_) => {}
             // Only writing is limited; and padding may make a ROS 2 message longer than its JSON.
             Err(CodecErrorKind::TooMany { .. } | CodecErrorKind::TooLarge(_))
                 if message.version() == RosVersion::Two =>

@@ -69,6 +69,28 @@ fn expect_differences_reported(robot: &mut Robot) -> Verdict {
     robot.send(json!({"op": "unadvertise", "topic": "/name"}))
 }
 
+/// Checks that a header as ROS 1 has it arrives without its `seq`, and that the client is told so once.
+fn expect_seq_dropped(robot: &mut Robot) -> Verdict {
+    robot.send(json!({"op": "set_level", "level": "warning"}))?;
+    robot.send(json!({"op": "advertise", "topic": "/square", "type": SQUARE}))?;
+    robot.subscribe("/square")?;
+    let header = json!({"seq": 7, "stamp": {"secs": 5, "nsecs": 6}, "frame_id": "floor"});
+    let square = json!({"op": "publish", "topic": "/square", "msg": {"header": header, "polygon": {"points": []}}});
+    let is_square = |told: &Value| told["op"] == "publish" && told["topic"] == "/square";
+    for _ in 0..2 {
+        let heard = robot.send_until(&square, "the square", is_square)?;
+        let plain = json!({"stamp": {"sec": 5, "nanosec": 6}, "frame_id": "floor"});
+        ensure!(heard["msg"]["header"] == plain, "{heard}");
+    }
+    let told = robot.wait_for_status("\"seq\" of a std_msgs/msg/Header was dropped")?;
+    ensure!(told["level"] == "warning", "{told}");
+    let tells_again = |told: &Value| told["msg"].as_str().is_some_and(|text| text.contains("\"seq\""));
+    ensure!(robot.has_not_heard(tells_again)?, "it was told twice");
+    robot.send(json!({"op": "unsubscribe", "topic": "/square"}))?;
+    robot.send(json!({"op": "unadvertise", "topic": "/square"}))?;
+    robot.send(json!({"op": "set_level", "level": "error"}))
+}
+
 /// Records the robot's messages in both directions, reads them with the format's own reader, and replays them.
 fn check_recording(daemon: &Daemon, servant: &str, robot: &mut Robot) -> Verdict {
     let place = world().directory("recordings-2")?;
@@ -126,6 +148,7 @@ pub fn they_find_nothing_missing() -> Verdict {
     let servant = daemon.servant_of(HERALD.name, "rover")?;
     let servant = servant["id"].as_str().context("an id")?.to_owned();
     expect_differences_reported(&mut rover)?;
+    expect_seq_dropped(&mut rover)?;
     let olga = create_token(&daemon, &["olga", "--role", "operator"])?;
     let eve = create_token(&daemon, &["eve", "--role", "viewer", "--service", "herald"])?;
     run_while_publishing(&mut rover, || {

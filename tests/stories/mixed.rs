@@ -195,6 +195,53 @@ pub fn simulated_time_is_the_robots(ros: RosVersion) -> Verdict {
     }
 }
 
+/// Waits until the node says that this is its label.
+fn wait_for_label(site: &Site, app: &(impl HasBus + ?Sized), stub: &NodeProcess, wanted: &str) -> Verdict {
+    let deadline = Deadline::begin();
+    loop {
+        let (_, label) = with_log(call_trigger(site, app, "/crossing/label"), stub)?;
+        if label == wanted {
+            return Ok(());
+        }
+        with_log(deadline.check(|| format!("the label is {label}, and should be {wanted}")), stub)?;
+    }
+}
+
+pub fn parameters_of_the_node_are_the_robots(ros: RosVersion) -> Verdict {
+    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let label = |text: &str| ParamValue::String(text.to_owned());
+    // In ROS 1 they stand at the Master, in ROS 2 on the command line.
+    let argv: &[&str] = match ros {
+        RosVersion::One => {
+            site.runtime.block_on(app.parameters()?.set("/crossing/label", label("front")))?;
+            &[]
+        }
+        RosVersion::Two => &["-p", "label:=front"],
+    };
+    let stub = start_crossing(&site, &daemon, "labelled", argv)?;
+    wait_until_ready(&site, &app, &stub)?;
+    let served = site.wait_for_graph(&app, "the node's services", |graph| graph.serves("/crossing/label"));
+    with_log(served.map(drop), &stub)?;
+    wait_for_label(&site, &app, &stub, "front")?;
+    // A change while it runs, as `rosparam set` and `ros2 param set` make it.
+    match ros {
+        RosVersion::One => site.runtime.block_on(app.parameters()?.set("/crossing/label", label("rear")))?,
+        RosVersion::Two => {
+            let served = site.wait_for_graph(&app, "the services about parameters", |graph| {
+                graph.serves("/crossing/set_parameters") && graph.serves("/crossing/get_parameter_types")
+            });
+            with_log(served.map(drop), &stub)?;
+            let change = vec![("label".to_owned(), Some(label("rear")))];
+            let set = site.runtime.block_on(app.node_parameters()?.set(NODE, change));
+            let set = with_log(set.map_err(Into::into), &stub)?;
+            ensure!(set.iter().all(Result::is_ok), "{set:?}");
+        }
+    }
+    wait_for_label(&site, &app, &stub, "rear")
+}
+
 pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -> Verdict {
     let (own, cloud) = (localiser(ros), localiser(other(ros)));
     // The original comes from an image of the robot's ROS.

@@ -3,6 +3,7 @@
 mod actions;
 mod calls;
 mod decoding;
+mod dropped_seq;
 mod inbox;
 mod publishing;
 mod serving;
@@ -108,6 +109,7 @@ impl BridgeClient {
             topic_publishers: Mutex::default(),
             services: Mutex::default(),
             actions: Mutex::default(),
+            seq_reported: Mutex::default(),
         })
     }
 
@@ -179,7 +181,7 @@ impl BridgeClient {
             Op::Fragment(op) => self.fragment(inbox, &op, wrapping)?,
             Op::Png(op) => self.png(inbox, &op, wrapping)?,
             Op::CallService(op) => self.call_service(op, reply),
-            Op::ServiceResponse(op) => self.service_response(op)?,
+            Op::ServiceResponse(op) => self.service_response(op, reply)?,
             Op::Subscribe(op) => self.subscribe(op, reply)?,
             Op::Unsubscribe(op) => self.unsubscribe(&op, reply),
             Op::Advertise(op) => self.advertise(&op, reply)?,
@@ -188,8 +190,8 @@ impl BridgeClient {
             Op::UnadvertiseService(op) => self.unadvertise_service(&op, reply)?,
             Op::SendActionGoal(op) => self.send_action_goal(op, reply)?,
             Op::CancelActionGoal(op) => self.cancel_action_goal(&op)?,
-            Op::ActionFeedback(op) => self.action_feedback(&op)?,
-            Op::ActionResult(op) => self.action_result(&op)?,
+            Op::ActionFeedback(op) => self.action_feedback(&op, reply)?,
+            Op::ActionResult(op) => self.action_result(&op, reply)?,
             Op::AdvertiseAction(op) => self.advertise_action(&op, reply)?,
             Op::UnadvertiseAction(op) => self.unadvertise_action(&op, reply)?,
             Op::SetLevel(op) => self.level.store(op.level as u8, Ordering::Relaxed),

@@ -42,6 +42,8 @@ pub(crate) struct BridgeClient {
     pub(crate) topic_publishers: Mutex<TopicPublishers>,
     pub(crate) services: Mutex<ClientServices>,
     pub(crate) actions: Mutex<Actions>,
+    /// Topics, services and actions (`topic /scan`) about which the client was told that `seq` is dropped.
+    pub(crate) seq_reported: Mutex<HashSet<String>>,
 }
 
 /// Destination of an answer: the interaction and the format.

@@ -322,12 +322,12 @@ impl Hub {
             copied.map_err(|error| LinkRefusal { reason: error.to_string(), again: true })?;
         }
         let lines = self.nodes.output_lines(node);
+        let mut not_given = None;
         if !ours {
             self.record_run(node, &hello.run).await;
-            self.nodes
-                .start(&hello.node, &hello.run)
-                .await
-                .map_err(|error| LinkRefusal::permanent(error.to_string()))?;
+            let (launch, left_out) = self.prepare_launch(&view, &hello.node).await;
+            not_given = left_out;
+            self.nodes.start(&launch, &hello.run).await.map_err(|error| LinkRefusal::permanent(error.to_string()))?;
         }
         let link = NodeLink::start(self, hello, Arc::clone(&view), session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
@@ -343,6 +343,9 @@ impl Hub {
         if let Some(text) = self.nodes.describe_unused_settings(hello) {
             let warning = true;
             link.session.send_control(&FromCloud::Notice { warning, text });
+        }
+        if let Some(text) = not_given {
+            link.session.send_control(&FromCloud::Notice { warning: true, text });
         }
         if !ignored.is_empty() {
             let (servant, words) = (self.bus.version().number(), ignored.join(", "));

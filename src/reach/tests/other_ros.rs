@@ -7,11 +7,12 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use link::control::{Exit, Hello, InputChannel, NodeLaunch};
+use link::control::{Exit, FromRobot, Hello, InputChannel, NodeLaunch};
 use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
 use ros::bus::{Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType};
+use ros::codec::put::CdrWriter;
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -279,10 +280,69 @@ async fn a_node_is_started_in_the_terms_of_its_ros() {
     hello.node.named_by_argv = true;
     hello.parameters.insert("use_sim_time".to_owned(), ParamValue::Bool(true));
     let robot = LinkedRobot::connect(&servant.hub, &hello).await;
-    assert_eq!(servant.nodes.started.lock()[NODE].argv, ["image:=/left", "_rate:=2"]);
+    // Its parameters stand at the Master before it starts.
+    assert_eq!(servant.nodes.started.lock()[NODE].argv, ["image:=/left"]);
+    assert_eq!(servant.bus.parameter("/see/rate").await.expect("a parameter"), ParamValue::Int(2));
     let simulated = servant.bus.parameter("/use_sim_time").await.expect("a parameter");
     assert_eq!(simulated, ParamValue::Bool(true));
     assert_eq!(robot.wait_notice("--log-level debug").await, 1);
+}
+
+#[tokio::test]
+async fn parameters_of_a_robot_of_ros_1_are_those_of_the_node_of_ros_2() {
+    let gain = json!({ "name": "/look/gain", "node": "/look", "descriptor": { "type": "double" } });
+    let interface = serde_json::from_value(json!({ "parameters": [gain] })).expect("an interface");
+    let servant = Servant::new(RosVersion::Two, Some(interface)).await;
+    let mut hello = servant.hello();
+    hello.node.argv = vec!["_rate:=2".to_owned()];
+    let value = |value: Value| serde_json::from_value::<ParamValue>(value).expect("a value");
+    let see = value(json!({ "gain": 1, "gains": { "p": 0.5 }, "boxes": [[1]] }));
+    hello.parameters = [("see".to_owned(), see), ("map_frame".to_owned(), value(json!("map")))].into();
+    let robot = LinkedRobot::connect(&servant.hub, &hello).await;
+    // With the type that the push has recorded, and overridden by the command line.
+    let expected = "--ros-args -p gain:=1.0 -p gains.p:=0.5 -- --ros-args -p rate:=2 --";
+    assert_eq!(servant.nodes.started.lock()[NODE].argv.join(" "), expected);
+    assert_eq!(robot.wait_notice("boxes: a list of lists cannot be a ROS 2 parameter").await, 1);
+    // The node declares its parameters, and the robot learns what they are.
+    let parameters = servant.node.node_parameters().expect("they are offered");
+    let declared = [("gain", value(json!(1.0))), ("own", value(json!(true)))];
+    let declared = declared.map(|(name, value)| (name.to_owned(), Some(value))).to_vec();
+    parameters.set(NODE, declared).await.expect("a node");
+    robot.wait_change("/see/gain", Some(&value(json!(1.0)))).await;
+    robot.wait_change("/see/own", Some(&value(json!(true)))).await;
+    // A change on the robot is set at the node.
+    robot.session.send_control(&FromRobot::Parameters(vec![("/see/gain".to_owned(), Some(value(json!(3))))]));
+    let mut events = parameters.watch(Some(NODE)).await.expect("events");
+    let names = ["gain".to_owned()];
+    while parameters.get(NODE, &names).await.expect("a node") != [Some(value(json!(3.0)))] {
+        timeout(LONG, events.next()).await.expect("it is set");
+    }
+}
+
+#[tokio::test]
+async fn a_robot_of_ros_2_has_the_parameter_services_of_a_node_of_ros_1() {
+    let servant = Servant::new(RosVersion::One, None).await;
+    let alive = WireType::from_message(&string(RosVersion::One));
+    let _alive = servant.node.advertise("/alive", alive, QosProfile::keep_last(1)).await.expect("a topic");
+    let parameters = servant.bus.parameters().expect("a Master");
+    parameters.set("/see/rate", ParamValue::Int(5)).await.expect("a Master");
+    let mut robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let graph = robot.wait_graph(|graph| find_service(graph, "/see/set_parameters").is_some()).await;
+    let served = find_service(&graph, "/see/set_parameters").expect("a service");
+    assert_eq!(served.type_name, "rcl_interfaces/srv/SetParameters");
+    // One parameter, the integer 6.
+    let mut request = CdrWriter::new();
+    request.length(1);
+    request.text("rate");
+    request.byte(2);
+    request.byte(0);
+    request.number(6i64.to_le_bytes());
+    request.number(0f64.to_le_bytes());
+    request.text("");
+    (0..5).for_each(|_| request.length(0));
+    let response = robot.call(served, request.finish()).await.expect("a response");
+    assert_eq!(response[4..9], [1, 0, 0, 0, 1], "one, and successful");
+    assert_eq!(parameters.get("/see/rate").await.expect("a parameter"), ParamValue::Int(6));
 }
 
 #[tokio::test]

@@ -23,7 +23,7 @@ pub(super) fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
 }
 
 /// Returns a service type by its full name.
-pub(super) fn service(name: &str) -> Result<ServiceType, BusError> {
+pub fn service(name: &str) -> Result<ServiceType, BusError> {
     lookup(name, |registry| Ok(ServiceType::from_service(&*registry.service(name)?)))
 }
 

@@ -1,10 +1,10 @@
 //! Parameters of nodes, through the services that every ROS 2 node has
 //! (<https://design.ros2.org/articles/ros_parameters.html>).
 
-mod reading;
+pub mod reading;
 #[cfg(test)]
 mod tests;
-mod values;
+pub mod values;
 
 use std::slice;
 use std::time::Duration;

@@ -14,8 +14,8 @@
 //! header, may have either byte order, and is written little endian.
 //!
 //! Values follow rosbridge: bytes (`uint8[]`, `char[]`, ROS 2's `byte[]`) are base64 in JSON and a byte string in CBOR;
-//! times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (both are accepted as input); other numeric
-//! arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
+//! times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (both are accepted as input, and so is `seq` in
+//! a ROS 2 header, which is dropped); other numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
 //!
 //! On an error the output buffer is left unchanged.
 
@@ -51,7 +51,7 @@ use crate::schema::MessageType;
 pub use cbor_item::cbor_item_len;
 pub use fault::{CodecError, CodecErrorKind};
 pub use json_text::json_value_len;
-pub use options::{CborOptions, DEFAULT_MAX_BYTES, FillOptions, InvalidUtf8, JsonOptions, NonFinite, Time};
+pub use options::{CborOptions, DEFAULT_MAX_BYTES, FillOptions, FillReport, InvalidUtf8, JsonOptions, NonFinite, Time};
 pub use stamps::Stamps;
 pub use value::Value;
 
@@ -71,7 +71,7 @@ pub fn from_json(
     json: &[u8],
     out: &mut Vec<u8>,
     options: &FillOptions,
-) -> Result<(), CodecError> {
+) -> Result<FillReport, CodecError> {
     undo_on_error(message, out, |out| json_in::read(message, json, out, options))
 }
 
@@ -91,7 +91,7 @@ pub fn from_cbor(
     cbor: &[u8],
     out: &mut Vec<u8>,
     options: &FillOptions,
-) -> Result<(), CodecError> {
+) -> Result<FillReport, CodecError> {
     undo_on_error(message, out, |out| cbor_in::read(message, cbor, out, options))
 }
 
@@ -107,7 +107,7 @@ pub fn default_message(message: &MessageType) -> Vec<u8> {
     let unlimited = FillOptions { now: None, max_bytes: usize::MAX };
     // An object without fields is a valid message of any type, so this cannot fail.
     match from_json(message, b"{}", &mut out, &unlimited) {
-        Ok(()) => out,
+        Ok(_) => out,
         Err(_) => Vec::new(),
     }
 }
@@ -136,11 +136,11 @@ pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
     Some(Time { secs: word(4)?, nsecs: word(8)? })
 }
 
-fn undo_on_error(
+fn undo_on_error<T>(
     message: &MessageType,
     out: &mut Vec<u8>,
-    convert: impl FnOnce(&mut Vec<u8>) -> Result<(), fault::Fault>,
-) -> Result<(), CodecError> {
+    convert: impl FnOnce(&mut Vec<u8>) -> Result<T, fault::Fault>,
+) -> Result<T, CodecError> {
     let before = out.len();
     convert(out).map_err(|fault| {
         out.truncate(before);

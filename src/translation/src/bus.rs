@@ -17,6 +17,7 @@ mod losses;
 #[cfg(test)]
 #[path = "../../../tests/support/memory_bus.rs"]
 mod memory_bus;
+pub mod parameters;
 mod services;
 mod state;
 #[cfg(test)]
@@ -24,6 +25,7 @@ mod tests;
 mod topics;
 mod twins;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -32,8 +34,9 @@ use budget::Budget;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending, LentService, Offer, Publisher,
-    PublisherReports, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
+    ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph, Lending, LentService,
+    NodeParameters, Offer, ParameterKind, Publisher, PublisherReports, QosProfile, RosVersion, ServiceHandler,
+    ServiceType, Subscription, WireType,
 };
 use ros::schema::{ActionDef, MessageType, Registry, ServiceDef};
 use tokio::sync::watch;
@@ -47,6 +50,7 @@ use actions::ActionEnds;
 use lending::TranslatedLending;
 use losses::LossCounters;
 pub use losses::{TranslationLosses, TranslationObserver};
+use parameters::{ParameterServices, TranslatedLaunch, TranslatedParameters};
 use state::Translation;
 use state::not_translated;
 pub use state::{LeftOut, LeftOutEntry};
@@ -65,8 +69,8 @@ pub struct TranslatedBus {
 
 impl TranslatedBus {
     /// Creates the bus that robots of the other ROS see in place of `inner`. `registry` has the definitions of the
-    /// servant's image; goals under way and results kept for robots are charged to `budget`. Call it within a Tokio
-    /// runtime.
+    /// servant's image; goals under way, results and parameters that are kept for robots are charged to `budget`. Call it
+    /// within a Tokio runtime.
     pub fn new(
         inner: Arc<dyn Bus>,
         types: Arc<TypeTranslations>,
@@ -76,6 +80,7 @@ impl TranslatedBus {
     ) -> Arc<Self> {
         let version = other_version(inner.version());
         let translation = Arc::new(Translation {
+            parameters: TranslatedParameters::new(&inner, budget.clone()),
             inner,
             version,
             twins: KnownTwins::new(registry, types, version),
@@ -137,6 +142,17 @@ impl TranslatedBus {
         twin.err().map(|reason| reason.to_string())
     }
 
+    /// Returns what the robot's node of this absolute name is started with: its arguments, which are in the spelling of
+    /// the servant's ROS, and its parameters. `kinds`: types of the node's parameters, as far as they are known.
+    pub fn prepare_launch(
+        &self,
+        node: &str,
+        argv: &[String],
+        kinds: &BTreeMap<String, ParameterKind>,
+    ) -> TranslatedLaunch {
+        self.translation.parameters.prepare_launch(node, argv, kinds)
+    }
+
     /// Returns a service of the robot as the servant's nodes see it.
     pub fn lend_to_servant(&self, service: &str, lent: LentService) -> Result<LentService, BusError> {
         lending::lend_to_servant(&self.translation, service, lent)
@@ -182,15 +198,24 @@ impl Bus for TranslatedBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        match self.actions.find_service(service)? {
-            Some((end, action)) => action.call((end, service), digest, request, timeout).await,
-            None => services::call(&self.translation, service, digest, request, timeout).await,
+        if let Some((end, action)) = self.actions.find_service(service)? {
+            return action.call((end, service), digest, request, timeout).await;
         }
+        if self.translation.find_parameter_service(service).is_some() {
+            let parameters = self.translation.parameters.of_nodes()?;
+            let answer = tokio::time::timeout(timeout, ParameterServices::call(parameters, service, &request)).await;
+            return answer
+                .unwrap_or_else(|_| Err(BusError::Timeout { what: format!("service {service}"), after: timeout }));
+        }
+        services::call(&self.translation, service, digest, request, timeout).await
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
         if let Some((end, action)) = self.actions.find_service(service)? {
             return action.service_type(end, service);
+        }
+        if let Some(of) = self.translation.find_parameter_service(service) {
+            return of;
         }
         let of = self.translation.inner.service_type(service).await?;
         let twin = self.translation.twins.service(&of);
@@ -233,6 +258,14 @@ impl Bus for TranslatedBus {
         handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError> {
         self.actions.serve(action, of, handler)
+    }
+
+    fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
+        self.translation.parameters.global()
+    }
+
+    fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
+        self.translation.parameters.of_nodes()
     }
 
     fn lending(&self) -> Result<&dyn Lending, BusError> {

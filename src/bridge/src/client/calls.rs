@@ -175,7 +175,8 @@ impl BridgeClient {
                     (Err(_), Some(other)) => return Err(other.into()),
                     (Err(error), None) => return Err(error.into()),
                 };
-                (Some(def), request)
+                let service = ("service", call.service.as_str());
+                (Some(def), self.take_decoded(request, "call_service", service, &call.reply()))
             }
             // ROS bytes in both directions need no definition.
             (Err(_), Some(args)) if call.compression == Compression::CborRaw => {
@@ -288,7 +289,7 @@ impl BridgeClient {
             (args, _) => {
                 let request = decode_args(&def.request, args, call.compression)?;
                 let mut json = Vec::new();
-                self.print_payload(&def.request, &request, Format::Json, &mut json)?;
+                self.print_payload(&def.request, &request.bytes, Format::Json, &mut json)?;
                 Ok(Bytes::from(json))
             }
         }
@@ -309,7 +310,7 @@ impl BridgeClient {
         }
         let values = Payload { format: Format::Json, bytes: values };
         let response = decode_args(&def.response, Some(values), Compression::None)?;
-        Ok(self.response_frame(call, Some(def), &response)?)
+        Ok(self.response_frame(call, Some(def), &response.bytes)?)
     }
 
     fn response_frame(

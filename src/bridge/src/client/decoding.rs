@@ -24,6 +24,13 @@ pub(super) enum PayloadError {
     TooManyArgs,
 }
 
+/// A payload as a serialized message.
+pub(super) struct DecodedPayload {
+    pub(super) bytes: Bytes,
+    /// True if a header of ROS 2 came with a `seq`, which was dropped.
+    pub(super) dropped_seq: bool,
+}
+
 /// Returns the ROS serialization in a payload, without a check of its content.
 pub(super) fn read_raw(payload: Payload<'_>) -> Result<Cow<'_, [u8]>, PayloadError> {
     Ok(payload.raw().map_err(Box::new)?.bytes)
@@ -35,14 +42,15 @@ pub(super) fn decode(
     payload: Payload<'_>,
     compression: Compression,
     source: Option<&Bytes>,
-) -> Result<Bytes, PayloadError> {
+) -> Result<DecodedPayload, PayloadError> {
     if compression == Compression::CborRaw {
         let raw = read_raw(payload)?;
         codec::validate(message_type, &raw).map_err(Box::new)?;
-        return Ok(match (&raw, source) {
+        let bytes = match (&raw, source) {
             (Cow::Borrowed(slice), Some(source)) if slice.len() >= SLICED => source.slice_ref(slice),
             _ => Bytes::from(raw.into_owned()),
-        });
+        };
+        return Ok(DecodedPayload { bytes, dropped_seq: false });
     }
     let options = FillOptions { now: Some(Time::now()), ..FillOptions::default() };
     // Base64 shrinks by a quarter; everything else of relevance by more.
@@ -51,8 +59,8 @@ pub(super) fn decode(
         Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
         Format::Cbor => codec::from_cbor(message_type, payload.bytes, &mut out, &options),
     };
-    decoded.map_err(Box::new)?;
-    Ok(Bytes::from(out))
+    let report = decoded.map_err(Box::new)?;
+    Ok(DecodedPayload { bytes: Bytes::from(out), dropped_seq: report.dropped_seq })
 }
 
 /// Converts the arguments of a service or goal, an object or a list, to a serialized message; without arguments all
@@ -61,7 +69,7 @@ pub(super) fn decode_args(
     message_type: &MessageType,
     args: Option<Payload<'_>>,
     compression: Compression,
-) -> Result<Bytes, PayloadError> {
+) -> Result<DecodedPayload, PayloadError> {
     match args {
         None if compression == Compression::CborRaw && !message_type.fields().is_empty() => Err(PayloadError::NoArgs),
         None => decode(message_type, Payload::json("{}"), Compression::None, None),

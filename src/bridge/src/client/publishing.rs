@@ -267,9 +267,9 @@ impl BridgeClient {
                 Err(reason) => return self.report_once(&topic, reason),
             },
         };
-        let bytes = decode(&topic_publisher.message_type, op.msg, op.compression, source)
+        let decoded = decode(&topic_publisher.message_type, op.msg, op.compression, source)
             .map_err(|source| PublishError::Payload { topic: topic.to_string(), source })?;
-        topic_publisher.publish(bytes);
+        topic_publisher.publish(self.take_decoded(decoded, "publish", ("topic", &topic), reply));
         if op.compression != Compression::CborRaw && self.wants_level(StatusLevel::Warning) {
             self.warn_defaulted_fields(&topic, &topic_publisher.message_type, op.msg, reply);
         }
@@ -370,8 +370,9 @@ impl BridgeClient {
     ) -> Result<(), PublishError> {
         let topic_publisher = self.open_publisher(topic, message_type, message.offer, &message.reply, false)?;
         let payload = Payload { format: message.format, bytes: &message.payload };
-        let bytes = decode(&topic_publisher.message_type, payload, message.compression, None);
-        topic_publisher.publish(bytes.map_err(PublishError::UntypedPayload)?);
+        let decoded = decode(&topic_publisher.message_type, payload, message.compression, None);
+        let decoded = decoded.map_err(PublishError::UntypedPayload)?;
+        topic_publisher.publish(self.take_decoded(decoded, "publish", ("topic", topic), &message.reply));
         Ok(())
     }
 }

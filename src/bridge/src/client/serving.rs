@@ -257,7 +257,7 @@ impl BridgeClient {
         }
     }
 
-    pub(super) fn service_response(&self, op: ServiceResponse<'_>) -> Result<(), ServingError> {
+    pub(super) fn service_response(&self, op: ServiceResponse<'_>, reply: &ReplyTarget) -> Result<(), ServingError> {
         let service = self.resolve(&op.service)?;
         let id = op.id.as_ref().ok_or(ServingError::NoId)?.to_string();
         let mut services = self.services.lock();
@@ -298,6 +298,7 @@ impl BridgeClient {
         }
         match decode_args(&def.response, op.values, op.compression) {
             Ok(response) => {
+                let response = self.take_decoded(response, "service_response", ("service", &service), reply);
                 let _ = answer.send(Ok(response));
                 Ok(())
             }

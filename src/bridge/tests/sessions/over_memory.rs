@@ -6,6 +6,8 @@ mod actions;
 mod bad_input;
 #[path = "granted.rs"]
 mod granted;
+#[path = "headers.rs"]
+mod headers;
 #[path = "manners.rs"]
 mod manners;
 #[path = "memory.rs"]

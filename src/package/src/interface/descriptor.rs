@@ -73,6 +73,15 @@ impl From<ParameterDescription> for Descriptor {
     }
 }
 
+impl Descriptor {
+    /// Returns the parameter's type.
+    pub fn parameter_kind(&self) -> ParameterKind {
+        use ParameterKind::{Bool, Bools, Bytes, Double, Doubles, Integer, Integers, String, Strings};
+        let all = [Bool, Integer, Double, String, Bytes, Bools, Integers, Doubles, Strings];
+        all.into_iter().find(|kind| kind_name(*kind) == self.kind).unwrap_or_default()
+    }
+}
+
 /// Returns the type name used by ROS 2's tools.
 fn kind_name(kind: ParameterKind) -> &'static str {
     match kind {
@@ -120,8 +129,11 @@ mod tests {
             integer_range: Some(IntegerRange { from: -1, to: 9, step: u64::MAX }),
             ..ParameterDescription::default()
         });
+        let whole_kind = whole.parameter_kind();
         let written = toml::to_string(&whole).expect("TOML");
         assert_eq!(toml::from_str::<Descriptor>(&written), Ok(whole));
+        assert_eq!(whole_kind, ParameterKind::Integer);
+        assert_eq!(Descriptor::default().parameter_kind(), ParameterKind::NotSet);
         let long = "ä".repeat(LONGEST_TEXT + 1);
         assert_eq!(truncate(long).chars().count(), LONGEST_TEXT + 1);
     }

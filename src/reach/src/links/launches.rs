@@ -1,12 +1,16 @@
 //! The node that a robot of the other ROS wants to run, in the terms of the servant's ROS.
 
+use std::collections::BTreeMap;
+
 use link::control::{Hello, NodeLaunch};
-use ros::bus::{BusError, ParamValue, RosVersion};
+use package::interface::Interface;
+use ros::bus::{BusError, ParamValue, ParameterKind, RosVersion};
 use ros::ros2::arguments::BEGIN;
 use ros::spelling::RespelledArguments;
 
 use super::node_time::SIMULATED;
-use super::state::Hub;
+use super::parameters::translate_value;
+use super::state::{Hub, ServantView};
 
 /// Changes a hello's node into one of ROS `servant`; returns arguments that are ignored there.
 pub(super) fn adapt_node(hello: &mut Hello, servant: RosVersion) -> Vec<String> {
@@ -53,9 +57,68 @@ impl Hub {
     }
 }
 
+/// Returns the types of the parameters of a service's nodes, as its push has recorded them. A name that has several is
+/// left out: which of the nodes is meant is not known.
+fn parameter_kinds(interface: &Interface) -> BTreeMap<String, ParameterKind> {
+    let mut kinds: BTreeMap<String, Option<ParameterKind>> = BTreeMap::new();
+    for parameter in &interface.parameters {
+        let Some((name, descriptor)) = parameter.own_name().zip(parameter.descriptor.as_ref()) else { continue };
+        let kind = descriptor.parameter_kind();
+        let known = kinds.entry(name.to_owned()).or_insert(Some(kind));
+        *known = known.filter(|known| *known == kind);
+    }
+    kinds.into_iter().filter_map(|(name, kind)| Some((name, kind?))).collect()
+}
+
+impl Hub {
+    /// Returns the node of a robot as it is to be started, and what it is not given, in words. For a robot of the other
+    /// ROS its parameters are passed on as the servant's ROS has them.
+    pub(super) async fn prepare_launch(&self, view: &ServantView, node: &NodeLaunch) -> (NodeLaunch, Option<String>) {
+        let mut launch = node.clone();
+        let Some(bus) = view.translated() else {
+            return (launch, None);
+        };
+        let kinds = self.nodes.interface().map(parameter_kinds).unwrap_or_default();
+        let mut translated = bus.prepare_launch(&node.name, &node.argv, &kinds);
+        launch.argv = translated.argv;
+        if let Ok(parameters) = self.bus.parameters() {
+            for (key, value) in translated.parameters {
+                let value = translate_value(self, node, &value);
+                if let Err(error) = parameters.set(&key, value).await {
+                    translated.left_out.add(&key, &error);
+                }
+            }
+        }
+        (launch, translated.left_out.describe(&node.name))
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use package::interface::{Descriptor, Parameter};
+
     use super::*;
+
+    #[test]
+    fn types_of_parameters_are_those_that_the_push_has_recorded() {
+        let parameter = |node: &str, name: &str, kind: &str| Parameter {
+            name: format!("{node}/{name}"),
+            node: node.to_owned(),
+            descriptor: Some(Descriptor { kind: kind.to_owned(), ..Descriptor::default() }),
+            ..Parameter::default()
+        };
+        let interface = Interface {
+            parameters: vec![
+                parameter("/see", "gain", "double"),
+                parameter("/see", "mode", "integer"),
+                parameter("/look", "gain", "double"),
+                parameter("/look", "mode", "string"),
+                Parameter { name: "/shared".into(), ..Parameter::default() },
+            ],
+            ..Interface::default()
+        };
+        assert_eq!(parameter_kinds(&interface), [("gain".to_owned(), ParameterKind::Double)].into());
+    }
 
     fn hello(ros: u8, named_by_argv: bool, line: &str) -> Hello {
         let argv = line.split(' ').map(str::to_owned).collect();

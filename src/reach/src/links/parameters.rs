@@ -151,7 +151,7 @@ impl ParameterMirror {
 }
 
 /// Replaces the robot's paths in a value with the servant's.
-fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
+pub(super) fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
     match value {
         ParamValue::String(text) => ParamValue::String(hub.nodes.translate(node, text)),
         ParamValue::List(items) => {

@@ -16,7 +16,7 @@ use link::session::{receive_open, send_open};
 use link::{DeliveryMode, MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use parking_lot::Mutex;
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
-use ros::bus::{Bus, FailureReason, ParamValue, RosVersion, ServiceType};
+use ros::bus::{Bus, FailureReason, ParamChange, ParamValue, RosVersion, ServiceType};
 use ros::schema::Registry;
 use tokio::io::DuplexStream;
 use tokio::sync::{mpsc, watch};
@@ -126,6 +126,8 @@ struct CloudRequestForwarder {
     graph: watch::Sender<Graph>,
     types: Mutex<HashMap<(String, String), String>>,
     notices: watch::Sender<Vec<String>>,
+    /// Changed parameters, in order.
+    changes: watch::Sender<Vec<ParamChange>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
     answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
     asked: mpsc::UnboundedSender<CloudRequest>,
@@ -144,6 +146,7 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
             Record::Control(FromCloud::Type { name, md5, definition }) => {
                 drop(self.types.lock().insert((name, md5), definition))
             }
+            Record::Control(FromCloud::Parameters(changes)) => self.changes.send_modify(|all| all.extend(changes)),
             Record::Control(FromCloud::Notice { text, .. }) => self.notices.send_modify(|all| all.push(text)),
             Record::Control(_) => {}
         }
@@ -180,6 +183,7 @@ impl LinkedRobot {
             graph: watch::Sender::default(),
             types: Mutex::default(),
             notices: watch::Sender::default(),
+            changes: watch::Sender::default(),
             heard,
             answers,
             asked: asks,
@@ -213,6 +217,16 @@ impl LinkedRobot {
         match timeout(LONG, notices.wait_for(|all| count(all) > 0)).await {
             Ok(all) => count(&all.expect("the link is there")),
             Err(_) => panic!("{words}: {:#?}", self.ear.notices.borrow()),
+        }
+    }
+
+    /// Waits until the cloud has told this change of a parameter.
+    #[allow(dead_code, reason = "not every test that includes this file has parameters")]
+    pub async fn wait_change(&self, key: &str, value: Option<&ParamValue>) {
+        let mut changes = self.ear.changes.subscribe();
+        let is_told = |all: &Vec<ParamChange>| all.iter().any(|(told, to)| told == key && to.as_ref() == value);
+        if timeout(LONG, changes.wait_for(|all| is_told(all))).await.is_err() {
+            panic!("{key} = {value:?}: {:#?}", self.ear.changes.borrow());
         }
     }
 

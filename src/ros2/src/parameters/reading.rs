@@ -10,7 +10,7 @@ const MAX_BYTES: usize = 16 << 20;
 const MAX_ELEMENTS: usize = 1 << 20;
 
 /// Reader of a message. Methods return `None` where the message ends too early.
-pub(super) struct ParameterReader<'a> {
+pub struct ParameterReader<'a> {
     cursor: MessageCursor<'a>,
     /// Remaining number of elements.
     elements: usize,
@@ -18,55 +18,61 @@ pub(super) struct ParameterReader<'a> {
 
 impl<'a> ParameterReader<'a> {
     /// Creates a reader at the beginning of the message; `None` if it is too long.
-    pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
+    pub fn new(bytes: &'a [u8]) -> Option<Self> {
         let cursor = MessageCursor::new(RosVersion::Two, bytes)?;
         (bytes.len() <= MAX_BYTES).then_some(Self { cursor, elements: MAX_ELEMENTS })
     }
 
-    pub(super) fn byte(&mut self) -> Option<u8> {
+    /// Reads a byte.
+    pub fn byte(&mut self) -> Option<u8> {
         self.cursor.number().map(|[byte]| byte)
     }
 
-    pub(super) fn bool(&mut self) -> Option<bool> {
+    /// Reads a bool.
+    pub fn bool(&mut self) -> Option<bool> {
         self.byte().map(|byte| byte != 0)
     }
 
-    pub(super) fn integer(&mut self) -> Option<i64> {
+    /// Reads an `int64`.
+    pub fn integer(&mut self) -> Option<i64> {
         self.cursor.number().map(i64::from_le_bytes)
     }
 
-    pub(super) fn unsigned_integer(&mut self) -> Option<u64> {
+    /// Reads a `uint64`.
+    pub fn unsigned_integer(&mut self) -> Option<u64> {
         self.cursor.number().map(u64::from_le_bytes)
     }
 
-    pub(super) fn double(&mut self) -> Option<f64> {
+    /// Reads a `float64`.
+    pub fn double(&mut self) -> Option<f64> {
         self.cursor.number().map(f64::from_le_bytes)
     }
 
     /// Skips a time.
-    pub(super) fn skip_time(&mut self) -> Option<()> {
+    pub fn skip_time(&mut self) -> Option<()> {
         self.cursor.skip(2, 4, 4)
     }
 
     /// Reads a text; invalid UTF-8 is replaced.
-    pub(super) fn text(&mut self) -> Option<String> {
+    pub fn text(&mut self) -> Option<String> {
         let bytes = self.text_bytes()?;
         Some(String::from_utf8_lossy(bytes).into_owned())
     }
 
-    pub(super) fn text_bytes(&mut self) -> Option<&'a [u8]> {
+    /// Reads the bytes of a text.
+    pub fn text_bytes(&mut self) -> Option<&'a [u8]> {
         let bytes = self.cursor.string(false)?;
         Some(bytes.strip_suffix(&[0]).unwrap_or(bytes))
     }
 
     /// Reads a list of bytes or bools.
-    pub(super) fn bytes(&mut self) -> Option<&'a [u8]> {
+    pub fn bytes(&mut self) -> Option<&'a [u8]> {
         let length = self.cursor.length()?;
         self.cursor.take(length, 1)
     }
 
     /// Reads a list of 8-byte numbers, as little-endian bytes.
-    pub(super) fn numbers(&mut self) -> Option<impl ExactSizeIterator<Item = [u8; 8]> + use<'a>> {
+    pub fn numbers(&mut self) -> Option<impl ExactSizeIterator<Item = [u8; 8]> + use<'a>> {
         let length = self.cursor.length()?;
         let bytes = match length {
             0 => &[][..],
@@ -83,24 +89,26 @@ impl<'a> ParameterReader<'a> {
         }))
     }
 
-    pub(super) fn texts(&mut self) -> Option<Vec<String>> {
+    /// Reads a list of texts.
+    pub fn texts(&mut self) -> Option<Vec<String>> {
         self.list(Self::text)
     }
 
-    pub(super) fn skip_texts(&mut self) -> Option<()> {
+    /// Skips a list of texts.
+    pub fn skip_texts(&mut self) -> Option<()> {
         let length = self.cursor.length()?;
         (0..length).try_for_each(|_| self.text_bytes().map(drop))
     }
 
     /// Reads a list, element by element.
-    pub(super) fn list<T>(&mut self, one: impl Fn(&mut Self) -> Option<T>) -> Option<Vec<T>> {
+    pub fn list<T>(&mut self, one: impl Fn(&mut Self) -> Option<T>) -> Option<Vec<T>> {
         let length = self.cursor.length()?;
         self.spend(length)?;
         (0..length).map(|_| one(self)).collect()
     }
 
     /// Counts elements that are kept; `None` beyond the limit.
-    pub(super) fn spend(&mut self, elements: usize) -> Option<()> {
+    pub fn spend(&mut self, elements: usize) -> Option<()> {
         self.elements = self.elements.checked_sub(elements)?;
         Some(())
     }

@@ -12,21 +12,36 @@ const EXACT: u64 = 1 << 53;
 
 /// A value of a type defined by ROS 2.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum TypedValue {
+pub enum TypedValue {
+    /// No value.
     NotSet,
+    /// A bool.
     Bool(bool),
+    /// An `int64`.
     Integer(i64),
+    /// A `float64`.
     Double(f64),
+    /// A text.
     String(String),
+    /// An array of bytes.
     Bytes(Vec<u8>),
+    /// An array of bools.
     Bools(Vec<bool>),
+    /// An array of `int64`.
     Integers(Vec<i64>),
+    /// An array of `float64`.
     Doubles(Vec<f64>),
+    /// An array of texts.
     Strings(Vec<String>),
 }
 
+/// Returns the number of a type in `rcl_interfaces/msg/ParameterType`.
+pub fn number_from_kind(kind: ParameterKind) -> u8 {
+    (0..=9).find(|number| kind_from_number(*number) == kind).unwrap_or(0)
+}
+
 /// Returns the type of this number in `rcl_interfaces/msg/ParameterType`; an unknown number counts as not set.
-pub(super) fn kind_from_number(number: u8) -> ParameterKind {
+pub fn kind_from_number(number: u8) -> ParameterKind {
     match number {
         1 => ParameterKind::Bool,
         2 => ParameterKind::Integer,
@@ -42,23 +57,26 @@ pub(super) fn kind_from_number(number: u8) -> ParameterKind {
 }
 
 /// Returns true if the value's type may have to be adapted to the parameter's, or is not determined by the value.
-pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
+pub fn depends_on_kind(value: &ParamValue) -> bool {
     !matches!(value, ParamValue::Bool(_) | ParamValue::Binary(_) | ParamValue::Nil)
 }
 
 /// The reason why no ROS 2 parameter can have a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum CoerceError {
+pub enum CoerceError {
+    /// Only values have parameters.
     #[error("a ROS 2 parameter cannot be a dictionary: set each of its values")]
     Dictionary,
+    /// A list needs a type.
     #[error("an empty list does not say what it is a list of")]
     EmptyList,
+    /// A list has one type.
     #[error("a list holds values of one type: all booleans, numbers or strings")]
     MixedList,
 }
 
 /// Converts the value to the parameter's type where that is lossless; otherwise leaves it for the node to judge.
-pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, CoerceError> {
+pub fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, CoerceError> {
     let natural = match (value, kind) {
         (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => TypedValue::Double(value as f64),
         (ParamValue::Double(value), ParameterKind::Integer) if is_integer(value) => TypedValue::Integer(value as i64),
@@ -155,7 +173,7 @@ fn is_integer(value: f64) -> bool {
 }
 
 /// Writes a value.
-pub(super) fn write(value: &TypedValue, put: &mut CdrWriter) {
+pub fn write(value: &TypedValue, put: &mut CdrWriter) {
     use TypedValue::*;
     let number = match value {
         NotSet => 0,
@@ -194,7 +212,7 @@ pub(super) fn write(value: &TypedValue, put: &mut CdrWriter) {
 }
 
 /// Reads a value; the inner `None` means that the parameter is not set.
-pub(super) fn read(reading: &mut ParameterReader<'_>) -> Option<Option<ParamValue>> {
+pub fn read(reading: &mut ParameterReader<'_>) -> Option<Option<ParamValue>> {
     let kind = kind_from_number(reading.byte()?);
     let bool = reading.byte()? != 0;
     let integer = reading.integer()?;

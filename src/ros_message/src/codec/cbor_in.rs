@@ -1,23 +1,28 @@
 //! CBOR → ROS bytes (RFC 8949), including typed arrays (RFC 8746).
 
 use crate::cbor_head::{ARRAY, BYTES, MAP, NEGATIVE, SIMPLE, TAG, TEXT, UNSIGNED};
-use crate::codec::FillOptions;
 use crate::codec::cbor_item::{INDEFINITE, ItemHead};
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::fill::{ValueInput, fill};
 use crate::codec::number::{Number, Wire};
 use crate::codec::typed_array::{ElementLayout, head_to_float};
+use crate::codec::{FillOptions, FillReport};
 use crate::schema::MessageType;
 use crate::schema::plan::Members;
 
 /// Appends the message that the CBOR map describes.
-pub(crate) fn read(message: &MessageType, cbor: &[u8], out: &mut Vec<u8>, options: &FillOptions) -> Result<(), Fault> {
+pub(crate) fn read(
+    message: &MessageType,
+    cbor: &[u8],
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+) -> Result<FillReport, Fault> {
     let mut input = Cbor { input: cbor, at: 0, scratch: Vec::new() };
-    fill(&mut input, message, out, options)?;
+    let report = fill(&mut input, message, out, options)?;
     if input.at < cbor.len() {
         return Err(input.invalid("more follows the message"));
     }
-    Ok(())
+    Ok(report)
 }
 
 struct Cbor<'a> {

@@ -15,9 +15,9 @@ use crate::codec::cdr;
 use crate::codec::fault::{CodecErrorKind, Fault};
 use crate::codec::fill::layout::{Aligned, OutputLayout, Packed};
 use crate::codec::number::Wire;
-use crate::codec::{FillOptions, Time};
+use crate::codec::{FillOptions, FillReport, Time};
 use crate::schema::MessageType;
-use crate::schema::plan::{Count, Kind, Member, Members, Scalar, Text};
+use crate::schema::plan::{Count, Kind, Member, Members, SEQ, Scalar, Text};
 
 /// A source of values.
 pub(crate) trait ValueInput {
@@ -27,8 +27,8 @@ pub(crate) trait ValueInput {
     type Array;
 
     fn begin_object(&mut self) -> Result<Self::Object, Fault>;
-    /// Reads the next key and returns the index of its field, or `None` at the end of the object. `expected` is the
-    /// likely index.
+    /// Reads the next key and returns the index of its field, as [`Members::find`] does, or `None` at the end of the
+    /// object. `expected` is the likely index.
     fn next_member(
         &mut self,
         object: &mut Self::Object,
@@ -56,7 +56,7 @@ pub(crate) fn fill<I: ValueInput>(
     message: &MessageType,
     out: &mut Vec<u8>,
     options: &FillOptions,
-) -> Result<(), Fault> {
+) -> Result<FillReport, Fault> {
     let end = out.len().saturating_add(options.max_bytes);
     match message.version() {
         RosVersion::One => fill_body(input, message, out, options, (Packed, end)),
@@ -74,10 +74,12 @@ fn fill_body<I: ValueInput, L: OutputLayout>(
     out: &mut Vec<u8>,
     options: &FillOptions,
     (layout, end): (L, usize),
-) -> Result<(), Fault> {
-    let mut filler = Filler { input, out, layout, options, end, places: Vec::new(), scratch: Vec::new() };
+) -> Result<FillReport, Fault> {
+    let (places, scratch, report) = (Vec::new(), Vec::new(), FillReport::default());
+    let mut filler = Filler { input, out, layout, options, end, places, scratch, report };
     filler.message(message)?;
-    filler.check_room(0)
+    filler.check_room(0)?;
+    Ok(filler.report)
 }
 
 struct Filler<'a, I, L> {
@@ -90,6 +92,7 @@ struct Filler<'a, I, L> {
     /// Begin and end, in `out`, of the fields of the open objects; innermost object last.
     places: Vec<(usize, usize)>,
     scratch: Vec<u8>,
+    report: FillReport,
 }
 
 impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
@@ -104,6 +107,10 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
             let Some(index) = self.input.next_member(&mut object, &plan.members, next)? else {
                 break;
             };
+            if index == members.len() {
+                self.drop_seq()?;
+                continue;
+            }
             for skipped in &members[next.min(index)..index] {
                 self.default_field(plan.header, skipped)?;
             }
@@ -129,6 +136,14 @@ impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
         if L::PLACEHOLDERS && plan.placeholder {
             self.out.push(0);
         }
+        Ok(())
+    }
+
+    /// Reads the `seq` of a header of ROS 1, which must be right, and drops it.
+    #[cold]
+    fn drop_seq(&mut self) -> Result<(), Fault> {
+        self.input.number::<u32>().map_err(|fault| fault.in_field(SEQ))?;
+        self.report.dropped_seq = true;
         Ok(())
     }
 

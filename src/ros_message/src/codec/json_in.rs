@@ -3,22 +3,27 @@
 
 use memchr::memchr2;
 
-use crate::codec::FillOptions;
 use crate::codec::digits::{eight_digits, many_digits};
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::fill::{ValueInput, fill};
 use crate::codec::json_text::{is_space, plain_prefix, unescape};
 use crate::codec::number::{Decimal, Wire};
+use crate::codec::{FillOptions, FillReport};
 use crate::schema::MessageType;
 use crate::schema::plan::Members;
 
 /// Appends the message that the JSON object describes.
-pub(crate) fn read(message: &MessageType, json: &[u8], out: &mut Vec<u8>, options: &FillOptions) -> Result<(), Fault> {
+pub(crate) fn read(
+    message: &MessageType,
+    json: &[u8],
+    out: &mut Vec<u8>,
+    options: &FillOptions,
+) -> Result<FillReport, Fault> {
     let mut input = Json { input: json, at: 0, scratch: Vec::new() };
-    fill(&mut input, message, out, options)?;
+    let report = fill(&mut input, message, out, options)?;
     input.skip_space();
     match input.peek() {
-        None => Ok(()),
+        None => Ok(report),
         Some(_) => Err(input.invalid("more follows the message")),
     }
 }

@@ -103,3 +103,11 @@ impl Default for FillOptions {
         FillOptions { now: None, max_bytes: DEFAULT_MAX_BYTES }
     }
 }
+
+/// What the input held that the message cannot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FillReport {
+    /// True if a `std_msgs/Header` of a ROS 2 message, at any depth, came with `seq`, which ROS 2 removed from headers:
+    /// it was dropped.
+    pub dropped_seq: bool,
+}

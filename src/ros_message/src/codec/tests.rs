@@ -95,7 +95,7 @@ fn ros_at(message: &MessageType, json: &str, now: Option<Time>) -> Result<Vec<u8
     let result = from_json(message, json.as_bytes(), &mut out, &FillOptions { now, ..FillOptions::default() });
     assert_eq!(&out[..4], b"kept");
     match result {
-        Ok(()) => {
+        Ok(_) => {
             let bytes = out.split_off(4);
             validate(message, &bytes).unwrap();
             Ok(bytes)

@@ -55,12 +55,17 @@ struct Name {
     name: Box<str>,
 }
 
+/// The field that headers have in ROS 1 alone.
+pub(crate) const SEQ: &str = "seq";
+
 /// The fields of a message, for input.
 #[derive(Debug, Default)]
 pub(crate) struct Members {
     list: Vec<Member>,
     /// Indices into `list`, sorted by name.
     sorted: Vec<usize>,
+    /// True for the header of ROS 2: clients made for ROS 1 write `seq`, too, which is read and dropped.
+    drops_seq: bool,
 }
 
 /// A field, for input.
@@ -134,6 +139,7 @@ impl CodecPlan {
             members: Members::new(fields.iter().map(member).collect()),
             ..CodecPlan::default()
         };
+        plan.members.drops_seq = plan.header && version == RosVersion::Two;
         let mut pending = Pending::default();
         plan.flatten(fields, None, &mut pending);
         plan.tail = plan.literal(&mut pending);
@@ -229,7 +235,7 @@ impl Members {
     pub(crate) fn new(list: Vec<Member>) -> Members {
         let mut sorted: Vec<usize> = (0..list.len()).collect();
         sorted.sort_unstable_by_key(|index| list[*index].name.as_bytes());
-        Members { list, sorted }
+        Members { list, sorted, drops_seq: false }
     }
 
     /// Returns the fields in order of serialization.
@@ -238,10 +244,12 @@ impl Members {
         &self.list
     }
 
-    /// Returns the index of the field of this name.
+    /// Returns the index of the field of this name; for a `seq` that is to be dropped, the number of fields.
     pub(crate) fn find(&self, name: &[u8]) -> Option<usize> {
-        let found = self.sorted.binary_search_by_key(&name, |index| self.list[*index].name.as_bytes());
-        found.ok().map(|at| self.sorted[at])
+        match self.sorted.binary_search_by_key(&name, |index| self.list[*index].name.as_bytes()) {
+            Ok(at) => Some(self.sorted[at]),
+            Err(_) => (self.drops_seq && name == SEQ.as_bytes()).then_some(self.list.len()),
+        }
     }
 }
 

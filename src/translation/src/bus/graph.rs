@@ -3,7 +3,8 @@
 //! * For a robot of ROS 1 a process of ROS 2 is one node, the one that the robot has started; what belongs to ROS 2
 //!   itself (parameter services and events) is not shown.
 //! * For a robot of ROS 2 each endpoint announces its type and quality of service. In ROS 1 only the node itself knows
-//!   the type of a service and whether a topic is latched, so it is asked, and shown once it has answered.
+//!   the type of a service and whether a topic is latched, so it is asked, and shown once it has answered. Each node
+//!   has the services about parameters that nodes of ROS 2 have.
 //!
 //! Actions consist of other parts in each ROS; `actions` adds them.
 
@@ -16,6 +17,7 @@ use ros::ros2::names;
 use tokio::sync::watch;
 
 use super::actions::add_actions;
+use super::parameters::ParameterServices;
 use super::state::{LeftOut, TranslatedGraph, Translation};
 use super::twins::{KnownTwins, Untranslatable};
 
@@ -25,6 +27,8 @@ const OF_ROS_2: [&str; 2] = ["rcl_interfaces/", "type_description_interfaces/"];
 const PARAMETER_EVENTS: &str = "/parameter_events";
 /// Package of ROS 1 whose services every node provides.
 const OF_ROS_1: &str = "roscpp/";
+/// Type of the services by which nodes of ROS 1 change parameters: robots of ROS 2 use the services about parameters.
+const RECONFIGURE: &str = "dynamic_reconfigure/Reconfigure";
 /// Topic of ROS 1 on which rosout repeats all messages.
 const AGGREGATED_LOG: &str = "/rosout_agg";
 /// Topic that subscribers of ROS 2 always request with its last messages.
@@ -215,7 +219,7 @@ pub(super) fn for_ros2(
     }
     for (service, server) in &inner.services {
         let told = (server != own).then(|| service_type(service)).flatten();
-        let Some(of) = told.filter(|of| !of.name.starts_with(OF_ROS_1)) else {
+        let Some(of) = told.filter(|of| !of.name.starts_with(OF_ROS_1) && of.name != RECONFIGURE) else {
             continue;
         };
         let twin = if names::is_global(service) { twins.service(&of) } else { Err(Untranslatable::Name) };
@@ -227,6 +231,12 @@ pub(super) fn for_ros2(
             }
             Err(reason) => out.leave_out(format!("service {service}"), [&**server].into_iter(), &reason),
         }
+    }
+    for node in inner.nodes.keys().filter(|node| *node != own && names::is_global(node)) {
+        // The definitions are built in.
+        let all = ParameterServices::of_node(node).unwrap_or_default();
+        out.graph.services.extend(all.keys().map(|service| (service.clone(), node.clone())));
+        ends.entry(node.clone()).or_default().services.extend(all);
     }
     out.graph.sought = inner
         .sought

@@ -4,9 +4,10 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, TopicPeer, WireType};
+use ros::bus::{Bus, BusError, Graph, MatchedPeers, Offer, PeerId, RosVersion, ServiceType, TopicPeer, WireType};
 
 use super::losses::LossCounters;
+use super::parameters::{ParameterServices, TranslatedParameters};
 use super::twins::{KnownTwins, Untranslatable};
 use crate::ServiceTwin;
 
@@ -18,6 +19,8 @@ pub(super) struct Translation {
     pub(super) version: RosVersion,
     pub(super) twins: KnownTwins,
     pub(super) losses: LossCounters,
+    /// The servant's parameters as the robot sees them.
+    pub(super) parameters: TranslatedParameters,
     /// Types of the services that were called, by name.
     pub(super) called: Mutex<HashMap<String, Arc<ServiceTwin>>>,
 }
@@ -55,6 +58,14 @@ impl TranslatedGraph {
 }
 
 impl Translation {
+    /// Returns the type of a service about parameters that a node of ROS 1 has for robots of ROS 2.
+    pub(super) fn find_parameter_service(&self, service: &str) -> Option<Result<ServiceType, BusError>> {
+        if self.version == RosVersion::One {
+            return None;
+        }
+        ParameterServices::find_type(&self.inner.graph().borrow(), service)
+    }
+
     /// Returns the ROS version of the servant.
     pub(super) fn servant_version(&self) -> RosVersion {
         self.inner.version()

@@ -6,9 +6,10 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use ros::bus::{
-    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, PeerId, QosProfile, RosVersion,
-    ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
+    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, ParamValue, PeerId, QosProfile,
+    RosVersion, ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
 };
+use ros::codec::put::CdrWriter;
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -344,6 +345,36 @@ async fn what_cannot_be_carried_is_left_out_or_dropped_with_a_reason() {
     // No type of the robot's that nobody describes is published.
     let refused = bus.advertise("/brew", WireType::new("lab_msgs/Brew", "0", ""), QosProfile::keep_last(1)).await;
     assert!(refused.is_err() || bus.message(&WireType::with_name("lab_msgs/Brew")).is_none());
+}
+
+#[tokio::test]
+async fn parameters_of_a_servant_are_those_of_the_robots_ros() {
+    let (bus, _, node) = servant_of_ros2();
+    let rate = vec![("rate".to_owned(), Some(ParamValue::Int(5)))];
+    node.node_parameters().expect("they are offered").set("/see", rate).await.expect("a node");
+    let parameters = bus.parameters().expect("they are offered");
+    assert_eq!(parameters.get("/see/rate").await.expect("a parameter"), ParamValue::Int(5));
+    assert!(bus.node_parameters().is_err(), "ROS 1 has none");
+    parameters.set("/late/rate", ParamValue::Int(6)).await.expect("it is kept");
+    assert_eq!(bus.prepare_launch("/late", &[], &BTreeMap::new()).argv, ["--ros-args", "-p", "rate:=6", "--"]);
+
+    let (bus, _, node) = servant_of_ros1().await;
+    node.parameters().expect("a Master").set("/see/rate", ParamValue::Int(5)).await.expect("a Master");
+    assert!(bus.parameters().is_err(), "ROS 2 has none");
+    let _topic = node.advertise("/alive", string(RosVersion::One), QosProfile::keep_last(1)).await.expect("a topic");
+    let service = "/see/get_parameters";
+    let graph = wait_graph(&*bus, |graph| graph.services.contains_key(service)).await;
+    let of = bus.service_type(service).await.expect("a type");
+    assert_eq!(of.name, "rcl_interfaces/srv/GetParameters");
+    assert_eq!(graph.ends["/see"].services[service], of);
+    let mut request = CdrWriter::new();
+    request.length(1);
+    request.text("rate");
+    let answer = bus.call(service, request.finish(), LONG).await.expect("an answer");
+    // One value, an integer.
+    assert_eq!((&answer[4..9], &answer[12..20]), (&[1, 0, 0, 0, 2][..], &[5, 0, 0, 0, 0, 0, 0, 0][..]));
+    let launch = bus.prepare_launch("/late", &["_rate:=6".to_owned()], &BTreeMap::new());
+    assert_eq!(launch.parameters, [("/late/rate".to_owned(), ParamValue::Int(6))]);
 }
 
 #[test]

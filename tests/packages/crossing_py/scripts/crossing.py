@@ -66,6 +66,7 @@ rospy.Subscriber("~picture", Image, mirrored.publish, queue_size=1, buff_size=1 
 rospy.Subscriber("/tf", TFMessage, learn("moving"))
 rospy.Subscriber("/tf_static", TFMessage, learn("fixed"))
 rospy.Service("~now", Trigger, lambda _: TriggerResponse(True, str(rospy.Time.now().to_nsec())))
+rospy.Service("~label", Trigger, lambda _: TriggerResponse(True, str(rospy.get_param("~label", "none"))))
 rospy.Service("~ask", Trigger, ask)
 rospy.Service("~wait", Trigger, wait)
 server = actionlib.SimpleActionServer("~act", TestAction, act, auto_start=False)

@@ -74,14 +74,22 @@ impl BridgeClient {
         server.ok_or_else(|| ClientActionError::NotAdvertised(name.into_owned()))
     }
 
-    pub(in crate::client) fn action_feedback(&self, op: &ActionFeedback<'_>) -> Result<(), ClientActionError> {
+    pub(in crate::client) fn action_feedback(
+        &self,
+        op: &ActionFeedback<'_>,
+        reply: &ReplyTarget,
+    ) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
         let request = op.id.to_string();
         let body = decode(&server.def.feedback, op.values, op.compression, None)?;
-        server.publish_feedback(&request, body)
+        server.publish_feedback(&request, self.take_decoded(body, "action_feedback", ("action", &server.name), reply))
     }
 
-    pub(in crate::client) fn action_result(&self, op: &ActionResult<'_>) -> Result<(), ClientActionError> {
+    pub(in crate::client) fn action_result(
+        &self,
+        op: &ActionResult<'_>,
+        reply: &ReplyTarget,
+    ) -> Result<(), ClientActionError> {
         let server = self.action_server(&op.action)?;
         let request = op.id.as_ref().ok_or(ClientActionError::NoId)?.to_string();
         let text = match op.values {
@@ -100,7 +108,10 @@ impl BridgeClient {
             return server.end_goal(&request, outcome, &text, server.default_result());
         }
         match decode_args(&server.def.result, op.values, op.compression) {
-            Ok(body) => server.end_goal(&request, outcome, "", body),
+            Ok(body) => {
+                let body = self.take_decoded(body, "action_result", ("action", &server.name), reply);
+                server.end_goal(&request, outcome, "", body)
+            }
             Err(error) => {
                 let text = format!("the result does not fit: {error}");
                 server.end_goal(&request, GoalOutcome::Aborted, &text, server.default_result())?;

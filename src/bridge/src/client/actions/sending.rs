@@ -93,6 +93,7 @@ impl BridgeClient {
         let def = self.action_def(&name, &op.action_type)?;
         self.warn_surplus_args(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
+        let body = self.take_decoded(body, "send_action_goal", ("action", &name), reply);
         let action = self.action_client(&name, def)?;
         // In the format of actionlib: neither another node nor a later one of the same name makes equal ids.
         let now = Time::now();

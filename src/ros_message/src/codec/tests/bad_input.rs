@@ -205,7 +205,7 @@ fn output_beyond_the_limit_is_refused() {
     let options = CborOptions { max_bytes: 500, ..CborOptions::default() };
     too_large(to_cbor(&string, &bytes, &mut Vec::new(), &options));
     let options = FillOptions { max_bytes: 500, ..FillOptions::default() };
-    too_large(from_json(&string, json.as_bytes(), &mut Vec::new(), &options));
+    too_large(from_json(&string, json.as_bytes(), &mut Vec::new(), &options).map(drop));
 
     // A few bytes of JSON must not become gigabytes of defaults.
     let registry = Registry::new();

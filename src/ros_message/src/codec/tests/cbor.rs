@@ -10,7 +10,7 @@ fn cbor_of(message: &MessageType, bytes: &[u8]) -> Vec<u8> {
 fn ros_of(message: &MessageType, cbor: &[u8]) -> Result<Vec<u8>, String> {
     let mut out = Vec::new();
     let result = from_cbor(message, cbor, &mut out, &FillOptions::default());
-    result.map(|()| out).map_err(|error| error.to_string())
+    result.map(|_| out).map_err(|error| error.to_string())
 }
 
 /// A map with one key, `data`.

@@ -230,3 +230,54 @@ fn what_may_be_written_is_limited() {
     let of_one = from_json(&path, json.as_bytes(), &mut out, &options).unwrap_err();
     assert_eq!(of_one.kind, refused.kind);
 }
+
+#[test]
+fn the_seq_of_a_ros_1_header_is_dropped_wherever_the_header_stands() {
+    let way = message("a/Way");
+    let filled = |json: &str| {
+        let mut bytes = Vec::new();
+        let report = from_json(&way, json.as_bytes(), &mut bytes, &FillOptions::default());
+        report.map(|report| (bytes, report)).map_err(|error| error.to_string())
+    };
+    let (dropped, plain) = (FillReport { dropped_seq: true }, FillReport::default());
+    let (expected, report) = filled(
+        r#"{"places":[{"header":{"stamp":{"sec":1,"nanosec":2},"frame_id":"ab"},"x":2}],
+            "one":{"header":{"frame_id":"c"}}}"#,
+    )
+    .unwrap();
+    assert_eq!(report, plain);
+    for json in [
+        r#"{"places":[{"header":{"seq":7,"stamp":{"secs":1,"nsecs":2},"frame_id":"ab"},"x":2}],
+            "one":{"header":{"frame_id":"c"}}}"#,
+        r#"{"one":{"header":{"frame_id":"c","s\u0065q":4294967295}},
+            "places":[{"x":2,"header":{"frame_id":"ab","seq":0,"stamp":{"sec":1,"nsecs":2},"seq":1}}]}"#,
+    ] {
+        assert_eq!(filled(json), Ok((expected.clone(), dropped)), "{json}");
+    }
+    // Only a number is dropped, and only from a header.
+    for (json, error) in [
+        (r#"{"one":{"header":{"seq":-1}}}"#, "field one.header.seq of a/msg/Way: -1 does not fit into uint32"),
+        (r#"{"one":{"header":{"seq":"1"}}}"#, "field one.header.seq of a/msg/Way: takes uint32, got a string"),
+        (r#"{"one":{"seq":1}}"#, "field one.seq of a/msg/Way: there is no such field"),
+        (r#"{"one":{"header":{"sequence":1}}}"#, "field one.header.sequence of a/msg/Way: there is no such field"),
+    ] {
+        assert_eq!(filled(json).unwrap_err(), error);
+    }
+
+    // In CBOR, and as the message itself.
+    let mut bytes = Vec::new();
+    let header = message("std_msgs/Header");
+    for cbor in [&b"\xa1\x63seq\x07"[..], b"\xa2\x68frame_id\x60\x63seq\x1a\xff\xff\xff\xff"] {
+        bytes.clear();
+        assert_eq!(from_cbor(&header, cbor, &mut bytes, &FillOptions::default()), Ok(dropped));
+        assert_eq!(bytes, default_message(&header));
+    }
+    let refused = from_cbor(&header, b"\xa1\x63seq\x20", &mut bytes, &FillOptions::default()).unwrap_err();
+    assert_eq!(refused.to_string(), "field seq of std_msgs/msg/Header: -1 does not fit into uint32");
+
+    // ROS 1 keeps it.
+    bytes.clear();
+    let path = message_of_one("nav_msgs/Path");
+    let report = from_json(&path, br#"{"header":{"seq":7}}"#, &mut bytes, &FillOptions::default());
+    assert_eq!((report, &bytes[..4]), (Ok(plain), &[7, 0, 0, 0][..]));
+}

@@ -30,6 +30,8 @@ class Crossing(Node):
         self.create_subscription(TFMessage, "/tf", self.learn("moving"), 100)
         self.create_subscription(TFMessage, "/tf_static", self.learn("fixed"), latched)
         self.create_service(Trigger, "~/now", self.now)
+        self.declare_parameter("label", "none")
+        self.create_service(Trigger, "~/label", self.label)
         # A goal is cancelled while it is carried out.
         self.acting = ActionServer(
             self,
@@ -62,6 +64,11 @@ class Crossing(Node):
     def now(self, _, response):
         response.success = True
         response.message = str(self.get_clock().now().nanoseconds)
+        return response
+
+    def label(self, _, response):
+        response.success = True
+        response.message = self.get_parameter("label").value
         return response
 
     def act(self, goal):

@@ -1,0 +1,356 @@
+//! The parameters of a servant of ROS 1 as a robot of ROS 2 sees them: those of each node, with descriptions.
+//!
+//! ```text
+//!  gains.p of /camera/see         /camera/see/gains/p at the Master
+//!  filter.gain of /camera/see     gain of the dynamic_reconfigure server at /camera/see/filter, described by it
+//!  use_sim_time of any node       /use_sim_time at the Master
+//! ```
+//! A Master takes whatever is set; whether the node reads it again is not known. Parameters of dynamic_reconfigure are
+//! set at their server, which applies them, and have its types and ranges.
+
+mod events;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use ros::bus::{
+    Bus, BusError, FailureReason, NodeParameters, ParamChange, ParamValue, ParameterDescription, ParameterEvents,
+    ParameterKind, ParameterNames,
+};
+use tokio::sync::Mutex;
+
+use super::names::{SIM_TIME, SIM_TIME_KEY, shown_key, to_key};
+use super::reconfigure::{Config, ReconfigureRefusal, ReconfigureServer};
+use super::values::{ParameterRefusal, Tree, check_for_ros1, value_at};
+use events::MasterWatch;
+
+/// The parameters of nodes, over the Master of a ROS 1 bus.
+pub struct NodeParameterView {
+    inner: Arc<dyn Bus>,
+    /// The watch of the Master that all receivers of events share.
+    watch: Mutex<Option<MasterWatch>>,
+}
+
+/// Reasons why a parameter of a node is not set.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+enum SetRefusal {
+    #[error(transparent)]
+    Value(#[from] ParameterRefusal),
+    #[error(transparent)]
+    Reconfigure(#[from] ReconfigureRefusal),
+    #[error("nodes of ROS 1 read use_sim_time only when they start; start the node with it")]
+    SimTime,
+    #[error("it is not set")]
+    NotSet,
+}
+
+/// A checked change.
+enum PlannedChange {
+    /// Of the server of this index, by its own name.
+    Reconfigure(usize, String, ParamValue),
+    /// At the Master.
+    Set(String, ParamValue),
+    Delete(String),
+    /// It has this value.
+    Nothing,
+}
+
+/// The parameters of a node, as far as changes depend on them.
+struct NodeState {
+    tree: Tree,
+    servers: Vec<ReconfigureServer>,
+    simulated: bool,
+}
+
+impl NodeParameterView {
+    /// Creates the view.
+    pub fn new(inner: Arc<dyn Bus>) -> Self {
+        Self { inner, watch: Mutex::default() }
+    }
+
+    /// Returns the error for a node that does not exist, as a bus of ROS 2 has it.
+    fn check_node(&self, node: &str) -> Result<(), BusError> {
+        if self.inner.graph().borrow().has_node(node) {
+            return Ok(());
+        }
+        Err(BusError::NoService(format!("{node}/get_parameters")))
+    }
+
+    /// Reads the parameters below the node's name.
+    async fn read_tree(&self, node: &str) -> Result<Tree, BusError> {
+        self.check_node(node)?;
+        match self.inner.parameters()?.get(node).await {
+            Ok(ParamValue::Map(tree)) => Ok(tree),
+            Ok(_) | Err(BusError::NoParam(_)) => Ok(Tree::new()),
+            Err(error) => Err(error),
+        }
+    }
+
+    async fn read_sim_time(&self) -> Result<bool, BusError> {
+        match self.inner.parameters()?.get(SIM_TIME_KEY).await {
+            Ok(value) => Ok(value == ParamValue::Bool(true)),
+            Err(BusError::NoParam(_)) => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
+    async fn read_state(&self, node: &str) -> Result<NodeState, BusError> {
+        Ok(NodeState {
+            tree: self.read_tree(node).await?,
+            servers: ReconfigureServer::find_all(&*self.inner, node).await,
+            simulated: self.read_sim_time().await?,
+        })
+    }
+
+    /// Makes checked changes; returns for each whether it was made. Those of one dynamic_reconfigure server are made at
+    /// once.
+    async fn make(
+        &self,
+        state: &NodeState,
+        planned: Vec<Result<PlannedChange, SetRefusal>>,
+    ) -> Result<Vec<Result<(), FailureReason>>, BusError> {
+        let mut results: Vec<Result<(), FailureReason>> = Vec::with_capacity(planned.len());
+        let mut configs: BTreeMap<usize, (Config, Vec<(usize, String)>)> = BTreeMap::new();
+        let master = self.inner.parameters()?;
+        for (at, change) in planned.into_iter().enumerate() {
+            let made = match change {
+                Err(refusal) => Err(FailureReason::new(refusal.to_string())),
+                Ok(PlannedChange::Nothing) => Ok(()),
+                Ok(PlannedChange::Set(key, value)) => to_failure(master.set(&key, value).await)?,
+                Ok(PlannedChange::Delete(key)) => to_failure(master.delete(&key).await)?,
+                Ok(PlannedChange::Reconfigure(server, name, value)) => {
+                    let (config, places) = configs.entry(server).or_default();
+                    config.values.insert(name.clone(), value);
+                    places.push((at, name));
+                    Ok(())
+                }
+            };
+            results.push(made);
+        }
+        for (server, (config, places)) in configs {
+            let chosen = to_failure(state.servers[server].change(&*self.inner, &config).await)?;
+            for (at, name) in places {
+                results[at] = match &chosen {
+                    Err(reason) => Err(reason.clone()),
+                    Ok(chosen) => check_chosen(config.values.get(&name), chosen.values.get(&name)),
+                };
+            }
+        }
+        Ok(results)
+    }
+}
+
+/// Separates what one parameter is refused for from what ends the whole request.
+fn to_failure<T>(done: Result<T, BusError>) -> Result<Result<T, FailureReason>, BusError> {
+    match done {
+        Ok(done) => Ok(Ok(done)),
+        Err(error @ (BusError::BadParam { .. } | BusError::NoParam(_) | BusError::Master { .. })) => {
+            Ok(Err(FailureReason::new(error.to_string())))
+        }
+        Err(BusError::CallFailed { reason, .. }) => Ok(Err(FailureReason::new(reason))),
+        Err(error) => Err(error),
+    }
+}
+
+/// Checks that a server has chosen what was asked for.
+fn check_chosen(asked: Option<&ParamValue>, chosen: Option<&ParamValue>) -> Result<(), FailureReason> {
+    if asked == chosen {
+        return Ok(());
+    }
+    let refusal = match chosen {
+        Some(chosen) => ReconfigureRefusal::Other(ros::ros2::process::yaml(chosen)),
+        None => ReconfigureRefusal::Untold,
+    };
+    Err(FailureReason::new(refusal.to_string()))
+}
+
+impl NodeState {
+    /// Returns the value of a parameter.
+    fn value(&self, name: &str) -> Option<ParamValue> {
+        find_value(&self.tree, self.simulated, name)
+    }
+
+    /// Checks a change.
+    fn plan(&self, node: &str, (name, value): ParamChange) -> Result<PlannedChange, SetRefusal> {
+        let value = value.filter(|value| *value != ParamValue::Nil);
+        if name == SIM_TIME {
+            let is_so = value == Some(ParamValue::Bool(self.simulated));
+            return if is_so { Ok(PlannedChange::Nothing) } else { Err(SetRefusal::SimTime) };
+        }
+        let mut servers = self.servers.iter().enumerate();
+        if let Some((at, (own, described))) = servers.find_map(|(at, server)| Some((at, server.find(&name)?))) {
+            let value = value.ok_or(ReconfigureRefusal::Deleted)?;
+            return Ok(PlannedChange::Reconfigure(at, own.to_owned(), described.check(&value)?));
+        }
+        let key = to_key(node, &name).ok_or_else(|| ParameterRefusal::Key(shown_key("~", &name)))?;
+        let path = name.replace('.', "/");
+        let there = value_at(&self.tree, &path);
+        let Some(value) = value else {
+            return match there {
+                Some(ParamValue::Map(_)) | None => Err(SetRefusal::NotSet),
+                Some(_) => Ok(PlannedChange::Delete(key)),
+            };
+        };
+        check_for_ros1(&value)?;
+        if matches!(there, Some(ParamValue::Map(below)) if !below.is_empty()) {
+            return Err(ParameterRefusal::HasParametersBelow.into());
+        }
+        let mut ends = path.match_indices('/').map(|(at, _)| &path[..at]);
+        if let Some(above) = ends.find(|above| !matches!(value_at(&self.tree, above), None | Some(ParamValue::Map(_))))
+        {
+            return Err(ParameterRefusal::BelowValue(above.replace('/', ".")).into());
+        }
+        Ok(PlannedChange::Set(key, value))
+    }
+}
+
+/// Returns the value of a parameter. A dictionary is no value, but has parameters below it.
+fn find_value(tree: &Tree, simulated: bool, name: &str) -> Option<ParamValue> {
+    if name == SIM_TIME {
+        return Some(ParamValue::Bool(simulated));
+    }
+    to_key("", name)?;
+    match value_at(tree, &name.replace('.', "/"))? {
+        ParamValue::Map(_) | ParamValue::Nil => None,
+        value => Some(value.clone()),
+    }
+}
+
+/// Returns the type that a value has in ROS 2.
+fn kind_of(value: &ParamValue) -> ParameterKind {
+    match value {
+        ParamValue::Bool(_) => ParameterKind::Bool,
+        ParamValue::Int(_) => ParameterKind::Integer,
+        ParamValue::Double(_) => ParameterKind::Double,
+        ParamValue::String(_) => ParameterKind::String,
+        ParamValue::Binary(_) => ParameterKind::Bytes,
+        ParamValue::List(items) => match items.first() {
+            Some(ParamValue::Bool(_)) => ParameterKind::Bools,
+            Some(ParamValue::String(_)) => ParameterKind::Strings,
+            Some(ParamValue::Int(_)) if items.iter().all(|item| matches!(item, ParamValue::Int(_))) => {
+                ParameterKind::Integers
+            }
+            Some(ParamValue::Int(_) | ParamValue::Double(_)) => ParameterKind::Doubles,
+            _ => ParameterKind::NotSet,
+        },
+        ParamValue::Nil | ParamValue::Map(_) => ParameterKind::NotSet,
+    }
+}
+
+/// Collects the names of all parameters that ROS 2 can have.
+fn collect_names(above: &str, tree: &Tree, into: &mut BTreeSet<String>) {
+    for (entry, value) in tree {
+        // Such an entry has no name in ROS 2 that leads back to it.
+        if entry.is_empty() || entry.contains(['.', '/']) {
+            continue;
+        }
+        let name = format!("{above}{entry}");
+        match value {
+            ParamValue::Map(below) => collect_names(&format!("{name}."), below, into),
+            ParamValue::Nil => {}
+            _ => drop(into.insert(name)),
+        }
+    }
+}
+
+/// Selects names as the nodes of ROS 2 do: below one of the prefixes, and of at most so many levels beyond it.
+fn select_names(all: BTreeSet<String>, prefixes: &[String], depth: u64) -> ParameterNames {
+    let is_within = |rest: &str| depth == 0 || (rest.matches('.').count() as u64) < depth;
+    let is_meant = |name: &String| {
+        if prefixes.is_empty() {
+            return is_within(name);
+        }
+        prefixes.iter().any(|prefix| match name.strip_prefix(&**prefix) {
+            Some("") => true,
+            Some(rest) => rest.strip_prefix('.').is_some_and(is_within),
+            None => false,
+        })
+    };
+    let names: Vec<String> = all.into_iter().filter(is_meant).collect();
+    let prefixes = names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned()));
+    let prefixes: BTreeSet<String> = prefixes.collect();
+    ParameterNames { names, prefixes: prefixes.into_iter().collect() }
+}
+
+#[async_trait]
+impl NodeParameters for NodeParameterView {
+    async fn get(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParamValue>>, BusError> {
+        let tree = self.read_tree(node).await?;
+        let simulated = names.iter().any(|name| name == SIM_TIME) && self.read_sim_time().await?;
+        Ok(names.iter().map(|name| find_value(&tree, simulated, name)).collect())
+    }
+
+    async fn set(&self, node: &str, changes: Vec<ParamChange>) -> Result<Vec<Result<(), FailureReason>>, BusError> {
+        let state = self.read_state(node).await?;
+        let planned = changes.into_iter().map(|change| state.plan(node, change)).collect();
+        self.make(&state, planned).await
+    }
+
+    /// Sets parameters after all of them were checked. The changes of one dynamic_reconfigure server are made at once.
+    async fn set_atomically(&self, node: &str, changes: Vec<ParamChange>) -> Result<(), BusError> {
+        let state = self.read_state(node).await?;
+        let mut planned = Vec::new();
+        let mut names = Vec::new();
+        for change in changes {
+            let key = change.0.clone();
+            match state.plan(node, change) {
+                Ok(change) => planned.push(Ok(change)),
+                Err(refusal) => return Err(BusError::BadParam { key, reason: refusal.to_string() }),
+            }
+            names.push(key);
+        }
+        for (key, made) in names.into_iter().zip(self.make(&state, planned).await?) {
+            if let Err(reason) = made {
+                return Err(BusError::BadParam { key, reason: reason.into_string() });
+            }
+        }
+        Ok(())
+    }
+
+    async fn list(&self, node: &str, prefixes: &[String], depth: u64) -> Result<ParameterNames, BusError> {
+        let mut all = BTreeSet::from([SIM_TIME.to_owned()]);
+        collect_names("", &self.read_tree(node).await?, &mut all);
+        Ok(select_names(all, prefixes, depth))
+    }
+
+    async fn describe(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParameterDescription>>, BusError> {
+        let state = self.read_state(node).await?;
+        let describe = |name: &String| {
+            let described = state.servers.iter().find_map(|server| Some(server.find(name)?.1.describe(name)));
+            described.or_else(|| {
+                let value = state.value(name)?;
+                let kind = kind_of(&value);
+                let is_time = name == SIM_TIME;
+                // What is at a Master may change its type at any time.
+                Some(ParameterDescription {
+                    name: name.clone(),
+                    kind,
+                    read_only: is_time,
+                    dynamic_typing: !is_time,
+                    ..ParameterDescription::default()
+                })
+            })
+        };
+        Ok(names.iter().map(describe).collect())
+    }
+
+    async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {
+        if let Some(node) = node {
+            self.check_node(node)?;
+        }
+        let mut watch = self.watch.lock().await;
+        if let Some(running) = watch.as_ref()
+            && let Some(events) = running.subscribe(node)
+        {
+            return Ok(Box::new(events));
+        }
+        // Another watcher has replaced the earlier one, or there was none.
+        let changes = self.inner.parameters()?.watch().await?;
+        let (running, events) = MasterWatch::start(changes, self.inner.graph(), node);
+        *watch = Some(running);
+        Ok(Box::new(events))
+    }
+}
