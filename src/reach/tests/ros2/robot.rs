@@ -128,6 +128,8 @@ struct CloudRequestForwarder {
     notices: watch::Sender<Vec<String>>,
     /// Changed parameters, in order.
     changes: watch::Sender<Vec<ParamChange>>,
+    /// By channel: the number of messages that late subscribers are given.
+    kept: watch::Sender<HashMap<u32, usize>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
     answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
     asked: mpsc::UnboundedSender<CloudRequest>,
@@ -148,6 +150,11 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
             }
             Record::Control(FromCloud::Parameters(changes)) => self.changes.send_modify(|all| all.extend(changes)),
             Record::Control(FromCloud::Notice { text, .. }) => self.notices.send_modify(|all| all.push(text)),
+            Record::Control(FromCloud::Kept { channel, messages }) => {
+                self.kept.send_modify(|kept| {
+                    kept.insert(channel, messages);
+                });
+            }
             Record::Control(_) => {}
         }
     }
@@ -184,6 +191,7 @@ impl LinkedRobot {
             types: Mutex::default(),
             notices: watch::Sender::default(),
             changes: watch::Sender::default(),
+            kept: watch::Sender::default(),
             heard,
             answers,
             asked: asks,
@@ -228,6 +236,12 @@ impl LinkedRobot {
         if timeout(LONG, changes.wait_for(|all| is_told(all))).await.is_err() {
             panic!("{key} = {value:?}: {:#?}", self.ear.changes.borrow());
         }
+    }
+
+    /// Returns the number of messages of an output that late subscribers are given, if the cloud has told it.
+    #[allow(dead_code, reason = "not every test that includes this file has late subscribers")]
+    pub fn kept(&self, output: &OutputChannel) -> Option<usize> {
+        self.ear.kept.borrow().get(&output.channel).copied()
     }
 
     /// Subscribes to an output on behalf of a node of the robot.
