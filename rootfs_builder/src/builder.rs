@@ -518,6 +518,31 @@ pub(crate) mod tests {
         }
     }
 
+    #[tokio::test]
+    async fn a_missing_module_is_advised_without_reading_definitions() {
+        let place = tempfile::tempdir().expect("a directory");
+        let mut builder = new_builder(place.path());
+        let text = "usr/lib/python3/dist-packages/scipy/__init__.py python/python3-scipy\n";
+        let lists = [crate::contents::tests::list(place.path(), "c.gz", text)];
+        for name in [DEFAULT_BASE, "bookworm-jazzy-wheels"] {
+            let base = base::load(&builder.config.bases_dir, name).expect("valid");
+            let archive = Arc::new(Archive {
+                apt: crate::apt::Apt::open(place.path(), "").expect("prepared"),
+                contents: crate::contents::Contents::open(place.path(), &lists).expect("read").into(),
+                candidates: crate::candidates::tests::candidates_named(&["python3-scipy"]),
+                stamp: String::new(),
+                sources: String::new(),
+            });
+            builder.archives.lock().await.insert(name.to_owned(), OpenedArchive::from_parts(&base, &archive));
+        }
+        // A stranger's thread, which asks for the advice, can open nothing there.
+        builder.config.bases_dir = place.path().join("unreadable");
+        for name in [DEFAULT_BASE, "bookworm-jazzy-wheels"] {
+            let advice = builder.advice(name, "ModuleNotFoundError: No module named 'scipy.linalg'").await;
+            assert_eq!(advice, ["the Python module scipy is missing: push with `--with python3-scipy`"], "{name}");
+        }
+    }
+
     #[test]
     fn only_the_newest_logs_are_kept() {
         let directory = tempfile::tempdir().expect("a directory");
