@@ -510,6 +510,7 @@ fn main() -> ExitCode {
             a_workspace_is_built_in_order,
             a_prebuilt_space_is_served,
             what_was_compiled_before_a_failure_stays_compiled,
+            what_a_cancelled_push_has_compiled_stays_compiled,
             mistakes_in_cmake_are_told_before_anything_is_compiled,
             a_package_may_use_others_that_it_does_not_name,
             packages_with_the_same_libraries_share_their_layers,

@@ -124,8 +124,9 @@ impl Builder {
         })
     }
 
-    /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
-    /// directory is removed ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
+    /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended, what was compiled
+    /// or installed completely is still packed into the cache, and the build's directory is removed
+    /// ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
     pub async fn build(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
         blocking::cancellable(self.make(request, events)).await
     }
@@ -150,7 +151,13 @@ impl Builder {
         &self.config.build_dir
     }
 
-    /// Waits until the containers of a build have ended and its directory is removed.
+    /// Gives up the packing that cancelled builds have left, since the daemon ends.
+    pub fn stop_packing(&self) {
+        self.layers.ending().cancel();
+    }
+
+    /// Waits until the containers of a build have ended, its complete layers are in the cache, and its directory is
+    /// removed.
     pub async fn wait_removed(&self, id: &str) {
         self.removals.wait(id).await;
     }
@@ -478,6 +485,14 @@ pub(crate) mod tests {
             limits: Limits::default(),
         })
         .expect("prepared")
+    }
+
+    /// Creates the context of a build that runs nothing.
+    pub(crate) fn new_context(builder: &Builder, id: &str) -> BuildContext {
+        let Config { build_dir, sandbox, limits, .. } = &builder.config;
+        let site = BuildSite::new(build_dir, id, sandbox.clone(), *limits, builder.removals.clone()).expect("made");
+        let progress = Progress::new(mpsc::channel(1).0);
+        BuildContext::new(site, builder.layers.clone(), builder.turns.clone(), PushLabel::default(), progress)
     }
 
     #[tokio::test]

@@ -381,6 +381,9 @@ pub enum Error {
     /// Files of a sandbox or a push could not be read as expected.
     #[error(transparent)]
     Foreign(foreign::Error),
+    /// The thread that packs a layer has ended without a result.
+    #[error("a layer was not packed; push again")]
+    NotPacked,
     /// A task of this process panicked.
     #[error("an internal task ended early: {0}")]
     Task(#[from] tokio::task::JoinError),

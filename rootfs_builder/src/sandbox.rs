@@ -116,6 +116,21 @@ impl BuildSite {
         }
     }
 
+    /// Lets the directory stay until `packing` has ended, which reads trees in it.
+    pub(crate) fn keep_while(&self, packing: Vec<JoinHandle<Result<(), Error>>>) {
+        let Ok(runtime) = tokio::runtime::Handle::try_current() else {
+            return;
+        };
+        let waiting = packing.into_iter().map(|archive| {
+            runtime.spawn(async move {
+                if let Ok(Err(error)) = archive.await {
+                    tracing::info!("a layer of a build that was cancelled is not kept: {error}");
+                }
+            })
+        });
+        self.running.lock().unwrap_or_else(PoisonError::into_inner).extend(waiting);
+    }
+
     /// Runs a program to its end; each line of its output is passed to `on_line`.
     pub(crate) async fn run(&self, run: SandboxRun, mut on_line: impl FnMut(&str)) -> Result<RunResult, Error> {
         let spec = ContainerSpec {

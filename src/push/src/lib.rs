@@ -148,6 +148,7 @@ impl Pusher {
     /// start.
     pub async fn cancel_all(&self, patience: Duration) {
         self.cancel.cancel();
+        self.builder.stop_packing();
         self.tasks.close();
         if tokio::time::timeout(patience, self.tasks.wait()).await.is_err() {
             tracing::warn!("leftovers of cancelled pushes are removed at the next start");
