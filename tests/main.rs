@@ -497,6 +497,7 @@ fn main() -> ExitCode {
         stories![bounds:
             a_build_that_takes_too_much_is_ended_and_leaves_nothing,
             a_push_outlives_its_client,
+            what_a_push_lacks_is_told_before_it_waits_for_others,
             a_push_ends_with_what_its_deployer_showed,
             a_push_nobody_waits_for_ends_with_its_daemon,
             a_second_signal_ends_the_daemon_at_once,

@@ -6,9 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, Store};
-use package::foreseen::{self, SourceProblem};
-use package::workspace::{PushedDirectory, Workspace};
-use ros::flavour::Version;
+use package::workspace::PushedDirectory;
 use servant::sandbox::Sandbox;
 use servant::spec::Limits;
 use tokio::sync::mpsc;
@@ -22,17 +20,14 @@ use crate::cache::{LayerCache, LayerEntry};
 use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
-use crate::indexed::IndexedPackages;
+use crate::inspect::{InspectedPush, PushContent};
 use crate::install::LayerSet;
-use crate::pushed::InspectedTree;
 use crate::removal::PendingRemovals;
 use crate::request::{BuildOutcome, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{
-    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, stock, unused, wheels,
-};
+use crate::{advice, blocking, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
 
 /// Default base for packages that support ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -84,24 +79,6 @@ pub(crate) fn keep_note_key(base: &str) -> String {
     format!("keep-{base}")
 }
 
-enum PushContent<'a> {
-    Tree(PushedDirectory),
-    Packaged(&'a str),
-}
-
-impl PushContent<'_> {
-    /// Returns the main package, as far as known.
-    fn name(&self) -> String {
-        match self {
-            Self::Tree(pushed) => {
-                let packages = pushed::sort_by_importance(pushed.packages());
-                packages.into_iter().next().unwrap_or_default()
-            }
-            Self::Packaged(name) => (*name).to_owned(),
-        }
-    }
-}
-
 impl OpenedArchive {
     fn from_parts(base: &Base, archive: &Arc<Archive>) -> Self {
         Self { base: base.clone(), archive: archive.clone() }
@@ -127,8 +104,13 @@ impl Builder {
     /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended, what was compiled
     /// or installed completely is still packed into the cache, and the build's directory is removed
     /// ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
-    pub async fn build(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
-        blocking::cancellable(self.make(request, events)).await
+    pub async fn build(
+        &self,
+        request: &PushRequest,
+        inspected: InspectedPush,
+        events: mpsc::Sender<BuildEvent>,
+    ) -> Result<BuildOutcome, Error> {
+        blocking::cancellable(self.make(request, inspected, events)).await
     }
 
     /// Returns the directory of layers and packages.
@@ -162,16 +144,15 @@ impl Builder {
         self.removals.wait(id).await;
     }
 
-    async fn make(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
+    async fn make(
+        &self,
+        request: &PushRequest,
+        inspected: InspectedPush,
+        events: mpsc::Sender<BuildEvent>,
+    ) -> Result<BuildOutcome, Error> {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
-        let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
-            choice::choose_base(&self.config.bases_dir, request.base.as_deref(), &request.source)
-        })?;
-        if let Some(note) = note {
-            progress.warn(note).await;
-        }
         let site = BuildSite::new(
             &self.config.build_dir,
             &request.id,
@@ -179,38 +160,14 @@ impl Builder {
             self.config.limits.or(sandbox::default_limits()),
             self.removals.clone(),
         )?;
-        // Before anything is downloaded: what was pushed may not be a package at all.
-        let what = match &request.source {
-            PushSource::Tree(path) => {
-                let inspect = || pushed::inspect_pushed(path, &base, &request.package_query());
-                let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
-                if let PushedDirectory::Source(workspace) = &pushed {
-                    tell_selection(workspace, &left_out, progress).await;
-                    ask_what_to_run(request, workspace, &base)?;
-                    let problems = find_source_problems(request, workspace, &base)?;
-                    for problem in problems.iter().take(MOST_PROBLEMS) {
-                        progress.warn(problem.to_string()).await;
-                    }
-                    if problems.len() > MOST_PROBLEMS {
-                        progress.warn(format!("{} more like these", problems.len() - MOST_PROBLEMS)).await;
-                    }
-                    let tree = path.clone();
-                    blocking::spawn(move || seal::seal(&tree)).await??;
-                }
-                PushContent::Tree(pushed)
-            }
-            PushSource::Packaged(name) => PushContent::Packaged(name),
-        };
-        if !matches!(what, PushContent::Tree(PushedDirectory::Source(_))) && request.has_build_options() {
-            return Err(Error::NothingToCompile);
+        let push = inspected.label(request);
+        let InspectedPush { base, content } = inspected;
+        if let (PushContent::Tree(PushedDirectory::Source(_)), PushSource::Tree(tree)) = (&content, &request.source) {
+            let tree = tree.clone();
+            blocking::spawn(move || seal::seal(&tree)).await??;
         }
-        let push = PushLabel { id: request.id.clone(), name: request.name.clone().unwrap_or_else(|| what.name()) };
+        let archive = self.archive(&push, &base, progress).await?;
         let shop = BuildContext::new(site, self.layers.clone(), self.turns.clone(), push, progress.clone());
-        let archive = self.archive(&shop, &base, progress).await?;
-        match &what {
-            PushContent::Tree(pushed) => check_dependencies(&archive, &base, request, pushed)?,
-            PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, &base, &request.map)?),
-        }
         let (layers, of) = (self.layers.clone(), base.clone());
         let imported = blocking::spawn(move || stock::find_imported(&layers, &of)).await??;
         let (base_layer, archive) = match &imported {
@@ -229,10 +186,10 @@ impl Builder {
         let swept = cache.clone();
         blocking::spawn(move || unused::sweep(&swept)).await?;
         let work = async {
-            let made = match what {
+            let made = match content {
                 PushContent::Tree(PushedDirectory::Source(workspace)) => source::build(&build, workspace).await?,
                 PushContent::Tree(PushedDirectory::Installed(space)) => prebuilt::build(&build, space).await?,
-                PushContent::Packaged(name) => packaged::build(&build, name).await?,
+                PushContent::Packaged(name) => packaged::build(&build, &name).await?,
             };
             build.finish(made, hold).await
         };
@@ -274,18 +231,24 @@ impl Builder {
         notes.flatten().collect()
     }
 
-    async fn archive(&self, shop: &BuildContext, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
-        // Opening may take minutes: whoever waits is told for whom.
-        let _turn = shop.lock_key(&format!("archive of {}", base.name)).await;
-        let mut archives = self.archives.lock().await;
-        if let Some(opened) = archives.get_mut(&base.name)
+    /// Returns the archive of a base for a push, which reads the package lists if they are old.
+    pub(crate) async fn archive(
+        &self,
+        push: &PushLabel,
+        base: &Base,
+        progress: &Progress,
+    ) -> Result<Arc<Archive>, Error> {
+        // Opening may take minutes: whoever waits is told for whom. Advice and other bases do not wait.
+        let _turn = self.turns.lock(&format!("archive of {}", base.name), push, progress).await;
+        if let Some(opened) = self.archives.lock().await.get_mut(&base.name)
             && opened.archive.is_fresh()
         {
             opened.base = base.clone();
             return Ok(opened.archive.clone());
         }
         progress.step(&format!("reading the package lists of {}", base.name)).await;
-        let scratch = shop.site.directory("sources")?;
+        let scratch = sandbox::create_build_directory(&self.config.build_dir, &push.id)?.join("sources");
+        fs::create_dir_all(&scratch).io_context("making", &scratch)?;
         let opened = async {
             let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
             Archive::open(&self.config.cache_dir, sources, false, progress).await
@@ -304,7 +267,7 @@ impl Builder {
             }
         };
         let archive = Arc::new(archive);
-        archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
+        self.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         Ok(archive)
     }
 
@@ -341,96 +304,6 @@ impl Builder {
         }
         Ok((made, archive))
     }
-}
-
-/// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
-/// file. Blocking.
-fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
-    let version = base.ros.ros_version();
-    if let Some(launch) = &request.launch
-        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
-    {
-        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
-        return Err(Error::NotInPackage {
-            what: "launch file",
-            name: launch.clone(),
-            known: launch::join_names(&foreseen.launch_files),
-            elsewhere: String::new(),
-        });
-    }
-    if request.launch.is_some() || !request.nodes.is_empty() {
-        return Ok(());
-    }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
-    if !foreseen.must_be_chosen() {
-        return Ok(());
-    }
-    Err(Error::NothingToRun {
-        executables: launch::join_names(&foreseen.executables),
-        launch_files: launch::join_names(&foreseen.launch_files),
-        more: "; nothing is compiled yet, so there may be more",
-    })
-}
-
-/// Maximum number of mistakes in build files that are named.
-const MOST_PROBLEMS: usize = 20;
-/// Maximum number of packages that are named when they are not built.
-const NAMED: usize = 12;
-
-/// Tells which packages are not built.
-async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &Progress) {
-    if left_out.is_empty() {
-        return;
-    }
-    let built = workspace.packages.len();
-    let more = if left_out.len() > NAMED { ", …" } else { "" };
-    let names = left_out[..left_out.len().min(NAMED)].join(", ");
-    let all = built + left_out.len();
-    progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
-}
-
-/// Returns mistakes in build files; fails if no program is left because of them. Blocking.
-fn find_source_problems(
-    request: &PushRequest,
-    workspace: &Workspace,
-    base: &Base,
-) -> Result<Vec<SourceProblem>, Error> {
-    let version = base.ros.ros_version();
-    privilege::run_as_reader(|| {
-        let problems = foreseen::find_problems(workspace, version);
-        let is_own = |node: &String| {
-            let program = node.split_whitespace().next().unwrap_or_default();
-            let package = program.split_once('/').map(|(package, _)| package);
-            package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
-        };
-        let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
-        if runs_own && foreseen::has_no_programs(workspace, version) {
-            let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
-            return Err(Error::NoPrograms { problems: problems.join("; ") });
-        }
-        Ok(problems)
-    })
-}
-
-/// Reports unresolvable dependencies now and not after minutes of preparation. In ROS 2 many may be in a base that does
-/// not exist yet; there they are reported once it can be inspected.
-fn check_dependencies(
-    archive: &Archive,
-    base: &Base,
-    request: &PushRequest,
-    pushed: &PushedDirectory,
-) -> Result<(), Error> {
-    if base.ros != Version::Ros1 {
-        return Ok(());
-    }
-    let own = pushed::names(pushed.packages());
-    let mut asked = pushed::required_keys(pushed.packages());
-    if matches!(pushed, PushedDirectory::Installed(_)) {
-        asked.build.clear();
-    }
-    let there = IndexedPackages::default();
-    keys::resolve_keys(archive, base, &request.map, &own, &asked, &there)?;
-    Ok(())
 }
 
 fn to_layer_set(entry: &LayerEntry, cached: bool) -> LayerSet {
@@ -487,6 +360,29 @@ pub(crate) mod tests {
         .expect("prepared")
     }
 
+    /// Gives a base an archive with fresh lists: `contents` are the lines of its index, `names` its packages.
+    pub(crate) async fn put_archive(
+        builder: &Builder,
+        base: &str,
+        place: &Path,
+        (contents, names): (&str, &[&str]),
+    ) -> Arc<Archive> {
+        let base = base::load(&builder.config.bases_dir, base).expect("valid");
+        let root = place.join(format!("apt-{}", base.name));
+        let apt = crate::apt::Apt::open(&root, "").expect("prepared");
+        fs::write(root.join("updated"), "").expect("written");
+        let lists = [crate::contents::tests::list(&root, "c.gz", contents)];
+        let archive = Arc::new(Archive {
+            apt,
+            contents: crate::contents::Contents::open(&root, &lists).expect("read").into(),
+            candidates: crate::candidates::tests::candidates_named(names),
+            stamp: "today".to_owned(),
+            sources: String::new(),
+        });
+        builder.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(&base, &archive));
+        archive
+    }
+
     /// Creates the context of a build that runs nothing.
     pub(crate) fn new_context(builder: &Builder, id: &str) -> BuildContext {
         let Config { build_dir, sandbox, limits, .. } = &builder.config;
@@ -523,7 +419,7 @@ pub(crate) mod tests {
                     ..PushRequest::default()
                 };
                 let (sender, mut events) = mpsc::channel(100);
-                let refused = builder.build(&request, sender).await.expect_err("no package");
+                let refused = builder.inspect(&request, sender).await.expect_err("no package");
                 let text = refused.to_string();
                 assert!(text.contains("package.xml"), "{files:?} {base:?}: {text}");
                 assert_eq!(events.recv().await, None, "nothing is begun");
@@ -538,17 +434,8 @@ pub(crate) mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let mut builder = new_builder(place.path());
         let text = "usr/lib/python3/dist-packages/scipy/__init__.py python/python3-scipy\n";
-        let lists = [crate::contents::tests::list(place.path(), "c.gz", text)];
         for name in [DEFAULT_BASE, "bookworm-jazzy-wheels"] {
-            let base = base::load(&builder.config.bases_dir, name).expect("valid");
-            let archive = Arc::new(Archive {
-                apt: crate::apt::Apt::open(place.path(), "").expect("prepared"),
-                contents: crate::contents::Contents::open(place.path(), &lists).expect("read").into(),
-                candidates: crate::candidates::tests::candidates_named(&["python3-scipy"]),
-                stamp: String::new(),
-                sources: String::new(),
-            });
-            builder.archives.lock().await.insert(name.to_owned(), OpenedArchive::from_parts(&base, &archive));
+            put_archive(&builder, name, place.path(), (text, &["python3-scipy"])).await;
         }
         // A stranger's thread, which asks for the advice, can open nothing there.
         builder.config.bases_dir = place.path().join("unreadable");

@@ -89,10 +89,7 @@ impl BuildSite {
         limits: Limits,
         removals: PendingRemovals,
     ) -> Result<Self, Error> {
-        let directory = root.join(id);
-        fs::create_dir_all(&directory).io_context("making", &directory)?;
-        // Files that are readable in the container must not be readable for others on the host.
-        crate::modes::set_mode(&directory, 0o700)?;
+        let directory = create_build_directory(root, id)?;
         Ok(Self { id: id.to_owned(), directory, sandbox, limits, removals, running: Arc::default() })
     }
 
@@ -171,6 +168,15 @@ impl BuildSite {
             Err(_) => Err(Error::Inside { what: "the sandbox", last_lines: tail.text() }),
         }
     }
+}
+
+/// Creates the directory of a build below `root`, unless it exists, and returns it.
+pub(crate) fn create_build_directory(root: &Path, id: &str) -> Result<PathBuf, Error> {
+    let directory = root.join(id);
+    fs::create_dir_all(&directory).io_context("making", &directory)?;
+    // Files that are readable in the container must not be readable for others on the host.
+    crate::modes::set_mode(&directory, 0o700)?;
+    Ok(directory)
 }
 
 type Outcome = Result<(NodeExit, u32), servant::Error>;

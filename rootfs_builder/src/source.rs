@@ -18,7 +18,6 @@ use ros::flavour::Version;
 use crate::build::{Build, BuildParts};
 use crate::builder::keep_note_key;
 use crate::error::Error;
-use crate::indexed::IndexedPackages;
 use crate::install::LayerSet;
 use crate::keys::{self, ResolvedKeys};
 use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
@@ -32,10 +31,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
         pushed::has_python(&workspace.root),
     );
     let tools = toolchain(build).await?;
-    let there = IndexedPackages {
-        build: build.indexed_packages(&tools).await?,
-        run: build.indexed_packages(&build.base_diff_ids()).await?,
-    };
+    let there = indexed::find_known(build, &tools).await?;
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
         build.progress.warn(warning.as_str()).await;

@@ -169,7 +169,12 @@ struct KeyLock {
 
 impl KeyLocks {
     /// Waits for a lock, which is released when the guard is dropped. `progress` receives the name of the lock holder.
-    async fn lock(&self, key: &str, push: &PushLabel, progress: &Progress) -> tokio::sync::OwnedMutexGuard<()> {
+    pub(crate) async fn lock(
+        &self,
+        key: &str,
+        push: &PushLabel,
+        progress: &Progress,
+    ) -> tokio::sync::OwnedMutexGuard<()> {
         let turn = {
             let mut all = lock_unpoisoned(&self.0);
             // The guard of a lock holds only the inner mutex.

@@ -39,6 +39,7 @@ mod stateful;
 mod supplement;
 mod told;
 
+use std::future::Future;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -51,7 +52,7 @@ use package::inventory::Inventory;
 use package::requests;
 use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildOutcome, Builder, PushRequest, PushSource};
+use rootfs_builder::{BuildEvent, BuildOutcome, Builder, InspectedPush, PushRequest, PushSource};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -175,9 +176,11 @@ impl Pusher {
         let source = left.run_within(Box::pin(self.receive(id, options, archive, report))).await?;
         // From here on the push needs no client.
         report.received.cancel();
-        let mut admitted = self.places.admit(known, report).await?;
+        // Whoever has forgotten something need not wait for others to be told so.
         report.step("looking at what was pushed").await;
-        let made = left.run_within(Box::pin(self.build_or_import(id, options, source, (by, report)))).await?;
+        let work = left.run_within(Box::pin(self.inspect(id, options, source, (by, report)))).await?;
+        let mut admitted = self.places.admit(known, report).await?;
+        let made = left.run_within(Box::pin(self.build_or_import(options, work, (by, report)))).await?;
         let (built, imported) = match made {
             PushedImage::Built(built) => (*built, None),
             PushedImage::Imported(imported) => {
@@ -241,14 +244,14 @@ impl Pusher {
         Ok(PushSource::Tree(tree))
     }
 
-    /// Builds or imports the image.
-    async fn build_or_import(
+    /// Looks at what was received: a service that another server has exported, or something to build.
+    async fn inspect(
         &self,
         id: &str,
         options: &PushOptions,
         source: PushSource,
         (by, report): (&Deployer, &Reporter),
-    ) -> Result<PushedImage, Error> {
+    ) -> Result<PushedWork, Error> {
         match &source {
             PushSource::Packaged(package) => {
                 // Names of Debian packages contain hyphens, those of ROS packages do not.
@@ -259,7 +262,7 @@ impl Pusher {
             PushSource::Tree(tree) => {
                 let of = tree.clone();
                 if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
-                    return self.import(options, tree.clone(), report).await;
+                    return Ok(PushedWork::Exported(tree.clone()));
                 }
                 if let Some(name) = &options.name {
                     let of = tree.clone();
@@ -270,7 +273,29 @@ impl Pusher {
                 }
             }
         }
-        self.build(id, options, source, (by, report)).await.map(|built| PushedImage::Built(Box::new(built)))
+        let request = build_request(id, options, source);
+        let (builder, of) = (Arc::clone(&self.builder), request.clone());
+        let look = |events| async move { builder.inspect(&of, events).await };
+        let inspected = self.run_builder(options, look, (by, report)).await?;
+        Ok(PushedWork::Build(Box::new((request, inspected))))
+    }
+
+    /// Builds or imports the image.
+    async fn build_or_import(
+        &self,
+        options: &PushOptions,
+        work: PushedWork,
+        (by, report): (&Deployer, &Reporter),
+    ) -> Result<PushedImage, Error> {
+        let (request, inspected) = match work {
+            PushedWork::Exported(tree) => return self.import(options, tree, report).await,
+            PushedWork::Build(work) => *work,
+        };
+        report.step("preparing the build").await;
+        let builder = Arc::clone(&self.builder);
+        let build = |events| async move { builder.build(&request, inspected, events).await };
+        let built = self.run_builder(options, build, (by, report)).await?;
+        Ok(PushedImage::Built(Box::new(built)))
     }
 
     /// Probes the interface of an image; returns the revision to publish.
@@ -344,39 +369,53 @@ impl Pusher {
         }
     }
 
-    async fn build(
+    /// Runs work of the builder with the privileges that it needs, and forwards what it reports.
+    async fn run_builder<T, F>(
         &self,
-        id: &str,
         options: &PushOptions,
-        source: PushSource,
+        work: impl FnOnce(mpsc::Sender<BuildEvent>) -> F,
         (by, report): (&Deployer, &Reporter),
-    ) -> Result<BuildOutcome, Error> {
-        let request = PushRequest {
-            id: id.to_owned(),
-            name: options.name.clone(),
-            source,
-            base: options.base.clone(),
-            launch: options.launch.clone(),
-            nodes: options.nodes.clone(),
-            params: options.params.clone(),
-            args: options.args.clone(),
-            remaps: options.remaps.clone(),
-            map: options.map.clone(),
-            with: options.with.clone(),
-            created: options.created,
-            packages_up_to: options.packages_up_to.clone(),
-            packages_skip: options.packages_skip.clone(),
-            cmake_args: options.cmake_args.clone(),
-        };
+    ) -> Result<T, Error>
+    where
+        T: Send + 'static,
+        F: Future<Output = Result<T, rootfs_builder::Error>> + Send + 'static,
+    {
         let (sender, events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = self.forward_events(events, by, report);
-        let builder = Arc::clone(&self.builder);
-        let work = async move { builder.build(&request, sender).await };
         // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).
-        let work = privilege::run(report.building.track_future(work));
-        let (built, ()) = tokio::join!(work, forwarded);
-        built.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
+        let work = privilege::run(report.building.track_future(work(sender)));
+        let (done, ()) = tokio::join!(work, forwarded);
+        done.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
     }
+}
+
+/// Returns what is to be built.
+fn build_request(id: &str, options: &PushOptions, source: PushSource) -> PushRequest {
+    PushRequest {
+        id: id.to_owned(),
+        name: options.name.clone(),
+        source,
+        base: options.base.clone(),
+        launch: options.launch.clone(),
+        nodes: options.nodes.clone(),
+        params: options.params.clone(),
+        args: options.args.clone(),
+        remaps: options.remaps.clone(),
+        map: options.map.clone(),
+        with: options.with.clone(),
+        created: options.created,
+        packages_up_to: options.packages_up_to.clone(),
+        packages_skip: options.packages_skip.clone(),
+        cmake_args: options.cmake_args.clone(),
+    }
+}
+
+/// What to do with a push that was looked at.
+enum PushedWork {
+    /// Build it.
+    Build(Box<(PushRequest, InspectedPush)>),
+    /// Import the exported service in this tree.
+    Exported(PathBuf),
 }
 
 /// The image to publish, before it is probed.
