@@ -218,6 +218,7 @@ fn main() -> ExitCode {
             a_python_module_that_a_package_forgot_is_named,
             a_package_whose_programs_are_not_found_is_refused_at_once,
             what_to_run_is_asked_for_before_anything_is_compiled,
+            a_dependency_is_met_by_a_package_of_another_name,
         ],
         stories![calibration:
             fewer_cores_take_longer_and_rows_say_how_long,

@@ -409,7 +409,8 @@ fn unresolved_text(all: &[Unresolved]) -> String {
         }
     }
     text.push_str(
-        "\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also contains its source",
+        "\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also contains its source; \
+            with `--map KEY=` a key needs no package",
     );
     text
 }

@@ -23,6 +23,8 @@ pub(crate) struct IndexedPackages {
     pub(crate) build: BTreeSet<String>,
     /// Available at run time.
     pub(crate) run: BTreeSet<String>,
+    /// Python modules available at run time, which may have other names than their packages.
+    pub(crate) modules: BTreeSet<String>,
 }
 
 /// Returns the install spaces of a base as absolute paths: those in the environment of all processes and of compilers.
@@ -76,9 +78,11 @@ pub(crate) fn read_known(layers: &LayerCache, base: &Base, archive: &Archive) ->
 
 /// Finds the packages of a base, in `tools` with its toolchain, and keeps them for pushes that are only looked at.
 pub(crate) async fn find_known(build: &Build<'_>, tools: &[Digest]) -> Result<IndexedPackages, Error> {
+    let below = build.base_diff_ids();
     let there = IndexedPackages {
         build: build.indexed_packages(tools).await?,
-        run: build.indexed_packages(&build.base_diff_ids()).await?,
+        run: build.indexed_packages(&below).await?,
+        modules: find_modules(build, &below).await?,
     };
     write_known(&build.shop.layers, &build.base, &build.archive, &there)?;
     Ok(there)
@@ -92,6 +96,12 @@ pub(crate) fn write_known(
     there: &IndexedPackages,
 ) -> Result<(), Error> {
     layers.write_note(&known_key(base, archive), there)
+}
+
+/// Returns the Python modules in the install spaces of a base, in these layers.
+pub(crate) async fn find_modules(build: &Build<'_>, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
+    let (trees, prefixes) = (build.shop.extract_layers(layers).await?, install_prefixes(&build.base));
+    Ok(blocking::spawn_reader(move || package::ament::modules(&trees, &prefixes)).await??)
 }
 
 /// Returns the packages in the indexes of trees, given lowest first.

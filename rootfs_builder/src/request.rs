@@ -32,7 +32,8 @@ pub struct PushRequest {
     pub args: BTreeMap<String, String>,
     /// Name remappings for every node, from → to.
     pub remaps: BTreeMap<String, String>,
-    /// Manual dependency mapping: rosdep key or ROS package → Debian package.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian packages, or packages of the push or the base;
+    /// nothing for a key that needs none.
     pub map: BTreeMap<String, String>,
     /// Additional Debian or ROS packages, while compiling and at run time.
     pub with: Vec<String>,
@@ -62,7 +63,7 @@ impl PushRequest {
             skip: &self.packages_skip,
             launch: self.launch.as_deref(),
             nodes: &self.nodes,
-            texts: values.chain(self.args.values().cloned()).collect(),
+            texts: values.chain(self.args.values().cloned()).chain(self.map.values().cloned()).collect(),
         }
     }
 }

@@ -18,6 +18,7 @@ use std::sync::Arc;
 use foreign::Visit;
 use image::Digest;
 use package::manifest::Kind;
+use package::provided::Providers;
 use package::workspace::{Package, Workspace};
 use ros::flavour::Version;
 use rustix::fs::FileType;
@@ -183,12 +184,17 @@ fn unit_from_package(package: &Package) -> BuildUnit {
 
 /// Returns, for each package, its direct and indirect dependencies among the earlier ones.
 fn resolve_needs(packages: &[Package]) -> Vec<Vec<usize>> {
+    let providers = Providers::new(packages);
     let mut all: Vec<Vec<usize>> = Vec::new();
     for (index, package) in packages.iter().enumerate() {
         let named = package.manifest.needs(&NEEDS);
+        let provided = providers.find_all(&package.manifest);
         let mut found = BTreeSet::new();
         for (earlier, other) in packages[..index].iter().enumerate() {
-            if named.contains(other.manifest.name.as_str()) || package.manifest.needs_group_of(&other.manifest) {
+            if named.contains(other.manifest.name.as_str())
+                || provided.contains(&earlier)
+                || package.manifest.needs_group_of(&other.manifest)
+            {
                 found.insert(earlier);
                 found.extend(&all[earlier]);
             }

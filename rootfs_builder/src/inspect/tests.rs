@@ -37,7 +37,8 @@ fn write_python(tree: &Path, name: &str, needs: &str) {
          entry_points={{'console_scripts': ['go = {name}.node:main']}})\n"
     );
     let (manifest, module) = (manifest(name, &format!("{needs}{built}")), format!("{name}/__init__.py"));
-    let files = [("package.xml", &*manifest), ("setup.py", &*setup), (&*module, "")];
+    let settings = format!("[install]\ninstall_scripts=$base/lib/{name}\n");
+    let files = [("package.xml", &*manifest), ("setup.py", &*setup), ("setup.cfg", &*settings), (&*module, "")];
     write_push(&tree.join("src").join(name), WHEELS, &files);
 }
 
@@ -89,7 +90,7 @@ async fn on_ros_2_the_bases_packages_are_those_of_the_last_build() {
     inspect(&builder, &request).await.expect("what the base has is not known yet");
     let base = crate::base::load(builder.bases_dir(), WHEELS).expect("valid");
     let there = BTreeSet::from(["rclpy".to_owned()]);
-    let there = IndexedPackages { build: there.clone(), run: there };
+    let there = IndexedPackages { build: there.clone(), run: there, ..IndexedPackages::default() };
     indexed::write_known(builder.layers(), &base, &archive, &there).expect("written");
     let Err(Error::Unresolved(missing)) = inspect(&builder, &request).await else {
         panic!("nothing provides it");

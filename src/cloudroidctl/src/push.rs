@@ -78,8 +78,9 @@ pub struct PushArgs {
     /// Base image definition (default: one that fits the package's ROS).
     #[arg(long, value_name = "BASE")]
     base: Option<String>,
-    /// Debian package that provides a dependency; may be given several times.
-    #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
+    /// Debian package, or package of the workspace or base, that provides a dependency; KEY= if it needs nothing. May be
+    /// given several times.
+    #[arg(long = "map", value_name = "KEY=PACKAGE", value_parser = mapping)]
     map: Vec<(String, String)>,
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
@@ -170,8 +171,8 @@ fn volume(text: &str) -> anyhow::Result<Volume> {
 
 fn mapping(text: &str) -> anyhow::Result<(String, String)> {
     match text.split_once('=') {
-        Some((key, package)) if !key.is_empty() && !package.is_empty() => Ok((key.to_owned(), package.to_owned())),
-        _ => bail!("write KEY=DEB"),
+        Some((key, package)) if !key.is_empty() => Ok((key.to_owned(), package.to_owned())),
+        _ => bail!("write KEY=PACKAGE, or KEY= for a dependency that needs no package"),
     }
 }
 
@@ -652,7 +653,8 @@ mod tests {
             "./pkg --param :=v",
             "./pkg --arg a",
             "./pkg --remap a",
-            "./pkg --map key=",
+            "./pkg --map key",
+            "./pkg --map =deb",
             "./pkg --request /image",
             "./pkg --request image=/boxes",
             "./pkg --cpus none",
