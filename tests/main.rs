@@ -141,6 +141,8 @@ mod tls;
 mod tokens;
 #[path = "stories/trying.rs"]
 mod trying;
+#[path = "stories/underlays.rs"]
+mod underlays;
 #[path = "stories/untrusted.rs"]
 mod untrusted;
 #[path = "stories/viewers.rs"]
@@ -314,6 +316,10 @@ fn main() -> ExitCode {
             an_exported_service_is_published_on_another_server,
             a_base_is_moved_to_a_server_without_network,
             what_nobody_refers_to_is_collected,
+        ],
+        stories![underlays:
+            a_node_is_compiled_and_runs_upon_a_compiled_workspace,
+            an_underlay_of_ros_2_has_interfaces_and_modules,
         ],
         stories![registries: skopeo_and_containerd_pull_with_a_token],
         stories![inside:

@@ -23,7 +23,7 @@ use crate::event::{BuildEvent, Progress};
 use crate::inspect::{InspectedPush, PushContent};
 use crate::install::LayerSet;
 use crate::removal::PendingRemovals;
-use crate::request::{BuildOutcome, PushRequest, PushSource};
+use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
@@ -101,7 +101,7 @@ impl Builder {
         })
     }
 
-    /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended, what was compiled
+    /// Builds the image of a push, or an underlay. To cancel, drop the future: containers and blocking work are ended, what was compiled
     /// or installed completely is still packed into the cache, and the build's directory is removed
     /// ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
     pub async fn build(
@@ -109,7 +109,7 @@ impl Builder {
         request: &PushRequest,
         inspected: InspectedPush,
         events: mpsc::Sender<BuildEvent>,
-    ) -> Result<BuildOutcome, Error> {
+    ) -> Result<BuildResult, Error> {
         blocking::cancellable(self.make(request, inspected, events)).await
     }
 
@@ -149,7 +149,7 @@ impl Builder {
         request: &PushRequest,
         inspected: InspectedPush,
         events: mpsc::Sender<BuildEvent>,
-    ) -> Result<BuildOutcome, Error> {
+    ) -> Result<BuildResult, Error> {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
@@ -161,7 +161,7 @@ impl Builder {
             self.removals.clone(),
         )?;
         let push = inspected.label(request);
-        let InspectedPush { base, content } = inspected;
+        let InspectedPush { base, content, foundation } = inspected;
         if let (PushContent::Tree(PushedDirectory::Source(_)), PushSource::Tree(tree)) = (&content, &request.source) {
             let tree = tree.clone();
             blocking::spawn(move || seal::seal(&tree)).await??;
@@ -180,7 +180,7 @@ impl Builder {
         let tools = imported.as_ref().and_then(BaseStock::tool_layers);
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let base = base.with_cmake_arguments(&request.cmake_args);
-        let build = Build { shop, base, archive, base_layer, tools, request, progress, log };
+        let build = Build { shop, base, archive, base_layer, foundation, tools, request, progress, log };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
         let swept = cache.clone();
@@ -191,7 +191,10 @@ impl Builder {
                 PushContent::Tree(PushedDirectory::Installed(space)) => prebuilt::build(&build, space).await?,
                 PushContent::Packaged(name) => packaged::build(&build, &name).await?,
             };
-            build.finish(made, hold).await
+            match made.contents {
+                Some(_) => build.finish_underlay(made, hold).await.map(|made| BuildResult::Underlay(Box::new(made))),
+                None => build.finish(made, hold).await.map(|made| BuildResult::Service(Box::new(made))),
+            }
         };
         let outcome = work.await;
         // What was installed and compiled before a failure is kept: the next push continues there.

@@ -14,6 +14,7 @@ use crate::event::{BuildEvent, Progress};
 use crate::indexed::{self, IndexedPackages};
 use crate::pushed::{self, InspectedTree};
 use crate::request::{PushRequest, PushSource};
+use crate::underlay::Foundation;
 use crate::workshop::PushLabel;
 use crate::{blocking, choice, keys, launch};
 
@@ -27,6 +28,7 @@ const NAMED: usize = 12;
 pub struct InspectedPush {
     pub(crate) base: Base,
     pub(crate) content: PushContent,
+    pub(crate) foundation: Foundation,
 }
 
 /// Content of a push.
@@ -75,12 +77,12 @@ impl Builder {
     }
 
     async fn look_at(&self, request: &PushRequest, progress: &Progress) -> Result<InspectedPush, Error> {
-        let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
-            choice::choose_base(self.bases_dir(), request.base.as_deref(), &request.source)
-        })?;
+        let choice::ChosenBase { base, note } =
+            privilege::run_as_reader(|| choice::choose_base(self.bases_dir(), request.base_name(), &request.source))?;
         if let Some(note) = note {
             progress.warn(note).await;
         }
+        let foundation = Foundation::combine(&request.underlays, &base)?;
         // Before anything is downloaded: what was pushed may not be a package at all.
         let content = match &request.source {
             PushSource::Tree(path) => {
@@ -88,6 +90,7 @@ impl Builder {
                 let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
                 if let PushedDirectory::Source(workspace) = &pushed {
                     tell_selection(workspace, &left_out, progress).await;
+                    foundation.check_packages(&workspace.packages)?;
                     ask_what_to_run(request, workspace, &base)?;
                     tell_source_problems(request, workspace, &base, progress).await?;
                 }
@@ -98,13 +101,13 @@ impl Builder {
         if !matches!(content, PushContent::Tree(PushedDirectory::Source(_))) && request.has_build_options() {
             return Err(Error::NothingToCompile);
         }
-        let inspected = InspectedPush { base, content };
+        let inspected = InspectedPush { base, content, foundation };
         let (base, label) = (&inspected.base, inspected.label(request));
         let archive = self.archive(&label, base, progress).await?;
         match &inspected.content {
             PushContent::Tree(pushed) => {
                 let there = indexed::read_known(self.layers(), base, &archive);
-                check_dependencies((&archive, base), request, pushed, there)?;
+                check_dependencies((&archive, base), request, pushed, (there, &inspected.foundation))?;
             }
             PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, base, &request.map)?),
         }
@@ -127,7 +130,7 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
             elsewhere: String::new(),
         });
     }
-    if request.launch.is_some() || !request.nodes.is_empty() {
+    if request.as_underlay || request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
     let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
@@ -184,7 +187,7 @@ fn find_source_problems(
             let package = program.split_once('/').map(|(package, _)| package);
             package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
         };
-        let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
+        let runs_own = !request.as_underlay && request.launch.is_none() && request.nodes.iter().all(is_own);
         if runs_own && foreseen::has_no_programs(workspace, version) {
             let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
             return Err(Error::NoPrograms { problems: problems.join("; ") });
@@ -199,7 +202,7 @@ fn check_dependencies(
     (archive, base): (&Archive, &Base),
     request: &PushRequest,
     pushed: &PushedDirectory,
-    there: Option<IndexedPackages>,
+    (there, foundation): (Option<IndexedPackages>, &Foundation),
 ) -> Result<(), Error> {
     let Some(mut there) = there.or((base.ros == Version::Ros1).then(IndexedPackages::default)) else {
         return Ok(());
@@ -211,6 +214,7 @@ fn check_dependencies(
         asked.build.clear();
         there.build = pushed::build_tools(&asked);
     }
+    foundation.add_to(&mut there);
     keys::resolve_keys(archive, base, &request.map, &own, &asked, &there)?;
     Ok(())
 }

@@ -38,14 +38,16 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
     }
     let python = pushed::has_python(&space.root);
     let package = pack_space(build, &space, &prefix).await?;
-    let needed = source::needed_libraries(build, &package).await?;
-    let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
+    let libraries = source::needed_libraries(build, &package).await?;
+    let needs = source::runtime_needs(build, &resolved, (libraries, python)).await?;
+    let dependencies = source::dependencies(build, &needs).await?;
     Ok(BuildParts {
         packages,
         versions: pushed::versions(&space.packages),
         dependencies,
         package,
         prefix: Some(prefix),
+        contents: None,
     })
 }
 

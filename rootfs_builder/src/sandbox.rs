@@ -93,13 +93,6 @@ impl BuildSite {
         Ok(Self { id: id.to_owned(), directory, sandbox, limits, removals, running: Arc::default() })
     }
 
-    /// Creates a directory below the build's own.
-    pub(crate) fn directory(&self, name: &str) -> Result<PathBuf, Error> {
-        let path = self.directory.join(name);
-        fs::create_dir_all(&path).io_context("making", &path)?;
-        Ok(path)
-    }
-
     /// Creates a new directory of this build, even if others are called `name`.
     pub(crate) fn fresh_directory(&self, name: &str) -> Result<PathBuf, Error> {
         let mut number = 1;

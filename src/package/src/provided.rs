@@ -122,9 +122,10 @@ mod tests {
 
     #[test]
     fn a_module_of_another_package_is_enough_for_python() {
-        let needs = |built: &str| format!("<depend>tf2_ros</depend>{built}");
-        let tf2 = ("tf2_ros_py", PYTHON, &["setup.py", "tf2_ros/__init__.py", "test/__init__.py"][..]);
-        let packages = inspect(&[tf2, ("app", &needs(PYTHON), &[])]);
+        let [python, cmake] = [PYTHON, CMAKE].map(|built| format!("<depend>tf2_ros</depend>{built}"));
+        let files = ["setup.py", "tf2_ros/__init__.py", "test/__init__.py"];
+        let tf2 = ("tf2_ros_py", PYTHON, &files[..]);
+        let packages = inspect(&[tf2, ("app", &*python, &[][..])]);
         assert!(missing(&packages).is_empty(), "{packages:?}");
         assert_eq!(packages.iter().map(|one| one.modules.len()).sum::<usize>(), 1, "{packages:?}");
         let app = packages.iter().find(|one| one.manifest.name == "app").expect("there");
@@ -132,22 +133,22 @@ mod tests {
         let names: Vec<&str> = found.iter().map(|index| packages[*index].manifest.name.as_str()).collect();
         assert_eq!(names, ["tf2_ros_py"]);
         // Headers are not.
-        let packages = inspect(&[tf2, ("app", &needs(CMAKE), &[]), ("py", &needs(PYTHON), &[])]);
+        let packages = inspect(&[tf2, ("app", &*cmake, &[][..]), ("py", &*python, &[][..])]);
         assert_eq!(missing(&packages), [("tf2_ros".to_owned(), vec!["app".to_owned()])]);
         let run = format!("<exec_depend>tf2_ros</exec_depend>{CMAKE}");
-        assert!(missing(&inspect(&[tf2, ("app", &run, &[])])).is_empty());
+        assert!(missing(&inspect(&[tf2, ("app", &*run, &[][..])])).is_empty());
     }
 
     #[test]
     fn a_package_that_replaces_another_comes_before_those_that_need_it() {
-        let fork = ("zz_fork", &*format!("<replace>warp</replace>{CMAKE}"), &[][..]);
-        let packages = inspect(&[("app", &format!("<depend>warp</depend>{CMAKE}"), &[]), fork]);
+        let (replaces, needs) = (format!("<replace>warp</replace>{CMAKE}"), format!("<depend>warp</depend>{CMAKE}"));
+        let (fork, app) = (("zz_fork", &*replaces, &[][..]), ("app", &*needs, &[][..]));
+        let packages = inspect(&[app, fork]);
         let names: Vec<&str> = packages.iter().map(|one| one.manifest.name.as_str()).collect();
         assert_eq!(names, ["zz_fork", "app"]);
         assert!(missing(&packages).is_empty(), "{packages:?}");
         // The package itself is meant where it is there too.
-        let own = ("warp", CMAKE, &[][..]);
-        let packages = inspect(&[("app", &format!("<depend>warp</depend>{CMAKE}"), &[]), fork, own]);
+        let packages = inspect(&[app, fork, ("warp", CMAKE, &[][..])]);
         let app = packages.iter().find(|one| one.manifest.name == "app").expect("there");
         assert!(Providers::new(&packages).find_all(&app.manifest).is_empty());
     }

@@ -15,6 +15,7 @@
 
 mod bases;
 mod bounds;
+mod building;
 mod deployer;
 mod disks;
 mod error;
@@ -38,8 +39,9 @@ mod shared;
 mod stateful;
 mod supplement;
 mod told;
+mod underlays;
 
-use std::future::Future;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -52,13 +54,13 @@ use package::inventory::Inventory;
 use package::requests;
 use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildEvent, BuildOutcome, Builder, InspectedPush, PushRequest, PushSource};
+use rootfs_builder::{BuildOutcome, Builder, PushSource};
 use servant::engine::Engine;
-use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use bounds::PushBudget;
+use building::PushedImage;
 use disks::Disks;
 use exported::ImportedService;
 use places::PushQueue;
@@ -67,12 +69,12 @@ use reporter::Reporter;
 use store::{Journal, Plan, RevisionRecord, State};
 use told::PUSHED;
 
-pub use deployer::Deployer;
+pub use deployer::{Deployer, UnderlayUse};
 pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
-pub use request::PushResult;
+pub use request::{Published, PushResult};
 pub use running::{PushFollower, ReceptionGuard, RunningPush};
 
 /// Capacity of a queue of events, which the task of the push empties.
@@ -167,7 +169,8 @@ impl Pusher {
     ) -> Result<PushResult, Error> {
         let began = Instant::now();
         let asked_name = options.name.as_deref();
-        let known = asked_name.or(options.apt.as_deref());
+        let as_underlay = options.as_underlay.as_deref().map(underlays::lock_name);
+        let known = asked_name.or(options.apt.as_deref()).or(as_underlay.as_deref());
         let _entered = self.places.enter()?;
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
@@ -180,14 +183,23 @@ impl Pusher {
         report.step("looking at what was pushed").await;
         let work = left.run_within(Box::pin(self.inspect(id, options, source, (by, report)))).await?;
         let mut admitted = self.places.admit(known, report).await?;
+        let work = left.run_within(Box::pin(self.renew_underlays(options, work, (by, report)))).await?;
         let made = left.run_within(Box::pin(self.build_or_import(options, work, (by, report)))).await?;
-        let (built, imported) = match made {
-            PushedImage::Built(built) => (*built, None),
+        let (built, underlays, imported) = match made {
+            PushedImage::Built(built) => {
+                let (built, underlays) = *built;
+                (built, underlays, None)
+            }
+            PushedImage::Underlay(built) => {
+                let (layers, underlay, unchanged) = self.publish_underlay(options, *built, (by, report)).await?;
+                let published = Published::Underlay(Box::new(underlay));
+                return Ok(PushResult { layers, published, took: began.elapsed(), unchanged });
+            }
             PushedImage::Imported(imported) => {
                 let ImportedService { record, options, built } = *imported;
                 // The exporting server allowed it; this one may not.
                 self.check_request(&options, by)?;
-                (built, Some((record, options)))
+                (built, BTreeMap::new(), Some((record, options)))
             }
         };
         let options = imported.as_ref().map_or(options, |(_, options)| options);
@@ -205,6 +217,7 @@ impl Pusher {
         let image = built.image.to_string();
         self.check_quota(by.owner.as_deref(), Some(&image)).await?;
         let mut plan = make_plan(&built, options);
+        plan.underlays = underlays;
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;
         }
@@ -224,7 +237,8 @@ impl Pusher {
         if let Some((record, _)) = &imported {
             self.import_dictionary(&name, record, report);
         }
-        Ok(PushResult { layers, service: name, took: began.elapsed(), unchanged: unchanged.is_some() })
+        let published = Published::Service(name);
+        Ok(PushResult { layers, published, took: began.elapsed(), unchanged: unchanged.is_some() })
     }
 
     /// Receives what is pushed.
@@ -242,60 +256,6 @@ impl Pusher {
         let tree = self.home.join("build").join(id).join(PUSHED);
         receive::unpack(archive, &tree, &self.options, report).await?;
         Ok(PushSource::Tree(tree))
-    }
-
-    /// Looks at what was received: a service that another server has exported, or something to build.
-    async fn inspect(
-        &self,
-        id: &str,
-        options: &PushOptions,
-        source: PushSource,
-        (by, report): (&Deployer, &Reporter),
-    ) -> Result<PushedWork, Error> {
-        match &source {
-            PushSource::Packaged(package) => {
-                // Names of Debian packages contain hyphens, those of ROS packages do not.
-                if let (Some(name), false) = (&options.name, package.contains('-')) {
-                    self.check_owner(name, std::slice::from_ref(package))?;
-                }
-            }
-            PushSource::Tree(tree) => {
-                let of = tree.clone();
-                if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
-                    return Ok(PushedWork::Exported(tree.clone()));
-                }
-                if let Some(name) = &options.name {
-                    let of = tree.clone();
-                    let look = move || privilege::run_as_reader(|| receive::package_names(&of));
-                    let packages =
-                        privilege::spawn_blocking(look).await.map_err(|_| Error::Internal("inspecting the package"))?;
-                    self.check_owner(name, &packages)?;
-                }
-            }
-        }
-        let request = build_request(id, options, source);
-        let (builder, of) = (Arc::clone(&self.builder), request.clone());
-        let look = |events| async move { builder.inspect(&of, events).await };
-        let inspected = self.run_builder(options, look, (by, report)).await?;
-        Ok(PushedWork::Build(Box::new((request, inspected))))
-    }
-
-    /// Builds or imports the image.
-    async fn build_or_import(
-        &self,
-        options: &PushOptions,
-        work: PushedWork,
-        (by, report): (&Deployer, &Reporter),
-    ) -> Result<PushedImage, Error> {
-        let (request, inspected) = match work {
-            PushedWork::Exported(tree) => return self.import(options, tree, report).await,
-            PushedWork::Build(work) => *work,
-        };
-        report.step("preparing the build").await;
-        let builder = Arc::clone(&self.builder);
-        let build = |events| async move { builder.build(&request, inspected, events).await };
-        let built = self.run_builder(options, build, (by, report)).await?;
-        Ok(PushedImage::Built(Box::new(built)))
     }
 
     /// Probes the interface of an image; returns the revision to publish.
@@ -368,62 +328,9 @@ impl Pusher {
             _ => Ok(()),
         }
     }
-
-    /// Runs work of the builder with the privileges that it needs, and forwards what it reports.
-    async fn run_builder<T, F>(
-        &self,
-        options: &PushOptions,
-        work: impl FnOnce(mpsc::Sender<BuildEvent>) -> F,
-        (by, report): (&Deployer, &Reporter),
-    ) -> Result<T, Error>
-    where
-        T: Send + 'static,
-        F: Future<Output = Result<T, rootfs_builder::Error>> + Send + 'static,
-    {
-        let (sender, events) = mpsc::channel(EVENTS_AHEAD);
-        let forwarded = self.forward_events(events, by, report);
-        // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).
-        let work = privilege::run(report.building.track_future(work(sender)));
-        let (done, ()) = tokio::join!(work, forwarded);
-        done.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
-    }
 }
 
-/// Returns what is to be built.
-fn build_request(id: &str, options: &PushOptions, source: PushSource) -> PushRequest {
-    PushRequest {
-        id: id.to_owned(),
-        name: options.name.clone(),
-        source,
-        base: options.base.clone(),
-        launch: options.launch.clone(),
-        nodes: options.nodes.clone(),
-        params: options.params.clone(),
-        args: options.args.clone(),
-        remaps: options.remaps.clone(),
-        map: options.map.clone(),
-        with: options.with.clone(),
-        created: options.created,
-        packages_up_to: options.packages_up_to.clone(),
-        packages_skip: options.packages_skip.clone(),
-        cmake_args: options.cmake_args.clone(),
-    }
-}
-
-/// What to do with a push that was looked at.
-enum PushedWork {
-    /// Build it.
-    Build(Box<(PushRequest, InspectedPush)>),
-    /// Import the exported service in this tree.
-    Exported(PathBuf),
-}
-
-/// The image to publish, before it is probed.
-enum PushedImage {
-    Built(Box<BuildOutcome>),
-    Imported(Box<ImportedService>),
-}
-
+/// Describes a layer for the deployer.
 fn api_layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
     api::push::Layer {
         name: of.name.to_owned(),
@@ -453,5 +360,6 @@ fn make_plan(built: &BuildOutcome, options: &PushOptions) -> Plan {
         restart: options.launch.is_none(),
         stateful: options.stateful,
         shared: options.shared,
+        underlays: BTreeMap::new(),
     }
 }
