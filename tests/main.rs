@@ -143,6 +143,8 @@ mod tls;
 mod tokens;
 #[path = "stories/trying.rs"]
 mod trying;
+#[path = "stories/underlays.rs"]
+mod underlays;
 #[path = "stories/untrusted.rs"]
 mod untrusted;
 #[path = "stories/viewers.rs"]
@@ -220,6 +222,7 @@ fn main() -> ExitCode {
             a_python_module_that_a_package_forgot_is_named,
             a_package_whose_programs_are_not_found_is_refused_at_once,
             what_to_run_is_asked_for_before_anything_is_compiled,
+            a_dependency_is_met_by_a_package_of_another_name,
         ],
         stories![calibration:
             fewer_cores_take_longer_and_rows_say_how_long,
@@ -315,6 +318,10 @@ fn main() -> ExitCode {
             an_exported_service_is_published_on_another_server,
             a_base_is_moved_to_a_server_without_network,
             what_nobody_refers_to_is_collected,
+        ],
+        stories![underlays:
+            a_node_is_compiled_and_runs_upon_a_compiled_workspace,
+            an_underlay_of_ros_2_has_interfaces_and_modules,
         ],
         stories![registries: skopeo_and_containerd_pull_with_a_token],
         stories![inside:
@@ -507,6 +514,7 @@ fn main() -> ExitCode {
         stories![bounds:
             a_build_that_takes_too_much_is_ended_and_leaves_nothing,
             a_push_outlives_its_client,
+            what_a_push_lacks_is_told_before_it_waits_for_others,
             a_push_ends_with_what_its_deployer_showed,
             a_push_nobody_waits_for_ends_with_its_daemon,
             a_second_signal_ends_the_daemon_at_once,
@@ -520,6 +528,7 @@ fn main() -> ExitCode {
             a_workspace_is_built_in_order,
             a_prebuilt_space_is_served,
             what_was_compiled_before_a_failure_stays_compiled,
+            what_a_cancelled_push_has_compiled_stays_compiled,
             mistakes_in_cmake_are_told_before_anything_is_compiled,
             a_package_may_use_others_that_it_does_not_name,
             packages_with_the_same_libraries_share_their_layers,

@@ -23,8 +23,9 @@ use crate::key::Key;
 use crate::keys;
 use crate::launch::{self, LaunchPlan, LaunchQuery};
 use crate::pushed;
-use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
+use crate::request::{BuildOutcome, BuiltLayer, BuiltUnderlay, PushRequest};
 use crate::undeclared;
+use crate::underlay::{Foundation, UnderlayContents};
 use crate::workshop::{BuildContext, StagedLayer};
 
 /// Status file of dpkg.
@@ -36,6 +37,8 @@ pub(crate) struct Build<'a> {
     pub(crate) base: Base,
     pub(crate) archive: Arc<Archive>,
     pub(crate) base_layer: LayerSet,
+    /// Underlays that it is compiled and runs upon.
+    pub(crate) foundation: Foundation,
     /// Layers in which sources are compiled, if an imported base has them.
     pub(crate) tools: Option<Vec<Digest>>,
     pub(crate) request: &'a PushRequest,
@@ -54,6 +57,8 @@ pub(crate) struct BuildParts {
     pub(crate) package: LayerSet,
     /// Prefix of its install space; `None` for one below `/usr`.
     pub(crate) prefix: Option<PathBuf>,
+    /// What others need to know to stand on it, if it becomes an underlay.
+    pub(crate) contents: Option<UnderlayContents>,
 }
 
 impl Build<'_> {
@@ -148,7 +153,14 @@ impl Build<'_> {
 
     /// Resolves what to run and writes the image.
     pub(crate) async fn finish(&self, made: BuildParts, hold: image::GcHold) -> Result<BuildOutcome, Error> {
-        let parts = [("base", &self.base_layer), ("dependencies", &made.dependencies), ("package", &made.package)];
+        let underlay = self.foundation.run_layers().map(|diff_id| StagedLayer { diff_id, cached: true });
+        let underlay = LayerSet { layers: underlay.collect() };
+        let parts = [
+            ("base", &self.base_layer),
+            ("dependencies", &made.dependencies),
+            ("underlay", &underlay),
+            ("package", &made.package),
+        ];
         let parts = parts.into_iter().flat_map(|(name, part)| part.layers.iter().map(move |layer| (name, *layer)));
         let parts: Vec<(&'static str, StagedLayer)> = parts.collect();
         let diff_ids: Vec<Digest> = parts.iter().map(|(_, layer)| layer.diff_id).collect();
@@ -231,6 +243,29 @@ impl Build<'_> {
             inventory,
             hold,
         })
+    }
+
+    /// Writes the image that keeps the layers of an underlay and of those below it.
+    pub(crate) async fn finish_underlay(&self, made: BuildParts, hold: image::GcHold) -> Result<BuiltUnderlay, Error> {
+        let contents = made.contents.unwrap_or_default();
+        let layers = self.pack_layers(made.package.layers.iter().map(|layer| ("package", *layer)).collect()).await?;
+        let all = contents.layers.iter().flat_map(|layer| [layer.run, layer.compile]);
+        let all = all.map(|diff_id| ("underlay", StagedLayer { diff_id, cached: true })).collect();
+        let kept = self.pack_layers(all).await?;
+        let package = made.packages.first().cloned().unwrap_or_default();
+        let spec = ImageSpec {
+            layers: kept.iter().map(|layer| layer.info).collect(),
+            labels: BTreeMap::from([
+                ("org.cloudroid.package".to_owned(), package.clone()),
+                ("org.cloudroid.base".to_owned(), self.base.name.clone()),
+            ]),
+            created: creation_time(self.request.created, SystemTime::now()),
+            ..ImageSpec::default()
+        };
+        let store = self.shop.layers.store().clone();
+        let image = crate::blocking::spawn(move || store.put_image(&spec)).await??;
+        let _ = fs::remove_file(&self.log);
+        Ok(BuiltUnderlay { package, contents, flavour: self.base.flavour(), image, layers, hold })
     }
 
     /// Completes the layers with their archives.

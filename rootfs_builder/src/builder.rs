@@ -6,9 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{Digest, Store};
-use package::foreseen::{self, SourceProblem};
-use package::workspace::{PushedDirectory, Workspace};
-use ros::flavour::Version;
+use package::workspace::PushedDirectory;
 use servant::sandbox::Sandbox;
 use servant::spec::Limits;
 use tokio::sync::mpsc;
@@ -22,17 +20,14 @@ use crate::cache::{LayerCache, LayerEntry};
 use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
-use crate::indexed::IndexedPackages;
+use crate::inspect::{InspectedPush, PushContent};
 use crate::install::LayerSet;
-use crate::pushed::InspectedTree;
 use crate::removal::PendingRemovals;
-use crate::request::{BuildOutcome, PushRequest, PushSource};
+use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{
-    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, stock, unused, wheels,
-};
+use crate::{advice, blocking, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
 
 /// Default base for packages that support ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -84,24 +79,6 @@ pub(crate) fn keep_note_key(base: &str) -> String {
     format!("keep-{base}")
 }
 
-enum PushContent<'a> {
-    Tree(PushedDirectory),
-    Packaged(&'a str),
-}
-
-impl PushContent<'_> {
-    /// Returns the main package, as far as known.
-    fn name(&self) -> String {
-        match self {
-            Self::Tree(pushed) => {
-                let packages = pushed::sort_by_importance(pushed.packages());
-                packages.into_iter().next().unwrap_or_default()
-            }
-            Self::Packaged(name) => (*name).to_owned(),
-        }
-    }
-}
-
 impl OpenedArchive {
     fn from_parts(base: &Base, archive: &Arc<Archive>) -> Self {
         Self { base: base.clone(), archive: archive.clone() }
@@ -124,10 +101,16 @@ impl Builder {
         })
     }
 
-    /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
-    /// directory is removed ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
-    pub async fn build(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
-        blocking::cancellable(self.make(request, events)).await
+    /// Builds the image of a push, or an underlay. To cancel, drop the future: containers and blocking work are ended, what was compiled
+    /// or installed completely is still packed into the cache, and the build's directory is removed
+    /// ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
+    pub async fn build(
+        &self,
+        request: &PushRequest,
+        inspected: InspectedPush,
+        events: mpsc::Sender<BuildEvent>,
+    ) -> Result<BuildResult, Error> {
+        blocking::cancellable(self.make(request, inspected, events)).await
     }
 
     /// Returns the directory of layers and packages.
@@ -150,21 +133,26 @@ impl Builder {
         &self.config.build_dir
     }
 
-    /// Waits until the containers of a build have ended and its directory is removed.
+    /// Gives up the packing that cancelled builds have left, since the daemon ends.
+    pub fn stop_packing(&self) {
+        self.layers.ending().cancel();
+    }
+
+    /// Waits until the containers of a build have ended, its complete layers are in the cache, and its directory is
+    /// removed.
     pub async fn wait_removed(&self, id: &str) {
         self.removals.wait(id).await;
     }
 
-    async fn make(&self, request: &PushRequest, events: mpsc::Sender<BuildEvent>) -> Result<BuildOutcome, Error> {
+    async fn make(
+        &self,
+        request: &PushRequest,
+        inspected: InspectedPush,
+        events: mpsc::Sender<BuildEvent>,
+    ) -> Result<BuildResult, Error> {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
-        let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
-            choice::choose_base(&self.config.bases_dir, request.base.as_deref(), &request.source)
-        })?;
-        if let Some(note) = note {
-            progress.warn(note).await;
-        }
         let site = BuildSite::new(
             &self.config.build_dir,
             &request.id,
@@ -172,38 +160,14 @@ impl Builder {
             self.config.limits.or(sandbox::default_limits()),
             self.removals.clone(),
         )?;
-        // Before anything is downloaded: what was pushed may not be a package at all.
-        let what = match &request.source {
-            PushSource::Tree(path) => {
-                let inspect = || pushed::inspect_pushed(path, &base, &request.package_query());
-                let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
-                if let PushedDirectory::Source(workspace) = &pushed {
-                    tell_selection(workspace, &left_out, progress).await;
-                    ask_what_to_run(request, workspace, &base)?;
-                    let problems = find_source_problems(request, workspace, &base)?;
-                    for problem in problems.iter().take(MOST_PROBLEMS) {
-                        progress.warn(problem.to_string()).await;
-                    }
-                    if problems.len() > MOST_PROBLEMS {
-                        progress.warn(format!("{} more like these", problems.len() - MOST_PROBLEMS)).await;
-                    }
-                    let tree = path.clone();
-                    blocking::spawn(move || seal::seal(&tree)).await??;
-                }
-                PushContent::Tree(pushed)
-            }
-            PushSource::Packaged(name) => PushContent::Packaged(name),
-        };
-        if !matches!(what, PushContent::Tree(PushedDirectory::Source(_))) && request.has_build_options() {
-            return Err(Error::NothingToCompile);
+        let push = inspected.label(request);
+        let InspectedPush { base, content, foundation } = inspected;
+        if let (PushContent::Tree(PushedDirectory::Source(_)), PushSource::Tree(tree)) = (&content, &request.source) {
+            let tree = tree.clone();
+            blocking::spawn(move || seal::seal(&tree)).await??;
         }
-        let push = PushLabel { id: request.id.clone(), name: request.name.clone().unwrap_or_else(|| what.name()) };
+        let archive = self.archive(&push, &base, progress).await?;
         let shop = BuildContext::new(site, self.layers.clone(), self.turns.clone(), push, progress.clone());
-        let archive = self.archive(&shop, &base, progress).await?;
-        match &what {
-            PushContent::Tree(pushed) => check_dependencies(&archive, &base, request, pushed)?,
-            PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, &base, &request.map)?),
-        }
         let (layers, of) = (self.layers.clone(), base.clone());
         let imported = blocking::spawn(move || stock::find_imported(&layers, &of)).await??;
         let (base_layer, archive) = match &imported {
@@ -216,18 +180,21 @@ impl Builder {
         let tools = imported.as_ref().and_then(BaseStock::tool_layers);
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let base = base.with_cmake_arguments(&request.cmake_args);
-        let build = Build { shop, base, archive, base_layer, tools, request, progress, log };
+        let build = Build { shop, base, archive, base_layer, foundation, tools, request, progress, log };
         sweep_logs(&self.config.logs_dir);
         let cache = self.config.cache_dir.clone();
         let swept = cache.clone();
         blocking::spawn(move || unused::sweep(&swept)).await?;
         let work = async {
-            let made = match what {
+            let made = match content {
                 PushContent::Tree(PushedDirectory::Source(workspace)) => source::build(&build, workspace).await?,
                 PushContent::Tree(PushedDirectory::Installed(space)) => prebuilt::build(&build, space).await?,
-                PushContent::Packaged(name) => packaged::build(&build, name).await?,
+                PushContent::Packaged(name) => packaged::build(&build, &name).await?,
             };
-            build.finish(made, hold).await
+            match made.contents {
+                Some(_) => build.finish_underlay(made, hold).await.map(|made| BuildResult::Underlay(Box::new(made))),
+                None => build.finish(made, hold).await.map(|made| BuildResult::Service(Box::new(made))),
+            }
         };
         let outcome = work.await;
         // What was installed and compiled before a failure is kept: the next push continues there.
@@ -267,18 +234,24 @@ impl Builder {
         notes.flatten().collect()
     }
 
-    async fn archive(&self, shop: &BuildContext, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
-        // Opening may take minutes: whoever waits is told for whom.
-        let _turn = shop.lock_key(&format!("archive of {}", base.name)).await;
-        let mut archives = self.archives.lock().await;
-        if let Some(opened) = archives.get_mut(&base.name)
+    /// Returns the archive of a base for a push, which reads the package lists if they are old.
+    pub(crate) async fn archive(
+        &self,
+        push: &PushLabel,
+        base: &Base,
+        progress: &Progress,
+    ) -> Result<Arc<Archive>, Error> {
+        // Opening may take minutes: whoever waits is told for whom. Advice and other bases do not wait.
+        let _turn = self.turns.lock(&format!("archive of {}", base.name), push, progress).await;
+        if let Some(opened) = self.archives.lock().await.get_mut(&base.name)
             && opened.archive.is_fresh()
         {
             opened.base = base.clone();
             return Ok(opened.archive.clone());
         }
         progress.step(&format!("reading the package lists of {}", base.name)).await;
-        let scratch = shop.site.directory("sources")?;
+        let scratch = sandbox::create_build_directory(&self.config.build_dir, &push.id)?.join("sources");
+        fs::create_dir_all(&scratch).io_context("making", &scratch)?;
         let opened = async {
             let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
             Archive::open(&self.config.cache_dir, sources, false, progress).await
@@ -297,7 +270,7 @@ impl Builder {
             }
         };
         let archive = Arc::new(archive);
-        archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
+        self.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         Ok(archive)
     }
 
@@ -334,96 +307,6 @@ impl Builder {
         }
         Ok((made, archive))
     }
-}
-
-/// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
-/// file. Blocking.
-fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
-    let version = base.ros.ros_version();
-    if let Some(launch) = &request.launch
-        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
-    {
-        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
-        return Err(Error::NotInPackage {
-            what: "launch file",
-            name: launch.clone(),
-            known: launch::join_names(&foreseen.launch_files),
-            elsewhere: String::new(),
-        });
-    }
-    if request.launch.is_some() || !request.nodes.is_empty() {
-        return Ok(());
-    }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
-    if !foreseen.must_be_chosen() {
-        return Ok(());
-    }
-    Err(Error::NothingToRun {
-        executables: launch::join_names(&foreseen.executables),
-        launch_files: launch::join_names(&foreseen.launch_files),
-        more: "; nothing is compiled yet, so there may be more",
-    })
-}
-
-/// Maximum number of mistakes in build files that are named.
-const MOST_PROBLEMS: usize = 20;
-/// Maximum number of packages that are named when they are not built.
-const NAMED: usize = 12;
-
-/// Tells which packages are not built.
-async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &Progress) {
-    if left_out.is_empty() {
-        return;
-    }
-    let built = workspace.packages.len();
-    let more = if left_out.len() > NAMED { ", …" } else { "" };
-    let names = left_out[..left_out.len().min(NAMED)].join(", ");
-    let all = built + left_out.len();
-    progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
-}
-
-/// Returns mistakes in build files; fails if no program is left because of them. Blocking.
-fn find_source_problems(
-    request: &PushRequest,
-    workspace: &Workspace,
-    base: &Base,
-) -> Result<Vec<SourceProblem>, Error> {
-    let version = base.ros.ros_version();
-    privilege::run_as_reader(|| {
-        let problems = foreseen::find_problems(workspace, version);
-        let is_own = |node: &String| {
-            let program = node.split_whitespace().next().unwrap_or_default();
-            let package = program.split_once('/').map(|(package, _)| package);
-            package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
-        };
-        let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
-        if runs_own && foreseen::has_no_programs(workspace, version) {
-            let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
-            return Err(Error::NoPrograms { problems: problems.join("; ") });
-        }
-        Ok(problems)
-    })
-}
-
-/// Reports unresolvable dependencies now and not after minutes of preparation. In ROS 2 many may be in a base that does
-/// not exist yet; there they are reported once it can be inspected.
-fn check_dependencies(
-    archive: &Archive,
-    base: &Base,
-    request: &PushRequest,
-    pushed: &PushedDirectory,
-) -> Result<(), Error> {
-    if base.ros != Version::Ros1 {
-        return Ok(());
-    }
-    let own = pushed::names(pushed.packages());
-    let mut asked = pushed::required_keys(pushed.packages());
-    if matches!(pushed, PushedDirectory::Installed(_)) {
-        asked.build.clear();
-    }
-    let there = IndexedPackages::default();
-    keys::resolve_keys(archive, base, &request.map, &own, &asked, &there)?;
-    Ok(())
 }
 
 fn to_layer_set(entry: &LayerEntry, cached: bool) -> LayerSet {
@@ -480,6 +363,37 @@ pub(crate) mod tests {
         .expect("prepared")
     }
 
+    /// Gives a base an archive with fresh lists: `contents` are the lines of its index, `names` its packages.
+    pub(crate) async fn put_archive(
+        builder: &Builder,
+        base: &str,
+        place: &Path,
+        (contents, names): (&str, &[&str]),
+    ) -> Arc<Archive> {
+        let base = base::load(&builder.config.bases_dir, base).expect("valid");
+        let root = place.join(format!("apt-{}", base.name));
+        let apt = crate::apt::Apt::open(&root, "").expect("prepared");
+        fs::write(root.join("updated"), "").expect("written");
+        let lists = [crate::contents::tests::list(&root, "c.gz", contents)];
+        let archive = Arc::new(Archive {
+            apt,
+            contents: crate::contents::Contents::open(&root, &lists).expect("read").into(),
+            candidates: crate::candidates::tests::candidates_named(names),
+            stamp: "today".to_owned(),
+            sources: String::new(),
+        });
+        builder.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(&base, &archive));
+        archive
+    }
+
+    /// Creates the context of a build that runs nothing.
+    pub(crate) fn new_context(builder: &Builder, id: &str) -> BuildContext {
+        let Config { build_dir, sandbox, limits, .. } = &builder.config;
+        let site = BuildSite::new(build_dir, id, sandbox.clone(), *limits, builder.removals.clone()).expect("made");
+        let progress = Progress::new(mpsc::channel(1).0);
+        BuildContext::new(site, builder.layers.clone(), builder.turns.clone(), PushLabel::default(), progress)
+    }
+
     #[tokio::test]
     async fn what_is_no_package_is_refused_before_anything_is_made_for_it() {
         let place = tempfile::tempdir().expect("a directory");
@@ -508,13 +422,29 @@ pub(crate) mod tests {
                     ..PushRequest::default()
                 };
                 let (sender, mut events) = mpsc::channel(100);
-                let refused = builder.build(&request, sender).await.expect_err("no package");
+                let refused = builder.inspect(&request, sender).await.expect_err("no package");
                 let text = refused.to_string();
                 assert!(text.contains("package.xml"), "{files:?} {base:?}: {text}");
                 assert_eq!(events.recv().await, None, "nothing is begun");
                 let made = fs::read_dir(at("build")).expect("listed").count();
                 assert_eq!(made, 0, "{files:?} {base:?}");
             }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_missing_module_is_advised_without_reading_definitions() {
+        let place = tempfile::tempdir().expect("a directory");
+        let mut builder = new_builder(place.path());
+        let text = "usr/lib/python3/dist-packages/scipy/__init__.py python/python3-scipy\n";
+        for name in [DEFAULT_BASE, "bookworm-jazzy-wheels"] {
+            put_archive(&builder, name, place.path(), (text, &["python3-scipy"])).await;
+        }
+        // A stranger's thread, which asks for the advice, can open nothing there.
+        builder.config.bases_dir = place.path().join("unreadable");
+        for name in [DEFAULT_BASE, "bookworm-jazzy-wheels"] {
+            let advice = builder.advice(name, "ModuleNotFoundError: No module named 'scipy.linalg'").await;
+            assert_eq!(advice, ["the Python module scipy is missing: push with `--with python3-scipy`"], "{name}");
         }
     }
 

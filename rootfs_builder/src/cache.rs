@@ -6,6 +6,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use foreign::cancel::Cancel;
 use image::{LayerInfo, Store};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -19,6 +20,7 @@ pub(crate) struct LayerCache {
     directory: PathBuf,
     notes: PathBuf,
     store: Arc<Store>,
+    ending: Cancel,
 }
 
 /// A cached layer.
@@ -36,7 +38,12 @@ impl LayerCache {
         for path in [&directory, &notes] {
             fs::create_dir_all(path).io_context("making", path)?;
         }
-        Ok(Self { directory, notes, store })
+        Ok(Self { directory, notes, store, ending: Cancel::default() })
+    }
+
+    /// Returns the flag that is cancelled when the daemon ends, and with it the packing of layers.
+    pub(crate) fn ending(&self) -> &Cancel {
+        &self.ending
     }
 
     pub(crate) fn store(&self) -> &Arc<Store> {

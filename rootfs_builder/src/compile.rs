@@ -324,8 +324,8 @@ pub(crate) fn unit_options(base: &Base, uid_offset: u32) -> TreeOptions {
     TreeOptions { uid_offset, exclude: Vec::new(), overlay_upper: true, ..tree_options(base) }
 }
 
-/// Returns the options for packing an install space into a layer of an image, with all files owned by root. `owner` is
-/// their current owner.
+/// Returns the options for packing an install space into a layer of an image. `owner`, the current owner of its files,
+/// becomes root.
 pub(crate) fn package_options(base: &Base, owner: u32) -> TreeOptions {
     TreeOptions { uid_offset: owner, exclude: Vec::new(), level: 6, ..tree_options(base) }
 }

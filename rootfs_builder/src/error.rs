@@ -227,10 +227,44 @@ pub enum Error {
     },
     /// Options about compiling were given for what is not compiled.
     #[error(
-        "--packages-up-to, --packages-skip and --cmake-args are for sources, and nothing is compiled here; leave them \
-            out"
+        "--packages-up-to, --packages-skip, --cmake-args, --on and --as-underlay are for sources, and nothing is \
+            compiled here; leave them out"
     )]
     NothingToCompile,
+    /// An underlay is on another base than the push.
+    #[error("underlay {underlay} is built on base {base}, and this push on {wanted}; push it with --base {base}")]
+    UnderlayBase {
+        /// Name of the underlay.
+        underlay: String,
+        /// Its base.
+        base: String,
+        /// Base of the push.
+        wanted: String,
+    },
+    /// A package is in two underlays.
+    #[error(
+        "package {package} is in underlay {first} and, differently, in {second}; stand on one of them, or push {second} \
+            again --on {first} and without {package}"
+    )]
+    UnderlayConflict {
+        /// Name of the package.
+        package: String,
+        /// Underlay that has it.
+        first: String,
+        /// Other underlay that has it.
+        second: String,
+    },
+    /// A package of the push is in an underlay.
+    #[error(
+        "package {package} is also in underlay {underlay}; leave it out with --packages-skip {package}, or push the \
+            underlay with this version of it"
+    )]
+    InUnderlay {
+        /// Name of the package.
+        package: String,
+        /// Underlay that has it.
+        underlay: String,
+    },
     /// The package does not support the base's ROS version.
     #[error(
         "{package} {because}, which is ROS {version}, but base {base} is of ROS {base_version}; push it with {fitting}"
@@ -381,6 +415,9 @@ pub enum Error {
     /// Files of a sandbox or a push could not be read as expected.
     #[error(transparent)]
     Foreign(foreign::Error),
+    /// The thread that packs a layer has ended without a result.
+    #[error("a layer was not packed; push again")]
+    NotPacked,
     /// A task of this process panicked.
     #[error("an internal task ended early: {0}")]
     Task(#[from] tokio::task::JoinError),
@@ -406,7 +443,8 @@ fn unresolved_text(all: &[Unresolved]) -> String {
         }
     }
     text.push_str(
-        "\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also contains its source",
+        "\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also contains its source; \
+            with `--map KEY=` a key needs no package",
     );
     text
 }

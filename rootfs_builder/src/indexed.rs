@@ -4,19 +4,27 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use image::Digest;
 use ros::flavour::Version;
+use serde::{Deserialize, Serialize};
 
+use crate::archive::Archive;
 use crate::base::Base;
 use crate::blocking;
+use crate::build::Build;
+use crate::cache::LayerCache;
 use crate::error::Error;
+use crate::key::Key;
 
 /// Existing packages.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct IndexedPackages {
     /// Available while compiling.
     pub(crate) build: BTreeSet<String>,
     /// Available at run time.
     pub(crate) run: BTreeSet<String>,
+    /// Python modules available at run time, which may have other names than their packages.
+    pub(crate) modules: BTreeSet<String>,
 }
 
 /// Returns the install spaces of a base as absolute paths: those in the environment of all processes and of compilers.
@@ -49,6 +57,51 @@ pub(crate) fn library_directories(base: &Base) -> Vec<String> {
         places.extend(given.filter(|place| !place.is_empty()).map(str::to_owned));
     }
     places
+}
+
+/// Returns the key of the note with the packages of a base, which covers what they are selected by.
+fn known_key(base: &Base, archive: &Archive) -> String {
+    Key::new("indexed")
+        .input("system", base.system_key())
+        .inputs("toolchain", &base.build.packages)
+        .input("runtime", base.required.runtime.key())
+        .input("tools", base.required.build.key())
+        .inputs("prefixes", install_prefixes(base))
+        .input("lists", &archive.stamp)
+        .finish()
+}
+
+/// Returns the packages of a base as the last build with the same package lists found them. Blocking.
+pub(crate) fn read_known(layers: &LayerCache, base: &Base, archive: &Archive) -> Option<IndexedPackages> {
+    layers.read_note(&known_key(base, archive))
+}
+
+/// Finds the packages of a base, in `tools` with its toolchain, and keeps them for pushes that are only looked at.
+pub(crate) async fn find_known(build: &Build<'_>, tools: &[Digest]) -> Result<IndexedPackages, Error> {
+    let below = build.base_diff_ids();
+    let there = IndexedPackages {
+        build: build.indexed_packages(tools).await?,
+        run: build.indexed_packages(&below).await?,
+        modules: find_modules(build, &below).await?,
+    };
+    write_known(&build.shop.layers, &build.base, &build.archive, &there)?;
+    Ok(there)
+}
+
+/// Keeps the packages of a base for [`read_known`]. Blocking.
+pub(crate) fn write_known(
+    layers: &LayerCache,
+    base: &Base,
+    archive: &Archive,
+    there: &IndexedPackages,
+) -> Result<(), Error> {
+    layers.write_note(&known_key(base, archive), there)
+}
+
+/// Returns the Python modules in the install spaces of a base, in these layers.
+pub(crate) async fn find_modules(build: &Build<'_>, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
+    let (trees, prefixes) = (build.shop.extract_layers(layers).await?, install_prefixes(&build.base));
+    Ok(blocking::spawn_reader(move || package::ament::modules(&trees, &prefixes)).await??)
 }
 
 /// Returns the packages in the indexes of trees, given lowest first.

@@ -1,7 +1,8 @@
 //! Resolution of the names in a package.xml (rosdep keys and ROS packages) to Debian packages.
 //!
 //! In this order: the deployer's mapping (`--map`), packages of the same workspace, the base's table, existing ROS
-//! packages (ROS 2), ROS packages of the archive, a Debian package of the same name.
+//! packages (ROS 2), ROS packages of the archive, a Debian package of the same name, an existing Python module of that
+//! name, if no more is needed.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,6 +21,8 @@ pub(crate) struct RequiredKeys {
     pub(crate) build: BTreeMap<String, BTreeSet<String>>,
     /// Key → packages that need it at run time.
     pub(crate) run: BTreeMap<String, BTreeSet<String>>,
+    /// Keys of which at most the Python module is needed.
+    pub(crate) modules: BTreeSet<String>,
 }
 
 /// Result of the resolution.
@@ -59,9 +62,13 @@ pub(crate) fn resolve_keys(
     asked: &RequiredKeys,
     there: &IndexedPackages,
 ) -> Result<ResolvedKeys, Error> {
+    // A mapping may also name a package of the push or of the base.
+    let is_there = |name: &str| own.contains(name) || there.build.contains(name) || there.run.contains(name);
+    let modules = &there.modules;
     let find = |key: &str, there: &BTreeSet<String>| -> KeyProvider {
-        if let Some(deb) = map.get(key) {
-            return KeyProvider::Debs(split_names(deb).map(str::to_owned).collect());
+        if let Some(names) = map.get(key) {
+            let debs = split_names(names).filter(|name| !is_there(name));
+            return KeyProvider::Debs(debs.map(str::to_owned).collect());
         }
         if let Some(debs) = base.keys.get(key) {
             return KeyProvider::Debs(debs.clone());
@@ -82,6 +89,9 @@ pub(crate) fn resolve_keys(
         }
         if archive.candidates.contains(key) && !is_of_other_ros(archive, base, key) {
             return KeyProvider::Debs(vec![key.to_owned()]);
+        }
+        if asked.modules.contains(key) && modules.contains(key) {
+            return KeyProvider::There;
         }
         KeyProvider::Nothing
     };
@@ -116,7 +126,7 @@ pub(crate) fn resolve_keys(
         }
     }
     // The deployer's mapping may be wrong as well.
-    add_unknown(archive, map, &mut missing);
+    add_unknown(archive, map, is_there, &mut missing);
     refuse_missing(archive, base, missing, &there.build)?;
     Ok(resolved)
 }
@@ -129,7 +139,7 @@ pub(crate) fn mapped_packages(
     map: &BTreeMap<String, String>,
 ) -> Result<BTreeSet<String>, Error> {
     let mut unknown = BTreeMap::new();
-    add_unknown(archive, map, &mut unknown);
+    add_unknown(archive, map, |_| false, &mut unknown);
     refuse_missing(archive, base, unknown, &BTreeSet::new())?;
     let names = map.values().flat_map(|debs| split_names(debs));
     Ok(names.map(str::to_owned).collect())
@@ -140,10 +150,15 @@ fn split_names(debs: &str) -> impl Iterator<Item = &str> {
     debs.split([',', ' ']).filter(|deb| !deb.is_empty())
 }
 
-/// Adds the names in `--map` that are not in the archive, with the option that contains them.
-fn add_unknown(archive: &Archive, map: &BTreeMap<String, String>, missing: &mut BTreeMap<String, BTreeSet<String>>) {
+/// Adds the names in `--map` that are neither in the archive nor there anyway, with the option that contains them.
+fn add_unknown(
+    archive: &Archive,
+    map: &BTreeMap<String, String>,
+    is_there: impl Fn(&str) -> bool,
+    missing: &mut BTreeMap<String, BTreeSet<String>>,
+) {
     for (key, debs) in map {
-        for deb in split_names(debs).filter(|deb| !archive.candidates.contains(deb)) {
+        for deb in split_names(debs).filter(|deb| !is_there(deb) && !archive.candidates.contains(deb)) {
             let by = missing.entry(deb.to_owned()).or_default();
             by.insert(format!("--map {key}={debs}"));
         }
@@ -257,7 +272,7 @@ mod tests {
 
     fn new_required_keys(build: &[&str], run: &[&str]) -> RequiredKeys {
         let by = |keys: &[&str]| keys.iter().map(|&key| (key.to_owned(), set(&["app"]))).collect();
-        RequiredKeys { build: by(build), run: by(run) }
+        RequiredKeys { build: by(build), run: by(run), modules: BTreeSet::new() }
     }
 
     #[test]
@@ -345,6 +360,7 @@ mod tests {
         let there = IndexedPackages {
             build: set(&["rclpy", "ament_cmake", "rosidl_default_generators"]),
             run: set(&["rclpy"]),
+            modules: BTreeSet::new(),
         };
         let run = ["rclpy", "app_msgs", "nav_msgs", "python3-six", "ament_cmake"];
         let asked = new_required_keys(&["ament_cmake", "rosidl_default_generators", "nav_msgs"], &run);
@@ -358,6 +374,30 @@ mod tests {
             "{:?}",
             resolved.warnings
         );
+    }
+
+    #[test]
+    fn a_key_may_be_met_by_another_package_or_by_what_is_there() {
+        let lab = new_ros2_fixture();
+        let own = set(&["tf2_ros_py"]);
+        let there =
+            IndexedPackages { build: set(&["rclpy"]), run: set(&["rclpy"]), modules: set(&["tf2_py", "rclcpp"]) };
+        let keys = ["tf2_ros", "warp", "six", "rclcpp_py"];
+        let asked = new_required_keys(&keys, &keys);
+        let map = |pairs: &[(&str, &str)]| -> BTreeMap<String, String> {
+            pairs.iter().map(|(key, name)| ((*key).to_owned(), (*name).to_owned())).collect()
+        };
+        let met = map(&[("tf2_ros", "tf2_ros_py"), ("warp", ""), ("six", "python3-six"), ("rclcpp_py", "rclpy")]);
+        let resolved = resolve_keys(&lab.archive, &lab.base, &met, &own, &asked, &there).expect("all are met");
+        assert_eq!((resolved.build, resolved.run), (set(&["python3-six"]), set(&["python3-six"])));
+        let wrong = map(&[("tf2_ros", "tf2_ros_pi"), ("warp", ""), ("six", ""), ("rclcpp_py", "")]);
+        let refused = resolve_keys(&lab.archive, &lab.base, &wrong, &own, &asked, &there).expect_err("a slip");
+        assert!(refused.to_string().contains("tf2_ros_pi (wanted by --map tf2_ros=tf2_ros_pi)"), "{refused}");
+        // A module of the base is enough for those who need no more.
+        let asked = RequiredKeys { modules: set(&["tf2_py"]), ..new_required_keys(&["tf2_py"], &["tf2_py"]) };
+        resolve_keys(&lab.archive, &lab.base, &map(&[]), &own, &asked, &there).expect("it is there");
+        let asked = new_required_keys(&["rclcpp"], &["rclcpp"]);
+        resolve_keys(&lab.archive, &lab.base, &map(&[]), &own, &asked, &there).expect_err("headers are needed");
     }
 
     #[test]

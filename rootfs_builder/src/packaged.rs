@@ -50,7 +50,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, E
     let versions = versions.map(|package| (package.clone(), archive_version(build, package)));
     let versions = versions.collect();
     let dependencies = build.add_packages("dependencies", &build.base_diff_ids(), &debs, wanted.extras).await?;
-    Ok(BuildParts { packages, versions, dependencies, package: LayerSet::default(), prefix: None })
+    Ok(BuildParts { packages, versions, dependencies, package: LayerSet::default(), prefix: None, contents: None })
 }
 
 /// Builds on ROS 2, whose archive has a Debian package with all dependencies for each ROS package.
@@ -67,6 +67,7 @@ async fn build_ros2(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> 
         dependencies,
         package: LayerSet::default(),
         prefix: None,
+        contents: None,
     })
 }
 

@@ -15,7 +15,7 @@ use crate::key::{self, Key};
 use crate::keys::{self, RequiredKeys};
 use crate::modes::set_mode;
 use crate::workshop::PackJob;
-use crate::{pushed, source};
+use crate::{indexed, pushed, source};
 
 /// Directories that are replaced by scratch space in a servant, so that files of the image there are not visible.
 const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
@@ -30,6 +30,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
     let there = IndexedPackages {
         build: pushed::build_tools(&asked),
         run: build.indexed_packages(&build.base_diff_ids()).await?,
+        modules: indexed::find_modules(build, &build.base_diff_ids()).await?,
     };
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
@@ -37,14 +38,16 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
     }
     let python = pushed::has_python(&space.root);
     let package = pack_space(build, &space, &prefix).await?;
-    let needed = source::needed_libraries(build, &package).await?;
-    let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
+    let libraries = source::needed_libraries(build, &package).await?;
+    let needs = source::runtime_needs(build, &resolved, (libraries, python)).await?;
+    let dependencies = source::dependencies(build, &needs).await?;
     Ok(BuildParts {
         packages,
         versions: pushed::versions(&space.packages),
         dependencies,
         package,
         prefix: Some(prefix),
+        contents: None,
     })
 }
 

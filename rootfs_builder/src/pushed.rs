@@ -6,7 +6,7 @@ use std::path::Path;
 
 use foreign::Visit;
 use package::condition::Variables;
-use package::manifest::Kind;
+use package::manifest::{Kind, Manifest};
 use package::selection::{self, PackageQuery};
 use package::workspace::{self, Package, PushedDirectory};
 use ros::bus::RosVersion;
@@ -56,6 +56,8 @@ fn supported_build_types(version: RosVersion) -> &'static str {
 
 /// Returns the external dependencies of the packages.
 pub(crate) fn required_keys(packages: &[Package]) -> RequiredKeys {
+    let manifests = packages.iter().map(|package| (&package.manifest.name, &package.manifest));
+    let manifests: BTreeMap<&String, &Manifest> = manifests.collect();
     let mut asked = RequiredKeys::default();
     for external in workspace::external_dependencies(packages) {
         let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
@@ -64,6 +66,10 @@ pub(crate) fn required_keys(packages: &[Package]) -> RequiredKeys {
         }
         if needs(&[Kind::Exec]) {
             asked.run.insert(external.name.clone(), external.needed_by.clone());
+        }
+        let mut needing = external.needed_by.iter().filter_map(|name| manifests.get(name));
+        if needing.all(|manifest| manifest.needs_as_module(&external.name)) {
+            asked.modules.insert(external.name);
         }
     }
     asked

@@ -9,6 +9,7 @@ use package::selection::PackageQuery;
 use ros::flavour::Flavour;
 
 use crate::launch::LaunchPlan;
+use crate::underlay::{NamedUnderlay, UnderlayContents};
 
 /// A push to build.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -32,7 +33,8 @@ pub struct PushRequest {
     pub args: BTreeMap<String, String>,
     /// Name remappings for every node, from → to.
     pub remaps: BTreeMap<String, String>,
-    /// Manual dependency mapping: rosdep key or ROS package → Debian package.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian packages, or packages of the push or the base;
+    /// nothing for a key that needs none.
     pub map: BTreeMap<String, String>,
     /// Additional Debian or ROS packages, while compiling and at run time.
     pub with: Vec<String>,
@@ -45,12 +47,27 @@ pub struct PushRequest {
     pub packages_skip: Vec<String>,
     /// Arguments of CMake for the packages of the push, after those of the base.
     pub cmake_args: Vec<String>,
+    /// Underlays that it is compiled and runs upon, lowest first.
+    pub underlays: Vec<NamedUnderlay>,
+    /// True if it becomes an underlay, of which nothing is run.
+    pub as_underlay: bool,
 }
 
 impl PushRequest {
     /// Returns whether an option is about compiling.
     pub(crate) fn has_build_options(&self) -> bool {
-        !(self.packages_up_to.is_empty() && self.packages_skip.is_empty() && self.cmake_args.is_empty())
+        let has_none = self.packages_up_to.is_empty()
+            && self.packages_skip.is_empty()
+            && self.cmake_args.is_empty()
+            && self.underlays.is_empty();
+        self.as_underlay || !has_none
+    }
+
+    /// Returns the name of the base, as far as the options determine it: that of an underlay, unless another is asked
+    /// for.
+    pub(crate) fn base_name(&self) -> Option<&str> {
+        let of_underlay = self.underlays.first().map(|underlay| underlay.contents.base.as_str());
+        self.base.as_deref().or(of_underlay)
     }
 
     /// Returns what the request says about the packages to build.
@@ -62,7 +79,7 @@ impl PushRequest {
             skip: &self.packages_skip,
             launch: self.launch.as_deref(),
             nodes: &self.nodes,
-            texts: values.chain(self.args.values().cloned()).collect(),
+            texts: values.chain(self.args.values().cloned()).chain(self.map.values().cloned()).collect(),
         }
     }
 }
@@ -81,6 +98,32 @@ impl Default for PushSource {
     fn default() -> Self {
         Self::Packaged(String::new())
     }
+}
+
+/// What was built.
+#[derive(Debug)]
+pub enum BuildResult {
+    /// The image of a service.
+    Service(Box<BuildOutcome>),
+    /// An underlay.
+    Underlay(Box<BuiltUnderlay>),
+}
+
+/// A compiled underlay.
+#[derive(Debug)]
+pub struct BuiltUnderlay {
+    /// Main package, whose name is the default name of the underlay.
+    pub package: String,
+    /// What others need to know to stand on it.
+    pub contents: UnderlayContents,
+    /// Base and ROS flavour.
+    pub flavour: Flavour,
+    /// Digest of the image with all its layers in the store, untagged. Nothing can be run in it: it keeps the layers.
+    pub image: Digest,
+    /// Its own layers.
+    pub layers: Vec<BuiltLayer>,
+    /// Guard that protects the image from the garbage collector until it is tagged.
+    pub hold: image::GcHold,
 }
 
 /// Result of a build.
@@ -109,7 +152,7 @@ pub struct BuildOutcome {
 /// A layer of the image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BuiltLayer {
-    /// Name of the layer: `base`, `dependencies` or `package`.
+    /// Name of the layer: `base`, `dependencies`, `underlay` or `package`.
     pub name: &'static str,
     /// Layer in the store.
     pub info: LayerInfo,

@@ -89,18 +89,8 @@ impl BuildSite {
         limits: Limits,
         removals: PendingRemovals,
     ) -> Result<Self, Error> {
-        let directory = root.join(id);
-        fs::create_dir_all(&directory).io_context("making", &directory)?;
-        // Files that are readable in the container must not be readable for others on the host.
-        crate::modes::set_mode(&directory, 0o700)?;
+        let directory = create_build_directory(root, id)?;
         Ok(Self { id: id.to_owned(), directory, sandbox, limits, removals, running: Arc::default() })
-    }
-
-    /// Creates a directory below the build's own.
-    pub(crate) fn directory(&self, name: &str) -> Result<PathBuf, Error> {
-        let path = self.directory.join(name);
-        fs::create_dir_all(&path).io_context("making", &path)?;
-        Ok(path)
     }
 
     /// Creates a new directory of this build, even if others are called `name`.
@@ -114,6 +104,21 @@ impl BuildSite {
                 Err(error) => return Err(Error::io("making", path, error)),
             }
         }
+    }
+
+    /// Lets the directory stay until `packing` has ended, which reads trees in it.
+    pub(crate) fn keep_while(&self, packing: Vec<JoinHandle<Result<(), Error>>>) {
+        let Ok(runtime) = tokio::runtime::Handle::try_current() else {
+            return;
+        };
+        let waiting = packing.into_iter().map(|archive| {
+            runtime.spawn(async move {
+                if let Ok(Err(error)) = archive.await {
+                    tracing::info!("a layer of a build that was cancelled is not kept: {error}");
+                }
+            })
+        });
+        self.running.lock().unwrap_or_else(PoisonError::into_inner).extend(waiting);
     }
 
     /// Runs a program to its end; each line of its output is passed to `on_line`.
@@ -156,6 +161,15 @@ impl BuildSite {
             Err(_) => Err(Error::Inside { what: "the sandbox", last_lines: tail.text() }),
         }
     }
+}
+
+/// Creates the directory of a build below `root`, unless it exists, and returns it.
+pub(crate) fn create_build_directory(root: &Path, id: &str) -> Result<PathBuf, Error> {
+    let directory = root.join(id);
+    fs::create_dir_all(&directory).io_context("making", &directory)?;
+    // Files that are readable in the container must not be readable for others on the host.
+    crate::modes::set_mode(&directory, 0o700)?;
+    Ok(directory)
 }
 
 type Outcome = Result<(NodeExit, u32), servant::Error>;

@@ -14,11 +14,11 @@ use std::path::PathBuf;
 use image::Digest;
 use package::workspace::Workspace;
 use ros::flavour::Version;
+use serde::{Deserialize, Serialize};
 
 use crate::build::{Build, BuildParts};
 use crate::builder::keep_note_key;
 use crate::error::Error;
-use crate::indexed::IndexedPackages;
 use crate::install::LayerSet;
 use crate::keys::{self, ResolvedKeys};
 use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
@@ -32,22 +32,28 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
         pushed::has_python(&workspace.root),
     );
     let tools = toolchain(build).await?;
-    let there = IndexedPackages {
-        build: build.indexed_packages(&tools).await?,
-        run: build.indexed_packages(&build.base_diff_ids()).await?,
-    };
+    let mut there = indexed::find_known(build, &tools).await?;
+    build.foundation.add_to(&mut there);
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
         build.progress.warn(warning.as_str()).await;
     }
-    let below = build_dependencies(build, tools, &resolved).await?;
+    let wanted = build_packages(build, &resolved).await?;
+    let below = build_dependencies(build, tools, &wanted).await?;
     let workspace = check_interfaces(build, workspace, &below).await?;
-    let package = units::compile_workspace(build, workspace, below)
+    let of_underlay = build.request.as_underlay.then(|| workspace.packages.clone());
+    let compiled = units::compile_workspace(build, workspace, below)
         .await
         .map_err(|error| advice::add_advice(error, advice::AdviceIndex::for_base(&build.archive, &build.base)))?;
-    let needed = needed_libraries(build, &package).await?;
-    let dependencies = dependencies(build, &resolved, &needed, python).await?;
-    Ok(BuildParts { packages, versions, dependencies, package, prefix: Some(build.base.build.prefix.clone()) })
+    let libraries = needed_libraries(build, &compiled.package).await?;
+    let needs = runtime_needs(build, &resolved, (libraries, python)).await?;
+    let dependencies = dependencies(build, &needs).await?;
+    let contents = match (of_underlay, compiled.underlay) {
+        (Some(packages), Some(layer)) => Some(build.foundation.extend(&build.base, &packages, layer, (wanted, needs))),
+        _ => None,
+    };
+    let prefix = Some(build.base.build.prefix.clone());
+    Ok(BuildParts { packages, versions, dependencies, package: compiled.package, prefix, contents })
 }
 
 /// Returns the layers of base and toolchain.
@@ -65,18 +71,25 @@ async fn toolchain(build: &Build<'_>) -> Result<Vec<Digest>, Error> {
     Ok(below)
 }
 
-/// Returns the layers in which packages are compiled: base, toolchain, build dependencies.
-async fn build_dependencies(
-    build: &Build<'_>,
-    mut below: Vec<Digest>,
-    resolved: &ResolvedKeys,
-) -> Result<Vec<Digest>, Error> {
+/// Returns the Debian packages for compiling, those of the underlays included.
+async fn build_packages(build: &Build<'_>, resolved: &ResolvedKeys) -> Result<BTreeSet<String>, Error> {
     // Packages added by the deployer may be missing in package.xml for compiling as well as for running.
     let (ros, mut wanted) = build.extra_packages().await?;
     wanted.extend(ros.iter().flat_map(|name| build.archive.build_packages(name)));
     wanted.extend(resolved.build.iter().cloned());
-    let more = build.add_packages("build-dependencies", &below, &wanted, Vec::new()).await?;
+    wanted.extend(build.foundation.build_packages().iter().cloned());
+    Ok(wanted)
+}
+
+/// Returns the layers in which packages are compiled: base, toolchain, build dependencies, underlays.
+async fn build_dependencies(
+    build: &Build<'_>,
+    mut below: Vec<Digest>,
+    wanted: &BTreeSet<String>,
+) -> Result<Vec<Digest>, Error> {
+    let more = build.add_packages("build-dependencies", &below, wanted, Vec::new()).await?;
     below.extend(more.diff_ids());
+    below.extend(build.foundation.compile_layers());
     Ok(below)
 }
 
@@ -86,8 +99,10 @@ async fn check_interfaces(build: &Build<'_>, workspace: Workspace, below: &[Dige
         return Ok(workspace);
     }
     let trees = build.shop.extract_layers(below).await?;
-    let shares: Vec<String> =
-        indexed::install_prefixes(&build.base).iter().map(|prefix| format!("{prefix}/share")).collect();
+    let mut prefixes = indexed::install_prefixes(&build.base);
+    // Where underlays are.
+    prefixes.push(build.base.build.prefix.display().to_string());
+    let shares: Vec<String> = prefixes.iter().map(|prefix| format!("{prefix}/share")).collect();
     crate::blocking::spawn_reader(move || {
         let known = package::definitions::read(&trees, &shares)?;
         package::interfaces::check(&workspace, &known)?;
@@ -110,30 +125,65 @@ pub(crate) async fn needed_libraries(build: &Build<'_>, package: &LayerSet) -> R
     .await?
 }
 
-/// Adds the layer of all run-time dependencies.
-pub(crate) async fn dependencies(
+/// What packages need at run time.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct RuntimeNeeds {
+    /// ROS packages, still to be gathered.
+    ros: BTreeSet<String>,
+    /// Debian packages.
+    debs: BTreeSet<String>,
+    /// Shared libraries.
+    libraries: BTreeSet<String>,
+    /// True if Python code uses the ROS packages.
+    python: bool,
+}
+
+impl RuntimeNeeds {
+    /// Adds what others need.
+    pub(crate) fn extend(&mut self, others: &Self) {
+        self.ros.extend(others.ros.iter().cloned());
+        self.debs.extend(others.debs.iter().cloned());
+        self.libraries.extend(others.libraries.iter().cloned());
+        self.python |= others.python;
+    }
+}
+
+/// Returns what the packages of a push need at run time, with what their underlays need.
+pub(crate) async fn runtime_needs(
     build: &Build<'_>,
     resolved: &ResolvedKeys,
-    libraries: &BTreeSet<String>,
-    python: bool,
-) -> Result<LayerSet, Error> {
-    let below = build.base_diff_ids();
-    let (mut roots, mut debs) = build.extra_packages().await?;
+    (libraries, python): (BTreeSet<String>, bool),
+) -> Result<RuntimeNeeds, Error> {
+    let (mut ros, mut debs) = build.extra_packages().await?;
     // Those are for compiling; their libraries are found by what the result needs.
     debs.retain(|deb| !deb.ends_with("-dev"));
-    roots.extend(resolved.run_ros.iter().cloned());
-    let wanted = packaged::gather_wanted(build, &roots, python).await?;
-    debs.extend(wanted.install);
+    ros.extend(resolved.run_ros.iter().cloned());
     debs.extend(resolved.run.iter().cloned());
-    let trees = build.shop.extract_layers(&below).await?;
-    let mut libraries = libraries.clone();
-    let own = indexed::library_directories(&build.base);
+    let mut needs = RuntimeNeeds { ros, debs, libraries, python };
+    needs.extend(build.foundation.runtime_needs());
+    Ok(needs)
+}
+
+/// Adds the layer of all run-time dependencies.
+pub(crate) async fn dependencies(build: &Build<'_>, needs: &RuntimeNeeds) -> Result<LayerSet, Error> {
+    let below = build.base_diff_ids();
+    let wanted = packaged::gather_wanted(build, &needs.ros, needs.python).await?;
+    let mut debs = needs.debs.clone();
+    debs.extend(wanted.install);
+    let underlays: Vec<Digest> = build.foundation.run_layers().collect();
+    let underlays = build.shop.extract_layers(&underlays).await?;
+    let mut trees = build.shop.extract_layers(&below).await?;
+    trees.extend(underlays.iter().cloned());
+    let mut libraries = needs.libraries.clone();
+    let mut own = indexed::library_directories(&build.base);
+    own.push(format!("{}/lib", build.base.build.prefix.display()).trim_start_matches('/').to_owned());
     libraries.retain(|name| !has_library(&trees, &own, name));
     let (found, missing) = build.archive.libraries(&libraries);
     debs.extend(found.into_values());
     let made = build.add_packages("dependencies", &below, &debs, wanted.extras).await?;
     let all: Vec<Digest> = below.into_iter().chain(made.diff_ids()).collect();
-    let trees = build.shop.extract_layers(&all).await?;
+    let mut trees = build.shop.extract_layers(&all).await?;
+    trees.extend(underlays);
     for name in missing {
         // Not in the index, but perhaps in an image: a link created by a package's script.
         if !has_library(&trees, &system_library_directories(), &name) && !has_library(&trees, &own, &name) {

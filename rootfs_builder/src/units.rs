@@ -18,6 +18,7 @@ use std::sync::Arc;
 use foreign::Visit;
 use image::Digest;
 use package::manifest::Kind;
+use package::provided::Providers;
 use package::workspace::{Package, Workspace};
 use ros::flavour::Version;
 use rustix::fs::FileType;
@@ -29,6 +30,7 @@ use crate::install::LayerSet;
 use crate::key::{self, Key};
 use crate::merge::overlay_tree;
 use crate::modes::set_mode;
+use crate::underlay::UnderlayLayer;
 use crate::workshop::PackJob;
 
 /// Kinds of dependencies that make another package of the workspace visible.
@@ -183,12 +185,17 @@ fn unit_from_package(package: &Package) -> BuildUnit {
 
 /// Returns, for each package, its direct and indirect dependencies among the earlier ones.
 fn resolve_needs(packages: &[Package]) -> Vec<Vec<usize>> {
+    let providers = Providers::new(packages);
     let mut all: Vec<Vec<usize>> = Vec::new();
     for (index, package) in packages.iter().enumerate() {
         let named = package.manifest.needs(&NEEDS);
+        let provided = providers.find_all(&package.manifest);
         let mut found = BTreeSet::new();
         for (earlier, other) in packages[..index].iter().enumerate() {
-            if named.contains(other.manifest.name.as_str()) || package.manifest.needs_group_of(&other.manifest) {
+            if named.contains(other.manifest.name.as_str())
+                || provided.contains(&earlier)
+                || package.manifest.needs_group_of(&other.manifest)
+            {
                 found.insert(earlier);
                 found.extend(&all[earlier]);
             }
@@ -225,13 +232,30 @@ fn link_tree(from: &Path, to: &Path, skip: &BTreeSet<PathBuf>) -> Result<(), Err
     })
 }
 
+/// A compiled workspace.
+pub(crate) struct CompiledWorkspace {
+    /// Layer of the image.
+    pub(crate) package: LayerSet,
+    /// The same as part of an underlay, if it becomes one.
+    pub(crate) underlay: Option<UnderlayLayer>,
+}
+
+/// Owner of the files in a layer of all packages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MergedOwner {
+    /// Root, as in images.
+    Root,
+    /// The compiling user, who can add to it.
+    CompilingUser,
+}
+
 /// Returns the package layer: packages from the cache as far as possible, and others compiled now. `below` are base,
-/// toolchain and build dependencies.
+/// toolchain, build dependencies and underlays.
 pub(crate) async fn compile_workspace(
     build: &Build<'_>,
     workspace: Workspace,
     below: Vec<Digest>,
-) -> Result<LayerSet, Error> {
+) -> Result<CompiledWorkspace, Error> {
     let shop = &build.shop;
     let place = shop.site.fresh_directory("sources")?;
     let units = {
@@ -244,9 +268,9 @@ pub(crate) async fn compile_workspace(
     let mut making = WorkspaceBuild { build, units, below, place, keys: Vec::new(), diff_ids: Vec::new() };
     let missing = making.find_missing().await?;
     if missing.is_empty()
-        && let Some(diff_id) = cached_layer(build, &making.whole_key()).await?
+        && let Some(made) = making.find_merged().await?
     {
-        return Ok(LayerSet::single(diff_id, true));
+        return Ok(made);
     }
     let mut log = BuildLog::create(&build.log)?;
     if missing.len() > 1 {
@@ -257,7 +281,17 @@ pub(crate) async fn compile_workspace(
             making.build_unit(index, &mut log).await?;
         }
     }
-    making.merge_layers().await
+    let package = making.merge_layers(MergedOwner::Root).await?;
+    let mut underlay = None;
+    if build.request.as_underlay {
+        let compile = making.merge_layers(MergedOwner::CompilingUser).await?;
+        underlay = to_underlay(&package, &compile);
+    }
+    Ok(CompiledWorkspace { package, underlay })
+}
+
+fn to_underlay(run: &LayerSet, compile: &LayerSet) -> Option<UnderlayLayer> {
+    Some(UnderlayLayer { run: run.diff_ids().next()?, compile: compile.diff_ids().next()? })
 }
 
 /// Returns the cached layer of a key.
@@ -427,14 +461,36 @@ impl WorkspaceBuild<'_> {
         Ok(trees)
     }
 
-    fn whole_key(&self) -> String {
-        Key::new("workspace").inputs("unit", &self.keys).finish()
+    fn whole_key(&self, owner: MergedOwner) -> String {
+        let name = match owner {
+            MergedOwner::Root => "workspace",
+            MergedOwner::CompilingUser => "underlay",
+        };
+        Key::new(name).inputs("unit", &self.keys).finish()
     }
 
-    /// Merges all packages into the layer of the image, as if they had been installed one after the other.
-    async fn merge_layers(self) -> Result<LayerSet, Error> {
+    async fn find_layer(&self, owner: MergedOwner) -> Result<Option<LayerSet>, Error> {
+        let found = cached_layer(self.build, &self.whole_key(owner)).await?;
+        Ok(found.map(|diff_id| LayerSet::single(diff_id, true)))
+    }
+
+    /// Returns the cached layers of all packages, if there are all that are needed.
+    async fn find_merged(&self) -> Result<Option<CompiledWorkspace>, Error> {
+        let Some(package) = self.find_layer(MergedOwner::Root).await? else {
+            return Ok(None);
+        };
+        if !self.build.request.as_underlay {
+            return Ok(Some(CompiledWorkspace { package, underlay: None }));
+        }
+        let underlay = self.find_layer(MergedOwner::CompilingUser).await?;
+        let underlay = underlay.and_then(|compile| to_underlay(&package, &compile));
+        Ok(underlay.map(|underlay| CompiledWorkspace { package, underlay: Some(underlay) }))
+    }
+
+    /// Merges all packages into one layer, as if they had been installed one after the other.
+    async fn merge_layers(&self, owner: MergedOwner) -> Result<LayerSet, Error> {
         let shop = &self.build.shop;
-        let key = self.whole_key();
+        let key = self.whole_key(owner);
         let turn = shop.lock_key(&key).await;
         if let Some(diff_id) = cached_layer(self.build, &key).await? {
             return Ok(LayerSet::single(diff_id, true));
@@ -451,7 +507,10 @@ impl WorkspaceBuild<'_> {
             key,
             made_from: made_from.collect(),
             tree,
-            options: compile::package_options(&self.build.base, servant::rootfs::COMPILE_USER),
+            options: match owner {
+                MergedOwner::Root => compile::package_options(&self.build.base, servant::rootfs::COMPILE_USER),
+                MergedOwner::CompilingUser => compile::package_options(&self.build.base, 0),
+            },
             directory,
             turn,
         };

@@ -1,13 +1,15 @@
 //! Shared context of the steps of a build: the work directory, the layer cache, and locks on keys.
 //!
 //! A new layer is created in two stages: first its extracted tree, which the next step can use at once; then,
-//! concurrently, the compressed archive for the image and the cache.
+//! concurrently, the compressed archive for the image and the cache. Both are completed even if the build is cancelled
+//! meanwhile: the next push of the same sources goes on from there.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use image::{Digest, TreeOptions};
+use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
 use crate::cache::{LayerCache, LayerEntry};
@@ -71,11 +73,14 @@ impl BuildContext {
         packing: PackJob,
         record: impl FnOnce(u64) -> Result<(), Error> + Send + 'static,
     ) -> Result<Digest, Error> {
-        let store = self.layers.store().clone();
-        let (tree, options) = (packing.tree.clone(), packing.options.clone());
-        let (diff_id, bytes) = crate::blocking::spawn(move || store.stage_tree(&tree, &options)).await??;
+        let (stage, staged) = oneshot::channel();
         let layers = self.layers.clone();
-        let archive = crate::blocking::spawn(move || -> Result<_, Error> {
+        let work = move || -> Result<(), Error> {
+            // Of its own: that of the build ends with it.
+            let _hold = layers.store().hold()?;
+            let (diff_id, bytes) = layers.store().stage_tree(&packing.tree, &packing.options)?;
+            // Nobody listens any more if the build was cancelled.
+            let _ = stage.send(diff_id);
             let layer = layers.store().layer_from_tree(&packing.tree, &packing.options)?;
             if layer.diff_id != diff_id {
                 return Err(
@@ -86,9 +91,17 @@ impl BuildContext {
             record(bytes)?;
             drop(packing.turn);
             Ok(foreign::remove(&packing.directory)?)
-        });
+        };
+        // Before anything is awaited, since the build may be cancelled at any await.
+        let archive = crate::blocking::spawn_until(self.layers.ending().clone(), work);
         self.packing.lock().unwrap_or_else(PoisonError::into_inner).push(archive);
-        Ok(diff_id)
+        match staged.await {
+            Ok(diff_id) => Ok(diff_id),
+            Err(_) => {
+                self.wait_until_packed().await?;
+                Err(Error::NotPacked)
+            }
+        }
     }
 
     /// Returns whether archives are still in progress.
@@ -127,6 +140,13 @@ impl BuildContext {
     }
 }
 
+impl Drop for BuildContext {
+    fn drop(&mut self) {
+        let packing = std::mem::take(&mut *self.packing.lock().unwrap_or_else(PoisonError::into_inner));
+        self.site.keep_while(packing);
+    }
+}
+
 /// A push, as reported to others.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct PushLabel {
@@ -149,7 +169,12 @@ struct KeyLock {
 
 impl KeyLocks {
     /// Waits for a lock, which is released when the guard is dropped. `progress` receives the name of the lock holder.
-    async fn lock(&self, key: &str, push: &PushLabel, progress: &Progress) -> tokio::sync::OwnedMutexGuard<()> {
+    pub(crate) async fn lock(
+        &self,
+        key: &str,
+        push: &PushLabel,
+        progress: &Progress,
+    ) -> tokio::sync::OwnedMutexGuard<()> {
         let turn = {
             let mut all = lock_unpoisoned(&self.0);
             // The guard of a lock holds only the inner mutex.
@@ -183,12 +208,61 @@ fn lock_unpoisoned<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
-    use crate::event::BuildEvent;
+    use std::fs::File;
 
     use super::*;
+    use crate::builder::Builder;
+    use crate::builder::tests::{new_builder, new_context};
+    use crate::event::BuildEvent;
 
     fn push(name: &str) -> PushLabel {
         PushLabel { id: format!("push-{name}"), name: name.to_owned() }
+    }
+
+    /// Begins to pack a compiled package under a key while nothing can be packed, and cancels the build meanwhile.
+    async fn cancel_while_packing(builder: &Builder, id: &str, key: &str) {
+        let context = new_context(builder, id);
+        let directory = context.site.fresh_directory("compile").expect("made");
+        let tree = directory.join("tree");
+        std::fs::create_dir(&tree).expect("made");
+        std::fs::write(tree.join("node"), key).expect("written");
+        let store = File::open(context.layers.store().layers_dir()).expect("a store");
+        rustix::fs::flock(&store, rustix::fs::FlockOperation::NonBlockingLockExclusive).expect("free");
+        let packing = PackJob {
+            key: key.to_owned(),
+            made_from: Vec::new(),
+            tree,
+            options: TreeOptions::default(),
+            directory,
+            turn: context.lock_key(key).await,
+        };
+        let mut building = Box::pin(crate::blocking::cancellable(context.pack(packing, |_| Ok(()))));
+        tokio::select! {
+            biased;
+            packed = &mut building => panic!("the store is locked: {packed:?}"),
+            () = std::future::ready(()) => {}
+        }
+        drop(building);
+        drop(context);
+    }
+
+    #[tokio::test]
+    async fn what_a_cancelled_build_has_compiled_is_kept() {
+        let place = tempfile::tempdir().expect("a directory");
+        let builder = new_builder(place.path());
+        cancel_while_packing(&builder, "b1", "compiled").await;
+        builder.wait_removed("b1").await;
+        assert!(builder.layers().contains("compiled"));
+        let next = new_context(&builder, "b2");
+        drop(next.lock_key("compiled").await);
+        assert!(next.get_cached("compiled").await.expect("read").is_some());
+        assert!(!place.path().join("build/b1").exists());
+        // The daemon does not wait for it.
+        builder.stop_packing();
+        cancel_while_packing(&builder, "b3", "given-up").await;
+        builder.wait_removed("b3").await;
+        assert!(!builder.layers().contains("given-up"));
+        assert!(!place.path().join("build/b3").exists());
     }
 
     #[tokio::test]

@@ -184,3 +184,61 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     ensure!(!outcome.output().contains("compil"), "{}", outcome.output());
     Ok(())
 }
+
+/// Writes a package of Python for ROS 2 below `workspace`, with one module and perhaps a program `go` in its `node.py`.
+fn write_python_package(
+    workspace: &Path,
+    name: &str,
+    needs: &str,
+    (module, files): (&str, &[(&str, &str)]),
+) -> Verdict {
+    let has_program = files.iter().any(|(file, _)| *file == "node.py");
+    let program = if has_program { format!("'go = {module}.node:main'") } else { String::new() };
+    let setup = format!(
+        "from setuptools import setup\nsetup(name='{name}', version='1.0.0', packages=['{module}'],\n\
+         data_files=[('share/ament_index/resource_index/packages', ['resource/{name}']),\n\
+         ('share/{name}', ['package.xml'])],\nentry_points={{'console_scripts': [{program}]}})\n"
+    );
+    let built = "<export><build_type>ament_python</build_type></export>";
+    let directory = workspace.join("src").join(name);
+    write_files(
+        &directory,
+        &[
+            ("package.xml", manifest(name, &format!("{needs}{built}"))),
+            ("setup.py", setup),
+            ("setup.cfg", format!("[install]\ninstall_scripts=$base/lib/{name}\n")),
+            (&format!("resource/{name}"), String::new()),
+        ],
+    )?;
+    let files: Vec<(&str, String)> = files.iter().map(|(file, text)| (*file, (*text).to_owned())).collect();
+    write_files(&directory.join(module), &files)
+}
+
+/// As tf2_ros, which Python nodes name in their package.xml and find in tf2_ros_py.
+pub fn a_dependency_is_met_by_a_package_of_another_name() -> Verdict {
+    let daemon = world().ensure_shared()?;
+    let place = tempfile::tempdir()?;
+    let doubling = [("__init__.py", "def double(number):\n    return 2 * number\n")];
+    write_python_package(place.path(), "lab_maths_py", "", ("lab_maths", &doubling))?;
+    let node = "import rclpy\nfrom std_msgs.msg import String\n\nfrom lab_maths import double\n\n\n\
+                def main():\n    rclpy.init()\n    node = rclpy.create_node('app')\n\
+                \x20   said = node.create_publisher(String, '/said', 1)\n\
+                \x20   node.create_timer(0.2, lambda: said.publish(String(data=str(double(21)))))\n\
+                \x20   rclpy.spin(node)\n";
+    let needs = "<depend>rclpy</depend><depend>std_msgs</depend><depend>lab_maths</depend>";
+    let package = [("__init__.py", ""), ("node.py", node)];
+    write_python_package(place.path(), "lab_app", needs, ("lab_app", &package))?;
+    let push = ["push", path_str(place.path()), "--name", "met", "--node", "lab_app/go"];
+    daemon.deployer().run(&push)?.expect_success()?;
+    let mut robot = daemon.robot("met")?;
+    robot.subscribe("/said")?;
+    let said = robot.next_message_on("/said")?;
+    ensure!(said["data"] == "42", "{said}");
+    // What nothing provides is met where the deployer says so.
+    let more = format!("{needs}<depend>lab_flags</depend><depend>lab_flux</depend>");
+    write_python_package(place.path(), "lab_app", &more, ("lab_app", &package))?;
+    daemon.deployer().run(&push)?.expect_failure(&["lab_flags (wanted by lab_app)", "lab_flux", "--map KEY="])?;
+    let met = ["--map", "lab_flags=", "--map", "lab_flux=lab_maths_py"];
+    daemon.deployer().run(&[&push[..], &met].concat())?.expect_success()?;
+    Ok(())
+}

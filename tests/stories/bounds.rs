@@ -184,6 +184,36 @@ pub fn a_push_outlives_its_client() -> Verdict {
     Ok(())
 }
 
+pub fn what_a_push_lacks_is_told_before_it_waits_for_others() -> Verdict {
+    let daemon = world().setup("told-first").config("[push]\nat_once = 1\n").start()?;
+    let deployer = daemon.deployer();
+    let place = world().directory("told-first-packages")?;
+    let sleeper = write_package(place.path(), "sleeps_first", SLEEPER)?;
+    let detached = deployer.run(&["push", path_str(&sleeper), "--node", "x", "--detach"])?.expect_success()?;
+    let number: u64 = detached.stdout.trim().parse()?;
+    let is_running = |pushes: &Value| {
+        let push = pushes.as_array()?.iter().find(|push| push["number"] == number)?;
+        push["step"].as_str()?.starts_with("compiling").then(|| push["state"].clone())
+    };
+    daemon.wait_for("/api/v1/pushes", "the first push builds", is_running)?;
+    let needy = write_package(place.path(), "needs_warp", "")?;
+    let manifest = std::fs::read_to_string(needy.join("package.xml"))?;
+    let needs = "<depend>no_such_warp_drive</depend></package>";
+    std::fs::write(needy.join("package.xml"), manifest.replace("</package>", needs))?;
+    let choosy = write_package(place.path(), "choosy_twice", "")?;
+    let list = std::fs::read_to_string(choosy.join("CMakeLists.txt"))?;
+    std::fs::write(choosy.join("it.cpp"), "this is never compiled\n")?;
+    let programs = "add_executable(left it.cpp)\nadd_executable(right it.cpp)\n";
+    std::fs::write(choosy.join("CMakeLists.txt"), format!("{list}{programs}"))?;
+    for (package, words) in [(&needy, "no_such_warp_drive"), (&choosy, "choose what to run with --node or --launch")] {
+        deployer.run(&["push", path_str(package)])?.expect_failure(&[words])?;
+    }
+    let pushes = daemon.get_json("/api/v1/pushes")?;
+    ensure!(is_running(&pushes) == Some("running".into()), "{pushes:#}");
+    deployer.run(&["pushes", "cancel", &number.to_string()])?.expect_success()?;
+    Ok(())
+}
+
 pub fn a_push_ends_with_what_its_deployer_showed() -> Verdict {
     let daemon = world().setup("disowned").start()?;
     let place = world().directory("disowned-packages")?;

@@ -222,6 +222,29 @@ pub fn what_was_compiled_before_a_failure_stays_compiled() -> Verdict {
     Ok(())
 }
 
+pub fn what_a_cancelled_push_has_compiled_stays_compiled() -> Verdict {
+    let daemon = world().ensure_shared()?;
+    let deployer = daemon.deployer();
+    let place = tempfile::tempdir()?;
+    let workspace = write_workspace(place.path(), "<depend>aa_lib</depend>")?;
+    let list = workspace.join("src/bb_app/CMakeLists.txt");
+    let good = std::fs::read_to_string(&list)?;
+    // Not while it is configured, which comes before the library is compiled.
+    std::fs::write(&list, format!("{good}add_custom_target(endless ALL COMMAND sleep infinity)\n"))?;
+    let push = ["push", path_str(&workspace), "--name", "called_off", "--node", "bb_app/app", "--detach"];
+    let number: u64 = deployer.run(&push)?.expect_success()?.stdout.trim().parse()?;
+    daemon.wait_for("/api/v1/pushes", "the node is compiled", |pushes| {
+        let push = pushes.as_array()?.iter().find(|push| push["number"] == number)?;
+        push["step"].as_str()?.starts_with("compiling bb_app").then_some(())
+    })?;
+    deployer.run(&["pushes", "cancel", &number.to_string()])?.expect_success()?;
+    std::fs::write(&list, &good)?;
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "called_off")?;
+    outcome.expect_success()?;
+    ensure!(compiled_packages(&steps) == ["bb_app"], "{steps:?}");
+    Ok(())
+}
+
 pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Verdict {
     let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;

@@ -44,7 +44,8 @@ impl BenchDaemon {
 }
 
 /// Beginnings of the titles of steps before the build.
-const PREPARING: [&str; 3] = ["receiving", "looking at what was pushed", "reading the package lists"];
+const PREPARING: [&str; 4] =
+    ["receiving", "looking at what was pushed", "reading the package lists", "preparing the build"];
 
 impl TimedPush {
     /// Returns the final event.

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::Millis;
 
 /// Kinds of events of this version, sorted; docs/operators.md describes them.
-pub const EVENT_KINDS: [&str; 64] = [
+pub const EVENT_KINDS: [&str; 66] = [
     "base-imported",
     "base-removed",
     "certificate-not-renewed",
@@ -69,6 +69,8 @@ pub const EVENT_KINDS: [&str; 64] = [
     "terms",
     "terms-changed",
     "terms-refused",
+    "underlay-published",
+    "underlay-removed",
     "warm-failed",
 ];
 

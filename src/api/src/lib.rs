@@ -39,6 +39,7 @@ pub mod stream;
 pub mod stub;
 pub mod topics;
 pub mod trial;
+pub mod underlays;
 
 pub use calibration::{Calibration, CalibrationEvent, CalibrationOptions};
 pub use count::count;
@@ -64,6 +65,7 @@ pub use size::Size;
 pub use sla::{Measure, Sla, Span, Stated};
 pub use status::{Capacity, Clock, Isolation, Status};
 pub use stub::Stubs;
+pub use underlays::{StandingService, Underlay};
 
 /// Media type of streams: one JSON value per line.
 pub const NDJSON: &str = "application/x-ndjson";

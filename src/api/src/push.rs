@@ -10,6 +10,7 @@ use crate::limits::{Caps, Limits};
 use crate::problem::Problem;
 use crate::service::ServiceDetail;
 use crate::sla::Sla;
+use crate::underlays::Underlay;
 pub use qos::ParsePairError;
 
 /// Options of a push (`POST /api/v1/push?options=JSON`; the body is a tar archive, gzipped or not; empty with `apt`).
@@ -45,7 +46,8 @@ pub struct PushOptions {
     /// Additions to the interface, where the push cannot find all of it: the text of a TOML or JSON file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub interface: Option<String>,
-    /// Manual dependency mapping: rosdep key or ROS package → Debian package.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian packages, or packages of the push or the base; empty
+    /// for a key that needs none.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
     /// Request pairs that override those found by the push: `INPUT=OUTPUT`, or as in a robot's stub.toml,
@@ -64,6 +66,12 @@ pub struct PushOptions {
     /// Arguments of CMake for the packages of the push, such as `-DWITH_QT=OFF`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cmake_args: Vec<String>,
+    /// Underlays to compile and run upon; of two, the later one lies above.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub on: Vec<String>,
+    /// Name under which the workspace becomes an underlay for others, instead of a service.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub as_underlay: Option<String>,
     /// Resource limits of a servant; limits that are given are also reserved.
     pub limits: Limits,
     /// Upper limits on what robots may request.
@@ -127,7 +135,7 @@ impl PushEvent {
     }
 }
 
-/// One line of the response. The last line is `done` or `error`; a stream that ends otherwise was truncated.
+/// One line of the response. The last line is `done`, `underlay` or `error`; a stream that ends otherwise was truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
@@ -178,6 +186,18 @@ pub enum PushEvent {
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
         unchanged: bool,
     },
+    /// The underlay is published, or was already.
+    Underlay {
+        /// The published underlay.
+        underlay: Box<Underlay>,
+        /// Its layers.
+        layers: Vec<Layer>,
+        /// Duration of the push in milliseconds, from the first byte.
+        took: u64,
+        /// True if it is the same as before, and no revision was published.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        unchanged: bool,
+    },
     /// The push failed; an earlier revision remains in service.
     Error {
         /// Reason of the failure, and the next step.
@@ -189,7 +209,7 @@ pub enum PushEvent {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Layer {
-    /// Name of the layer: `base`, `dependencies` or `package`.
+    /// Name of the layer: `base`, `dependencies`, `underlay` or `package`.
     pub name: String,
     /// Digest of the compressed layer.
     pub digest: String,

@@ -18,6 +18,7 @@ mod owned;
 mod publish;
 pub mod stubs;
 mod unchanged;
+mod underlays;
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -9,8 +9,8 @@ use crate::inventory::digest;
 use crate::{Catalogue, Error, blocking};
 
 impl Catalogue {
-    /// Returns the compressed size of the layers of all images of a deployer's services, counting each layer once,
-    /// including those of `image`, which need not be published yet.
+    /// Returns the compressed size of the layers of all images of a deployer's services and underlays, counting each
+    /// layer once, including those of `image`, which need not be published yet.
     pub async fn owner_image_bytes(&self, owner: &str, image: Option<&str>) -> Result<u64, Error> {
         let (state, images) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let (owner, image) = (owner.to_owned(), image.map(str::to_owned));
@@ -24,6 +24,9 @@ impl Catalogue {
                 for revision in state.revisions(&service)? {
                     add_layers(&images, &revision.image, &mut layers)?;
                 }
+            }
+            for underlay in state.underlays()?.iter().filter(|one| one.owner.as_deref() == Some(owner.as_str())) {
+                add_layers(&images, &underlay.image, &mut layers)?;
             }
             if let Some(image) = image {
                 add_layers(&images, &image, &mut layers)?;

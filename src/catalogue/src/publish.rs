@@ -9,6 +9,7 @@ use package::inventory::Inventory;
 use store::{RevisionRecord, RevisionSummary};
 
 use crate::inventory::digest;
+use crate::underlays::tag_name;
 use crate::{Catalogue, Error, blocking};
 
 /// Result of a rollback.
@@ -149,6 +150,11 @@ impl Catalogue {
                 }
                 wanted.insert(service);
             }
+            for underlay in state.underlays()? {
+                let name = tag_name(&underlay.name);
+                keep(&name, &underlay.image)?;
+                wanted.insert(name);
+            }
             for tag in tagged.keys().filter(|tag| !wanted.contains(*tag)) {
                 store.untag(tag)?;
             }
@@ -179,7 +185,7 @@ fn tag_current(store: &Store, service: &str, image: &str) -> Result<(), Error> {
     set_tag(store, service, image)
 }
 
-fn set_tag(store: &Store, name: &str, image: &str) -> Result<(), Error> {
+pub(crate) fn set_tag(store: &Store, name: &str, image: &str) -> Result<(), Error> {
     match store.tag(name, &digest(image)?) {
         Err(error @ image::Error::UnknownImage { .. }) => {
             tracing::error!("{name} cannot be served: {error}");

@@ -19,7 +19,10 @@ const DESCRIPTIONS: usize = 15;
 
 /// Verbs by what they are about.
 const GROUPS: [(&str, &[&str]); 7] = [
-    ("Services", &["push", "pushes", "services", "rollback", "rollout", "diff", "rm", "export", "import", "bases"]),
+    (
+        "Services",
+        &["push", "pushes", "services", "rollback", "rollout", "diff", "rm", "export", "import", "bases", "underlays"],
+    ),
     ("Servants and robots", &["servants", "top", "logs", "exec", "set", "stop", "explain", "fit", "events"]),
     ("Topics, actions and recordings", &["topics", "goals", "record", "replay", "recordings"]),
     ("Measuring", &["try", "calibrate", "sla", "eval", "shadow"]),
@@ -31,7 +34,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 /// Options of `push` by what they are about; all others are under Options.
 const SECTIONS: [(&str, &[&str]); 5] = [
     ("What runs", &["launch", "node", "param", "arg", "remap"]),
-    ("Build", &["base", "map", "with", "packages-up-to", "packages-skip", "cmake-args"]),
+    ("Build", &["base", "map", "with", "on", "as-underlay", "packages-up-to", "packages-skip", "cmake-args"]),
     ("Interface and requests", &["interface", "request", "stateful", "rrt", "max-rrt"]),
     (
         "Servants",
@@ -61,7 +64,7 @@ const SECTIONS: [(&str, &[&str]); 5] = [
 ];
 
 /// Verbs that list things by name, with `list` of all others.
-const LISTING: [&str; 6] = ["services", "servants", "sessions", "bases", "pushes", "list"];
+const LISTING: [&str; 7] = ["services", "servants", "sessions", "bases", "underlays", "pushes", "list"];
 
 /// Arranges the help of the whole command line.
 pub fn arrange(command: Command) -> Command {

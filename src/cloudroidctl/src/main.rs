@@ -58,6 +58,7 @@ mod top;
 mod topics;
 mod trial;
 mod trust;
+mod underlays;
 mod version;
 mod wait;
 mod whole;
@@ -131,6 +132,8 @@ enum CtlCommand {
     Import(Box<import::ImportArgs>),
     #[command(visible_alias = "base")]
     Bases(bases::BasesArgs),
+    #[command(visible_alias = "underlay")]
+    Underlays(underlays::UnderlaysArgs),
     Rollout(rollout::RolloutArgs),
     Stub(stub::StubArgs),
     Try(Box<trial::TryArgs>),
@@ -165,7 +168,8 @@ fn parse(words: Vec<OsString>) -> Result<CtlArguments, clap::Error> {
         arguments.format = OutputChoice::Name;
     }
     if arguments.format == OutputChoice::Name && !help::is_listing(&matches) {
-        let message = "names are printed by verbs that list: services, servants, bases, pushes, and list of others\n";
+        let message =
+            "names are printed by verbs that list: services, servants, bases, underlays, pushes, and list of others\n";
         return Err(command_line().error(ErrorKind::ArgumentConflict, message));
     }
     Ok(arguments)
@@ -239,6 +243,7 @@ async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
         CtlCommand::Export(verb) => verb.run(&client, format).await,
         CtlCommand::Import(verb) => verb.run(&client, format).await,
         CtlCommand::Bases(verb) => verb.run(&client, format).await,
+        CtlCommand::Underlays(verb) => verb.run(&client, format).await,
         CtlCommand::Rollout(verb) => verb.run(&client, format).await,
         CtlCommand::Stub(verb) => verb.run(&client, format).await,
         CtlCommand::Try(verb) => verb.run(&client, format).await,

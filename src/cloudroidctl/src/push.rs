@@ -78,8 +78,9 @@ pub struct PushArgs {
     /// Base image definition (default: one that fits the package's ROS).
     #[arg(long, value_name = "BASE")]
     base: Option<String>,
-    /// Debian package that provides a dependency; may be given several times.
-    #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
+    /// Debian package, or package of the workspace or base, that provides a dependency; KEY= if it needs nothing. May be
+    /// given several times.
+    #[arg(long = "map", value_name = "KEY=PACKAGE", value_parser = mapping)]
     map: Vec<(String, String)>,
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
@@ -91,6 +92,13 @@ pub struct PushArgs {
     /// Do not build this package of the workspace; may be given several times.
     #[arg(long = "packages-skip", value_name = "PKG")]
     packages_skip: Vec<String>,
+    /// Compile and run upon this underlay, as pushed with --as-underlay; may be given several times, or with commas. Of
+    /// two, the later one lies above.
+    #[arg(long, value_name = "UNDERLAY", value_delimiter = ',')]
+    on: Vec<String>,
+    /// Publish the workspace as an underlay of this name, for others to compile and run upon, instead of a service.
+    #[arg(long = "as-underlay", value_name = "NAME", conflicts_with_all = ["apt", "name", "launch", "nodes"])]
+    as_underlay: Option<String>,
     /// Arguments of CMake for the packages of the push: --cmake-args '-DWITH_QT=OFF -DCMAKE_BUILD_TYPE=Release'; may be
     /// given several times.
     #[arg(long = "cmake-args", value_name = "ARGS", allow_hyphen_values = true)]
@@ -170,8 +178,8 @@ fn volume(text: &str) -> anyhow::Result<Volume> {
 
 fn mapping(text: &str) -> anyhow::Result<(String, String)> {
     match text.split_once('=') {
-        Some((key, package)) if !key.is_empty() && !package.is_empty() => Ok((key.to_owned(), package.to_owned())),
-        _ => bail!("write KEY=DEB"),
+        Some((key, package)) if !key.is_empty() => Ok((key.to_owned(), package.to_owned())),
+        _ => bail!("write KEY=PACKAGE, or KEY= for a dependency that needs no package"),
     }
 }
 
@@ -224,7 +232,7 @@ impl PushArgs {
         self.publish(client, format, stop).await.map(|_| ())
     }
 
-    /// Publishes the package; `None` if the push goes on without this command. `on_interrupt` decides what becomes of
+    /// Publishes the package; `None` if the push goes on without this command, and for an underlay. `on_interrupt` decides what becomes of
     /// the push with this number.
     async fn publish(
         self,
@@ -310,6 +318,8 @@ impl PushArgs {
             with: self.with.clone(),
             packages_up_to: self.packages_up_to.clone(),
             packages_skip: self.packages_skip.clone(),
+            on: self.on.clone(),
+            as_underlay: self.as_underlay.clone(),
             cmake_args: self.cmake_args.iter().flat_map(|text| text.split_whitespace()).map(str::to_owned).collect(),
             limits: self.limits.into(),
             caps: self.caps.into(),
@@ -389,7 +399,7 @@ fn continuation(number: u64) -> String {
 }
 
 /// Sends the package and shows the progress until the push ends; with `detach` only until the package is sent. Returns
-/// `None` if the push continues.
+/// `None` if the push continues, and for an underlay.
 async fn send(
     client: &DaemonClient,
     progress: &mut PushProgress,
@@ -447,6 +457,8 @@ async fn send(
                 state.publishing.store(true, Ordering::Relaxed);
             }
             PushEvent::Done { service, .. } => return Ok(Some(*service)),
+            // Nothing of it is run, so there is nothing to describe.
+            PushEvent::Underlay { .. } => return Ok(None),
             PushEvent::Error { problem } => {
                 return Err(packing_error(packing).unwrap_or_else(|| problem.into()));
             }
@@ -546,6 +558,19 @@ mod tests {
     }
 
     #[test]
+    fn underlays_are_named_one_by_one_or_with_commas() {
+        let options = |line: &str| parse(line).expect(line).options().expect("no file is read");
+        assert_eq!(options("./ws --on maps,arms --on lab").on, ["maps", "arms", "lab"]);
+        let underlay = options("./ws --as-underlay maps --on lab --packages-skip demo");
+        assert_eq!((underlay.as_underlay.as_deref(), &underlay.on[..]), (Some("maps"), &["lab".to_owned()][..]));
+        for line in
+            ["--apt p --as-underlay maps", "./ws --as-underlay maps --node a", "./ws --as-underlay maps --name a"]
+        {
+            assert_eq!(parse(line).expect_err(line).exit_code(), 2, "{line}");
+        }
+    }
+
+    #[test]
     fn packages_are_selected_in_colcons_words() {
         let words = [
             "push",
@@ -595,7 +620,8 @@ mod tests {
         // Chosen with controls of the form that are not fields.
         let chosen = ["--apt", "--stateful", "--shared", "--idempotent"];
         // The service's own page shows the progress of a rollout while it is open, and a page may always be left.
-        let needless = ["--wait", "--detach"];
+        // An underlay is no service, which the page is about.
+        let needless = ["--wait", "--detach", "--as-underlay"];
         let command = Line::command();
         let flags: Vec<String> =
             command.get_arguments().filter_map(|argument| Some(format!("--{}", argument.get_long()?))).collect();
@@ -652,7 +678,8 @@ mod tests {
             "./pkg --param :=v",
             "./pkg --arg a",
             "./pkg --remap a",
-            "./pkg --map key=",
+            "./pkg --map key",
+            "./pkg --map =deb",
             "./pkg --request /image",
             "./pkg --request image=/boxes",
             "./pkg --cpus none",

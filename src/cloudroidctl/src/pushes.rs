@@ -116,7 +116,7 @@ impl PushLogs {
             }
             match event {
                 PushEvent::Error { problem } if self.follow => return Err(problem.into()),
-                PushEvent::Error { .. } | PushEvent::Done { .. } => is_over = true,
+                PushEvent::Error { .. } | PushEvent::Done { .. } | PushEvent::Underlay { .. } => is_over = true,
                 _ => {}
             }
         }
@@ -134,7 +134,7 @@ impl CancelPush {
         let path = format!("/api/v1/pushes/{number}/output?follow=true");
         let mut events = client.get_lines::<PushEvent>(&path).await?;
         while let Some(event) = events.next().await {
-            if let PushEvent::Done { .. } = event? {
+            if let PushEvent::Done { .. } | PushEvent::Underlay { .. } = event? {
                 bail!("push {number} was published before it could be cancelled");
             }
         }
@@ -153,6 +153,10 @@ fn print(event: &PushEvent) -> anyhow::Result<()> {
         PushEvent::Done { service, took, unchanged, .. } => {
             let outcome = if *unchanged { "unchanged:" } else { "published" };
             output::line(&format!("== {outcome} {} in {:.1} s", service.summary.name, *took as f64 / 1000.0))
+        }
+        PushEvent::Underlay { underlay, took, unchanged, .. } => {
+            let outcome = if *unchanged { "unchanged:" } else { "published" };
+            output::line(&format!("== {outcome} underlay {} in {:.1} s", underlay.name, *took as f64 / 1000.0))
         }
         PushEvent::Error { problem: Problem { detail, .. } } => output::line(&format!("== failed: {detail}")),
         PushEvent::Accepted { .. } | PushEvent::Progress { .. } => Ok(()),

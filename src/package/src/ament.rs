@@ -24,6 +24,23 @@ pub fn packages<L: AsRef<Path>, P: AsRef<str>>(layers: &[L], prefixes: &[P]) -> 
     Ok(found)
 }
 
+/// Returns the names of the Python modules in install spaces (absolute paths in the layers), which lie in
+/// `lib/pythonX.Y/site-packages`. `layers` are extracted trees, lowest first. Blocking.
+pub fn modules<L: AsRef<Path>, P: AsRef<str>>(layers: &[L], prefixes: &[P]) -> Result<BTreeSet<String>, Error> {
+    let stack = merged::open_layers(layers)?;
+    let mut found = BTreeSet::new();
+    for prefix in prefixes {
+        let library = MergedDirectory::open_path(&stack, &format!("{}/lib", prefix.as_ref()))?;
+        for version in library.names()?.into_keys().filter(|name| name.starts_with(b"python3")) {
+            let modules = library.open_child(&version)?.open_child(b"site-packages")?;
+            let names = modules.names()?.into_keys();
+            let names = names.filter_map(|name| String::from_utf8(name).ok());
+            found.extend(names.filter(|name| names::is_type(name)));
+        }
+    }
+    Ok(found)
+}
+
 pub(crate) fn packages_in(stack: &[LayerDirectory], prefix: &str) -> Result<BTreeSet<String>, Error> {
     let index = MergedDirectory::open_path(stack, &format!("{prefix}/{INDEX}/packages"))?;
     let names = index.names()?.into_keys();
@@ -56,6 +73,17 @@ pub(crate) fn components(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn modules_are_directories_of_site_packages() {
+        let root = tempfile::tempdir().expect("a directory");
+        for path in ["python3.11/site-packages/tf2_ros/a", "python3.11/site-packages/tf2_ros-1.0.dist-info/a", "x/y/z"]
+        {
+            std::fs::create_dir_all(root.path().join("opt/ros/jazzy/lib").join(path)).expect("made");
+        }
+        let found = modules(&[root.path()], &["/opt/ros/jazzy", "/opt/none"]).expect("read");
+        assert_eq!(found, BTreeSet::from(["tf2_ros".to_owned()]));
+    }
 
     #[test]
     fn packages_of_all_spaces_and_layers_are_found() {

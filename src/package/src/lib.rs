@@ -34,6 +34,7 @@ pub mod manifest;
 mod merged;
 pub mod names;
 mod order;
+pub mod provided;
 mod read;
 mod request;
 pub mod requests;

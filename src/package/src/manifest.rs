@@ -35,6 +35,8 @@ pub struct Manifest {
     pub groups: BTreeSet<String>,
     /// Groups all of whose members are needed to build it (format 3).
     pub group_dependencies: BTreeSet<String>,
+    /// Packages or rosdep keys that the package replaces (`<replace>`).
+    pub replaces: BTreeSet<String>,
     /// True for a metapackage.
     pub metapackage: bool,
 }
@@ -68,6 +70,11 @@ pub enum Kind {
 }
 
 impl Kind {
+    /// Returns whether a package of another name is needed to build or run it.
+    pub fn is_needed(self) -> bool {
+        !matches!(self, Self::Test | Self::Doc)
+    }
+
     /// Returns the kinds that an element stands for in a format; `None` if the format does not define it.
     fn from_element(element: &str, format: u8) -> Option<&'static [Self]> {
         Some(match (element, format) {
@@ -103,6 +110,15 @@ impl Manifest {
     /// Returns whether the package needs a group that another one is a member of.
     pub fn needs_group_of(&self, other: &Self) -> bool {
         !self.group_dependencies.is_disjoint(&other.groups)
+    }
+
+    /// Returns whether at most the Python module of a dependency can be meant: the package itself consists of Python, or
+    /// needs it only at run time.
+    pub fn needs_as_module(&self, name: &str) -> bool {
+        // Looked up, since a package may have any number of dependencies.
+        let needs = |kind: Kind| self.dependencies.contains(&Dependency { name: name.to_owned(), kind });
+        self.build_type == "ament_python"
+            || ![Kind::Buildtool, Kind::BuildtoolExport, Kind::Build, Kind::BuildExport].into_iter().any(needs)
     }
 
     /// Returns the names of the dependencies of any of `kinds`.
@@ -148,6 +164,7 @@ impl<'a> ManifestReader<'a> {
         let (build_type, metapackage) = self.export(root)?;
         let groups = self.groups(root, "member_of_group", format)?;
         let group_dependencies = self.groups(root, "group_depend", format)?;
+        let replaces = self.names_in(root, "replace", "dependency")?;
         Ok(Manifest {
             format,
             name,
@@ -158,6 +175,7 @@ impl<'a> ManifestReader<'a> {
             build_type,
             groups,
             group_dependencies,
+            replaces,
             metapackage,
         })
     }
@@ -211,16 +229,20 @@ impl<'a> ManifestReader<'a> {
 
     /// Returns the names of groups in elements of this name.
     fn groups(&self, root: Node<'a, 'a>, element: &str, format: u8) -> Result<BTreeSet<String>, Error> {
-        let nodes = match format {
-            3.. => self.children(root, element)?,
-            _ => Vec::new(),
-        };
-        let named = nodes.into_iter().map(|node| {
+        match format {
+            3.. => self.names_in(root, element, "group"),
+            _ => Ok(BTreeSet::new()),
+        }
+    }
+
+    /// Returns the names in elements of this name, each of which names a `what`.
+    fn names_in(&self, root: Node<'a, 'a>, element: &str, what: &str) -> Result<BTreeSet<String>, Error> {
+        let named = self.children(root, element)?.into_iter().map(|node| {
             let name = self.text(node);
             if names::is_dependency(&name) {
                 Ok(name)
             } else {
-                Err(self.manifest_error(node, format!("{name:?} in <{element}> is not a valid group name")))
+                Err(self.manifest_error(node, format!("{name:?} in <{element}> is not a valid {what} name")))
             }
         });
         named.collect()
@@ -410,6 +432,18 @@ mod tests {
         assert!(manifest.group_dependencies.is_empty() && manifest.groups.is_empty());
         let message = refusal("<package format='3'><name>x</name><member_of_group>../g</member_of_group></package>");
         assert!(message.contains("not a valid group name"), "{message}");
+    }
+
+    #[test]
+    fn what_a_package_replaces_is_read_in_every_format() {
+        for format in 1..=3 {
+            let text = |name: &str| {
+                format!("<package format='{format}'><name>x</name><replace version_lt='2.0'>{name}</replace></package>")
+            };
+            assert_eq!(parse(&text("old_x")).unwrap().replaces, BTreeSet::from(["old_x".to_owned()]));
+            let message = refusal(&text("-o x"));
+            assert!(message.contains("\"-o x\" in <replace> is not a valid dependency name"), "{message}");
+        }
     }
 
     #[test]

@@ -15,6 +15,7 @@ use rustix::fs::FileType;
 use crate::Error;
 use crate::foreseen;
 use crate::manifest::Kind;
+use crate::provided::Providers;
 use crate::workspace::{Package, Workspace};
 
 /// Kinds of dependencies that a package needs to be built or run.
@@ -31,7 +32,7 @@ pub struct PackageQuery<'a> {
     pub launch: Option<&'a str>,
     /// Executables to run (`EXE` or `PACKAGE/EXE`) with their arguments.
     pub nodes: &'a [String],
-    /// Other texts that may name packages: values of parameters and launch arguments.
+    /// Other texts that may name packages: values of parameters, launch arguments and mappings of dependencies.
     pub texts: Vec<String>,
 }
 
@@ -91,15 +92,18 @@ fn indexes_of<'a>(packages: &'a [Package], names: &'a [String]) -> impl Iterator
     all.filter(move |(_, package)| names.contains(&package.manifest.name)).map(|(index, _)| index)
 }
 
-/// Returns, for each package, the others that it declares as dependencies.
+/// Returns, for each package, the others that it declares as dependencies, or that provide these.
 fn resolve_needs(packages: &[Package]) -> Vec<BTreeSet<usize>> {
+    let providers = Providers::new(packages);
     let needs_of = |package: &Package| {
         let named = package.manifest.needs(&NEEDS);
         let others = packages.iter().enumerate();
         let needed = others.filter(|(_, other)| {
             named.contains(other.manifest.name.as_str()) || package.manifest.needs_group_of(&other.manifest)
         });
-        needed.map(|(index, _)| index).collect()
+        let mut needed: BTreeSet<usize> = needed.map(|(index, _)| index).collect();
+        needed.extend(providers.find_all(&package.manifest));
+        needed
     };
     packages.iter().map(needs_of).collect()
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::condition::Variables;
 use crate::locate::{LocatedKind, locate};
 use crate::manifest::{Kind, Manifest};
+use crate::provided::{self, Providers};
 use crate::{Error, install_space, order};
 
 pub use crate::install_space::Layout;
@@ -26,6 +27,8 @@ pub struct Package {
     pub path: PathBuf,
     /// Content of its `package.xml`.
     pub manifest: Manifest,
+    /// Names of the Python modules in the sources of an `ament_python` package.
+    pub modules: BTreeSet<String>,
 }
 
 /// A workspace of source packages.
@@ -107,14 +110,15 @@ pub fn inspect(root: &Path, variables: &Variables) -> Result<PushedDirectory, Er
     })
 }
 
-/// Returns the dependencies of packages that are not among them, sorted by name.
+/// Returns the dependencies of packages that no one of them is or provides, sorted by name.
 pub fn external_dependencies(packages: &[Package]) -> Vec<ExternalDependency> {
     let own: BTreeSet<&str> = packages.iter().map(|package| package.manifest.name.as_str()).collect();
+    let providers = Providers::new(packages);
     let mut found: BTreeMap<&str, ExternalDependency> = BTreeMap::new();
     for package in packages {
         for dependency in &package.manifest.dependencies {
             let name = dependency.name.as_str();
-            if own.contains(name) {
+            if own.contains(name) || !providers.find(&package.manifest, name).is_empty() {
                 continue;
             }
             let external = found.entry(name).or_insert_with(|| ExternalDependency {
@@ -132,7 +136,12 @@ pub fn external_dependencies(packages: &[Package]) -> Vec<ExternalDependency> {
 /// Reads the package in `base/path`, whose links may point anywhere in `root`.
 fn read_package(root: &Path, base: &Path, path: &Path, variables: &Variables) -> Result<Package, Error> {
     let file = base.join(path).join("package.xml");
-    Ok(Package { manifest: Manifest::load(root, &file, variables)?, path: path.to_owned() })
+    let manifest = Manifest::load(root, &file, variables)?;
+    let modules = match manifest.build_type.as_str() {
+        "ament_python" => provided::find_modules(&base.join(path)),
+        _ => BTreeSet::new(),
+    };
+    Ok(Package { path: path.to_owned(), manifest, modules })
 }
 
 fn insert_unique(packages: &mut BTreeMap<String, Package>, package: Package) -> Result<(), Error> {

@@ -325,7 +325,7 @@ impl Error {
         | Error::UnknownToken { exists, .. }
         | Error::UnknownPairing { exists, .. }
         | Error::UnknownAccount { exists, .. }
-        | Error::Push(push::Error::UnknownBase { exists, .. })
+        | Error::Push(push::Error::UnknownBase { exists, .. } | push::Error::UnknownUnderlay { exists, .. })
         | Error::UnknownRule { exists, .. } = self
         {
             problem.exists = exists.clone();
@@ -479,6 +479,8 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
         P::Options(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
         P::UnknownBase { .. } => (S::NOT_FOUND, "unknown-base", "unknown base"),
+        P::UnknownUnderlay { .. } => (S::NOT_FOUND, "unknown-underlay", "unknown underlay"),
+        P::UnderlayInUse { .. } => (S::CONFLICT, "underlay-in-use", "underlay in use"),
         P::BaseNotImported(_) => (S::CONFLICT, "base-not-imported", "base not imported"),
         P::BaseNotSetUp(_) => (S::CONFLICT, "base-not-set-up", "base not set up"),
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
@@ -488,7 +490,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::Choreographer(error) => kind_of_choreographer(error),
         P::Catalogue(error) => kind_of_catalogue(error),
         P::Engine(error) => kind_of_engine(error),
-        P::State(_) | P::Image(_) | P::Internal(_) => INTERNAL,
+        P::State(_) | P::Image(_) | P::UnderlayRecord { .. } | P::Internal(_) => INTERNAL,
     }
 }
 

@@ -66,6 +66,7 @@ mod stubs;
 mod tls;
 mod tokens;
 mod topics;
+mod underlays;
 mod viewers;
 mod views;
 

@@ -3,14 +3,14 @@
 use std::io;
 use std::sync::Arc;
 
-use access::{AccessAction, ConnectionAccess};
+use access::{AccessAction, AccessObject, ConnectionAccess};
 use api::{PushEvent, PushOptions};
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, State};
 use axum::response::{IntoResponse, Response};
 use futures_util::{FutureExt, StreamExt, TryStreamExt};
-use push::{Deployer, PushResult, ReceptionGuard};
+use push::{Deployer, Published, PushResult, ReceptionGuard, UnderlayUse};
 
 use crate::app::App;
 use crate::audit::AuditObject;
@@ -45,9 +45,12 @@ pub async fn push(
     let started = pusher.start(options, by, archive, move |outcome| {
         let outcome = outcome.map_err(Error::from);
         match &outcome {
-            Ok(published) => {
-                let unchanged = if published.unchanged { ": unchanged" } else { "" };
-                let object = format!("service {}{unchanged}", published.service);
+            Ok(done) => {
+                let unchanged = if done.unchanged { ": unchanged" } else { "" };
+                let object = match &done.published {
+                    Published::Service(name) => format!("service {name}{unchanged}"),
+                    Published::Underlay(underlay) => format!("underlay {}{unchanged}", underlay.name),
+                };
                 app.audit.record(&caller, AccessAction::Deploy, "push", &object, 200);
             }
             Err(error) => {
@@ -69,16 +72,17 @@ pub async fn push(
 
 /// Describes what is pushed, before the service's name is known for certain.
 fn describe_push(options: &PushOptions) -> String {
-    match options.name.as_ref().or(options.apt.as_ref()) {
-        Some(name) => format!("service {name}"),
-        None if options.source.is_empty() => "a package".to_owned(),
-        None => format!("package {}", options.source),
+    match (options.name.as_ref().or(options.apt.as_ref()), &options.as_underlay) {
+        (Some(name), _) => format!("service {name}"),
+        (None, Some(name)) => format!("underlay {name}"),
+        (None, None) if options.source.is_empty() => "a package".to_owned(),
+        (None, None) => format!("package {}", options.source),
     }
 }
 
 /// Returns the permissions of the pushing caller, checked when the service's name is known, which without `--name` is
 /// after the build.
-fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
+pub fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     let principal = &caller.who.principal;
     let name = principal.name.clone();
     let owner = (!principal.is_unscoped()).then(|| name.clone());
@@ -87,6 +91,18 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
         let (app, who) = (Arc::clone(&known), who.clone());
         async move { app.principals.wait_for_end(&who, "", false).await }.boxed()
     };
+    let of_underlays = caller.clone();
+    let may_use_underlay = move |what: UnderlayUse, name: &str, owner: Option<Option<&str>>| {
+        let action = match what {
+            UnderlayUse::StandOn => AccessAction::See,
+            UnderlayUse::Publish => AccessAction::Deploy,
+        };
+        let (exists, owner) = (owner.is_some(), owner.flatten());
+        let may = of_underlays.check_access(action, &AccessObject { service: Some(name), exists, owner, robot: None });
+        may.map_err(|error| push::Error::NotAllowed(error.to_string()))
+    };
+    let (seeing, of_services) = (Arc::clone(app), caller.clone());
+    let may_see = Box::new(move |name: &str| of_services.can_see(&seeing, name));
     let app = Arc::clone(app);
     let may = move |name: &str| {
         if let ConnectionAccess::Ended(reason) = app.principals.connection_access(&caller.who, name) {
@@ -95,15 +111,18 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
         let may = caller.check_service_access(&app, AccessAction::Deploy, name, None);
         may.map_err(|error| push::Error::NotAllowed(error.to_string()))
     };
-    Deployer { name, owner, may: Box::new(may), over: Box::new(over) }
+    let may_use_underlay = Box::new(may_use_underlay);
+    Deployer { name, owner, may: Box::new(may), may_see, may_use_underlay, over: Box::new(over) }
 }
 
-fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {
-    Ok(PushEvent::Done {
-        service: Box::new(views::service(app, &published.service)?),
-        layers: published.layers,
-        took: published.took.as_millis() as u64,
-        unchanged: published.unchanged,
+fn done_event(app: &App, done: PushResult) -> Result<PushEvent, Error> {
+    let PushResult { published, layers, took, unchanged } = done;
+    let took = took.as_millis() as u64;
+    Ok(match published {
+        Published::Service(name) => {
+            PushEvent::Done { service: Box::new(views::service(app, &name)?), layers, took, unchanged }
+        }
+        Published::Underlay(underlay) => PushEvent::Underlay { underlay, layers, took, unchanged },
     })
 }
 
@@ -129,6 +148,8 @@ mod tests {
         assert_eq!(named(None, Some("opencv_apps"), ""), "service opencv_apps");
         assert_eq!(named(None, None, "student_vision"), "package student_vision");
         assert_eq!(named(None, None, ""), "a package");
+        let underlay = PushOptions { as_underlay: Some("maps".to_owned()), ..PushOptions::default() };
+        assert_eq!(describe_push(&underlay), "underlay maps");
     }
 
     #[test]

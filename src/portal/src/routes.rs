@@ -19,7 +19,7 @@ use utoipa::openapi::Required;
 use super::{
     App, api_v1, audit, bases, calibration, dictionary, differences, events, exec, goals, history, inside, logs,
     machines, metrics, oci, openapi, page, people, policy, push, pushes, recordings, robots, shadow, stream, stubs,
-    topics, viewers,
+    topics, underlays, viewers,
 };
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
@@ -233,7 +233,7 @@ pub const ROUTES: &[Route] = &[
         operation(
             "calibrate",
             "Replays recorded requests at several limits and proposes rows for the SLA table without writing them. The \
-                last line is `done` or `error`.",
+                last line is `done`, `underlay` or `error`.",
         )
         .asks_json::<api::CalibrationOptions>("options", "Options of the calibration.")
         .takes_file(
@@ -503,12 +503,19 @@ pub const ROUTES: &[Route] = &[
         operation("exportBase", "The layers of a base as a tar archive of an OCI image layout, for another server.")
             .answers_file(api::bases::BASE_ARCHIVE)
     }),
+    route("GET", "/api/v1/underlays", ENTER, || get(underlays::list)).with_operation(|| {
+        operation("underlays", "Underlays: compiled workspaces that packages are built upon.").lists::<api::Underlay>()
+    }),
+    route("DELETE", "/api/v1/underlays/{name}", May(Deploy, AccessTarget::Handler), || delete(underlays::remove))
+        .with_operation(|| {
+            operation("removeUnderlay", "Removes an underlay, unless services stand on it.").answers::<api::Underlay>()
+        }),
     route("GET", "/api/v1/pushes", ENTER, || get(pushes::list)).with_operation(|| {
         operation("pushes", "Pushes that run and those that ended lately, newest first.").lists::<api::PushStatus>()
     }),
     route("GET", "/api/v1/pushes/{number}/output", May(Logs, AccessTarget::Handler), || get(pushes::output))
         .with_operation(|| {
-            operation("pushOutput", "Events of a push. The last line of one that has ended is `done` or `error`.")
+            operation("pushOutput", "Events of a push. The last line of one that has ended is as of `push`.")
                 .asks::<pushes::PushOutputQuery>()
                 .streams::<api::PushEvent>()
         }),

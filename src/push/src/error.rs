@@ -42,6 +42,30 @@ pub enum Error {
         /// Names of existing bases.
         exists: Vec<String>,
     },
+    /// The underlay does not exist, as far as the caller may know.
+    #[error("there is no underlay {name:?}")]
+    UnknownUnderlay {
+        /// Name that was requested.
+        name: String,
+        /// Names of existing ones that the caller may see.
+        exists: Vec<String>,
+    },
+    /// Services stand on the underlay.
+    #[error("{services} stand on underlay {name}: without it they cannot be pushed again")]
+    UnderlayInUse {
+        /// Name of the underlay.
+        name: String,
+        /// Services that stand on it.
+        services: String,
+    },
+    /// The record of an underlay cannot be read.
+    #[error("the record of underlay {name} cannot be read: {source}")]
+    UnderlayRecord {
+        /// Name of the underlay.
+        name: String,
+        /// Reason.
+        source: serde_json::Error,
+    },
     /// There is nothing to export of a base.
     #[error("{0}")]
     BaseNotSetUp(String),
@@ -136,6 +160,20 @@ pub enum OptionsError {
         /// The value.
         name: String,
     },
+    /// A name of an underlay that is none.
+    #[error("{option}: {problem}")]
+    UnderlayName {
+        /// The option.
+        option: &'static str,
+        /// What is wrong with it.
+        problem: catalogue::names::NameError,
+    },
+    /// Options that are about a service.
+    #[error(
+        "--as-underlay takes only what is about building: --on, --base, --map, --with, --packages-up-to, \
+         --packages-skip and --cmake-args; nothing of an underlay is run"
+    )]
+    AsUnderlay,
     /// Too many values of an option.
     #[error("{option} may be given at most {most} times")]
     TooMany {

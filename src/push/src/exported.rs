@@ -20,8 +20,9 @@ use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
+use super::building::PushedImage;
 use super::reporter::Reporter;
-use super::{Error, HOME_INSIDE, Options, OptionsError, PushedImage, Pusher};
+use super::{Error, HOME_INSIDE, Options, OptionsError, Pusher};
 
 /// Annotation of the image's index entry with the digest of the record.
 pub const RECORD: &str = "org.cloudroid.record";

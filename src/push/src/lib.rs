@@ -15,6 +15,7 @@
 
 mod bases;
 mod bounds;
+mod building;
 mod deployer;
 mod disks;
 mod error;
@@ -38,7 +39,9 @@ mod shared;
 mod stateful;
 mod supplement;
 mod told;
+mod underlays;
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -51,13 +54,13 @@ use package::inventory::Inventory;
 use package::requests;
 use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildOutcome, Builder, PushRequest, PushSource};
+use rootfs_builder::{BuildOutcome, Builder, PushSource};
 use servant::engine::Engine;
-use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use bounds::PushBudget;
+use building::PushedImage;
 use disks::Disks;
 use exported::ImportedService;
 use places::PushQueue;
@@ -66,12 +69,12 @@ use reporter::Reporter;
 use store::{Journal, Plan, RevisionRecord, State};
 use told::PUSHED;
 
-pub use deployer::Deployer;
+pub use deployer::{Deployer, UnderlayUse};
 pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
-pub use request::PushResult;
+pub use request::{Published, PushResult};
 pub use running::{PushFollower, ReceptionGuard, RunningPush};
 
 /// Capacity of a queue of events, which the task of the push empties.
@@ -148,6 +151,7 @@ impl Pusher {
     /// start.
     pub async fn cancel_all(&self, patience: Duration) {
         self.cancel.cancel();
+        self.builder.stop_packing();
         self.tasks.close();
         if tokio::time::timeout(patience, self.tasks.wait()).await.is_err() {
             tracing::warn!("leftovers of cancelled pushes are removed at the next start");
@@ -165,7 +169,8 @@ impl Pusher {
     ) -> Result<PushResult, Error> {
         let began = Instant::now();
         let asked_name = options.name.as_deref();
-        let known = asked_name.or(options.apt.as_deref());
+        let as_underlay = options.as_underlay.as_deref().map(underlays::lock_name);
+        let known = asked_name.or(options.apt.as_deref()).or(as_underlay.as_deref());
         let _entered = self.places.enter()?;
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
@@ -174,16 +179,27 @@ impl Pusher {
         let source = left.run_within(Box::pin(self.receive(id, options, archive, report))).await?;
         // From here on the push needs no client.
         report.received.cancel();
-        let mut admitted = self.places.admit(known, report).await?;
+        // Whoever has forgotten something need not wait for others to be told so.
         report.step("looking at what was pushed").await;
-        let made = left.run_within(Box::pin(self.build_or_import(id, options, source, (by, report)))).await?;
-        let (built, imported) = match made {
-            PushedImage::Built(built) => (*built, None),
+        let work = left.run_within(Box::pin(self.inspect(id, options, source, (by, report)))).await?;
+        let mut admitted = self.places.admit(known, report).await?;
+        let work = left.run_within(Box::pin(self.renew_underlays(options, work, (by, report)))).await?;
+        let made = left.run_within(Box::pin(self.build_or_import(options, work, (by, report)))).await?;
+        let (built, underlays, imported) = match made {
+            PushedImage::Built(built) => {
+                let (built, underlays) = *built;
+                (built, underlays, None)
+            }
+            PushedImage::Underlay(built) => {
+                let (layers, underlay, unchanged) = self.publish_underlay(options, *built, (by, report)).await?;
+                let published = Published::Underlay(Box::new(underlay));
+                return Ok(PushResult { layers, published, took: began.elapsed(), unchanged });
+            }
             PushedImage::Imported(imported) => {
                 let ImportedService { record, options, built } = *imported;
                 // The exporting server allowed it; this one may not.
                 self.check_request(&options, by)?;
-                (built, Some((record, options)))
+                (built, BTreeMap::new(), Some((record, options)))
             }
         };
         let options = imported.as_ref().map_or(options, |(_, options)| options);
@@ -201,6 +217,7 @@ impl Pusher {
         let image = built.image.to_string();
         self.check_quota(by.owner.as_deref(), Some(&image)).await?;
         let mut plan = make_plan(&built, options);
+        plan.underlays = underlays;
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;
         }
@@ -220,7 +237,8 @@ impl Pusher {
         if let Some((record, _)) = &imported {
             self.import_dictionary(&name, record, report);
         }
-        Ok(PushResult { layers, service: name, took: began.elapsed(), unchanged: unchanged.is_some() })
+        let published = Published::Service(name);
+        Ok(PushResult { layers, published, took: began.elapsed(), unchanged: unchanged.is_some() })
     }
 
     /// Receives what is pushed.
@@ -238,38 +256,6 @@ impl Pusher {
         let tree = self.home.join("build").join(id).join(PUSHED);
         receive::unpack(archive, &tree, &self.options, report).await?;
         Ok(PushSource::Tree(tree))
-    }
-
-    /// Builds or imports the image.
-    async fn build_or_import(
-        &self,
-        id: &str,
-        options: &PushOptions,
-        source: PushSource,
-        (by, report): (&Deployer, &Reporter),
-    ) -> Result<PushedImage, Error> {
-        match &source {
-            PushSource::Packaged(package) => {
-                // Names of Debian packages contain hyphens, those of ROS packages do not.
-                if let (Some(name), false) = (&options.name, package.contains('-')) {
-                    self.check_owner(name, std::slice::from_ref(package))?;
-                }
-            }
-            PushSource::Tree(tree) => {
-                let of = tree.clone();
-                if privilege::spawn_blocking(move || exported::is_exported(&of)).await.unwrap_or(false) {
-                    return self.import(options, tree.clone(), report).await;
-                }
-                if let Some(name) = &options.name {
-                    let of = tree.clone();
-                    let look = move || privilege::run_as_reader(|| receive::package_names(&of));
-                    let packages =
-                        privilege::spawn_blocking(look).await.map_err(|_| Error::Internal("inspecting the package"))?;
-                    self.check_owner(name, &packages)?;
-                }
-            }
-        }
-        self.build(id, options, source, (by, report)).await.map(|built| PushedImage::Built(Box::new(built)))
     }
 
     /// Probes the interface of an image; returns the revision to publish.
@@ -342,48 +328,9 @@ impl Pusher {
             _ => Ok(()),
         }
     }
-
-    async fn build(
-        &self,
-        id: &str,
-        options: &PushOptions,
-        source: PushSource,
-        (by, report): (&Deployer, &Reporter),
-    ) -> Result<BuildOutcome, Error> {
-        let request = PushRequest {
-            id: id.to_owned(),
-            name: options.name.clone(),
-            source,
-            base: options.base.clone(),
-            launch: options.launch.clone(),
-            nodes: options.nodes.clone(),
-            params: options.params.clone(),
-            args: options.args.clone(),
-            remaps: options.remaps.clone(),
-            map: options.map.clone(),
-            with: options.with.clone(),
-            created: options.created,
-            packages_up_to: options.packages_up_to.clone(),
-            packages_skip: options.packages_skip.clone(),
-            cmake_args: options.cmake_args.clone(),
-        };
-        let (sender, events) = mpsc::channel(EVENTS_AHEAD);
-        let forwarded = self.forward_events(events, by, report);
-        let builder = Arc::clone(&self.builder);
-        let work = async move { builder.build(&request, sender).await };
-        // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).
-        let work = privilege::run(report.building.track_future(work));
-        let (built, ()) = tokio::join!(work, forwarded);
-        built.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
-    }
 }
 
-/// The image to publish, before it is probed.
-enum PushedImage {
-    Built(Box<BuildOutcome>),
-    Imported(Box<ImportedService>),
-}
-
+/// Describes a layer for the deployer.
 fn api_layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
     api::push::Layer {
         name: of.name.to_owned(),
@@ -413,5 +360,6 @@ fn make_plan(built: &BuildOutcome, options: &PushOptions) -> Plan {
         restart: options.launch.is_none(),
         stateful: options.stateful,
         shared: options.shared,
+        underlays: BTreeMap::new(),
     }
 }

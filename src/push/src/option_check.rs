@@ -1,14 +1,16 @@
 //! Names and arguments in the options of a push that would otherwise have no effect, or break the build.
 
 use api::PushOptions;
+use catalogue::names::validate_service;
 use package::names;
 
 use super::OptionsError;
 
-/// Maximum number of packages in an option, of nodes (as in an exported service), and of arguments of CMake; maximum
-/// length of an argument in bytes.
+/// Maximum number of packages in an option, of nodes (as in an exported service), of underlays, and of arguments of
+/// CMake; maximum length of an argument in bytes.
 const MOST_PACKAGES: usize = 1000;
 const MOST_NODES: usize = 256;
+const MOST_UNDERLAYS: usize = 16;
 const MOST_ARGUMENTS: usize = 64;
 const LONGEST_ARGUMENT: usize = 1024;
 /// Variables of CMake that the server sets.
@@ -19,6 +21,7 @@ const SERVERS_OWN: [&str; 2] = ["CMAKE_INSTALL_PREFIX", "CATKIN_DEVEL_PREFIX"];
 pub(super) fn check_options(options: &PushOptions) -> Result<(), OptionsError> {
     check_keys("parameter", options.params.keys())?;
     check_keys("launch argument", options.args.keys())?;
+    check_underlays(options)?;
     check_packages("--packages-up-to", &options.packages_up_to)?;
     check_packages("--packages-skip", &options.packages_skip)?;
     if options.nodes.len() > MOST_NODES {
@@ -37,6 +40,35 @@ fn check_keys<'a>(what: &'static str, keys: impl Iterator<Item = &'a String>) ->
         Some(name) => Err(OptionsError::ParameterName { what, name: name.clone() }),
         None => Ok(()),
     }
+}
+
+/// Rejects names that no underlay has, and options about a service for an underlay.
+fn check_underlays(options: &PushOptions) -> Result<(), OptionsError> {
+    if options.on.len() > MOST_UNDERLAYS {
+        return Err(OptionsError::TooMany { option: "--on", most: MOST_UNDERLAYS });
+    }
+    let check = |option, name: &String| {
+        validate_service(name).map_err(|problem| OptionsError::UnderlayName { option, problem })
+    };
+    options.on.iter().try_for_each(|name| check("--on", name))?;
+    let Some(name) = &options.as_underlay else {
+        return Ok(());
+    };
+    check("--as-underlay", name)?;
+    let built = PushOptions {
+        on: options.on.clone(),
+        as_underlay: options.as_underlay.clone(),
+        base: options.base.clone(),
+        map: options.map.clone(),
+        with: options.with.clone(),
+        packages_up_to: options.packages_up_to.clone(),
+        packages_skip: options.packages_skip.clone(),
+        cmake_args: options.cmake_args.clone(),
+        created: options.created,
+        source: options.source.clone(),
+        ..PushOptions::default()
+    };
+    if built == *options { Ok(()) } else { Err(OptionsError::AsUnderlay) }
 }
 
 fn check_packages(option: &'static str, packages: &[String]) -> Result<(), OptionsError> {
@@ -82,6 +114,30 @@ mod tests {
         let args = [("word:".to_owned(), String::new())].into();
         let refused = check_options(&PushOptions { args, ..PushOptions::default() }).expect_err("a sign").to_string();
         assert!(refused.starts_with("launch argument \"word:\" is no name"), "{refused}");
+    }
+
+    #[test]
+    fn an_underlay_has_a_name_and_runs_nothing() {
+        let underlay = PushOptions {
+            as_underlay: Some("maps".to_owned()),
+            on: vec!["lab".to_owned()],
+            base: Some("b".to_owned()),
+            cmake_args: vec!["-DA=1".to_owned()],
+            ..PushOptions::default()
+        };
+        check_options(&underlay).expect("it is built");
+        let more = [
+            PushOptions { name: Some("maps".to_owned()), ..underlay.clone() },
+            PushOptions { nodes: vec!["node".to_owned()], ..underlay.clone() },
+            PushOptions { stateful: true, ..underlay.clone() },
+        ];
+        for options in more {
+            let refused = check_options(&options).expect_err("it is about a service").to_string();
+            assert!(refused.starts_with("--as-underlay takes only"), "{refused}");
+        }
+        let refused = check_options(&PushOptions { on: vec!["../x".to_owned()], ..PushOptions::default() });
+        let refused = refused.expect_err("no name").to_string();
+        assert!(refused.starts_with("--on: \"../x\" cannot name"), "{refused}");
     }
 
     #[test]

@@ -20,11 +20,20 @@ use super::reporter::Reporter;
 use super::running::RunningPush;
 use super::{Archive, EVENTS_AHEAD, Error, OptionsError, Pusher, option_check, receive, shared};
 
+/// What a push has published, or found unchanged.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Published {
+    /// The service of this name.
+    Service(String),
+    /// This underlay.
+    Underlay(Box<api::Underlay>),
+}
+
 /// Result of a push.
 #[derive(Debug)]
 pub struct PushResult {
-    /// Name of the service.
-    pub service: String,
+    /// What was published.
+    pub published: Published,
     /// Layers of the image.
     pub layers: Vec<api::push::Layer>,
     /// Duration, including the time spent waiting for other pushes.
@@ -45,7 +54,8 @@ impl Pusher {
     ) -> Result<Arc<RunningPush>, Error> {
         let pusher = Arc::clone(self);
         let id = format!("push-{}", names::random(8));
-        let running = self.registry.begin(&id, (options.name.as_deref(), &options.source, &by.name))?;
+        let name = options.name.as_deref().or(options.as_underlay.as_deref());
+        let running = self.registry.begin(&id, (name, &options.source, &by.name))?;
         // Of a push that names no service, the name is known once the package was read.
         let span = tracing::error_span!(parent: None, "push", service = options.name, id);
         let started = Arc::clone(&running);
@@ -124,6 +134,9 @@ impl Pusher {
             names::validate_service(name).map_err(catalogue::Error::from)?;
             by.check_may_publish(name)?;
         }
+        if let Some(name) = &options.as_underlay {
+            self.check_may_publish_underlay(name, by)?;
+        }
         options.limits.check().map_err(OptionsError::from)?;
         if by.owner.is_some() {
             choreographer::limits::check_weight(&options.limits).map_err(OptionsError::from)?;
@@ -176,7 +189,7 @@ impl Pusher {
             }
             Err(error) => {
                 self.failed.fetch_add(1, Ordering::Relaxed);
-                let name = options.name.as_deref().or(options.apt.as_deref());
+                let name = options.name.as_deref().or(options.apt.as_deref()).or(options.as_underlay.as_deref());
                 let what = match &error {
                     Error::Cancelled | Error::Ending => "was cancelled".to_owned(),
                     error => format!("failed: {error}"),

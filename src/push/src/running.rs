@@ -171,7 +171,7 @@ impl RunningPush {
     /// Returns the record of the push that ends with this event, and its output as JSON lines.
     pub(super) fn to_record(&self, last: &PushEvent) -> (PushRecord, String) {
         let (state, message) = match last {
-            PushEvent::Done { .. } => (PushState::Published, None),
+            PushEvent::Done { .. } | PushEvent::Underlay { .. } => (PushState::Published, None),
             PushEvent::Error { .. } if self.cancel.is_cancelled() => (PushState::Cancelled, None),
             PushEvent::Error { problem } => {
                 (PushState::Failed, Some(problem.detail.chars().take(LONGEST_MESSAGE).collect()))
@@ -202,7 +202,10 @@ impl PushOutput {
             self.progress = Some(NumberedEvent { number, event });
             return None;
         }
-        let is_over = matches!(event, PushEvent::Step { .. } | PushEvent::Done { .. } | PushEvent::Error { .. });
+        let is_over = matches!(
+            event,
+            PushEvent::Step { .. } | PushEvent::Done { .. } | PushEvent::Underlay { .. } | PushEvent::Error { .. }
+        );
         let mut completed = None;
         if is_over {
             self.progress = None;
@@ -279,7 +282,11 @@ fn event_size(event: &PushEvent) -> usize {
         PushEvent::Log { line } => line.len(),
         PushEvent::Step { title, .. } => title.len(),
         PushEvent::Warning { message } => message.len(),
-        PushEvent::Accepted { .. } | PushEvent::Progress { .. } | PushEvent::Done { .. } | PushEvent::Error { .. } => 0,
+        PushEvent::Accepted { .. }
+        | PushEvent::Progress { .. }
+        | PushEvent::Done { .. }
+        | PushEvent::Underlay { .. }
+        | PushEvent::Error { .. } => 0,
     };
     text + EACH
 }

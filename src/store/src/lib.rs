@@ -27,6 +27,7 @@ mod servants;
 mod services;
 mod throttle;
 mod tokens;
+mod underlays;
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -56,9 +57,10 @@ pub use servants::ServantRecord;
 pub use services::{Plan, RevisionRecord, RevisionSummary};
 pub use throttle::NoticeThrottle;
 pub use tokens::{NewToken, TokenRecord};
+pub use underlays::{StandingService, UnderlayRecord};
 
 /// Migrations from an empty database to the current schema; append-only.
-const MIGRATIONS: [&str; 16] = [
+const MIGRATIONS: [&str; 17] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
     include_str!("003-inventory.sql"),
@@ -75,6 +77,7 @@ const MIGRATIONS: [&str; 16] = [
     include_str!("014-recorded-topics.sql"),
     include_str!("015-events-by-service.sql"),
     include_str!("016-pushes.sql"),
+    include_str!("017-underlays.sql"),
 ];
 
 /// Errors of the state database.

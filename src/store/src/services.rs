@@ -86,6 +86,9 @@ pub struct Plan {
     /// How robots share servants; absent if each robot has a servant of its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<api::Shared>,
+    /// Underlays that the image was built on, with their revisions.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub underlays: BTreeMap<String, u64>,
 }
 
 impl State {

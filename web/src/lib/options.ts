@@ -33,10 +33,11 @@ export const GROUPS: Group[] = [
   ] },
   { key: 'build', title: 'Base image and dependencies', fields: [
     { key: 'base', label: "Base image definition, which has ROS 1 or ROS 2 (default: the server's)", flag: '--base' },
-    { key: 'map', label: 'Dependencies mapped by hand, KEY=DEBIAN-PACKAGE, one per line', flag: '--map', lines: 2 },
+    { key: 'map', label: 'Dependencies mapped by hand, KEY=PACKAGE, one per line', flag: '--map', lines: 2 },
     { key: 'with', label: 'Additional Debian or ROS packages, one per line', flag: '--with', lines: 2 },
     { key: 'packages_up_to', label: 'Packages of the workspace to build, with what they need, one per line (default: what the programs need)', flag: '--packages-up-to', lines: 2 },
     { key: 'packages_skip', label: 'Packages of the workspace not to build, one per line', flag: '--packages-skip', lines: 2 },
+    { key: 'on', label: 'Underlays to build upon, one per line; the later lies above', flag: '--on', lines: 2 },
     { key: 'cmake_args', label: 'Arguments of CMake, one per line', flag: '--cmake-args', example: '-DWITH_QT=OFF', lines: 2 },
   ] },
   { key: 'interface', title: 'Topics, services and state', fields: [
@@ -166,6 +167,7 @@ export function options(values: Values, chosen: Chosen): Options {
     with: list(values.with),
     packages_up_to: list(values.packages_up_to),
     packages_skip: list(values.packages_skip),
+    on: list(values.on),
     cmake_args: list(values.cmake_args),
     interface: text('interface'),
     requests: list(values.requests),

@@ -1,6 +1,6 @@
 // A push that is looked at: one that this tab has sent, or another. Once it is sent, it goes on without the tab.
 import { exchanged, fetched, lines, Problem, sent } from './api';
-import type { Caps, Limits, PushEvent, PushOptions, PushStatus, ServiceDetail } from './types';
+import type { Caps, Limits, PushEvent, PushOptions, PushStatus, ServiceDetail, Underlay } from './types';
 
 /** Limits as they are written in a form: sizes may have a unit. */
 type Written<T> = { [name in keyof T]: string | number | undefined };
@@ -30,6 +30,8 @@ class Push {
   warnings = $state<string[]>([]);
   log = $state.raw<{ number: number; line: string }[]>([]);
   done = $state.raw<ServiceDetail>();
+  /** What was pushed from elsewhere for others to stand on. */
+  underlay = $state.raw<Underlay>();
   unchanged = $state(false);
   problem = $state.raw<unknown>();
   cancelled = $state(false);
@@ -91,6 +93,7 @@ class Push {
     this.log = [];
     this.#come = [];
     this.done = undefined;
+    this.underlay = undefined;
     this.problem = undefined;
     this.cancelled = false;
     if (first) this.#step(first);
@@ -102,7 +105,7 @@ class Push {
         if (this.#stop !== stop) return;
         if (line) this.#take(JSON.parse(line));
       }
-      if (!this.done && !this.problem && !this.cancelled) throw Problem.here('the daemon closed the connection', this.accepted ? 'see in the list of pushes what became of this one' : 'check that it is running, and see its log');
+      if (!this.done && !this.underlay && !this.problem && !this.cancelled) throw Problem.here('the daemon closed the connection', this.accepted ? 'see in the list of pushes what became of this one' : 'check that it is running, and see its log');
     } catch (error) {
       if (this.#stop !== stop) return;
       if (stop.signal.aborted) this.cancelled = true;
@@ -152,6 +155,10 @@ class Push {
         return;
       case 'done':
         this.done = event.service;
+        this.unchanged = event.unchanged ?? false;
+        return;
+      case 'underlay':
+        this.underlay = event.underlay;
         this.unchanged = event.unchanged ?? false;
         return;
       case 'error':

@@ -667,11 +667,13 @@ export type PushEvent =
   | { done: number; total?: number; type: 'progress'; unit: string }
   | { message: string; type: 'warning' }
   | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done'; unchanged?: boolean }
+  | { layers: Layer[]; took: number; type: 'underlay'; underlay: Underlay; unchanged?: boolean }
   | { problem: Problem; type: 'error' };
 
 export interface PushOptions {
   apt?: string;
   args?: Record<string, string>;
+  as_underlay?: string;
   base?: string;
   caps?: Caps;
   cmake_args?: string[];
@@ -683,6 +685,7 @@ export interface PushOptions {
   map?: Record<string, string>;
   name?: string;
   nodes?: string[];
+  on?: string[];
   packages_skip?: string[];
   packages_up_to?: string[];
   params?: Record<string, unknown>;
@@ -1042,6 +1045,11 @@ export interface Spread {
   requests: number;
 }
 
+export interface StandingService {
+  on: number;
+  service: string;
+}
+
 export interface Stated {
   aux?: Record<string, string>;
   class?: string;
@@ -1138,6 +1146,19 @@ export interface Trial {
   rrt?: Times;
   service: string;
   unused: string[];
+}
+
+export interface Underlay {
+  base: string;
+  bytes: Size;
+  distribution: string;
+  name: string;
+  packages: string[];
+  published: Millis;
+  revision: number;
+  ros: number;
+  services: StandingService[];
+  source: string;
 }
 
 export interface Update {

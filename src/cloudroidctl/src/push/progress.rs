@@ -3,7 +3,8 @@
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use api::{PushEvent, Size};
+use api::push::Layer;
+use api::{PushEvent, Size, count};
 use foreign::terminal;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
@@ -96,12 +97,20 @@ impl PushProgress {
             PushEvent::Log { line } => self.print(&format!("  | {line}")),
             PushEvent::Progress { unit, done, total } => self.progress(unit, *done, *total),
             PushEvent::Warning { message } => self.print(&format!("warning: {message}")),
+            PushEvent::Underlay { underlay, layers, took, unchanged } => {
+                self.finish();
+                show_layers(layers)?;
+                let state = if *unchanged { "unchanged" } else { "published" };
+                let (name, revision) = (&underlay.name, underlay.revision);
+                let packages = count(underlay.packages.len(), "package");
+                output::line(&format!(
+                    "== underlay {name} {state} in {:.1} s: revision {revision}, {packages}; push others with --on {name}",
+                    *took as f64 / 1000.0
+                ))
+            }
             PushEvent::Done { service, layers, took, unchanged } => {
                 self.finish();
-                for layer in layers {
-                    let how = if layer.cached { "unchanged" } else { "new" };
-                    output::line(&format!("   layer {:<14} {:>8}  {how}", layer.name, Size(layer.size).to_string()))?;
-                }
+                show_layers(layers)?;
                 let took = *took as f64 / 1000.0;
                 if *unchanged {
                     let number = service.summary.revision;
@@ -193,6 +202,15 @@ impl Drop for PushProgress {
     fn drop(&mut self) {
         self.finish();
     }
+}
+
+/// Prints the layers of an image.
+fn show_layers(layers: &[Layer]) -> anyhow::Result<()> {
+    for layer in layers {
+        let how = if layer.cached { "unchanged" } else { "new" };
+        output::line(&format!("   layer {:<14} {:>8}  {how}", layer.name, Size(layer.size).to_string()))?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]

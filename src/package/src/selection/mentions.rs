@@ -21,7 +21,7 @@ const PROSE: [&str; 3] = [".rst", ".md", "package.xml"];
 
 /// Reader of files that looks for the names of packages.
 pub(super) struct MentionReader<'a> {
-    /// Names of packages, with their indexes.
+    /// Names of packages and of their Python modules, with their indexes.
     names: BTreeMap<&'a [u8], usize>,
     files: usize,
     bytes: u64,
@@ -30,7 +30,12 @@ pub(super) struct MentionReader<'a> {
 impl<'a> MentionReader<'a> {
     pub(super) fn new(packages: &'a [Package]) -> Self {
         let names = packages.iter().enumerate();
-        let names = names.map(|(index, package)| (package.manifest.name.as_bytes(), index)).collect();
+        let names = names.map(|(index, package)| (package.manifest.name.as_bytes(), index));
+        let modules = packages.iter().enumerate();
+        let modules =
+            modules.flat_map(|(index, package)| package.modules.iter().map(move |name| (name.as_bytes(), index)));
+        // A package's own name is not that of another one's module.
+        let names = modules.chain(names).collect();
         Self { names, files: 0, bytes: 0 }
     }
 

@@ -190,6 +190,12 @@ fn push_next_step(error: &push::Error) -> String {
             format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
         }
         P::UnknownBase { .. } | P::BaseNotImported(_) => "list them with: cloudroidctl bases".into(),
+        P::UnknownUnderlay { .. } => {
+            "list them with: cloudroidctl underlays; publish one with: cloudroidctl push WORKSPACE --as-underlay NAME"
+                .into()
+        }
+        P::UnderlayInUse { .. } => "push these services without it, or remove them".into(),
+        P::UnderlayRecord { .. } => "push the underlay again".into(),
         P::BaseNotSetUp(_) => "push a package that uses it, then try again".into(),
         P::Options(_) => "correct the options and push again; see cloudroidctl push --help".into(),
         P::Failed { next, .. } => {

@@ -38,6 +38,7 @@ const WORDS: &[(&str, &str, &str)] = &[
     ("POST", "/api/v1/renew", "renew a certificate"),
     ("POST", "/api/v1/push", "begin a push"),
     ("DELETE", "/api/v1/pushes/{number}", "cancel a push"),
+    ("DELETE", "/api/v1/underlays/{name}", "remove an underlay"),
     ("POST", "/api/v1/bases", "import a base"),
     ("DELETE", "/api/v1/bases/{name}", "remove a base"),
 ];

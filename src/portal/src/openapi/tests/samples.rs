@@ -22,7 +22,8 @@ use api::{
     BackOff, CalibrationEvent, CalibrationOptions, Capacity, Caps, Check, CheckStatus, Clock, Cost, Doctor, Event,
     Expected, Fit, Grants, Isolation, Level, Limits, LogLevel, LogLine, Measure, Node, NodeDown, Phase, Pressure,
     Problem, PushEvent, PushOptions, Revision, Rollback, Servant, ServiceDetail, ServiceSummary, Shadow, ShadowEvent,
-    ShadowOptions, Size, Sla, Span, Stated, Status, Stopped, Stream, Terms, Usage, UseForecast, Volume,
+    ShadowOptions, Size, Sla, Span, StandingService, Stated, Status, Stopped, Stream, Terms, Underlay, Usage,
+    UseForecast, Volume,
 };
 use serde_json::Value;
 
@@ -301,6 +302,8 @@ fn options() -> PushOptions {
         packages_up_to: one_text("x"),
         packages_skip: one_text("x"),
         cmake_args: one_text("-DX=1"),
+        on: one_text("maps"),
+        as_underlay: some_text("x"),
         limits: limits(),
         caps: Caps { cpus: Some(2.0), memory: Some(Size(1 << 30)) },
         sla: Sla { rrt: Span::from_millis(100), max_rrt: Span::from_millis(300), ..Sla::default() },
@@ -316,6 +319,21 @@ fn options() -> PushOptions {
         rollout: Some(rollout_terms()),
         created: Some(1),
         source: "--apt x".into(),
+    }
+}
+
+fn underlay() -> Underlay {
+    Underlay {
+        name: "maps".into(),
+        revision: 2,
+        base: "bookworm-ros1".into(),
+        ros: 1,
+        distribution: "noetic".into(),
+        packages: one_text("map_tools"),
+        bytes: Size(1 << 20),
+        published: 1,
+        source: "~/lab_ws".into(),
+        services: vec![StandingService { service: "nav".into(), on: 1 }],
     }
 }
 
@@ -674,6 +692,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             },
         ),
         sample("BackOff", back_off()),
+        sample("StandingService", underlay().services.remove(0)),
+        sample("Underlay", underlay()),
         sample("BaseDetail", base()),
         sample("BaseSummary", base().summary),
         sample("Clock", Clock { now: 1.5 }),
@@ -763,6 +783,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
             took: 1,
             unchanged: true,
         },
+        PushEvent::Underlay { underlay: Box::new(underlay()), layers: Vec::new(), took: 1, unchanged: true },
         PushEvent::Error { problem: problem() },
     ] {
         samples.push(sample("PushEvent", event));
