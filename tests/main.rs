@@ -622,6 +622,7 @@ fn main() -> ExitCode {
             without_the_original_the_stub_stands_alone,
             what_is_not_outsourced_becomes_the_original,
             the_installer_checks_before_it_writes_and_undoes_itself,
+            where_the_other_ros_is_set_up_a_stub_is_refused,
             a_stub_that_was_changed_on_its_way_is_not_installed,
             its_nodelets_cannot_be_loaded_on_the_robot,
             stubs_are_served_to_those_who_may_and_say_what_is_lacking,

@@ -213,7 +213,7 @@ fn unpack_signed_by(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir 
 /// Writes the files of an unpacked archive.
 fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) {
     let mut files = files.clone();
-    files.insert(format!("lib/p/{PROGRAM}"), file(PROGRAM_OF_TESTS, true));
+    files.entry(format!("lib/p/{PROGRAM}")).or_insert_with(|| file(PROGRAM_OF_TESTS, true));
     let signer = format!("{}\n", key.public_key().allowed_signers_line());
     files.insert(SIGNER.into(), file(&signer, false));
     let list = manifest(&files);
@@ -420,6 +420,35 @@ fn the_key_that_is_known_is_the_one_that_counts() {
         let setup = std::fs::read_to_string(format!("{target}/setup.sh")).expect("there");
         assert!(setup.contains(&format!("_cloudroid_installed='{target}'")), "{setup}");
     }
+}
+
+#[test]
+fn a_robot_of_the_other_ros_is_refused_before_anything_happens() {
+    // The robot's program knows which ROS is set up.
+    const REFUSES: &str = r#"#!/bin/sh
+case "$*" in
+  pair*) touch "${0%/*}/paired" ;;
+  "doctor --share "*"/share/p --package p --only ros") echo "FAIL  ros"; exit 1 ;;
+esac
+"#;
+    let mut files = compose_stub(&["node"]);
+    files.insert(format!("lib/p/{PROGRAM}"), file(REFUSES, true));
+    let stub = unpack_stub(&files);
+    let prefix = tempfile::tempdir().expect("a directory");
+    let target = prefix.path().join("overlay");
+    let line = "cloudroid://here:9090/?robot=rover&code=1";
+    let arguments = ["--prefix", target.to_str().expect("text"), "--pair", line];
+    let install = |more: &[&str]| {
+        let output = run(&stub.path().join("install.sh"), &[&arguments, more].concat());
+        let told = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+        (output.status.success(), told.into_owned())
+    };
+    let paired = stub.path().join("lib/p/paired");
+    let (good, said) = install(&[]);
+    assert!(!good && said.contains("FAIL  ros") && said.contains("nothing was installed"), "{said}");
+    assert!(!target.exists() && !paired.exists(), "{said}");
+    let (good, said) = install(&["--force"]);
+    assert!(good && target.exists() && paired.exists(), "{said}");
 }
 
 #[test]
