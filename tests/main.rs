@@ -91,6 +91,8 @@ mod names;
 mod oidc;
 #[path = "stories/operations.rs"]
 mod operations;
+#[path = "stories/other_ros.rs"]
+mod other_ros;
 #[path = "stories/page.rs"]
 mod page;
 #[path = "stories/pairing.rs"]
@@ -614,6 +616,12 @@ fn main() -> ExitCode {
         stories![names:
             a_server_is_found_in_the_hosts_file_and_by_dns,
             a_server_is_found_by_multicast_dns,
+        ],
+        stories![other_ros:
+            a_robot_of_ros_2_starts_a_node_of_ros_1_as_its_own,
+            a_robot_of_ros_1_starts_a_node_of_ros_2_as_its_own,
+            tools_of_ros_1_find_the_stub_of_a_service_of_ros_2,
+            the_same_service_has_an_archive_for_either_ros,
         ],
         stories![shadowing:
             on_debians_layout_every_tool_finds_the_stub,

@@ -11,7 +11,6 @@ use std::process::ExitCode;
 use foreign::terminal;
 
 use crate::arguments::{DoctorPart, StubDoctorArgs};
-use crate::revision::Revision;
 use check::CheckVerdict;
 
 /// Runs the checks and prints them; fails if any is bad.
@@ -23,7 +22,7 @@ pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
     let is_asked = |part| asked.only.is_none_or(|only| only == part);
     let mut checks = Vec::new();
     if is_asked(DoctorPart::Ros) {
-        let wanted = Revision::read(&stub.share).ros();
+        let wanted = stub.revision().ros();
         checks.push(ros_version::check(wanted, &config.service, &variable, Path::new(ros_version::INSTALLED)));
     }
     if is_asked(DoctorPart::Server) {

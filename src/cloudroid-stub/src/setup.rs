@@ -1,6 +1,6 @@
-//! The ROS that is set up where a stub is installed or started: `ROS_VERSION` and `ROS_DISTRO`, which the setup files of
-//! upstream's packages set (package ros_environment, in both versions of ROS). Debian's own packages of ROS 1 have no
-//! setup file and set neither.
+//! The ROS that is set up where a stub is installed or started: `ROS_VERSION` and `ROS_DISTRO`, which the setup files
+//! of upstream's packages set (package ros_environment, in both versions of ROS). Debian's own packages of ROS 1 have
+//! no setup file and set neither.
 
 use ros::bus::RosVersion;
 
@@ -84,8 +84,8 @@ impl RosSetup {
 pub fn advice(wanted: RosVersion, service: &str) -> String {
     let (wanted, other) = (wanted.number(), wanted.other().number());
     format!(
-        "install the stub of a service of ROS {other} ({service} is one of ROS {wanted}: push the package for ROS \
-         {other}), or source the setup file of ROS {wanted}, if this robot's nodes use that"
+        "install the archive for robots of ROS {other} (cloudroidctl stub {service} --ros {other}), or source the \
+         setup file of ROS {wanted}, if this robot's nodes use that"
     )
 }
 

@@ -135,9 +135,9 @@ mod tests {
         assert_check(&robot.examine(RosVersion::One, &one), Good, "ROS 1 is set up (noetic)", "");
         assert_check(&robot.examine(RosVersion::Two, &two), Good, "ROS 2 is set up (jazzy)", "");
         let bad = robot.examine(RosVersion::Two, &one);
-        assert_check(&bad, Bad, "ROS 1 (ROS_VERSION is 1) is set up here", "source the setup file of ROS 2");
+        assert_check(&bad, Bad, "ROS 1 (ROS_VERSION is 1) is set up here", "cloudroidctl stub people --ros 1");
         let bad = robot.examine(RosVersion::One, &two);
-        assert_check(&bad, Bad, "this stub is for robots of ROS 1", "source the setup file of ROS 1");
+        assert_check(&bad, Bad, "this stub is for robots of ROS 1", "cloudroidctl stub people --ros 2");
         let mixed = robot.examine(RosVersion::Two, &[("ROS_VERSION", "2"), ("ROS_DISTRO", "noetic")]);
         assert_check(&mixed, Warning, "after noetic", "in a new shell");
     }
@@ -157,9 +157,9 @@ mod tests {
     #[test]
     fn a_robot_that_has_only_the_other_ros_is_refused() {
         let jazzy = Computer::with(&[JAZZY]);
-        assert_check(&jazzy.examine(RosVersion::One, &[]), Bad, "this robot has ROS 2", "ROS 2");
+        assert_check(&jazzy.examine(RosVersion::One, &[]), Bad, "this robot has ROS 2", "--ros 2");
         let debian = Computer::with(&["usr/bin/rosrun"]);
-        assert_check(&debian.examine(RosVersion::Two, &[]), Bad, "usr/bin/rosrun", "ROS 1");
+        assert_check(&debian.examine(RosVersion::Two, &[]), Bad, "usr/bin/rosrun", "--ros 1");
     }
 
     #[test]

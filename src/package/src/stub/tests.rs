@@ -1,4 +1,5 @@
 mod ament;
+mod other_ros;
 
 use super::*;
 use crate::interface::{Direction, Topic};
@@ -50,6 +51,11 @@ fn compose_stub_from(outsourced: &[&str], contents: Contents) -> Files {
 }
 
 fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
+    compose_stub_of(ros, ros, outsourced, contents)
+}
+
+/// Composes the stub of a service of one ROS for robots of the same or the other one.
+fn compose_stub_of(service_ros: RosVersion, ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
     let outsourced = outsourced.iter().map(|name| (*name).to_owned()).collect();
     let mut interface = Interface {
         topics: vec![Topic {
@@ -69,6 +75,7 @@ fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) ->
     }
     let about = StubInfo {
         ros,
+        service_ros,
         service: "serves",
         package: "p",
         revision: 3,
@@ -179,6 +186,7 @@ fn without_a_manifest_there_is_no_stub() {
     let interface = Interface::default();
     let about = StubInfo {
         ros: RosVersion::One,
+        service_ros: RosVersion::One,
         service: "p",
         package: "p",
         revision: 1,
@@ -420,35 +428,6 @@ fn the_key_that_is_known_is_the_one_that_counts() {
         let setup = std::fs::read_to_string(format!("{target}/setup.sh")).expect("there");
         assert!(setup.contains(&format!("_cloudroid_installed='{target}'")), "{setup}");
     }
-}
-
-#[test]
-fn a_robot_of_the_other_ros_is_refused_before_anything_happens() {
-    // The robot's program knows which ROS is set up.
-    const REFUSES: &str = r#"#!/bin/sh
-case "$*" in
-  pair*) touch "${0%/*}/paired" ;;
-  "doctor --share "*"/share/p --package p --only ros") echo "FAIL  ros"; exit 1 ;;
-esac
-"#;
-    let mut files = compose_stub(&["node"]);
-    files.insert(format!("lib/p/{PROGRAM}"), file(REFUSES, true));
-    let stub = unpack_stub(&files);
-    let prefix = tempfile::tempdir().expect("a directory");
-    let target = prefix.path().join("overlay");
-    let line = "cloudroid://here:9090/?robot=rover&code=1";
-    let arguments = ["--prefix", target.to_str().expect("text"), "--pair", line];
-    let install = |more: &[&str]| {
-        let output = run(&stub.path().join("install.sh"), &[&arguments, more].concat());
-        let told = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-        (output.status.success(), told.into_owned())
-    };
-    let paired = stub.path().join("lib/p/paired");
-    let (good, said) = install(&[]);
-    assert!(!good && said.contains("FAIL  ros") && said.contains("nothing was installed"), "{said}");
-    assert!(!target.exists() && !paired.exists(), "{said}");
-    let (good, said) = install(&["--force"]);
-    assert!(good && target.exists() && paired.exists(), "{said}");
 }
 
 #[test]
