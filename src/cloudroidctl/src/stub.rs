@@ -167,3 +167,16 @@ async fn list(client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()>
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ros_of_the_shell_is_a_number_or_none() {
+        for (variable, expected) in [("1", Some(1)), ("2", Some(2)), ("3", None), ("noetic", None), ("", None)] {
+            assert_eq!(ros_of_shell(Some(variable)), expected, "{variable:?}");
+        }
+        assert_eq!(ros_of_shell(None), None);
+    }
+}

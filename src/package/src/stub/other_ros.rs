@@ -3,11 +3,15 @@
 //! dependencies that they cannot have. Programs and definitions are those of the service's ROS: launchers and twins
 //! stand in for them.
 
+use std::path::Path;
+
 use ros::bus::RosVersion;
 use roxmltree::{Document, Node};
 
 use super::nodelets::{self, escape_xml};
 use super::{Content, Contents, StubInfo, ament};
+use crate::condition::Variables;
+use crate::manifest::Manifest;
 
 /// Directories of definitions, whose files the interface's definitions replace.
 const DEFINITIONS: [&str; 3] = ["msg", "srv", "action"];
@@ -18,7 +22,7 @@ pub(super) fn adapt_contents(about: &StubInfo<'_>, mut contents: Contents) -> Co
         contents.share.remove(&list);
     }
     contents.components.clear();
-    contents.share.retain(|path, content| match content {
+    contents.share.retain(|path, content| match &*content {
         Content::File { executable: true, .. } => false,
         Content::File { bytes, .. } => {
             !is_definition(path)
@@ -40,12 +44,9 @@ pub(super) fn adapt_contents(about: &StubInfo<'_>, mut contents: Contents) -> Co
 }
 
 fn is_definition(path: &str) -> bool {
-    let in_directory = |kind: &&str| {
-        let name = path.strip_prefix(**kind).and_then(|rest| rest.strip_prefix('/'));
-        let ending = name.and_then(|name| name.rsplit_once('.')).map(|(_, ending)| ending);
-        ending.is_some_and(|ending| ending == **kind || ending == "idl" || ending == "json")
-    };
-    DEFINITIONS.iter().any(|kind| in_directory(&kind))
+    let (top, name) = path.split_once('/').unwrap_or_default();
+    let ending = name.rsplit_once('.').map(|(_, ending)| ending);
+    DEFINITIONS.contains(&top) && ending.is_some_and(|ending| ending == top || matches!(ending, "idl" | "json"))
 }
 
 /// Returns whether a link at `path` leads to a file, or to a directory with files, among `kept`.
