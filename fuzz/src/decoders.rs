@@ -30,6 +30,7 @@ use foxglove::ws_protocol::client::ClientMessage;
 use serde::de::DeserializeOwned;
 
 use crate::codec::LIMIT;
+use crate::translation::PAIRS;
 pub use repeats::Repeat;
 use repeats::{DEFINITIONS, HELLO, ORDERS, ROSBRIDGE, VALUES, VIEWER, XML_RPC};
 
@@ -90,6 +91,7 @@ pub const DECODERS: &[Decoder] = &[
     decoder("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
     decoder("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
     decoder("ros2_definition", definition_2, 64, 64 << 10).with_repeats(DEFINITIONS),
+    decoder("translation_bytes", carry, 48, 256 << 10),
     decoder("rtps_datagram", datagram, 4, LITTLE),
     decoder("rtps_discovery", discovery, 4, LITTLE),
     decoder("codec_zlib", decode_packed, 8, CODEC),
@@ -261,6 +263,13 @@ fn definition_2(input: &[u8]) {
     if let Ok(text) = std::str::from_utf8(input) {
         let _ = InterfaceFile::read_idl("b/msg/X", text);
         let _ = InterfaceFile::read_description("b/msg/X", text);
+    }
+}
+
+fn carry(input: &[u8]) {
+    for pair in PAIRS.iter() {
+        let _ = pair.to_twin.translate(input);
+        let _ = pair.from_twin.translate(input);
     }
 }
 

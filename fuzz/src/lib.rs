@@ -17,6 +17,7 @@ pub mod ros;
 pub mod ros2;
 pub mod rosbridge;
 pub mod rtps;
+pub mod translation;
 pub mod viewer;
 pub mod ws;
 
@@ -60,6 +61,8 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("link_orders", link::orders),
     ("ws_frames", ws::frames),
     ("viewer_json", viewer::json),
+    ("translation_bytes", translation::bytes),
+    ("translation_rules", translation::rules),
 ];
 
 /// Defines the program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzing build the program does nothing.

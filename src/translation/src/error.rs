@@ -9,72 +9,75 @@ pub type TranslationError = CodecError;
 
 /// A type that has no twin in the other ROS.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{name} of ROS {} cannot be carried to ROS {}: {reason}", .version.number(), other_version(*.version).number())]
+#[error("{name} of ROS {} has no counterpart in ROS {}: {reason}", .version.number(), other_version(*.version).number())]
 pub struct NoTwin {
     /// Name of the type, as in the ROS that it belongs to.
     pub name: String,
     /// The ROS that the type belongs to.
     pub version: RosVersion,
     /// The problem.
-    pub reason: NoTwinReason,
+    pub reason: Box<NoTwinReason>,
 }
 
-/// Reasons for which a type has no twin.
+/// Reasons for which a type has no twin. `one` names a message of ROS 1, `two` the message of ROS 2 that belongs to it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NoTwinReason {
-    /// Each of the two definitions has fields that the other one lacks, so that they cannot be told to mean the same.
+    /// Each of the two definitions has fields that the other one lacks: they may mean the same or not.
     #[error(
-        "{name} alone has {}, and {twin} alone has {}; pair them by a rule (fields_1_to_2)",
-        .only_in_name.join(", "), .only_in_twin.join(", ")
+        "{one} of ROS 1 alone has {}, {two} of ROS 2 alone has {}; pair their fields by a rule (fields_1_to_2)",
+        .only_in_one.join(", "), .only_in_two.join(", ")
     )]
     Fields {
-        /// Name of the message.
-        name: String,
-        /// Name of the message in the other ROS.
-        twin: String,
-        /// Fields that the twin lacks.
-        only_in_name: Vec<String>,
-        /// Fields that the twin alone has.
-        only_in_twin: Vec<String>,
+        /// Name of the message in ROS 1.
+        one: String,
+        /// Name of the message in ROS 2.
+        two: String,
+        /// Fields that ROS 1 alone has.
+        only_in_one: Vec<String>,
+        /// Fields that ROS 2 alone has.
+        only_in_two: Vec<String>,
     },
-    /// Two fields of one name have types that are not converted into each other.
-    #[error("field {field} of {name} is {found} and field {twin_field} of {twin} is {twin_found}")]
-    FieldType {
-        /// Name of the message.
-        name: String,
-        /// Path of the field.
-        field: String,
-        /// Type of the field.
-        found: String,
-        /// Name of the message in the other ROS.
-        twin: String,
-        /// Path of the field there.
-        twin_field: String,
-        /// Type of the field there.
-        twin_found: String,
-    },
-    /// A rule names a field that does not exist, or that cannot be paired.
-    #[error("{rule} names the field {path:?}, which {name} does not have")]
+    /// The types of two fields are not converted into each other.
+    #[error("{0}")]
+    FieldType(
+        /// The fields.
+        Box<UnlikeFields>,
+    ),
+    /// A rule names a field that does not exist.
+    #[error("{rule} names field {path:?}, which {name} does not have; correct the rule")]
     NoSuchField {
-        /// Place of the rule: file and number.
+        /// Place of the rule.
         rule: String,
         /// The path as written.
         path: String,
         /// Name of the message.
         name: String,
     },
-    /// The definition of the twin does not follow from the type and its rule.
-    #[error("{rule} pairs {path:?} of {twin}, whose definition is unknown; give it by ros1_definition or ros2_definition")]
-    NoDefinition {
-        /// Place of the rule: file and number.
+    /// A rule names a field twice, or a field and a part of it.
+    #[error("{rule} names field {path:?} of {name} twice, as a whole or in part; name it once")]
+    Overlap {
+        /// Place of the rule.
         rule: String,
-        /// The path that cannot be derived.
+        /// The path as written.
         path: String,
-        /// Name of the twin.
-        twin: String,
+        /// Name of the message.
+        name: String,
     },
-    /// Two fields would have the same name in the other ROS.
-    #[error("fields {first} and {second} of {name} would have the same name in the other ROS; pair them by a rule")]
+    /// The definition of the twin is unknown and does not follow from the rule.
+    #[error(
+        "{rule} pairs field {path:?} of {name}, whose definition is unknown; \
+         add it to the rule (ros1_definition or ros2_definition)"
+    )]
+    NoDefinition {
+        /// Place of the rule.
+        rule: String,
+        /// The path as written.
+        path: String,
+        /// Name of the message.
+        name: String,
+    },
+    /// Two fields would have the same name in ROS 2, which knows no capital letters in them.
+    #[error("fields {first} and {second} of {name} would have one name in ROS 2; name them by a rule (fields_1_to_2)")]
     SameName {
         /// Name of the message.
         name: String,
@@ -84,11 +87,29 @@ pub enum NoTwinReason {
         second: String,
     },
     /// The definition of the twin is not valid.
-    #[error("the other ROS cannot express it: {0}")]
+    #[error("{0}")]
     Definition(
         /// The problem.
         SchemaError,
     ),
+}
+
+/// Two fields that belong together and whose types are not converted into each other.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{one_field} of {one} is {one_type} in ROS 1, {two_field} of {two} is {two_type} in ROS 2; change one of them")]
+pub struct UnlikeFields {
+    /// Name of the message in ROS 1.
+    pub one: String,
+    /// Path of the field there.
+    pub one_field: String,
+    /// Type of the field there.
+    pub one_type: String,
+    /// Name of the message in ROS 2.
+    pub two: String,
+    /// Path of the field there.
+    pub two_field: String,
+    /// Type of the field there.
+    pub two_type: String,
 }
 
 /// Returns the other ROS version.

@@ -2,19 +2,40 @@
 //! reverse.
 //!
 //! Each type has a *twin* in the other ROS: the definition of it that is known there, or else one derived from its
-//! fields. Pairs of twins whose fields do not agree are described by [`TranslationRules`]: a built-in table, and rules
-//! of a lab. A [`MessageTranslator`] carries serialized messages from one type to its twin.
+//! fields. Pairs whose names or fields differ are described by [`TranslationRules`]: a built-in table, and rules of a
+//! lab. A [`MessageTranslator`] carries serialized messages from one type to its twin, in one pass from bytes to bytes.
 //!
 //! ```text
-//! type ── rules: names, definitions ──▶ twin ── pairing: fields ──▶ program: steps ── translate ──▶ bytes of the twin
+//! type ── names, rules, derive ──▶ twin ── pairing ──▶ pairs of fields ── compile ──▶ program ── translate ──▶ bytes
 //! ```
+//!
+//! What the other ROS cannot hold is treated by rule. Lengths beyond a bound of ROS 2 are refused. Numbers out of range
+//! and times before 1970 (ROS 1 has none) or after 2038 (ROS 2 has none) become the nearest ones, and what is no Unicode
+//! becomes U+FFFD; [`MessageTranslator::saturated`] counts them. `Header.seq` is left out towards ROS 2 and 0 towards
+//! ROS 1.
 
+#![forbid(unsafe_code)]
+
+mod compile;
+mod derive;
 mod error;
+mod fault;
+mod names;
+mod number;
+mod output;
+mod pairing;
+mod program;
 mod rules;
+mod shape;
+mod stamp;
+mod text;
 mod translator;
 mod twins;
 
-pub use error::{NoTwin, NoTwinReason, TranslationError};
+#[cfg(test)]
+mod tests;
+
+pub use error::{NoTwin, NoTwinReason, TranslationError, UnlikeFields};
 pub use rules::{RuleError, TranslationRules};
 pub use translator::MessageTranslator;
 pub use twins::{ActionTwin, MessageTwin, ServiceTwin, TypeTranslations};

@@ -3,7 +3,8 @@
 use crate::RosVersion;
 use crate::codec::cdr::{HEADER, WIDE, split_header};
 
-/// Moves forward over one message. Methods return `None` where the message ends too early.
+/// Moves forward over one message. Methods return `None` where the message ends too early. A copy keeps its place.
+#[derive(Debug, Clone, Copy)]
 pub struct MessageCursor<'a> {
     bytes: &'a [u8],
     at: usize,
