@@ -93,6 +93,8 @@ mod names;
 mod oidc;
 #[path = "stories/operations.rs"]
 mod operations;
+#[path = "stories/other_ros.rs"]
+mod other_ros;
 #[path = "stories/page.rs"]
 mod page;
 #[path = "stories/pairing.rs"]
@@ -634,6 +636,12 @@ fn main() -> ExitCode {
             a_server_is_found_in_the_hosts_file_and_by_dns,
             a_server_is_found_by_multicast_dns,
         ],
+        stories![other_ros:
+            a_robot_of_ros_2_starts_a_node_of_ros_1_as_its_own,
+            a_robot_of_ros_1_starts_a_node_of_ros_2_as_its_own,
+            tools_of_ros_1_find_the_stub_of_a_service_of_ros_2,
+            the_same_service_has_an_archive_for_either_ros,
+        ],
         stories![shadowing:
             on_debians_layout_every_tool_finds_the_stub,
             on_an_opt_ros_layout_every_tool_finds_the_stub,
@@ -641,6 +649,7 @@ fn main() -> ExitCode {
             without_the_original_the_stub_stands_alone,
             what_is_not_outsourced_becomes_the_original,
             the_installer_checks_before_it_writes_and_undoes_itself,
+            where_the_other_ros_is_set_up_a_stub_is_refused,
             a_stub_that_was_changed_on_its_way_is_not_installed,
             its_nodelets_cannot_be_loaded_on_the_robot,
             stubs_are_served_to_those_who_may_and_say_what_is_lacking,

@@ -47,6 +47,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("names", &["cloudroid-stub"]),
     ("oidc", &["oidc", "outbound"]),
     ("operations", &["access", "bridge", "rosbridge"]),
+    ("other_ros", &["cloudroid-stub", "package", "translation"]),
     ("page", &["api"]),
     ("pairing", &["authority", "tls"]),
     ("patience", &["cloudroid-stub", "push"]),

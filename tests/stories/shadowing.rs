@@ -209,6 +209,26 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
     Ok(())
 }
 
+pub fn where_the_other_ros_is_set_up_a_stub_is_refused() -> Verdict {
+    let machine = machine_with_stub()?;
+    let other = "export ROS_VERSION=2 ROS_DISTRO=jazzy\n";
+    let install = format!("{other}sh opencv_apps-stub/install.sh");
+    let refused = ["FAIL  ros", "ROS 2 (ROS_VERSION is 2)", "robots of ROS 1", "nothing was installed"];
+    machine.run_script("sh", &install)?.expect_failure(&refused)?;
+    let written = machine.run_script("sh", &format!("ls -d {OVERLAY}"))?;
+    ensure!(written.status != 0, "{}", written.output());
+    machine.run_script("sh", &format!("{install} --force"))?.expect_success()?;
+    for program in ["cloudroid-stub doctor", "people_detect"] {
+        let script = format!("{other}. {OVERLAY}/setup.sh\n{OVERLAY}/lib/opencv_apps/{program}");
+        machine.run_script("sh", &script)?.expect_failure(&["ROS 2 (ROS_VERSION is 2)", "robots of ROS 1"])?;
+    }
+    // Debian's own ROS 1 sets no variable.
+    let doctor = format!(". {OVERLAY}/setup.sh\nrosrun opencv_apps cloudroid-stub doctor");
+    let good = machine.run_script("sh", &doctor)?.expect_success()?;
+    ensure!(good.stdout.contains("ok    ros        ROS_VERSION is not set"), "{}", good.output());
+    Ok(())
+}
+
 pub fn a_stub_that_was_changed_on_its_way_is_not_installed() -> Verdict {
     let machine = machine_with_stub()?;
     let program = "opencv_apps-stub/lib/opencv_apps/cloudroid-stub";

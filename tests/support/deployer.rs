@@ -64,7 +64,8 @@ impl Deployer {
         let outcome = run(Command::new(binaries::path("cloudroidctl"))
             .args(&arguments)
             .env("CLOUDROID_HOME", &self.home)
-            .env_remove("CLOUDROID_SERVER"))?;
+            .env_remove("CLOUDROID_SERVER")
+            .env_remove("ROS_VERSION"))?;
         if let Some(push) = push.filter(|_| outcome.status == 0) {
             push.keep();
         }

@@ -61,7 +61,7 @@ impl Machine {
         let machine = Machine::new()?;
         let place = world().directory("stub")?;
         let (address, directory) = (format!("http://{}", daemon.address), path_str(place.path()));
-        let words = ["--server", &address, "stub", service, "-o", directory];
+        let words = ["--server", &address, "stub", service, "--ros", "1", "-o", directory];
         daemon.deployer().run(&words)?.expect_success()?;
         machine.unpack(&place.path().join(format!("{service}.tar.gz")))?;
         Ok(machine)

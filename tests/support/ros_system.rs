@@ -182,6 +182,8 @@ impl RosSystem {
 
     /// Makes a process join the system.
     pub fn configure(&self, command: &mut Command) {
+        // Those of this machine, if a setup file was sourced; a stub of the other version refuses to run there.
+        command.env_remove("ROS_VERSION").env_remove("ROS_DISTRO");
         match self {
             Self::Master { address, .. } => {
                 command.env("ROS_MASTER_URI", format!("http://{address}")).env_remove("ROS_NAMESPACE");

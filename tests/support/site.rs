@@ -266,7 +266,7 @@ impl Site {
         self.start(command, &overlay.join("log"))
     }
 
-    /// Installs a stub of a service from its archive, with `settings` appended to its `stub.toml`; returns the overlay.
+    /// Installs a stub of a service from the archive for this robot's ROS, with `settings` appended to its `stub.toml`; returns the overlay.
     pub fn install_stub(&self, daemon: &Daemon, service: &str, settings: &str) -> anyhow::Result<PathBuf> {
         self.install_stub_for(daemon, service, std::env::consts::ARCH, settings)
     }
@@ -281,7 +281,8 @@ impl Site {
     ) -> anyhow::Result<PathBuf> {
         let place = tempfile::Builder::new().prefix("installed").tempdir_in(self.place.path())?.keep();
         let directory = path_str(&place);
-        let words = ["stub", service, "--arch", architecture, "-o", directory];
+        let ros = self.system.version().number().to_string();
+        let words = ["stub", service, "--arch", architecture, "--ros", &ros, "-o", directory];
         daemon.deployer().run(&words)?.expect_success()?;
         let archive = File::open(place.join(format!("{service}.tar.gz")))?;
         tar::Archive::new(flate2::read::GzDecoder::new(archive)).unpack(&place)?;

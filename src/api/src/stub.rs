@@ -1,5 +1,6 @@
-//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE` returns the archive, `NAME.tar.gz.sig` its signature, and
-//! `GET /stubs` the list, [`Stubs`].
+//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE&ros=1` returns the archive for robots of that architecture and ROS
+//! version (default: those of the server and of the service), `NAME.tar.gz.sig` its signature, and `GET /stubs` the
+//! list, [`Stubs`].
 
 use serde::{Deserialize, Serialize};
 
@@ -8,6 +9,9 @@ pub const ARCHITECTURES: [&str; 3] = ["x86_64", "aarch64", "armv7"];
 
 /// Response header with the architecture of an archive.
 pub const ARCHITECTURE: &str = "cloudroid-architecture";
+
+/// Response header with the ROS version of the robots that an archive is for, 1 or 2.
+pub const ROS: &str = "cloudroid-ros";
 
 /// Response header with the signature of an archive: the lines of the detached signature without its begin and end
 /// markers.

@@ -35,6 +35,14 @@ pub enum Error {
         /// Reason.
         reason: String,
     },
+    /// Robots of the other ROS cannot use the service.
+    #[error("no stub of {service} for the other ROS: {reason}")]
+    NoTwins {
+        /// Name of the service.
+        service: String,
+        /// The types that have no equivalent, with their fields.
+        reason: package::Error,
+    },
     /// The robot's program is not installed for this architecture.
     #[error("this server has no cloudroid-stub for {asked:?}")]
     UnknownArchitecture {

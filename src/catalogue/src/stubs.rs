@@ -1,5 +1,6 @@
 //! Stub archives of published services: composed from the image and the interface, and packed with the robot's program.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
@@ -17,6 +18,7 @@ use ros::ros2::arguments;
 use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
+use translation::{TranslationRules, TypeTranslations};
 
 use crate::{Error, inventory};
 
@@ -82,32 +84,53 @@ pub fn is_authority(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
+/// Robots that an archive is for.
+pub struct TargetRobots<'a> {
+    /// ROS version of the robots.
+    pub ros: RosVersion,
+    /// Program for the architecture of the robots.
+    pub program: &'a StubProgram,
+    /// Where the robots reach the portal.
+    pub portal: &'a Portal,
+}
+
 /// Returns the files of a revision's stub, except the robot's program.
-pub fn compose_files(
+fn compose_files(
     store: &image::Store,
     revision: &RevisionRecord,
     inventory: &Inventory,
-    architecture: &str,
-    portal: &Portal,
+    robots: &TargetRobots<'_>,
 ) -> Result<Files, Error> {
-    let no_stub =
-        |error: package::Error| Error::NoStub { service: revision.service.clone(), reason: error.to_string() };
+    let no_stub = |error: package::Error| match error {
+        package::Error::NoTwins { .. } => Error::NoTwins { service: revision.service.clone(), reason: error },
+        error => Error::NoStub { service: revision.service.clone(), reason: error.to_string() },
+    };
+    let service_ros = revision.flavour.ros.ros_version();
+    let ros = robots.ros;
+    let interface = if ros == service_ros {
+        Cow::Borrowed(&revision.interface)
+    } else {
+        let translations = TypeTranslations::new(TranslationRules::default());
+        let twin = revision.interface.to_other_ros(service_ros, &revision.service, &translations);
+        Cow::Owned(twin.map_err(no_stub)?)
+    };
     let layers = inventory::layers(store, &revision.image)?;
     let contents = match inventory.packages.get(&revision.package) {
         Some(package) => Contents::read(&layers, package).map_err(no_stub)?,
         None => Contents::default(),
     };
     let about = StubInfo {
-        ros: revision.flavour.ros.ros_version(),
+        ros,
+        service_ros,
         service: &revision.service,
         package: &revision.package,
         revision: revision.number,
         image: &revision.image,
-        portal,
-        architecture,
+        portal: robots.portal,
+        architecture: robots.program.architecture,
         outsourced: &inventory.programs.keys().cloned().collect(),
-        names: &node_names(revision, inventory),
-        interface: &revision.interface,
+        names: &node_names(revision, inventory, ros),
+        interface: &interface,
         stateful: revision.plan.stateful,
         requests: &request_pairs(revision, inventory),
         times: response_times(&revision.plan.sla),
@@ -118,10 +141,12 @@ pub fn compose_files(
 /// Returns the names that ROS 2 programs give their own nodes, for programs that run once, or once without an explicit
 /// name; for a program of several nodes, the name of the first. A robot's launch files seldom name its nodes, and its
 /// parameter files refer to these names. The namespace is included if the program sets it (`/camera/detector`), not if
-/// the push did, since a robot has its own. ROS 1 programs always name their nodes.
-fn node_names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
+/// the push did, since a robot has its own. Launch files of ROS 1 always name the nodes of its programs; those of
+/// robots of ROS 2 may leave it to the names at the push.
+fn node_names(revision: &RevisionRecord, inventory: &Inventory, robot: RosVersion) -> BTreeMap<String, String> {
     let mut names = BTreeMap::new();
-    if revision.flavour.ros.ros_version() == RosVersion::One {
+    let service = revision.flavour.ros.ros_version();
+    if service == RosVersion::One && robot == RosVersion::One {
         return names;
     }
     for (program, path) in &inventory.programs {
@@ -130,7 +155,7 @@ fn node_names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<Stri
         if let Some(node) = arguments::node_for_stub(nodes, |node| &node.argv) {
             let name = match node.name.rsplit_once('/') {
                 Some(("", name)) => name,
-                Some((_, name)) if arguments::sets_namespace(&node.argv) => name,
+                Some((_, name)) if service == RosVersion::One || arguments::sets_namespace(&node.argv) => name,
                 _ => &node.name,
             };
             names.insert(program.clone(), name.to_owned());
@@ -183,16 +208,15 @@ pub fn build_archive(
     store: &image::Store,
     revision: &RevisionRecord,
     inventory: &Inventory,
-    program: &StubProgram,
-    portal: &Portal,
+    robots: &TargetRobots<'_>,
     key: &SigningKey,
 ) -> Result<Archive, Error> {
-    let mut files = compose_files(store, revision, inventory, program.architecture, portal)?;
+    let mut files = compose_files(store, revision, inventory, robots)?;
     let failed = |error: std::io::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: format!("it could not be packed: {error}"),
     };
-    let bytes = std::fs::read(&program.path).map_err(failed)?;
+    let bytes = std::fs::read(&robots.program.path).map_err(failed)?;
     let executable = true;
     files.insert(format!("lib/{}/{PROGRAM}", revision.package), Content::File { bytes, executable });
     pack(&revision.service, files, key).map_err(failed)
@@ -338,9 +362,14 @@ mod tests {
         // A program that runs twice does not determine a name, unless only one of its nodes was left unnamed.
         let expected = [("camera_node", "camera"), ("duet", "alto"), ("gripper", "/arm/gripper")];
         let expected = expected.map(|(program, node)| (program.to_owned(), node.to_owned()));
-        assert_eq!(node_names(&revision, &inventory), expected.into());
+        for robot in [RosVersion::Two, RosVersion::One] {
+            assert_eq!(node_names(&revision, &inventory, robot), expected.clone().into());
+        }
         revision.flavour.ros = Version::Ros1;
-        assert!(node_names(&revision, &inventory).is_empty());
+        assert!(node_names(&revision, &inventory, RosVersion::One).is_empty());
+        // A robot's launch file of ROS 2 may leave the name to the program; the namespace is the robot's.
+        let names = node_names(&revision, &inventory, RosVersion::Two);
+        assert_eq!((&*names["camera_node"], &*names["gripper"]), ("camera", "gripper"));
     }
 
     #[test]

@@ -2,8 +2,10 @@
 
 mod check;
 mod overlay;
+mod ros_version;
 mod server;
 
+use std::path::Path;
 use std::process::ExitCode;
 
 use foreign::terminal;
@@ -16,9 +18,17 @@ pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
     let stub = overlay::ExaminedStub::from_args(asked)?;
     let config = crate::config::load(&stub.share, std::env::vars())?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let mut checks = runtime.block_on(server::checks(&config, &stub));
-    if asked.only != Some(DoctorPart::Server) {
-        let variable = |name: &str| std::env::var(name).ok();
+    let variable = |name: &str| std::env::var(name).ok();
+    let is_asked = |part| asked.only.is_none_or(|only| only == part);
+    let mut checks = Vec::new();
+    if is_asked(DoctorPart::Ros) {
+        let wanted = stub.revision().ros();
+        checks.push(ros_version::check(wanted, &config.service, &variable, Path::new(ros_version::INSTALLED)));
+    }
+    if is_asked(DoctorPart::Server) {
+        checks.extend(runtime.block_on(server::checks(&config, &stub)));
+    }
+    if asked.only.is_none() {
         checks.extend(runtime.block_on(overlay::checks(&stub, &config, &variable)));
     }
     for check in &checks {

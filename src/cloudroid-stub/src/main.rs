@@ -35,6 +35,7 @@ mod revision;
 mod robot;
 mod run;
 mod seen;
+mod setup;
 mod stream;
 mod terms;
 #[cfg(test)]

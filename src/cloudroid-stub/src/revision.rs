@@ -10,8 +10,10 @@ use serde::Deserialize;
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub struct Revision {
-    /// ROS version of the service, 1 or 2 (default: 1, as in stubs made before ROS 2 was supported).
+    /// ROS version of the robot, 1 or 2 (default: 1, as in stubs made before ROS 2 was supported).
     pub ros: Option<u8>,
+    /// ROS version of the service, if it differs from the robot's.
+    pub service_ros: Option<u8>,
     /// Revision of the service.
     pub revision: Option<u64>,
     /// Digest of its image.
@@ -55,11 +57,20 @@ impl Revision {
         toml::from_str(&text).unwrap_or_default()
     }
 
-    /// Returns the ROS version of the service, which is the robot's, too.
+    /// Returns the ROS version of the robot that the stub is for.
     pub fn ros(&self) -> RosVersion {
         match self.ros {
             Some(2) => RosVersion::Two,
             _ => RosVersion::One,
+        }
+    }
+
+    /// Returns the ROS version of the service, whose nodes run in the cloud.
+    pub fn service_ros(&self) -> RosVersion {
+        match self.service_ros {
+            Some(1) => RosVersion::One,
+            Some(2) => RosVersion::Two,
+            _ => self.ros(),
         }
     }
 }

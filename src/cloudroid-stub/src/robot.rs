@@ -1,5 +1,6 @@
 //! The node as launch files started it, and the robot's ROS as its environment describes it.
 
+mod other_ros;
 mod ros1;
 mod ros2;
 
@@ -23,7 +24,9 @@ pub struct LaunchedNode {
     pub place: RosLocation,
     /// Absolute name of the node.
     pub node: String,
-    /// Arguments for the node in the cloud. In ROS 1 they omit those that define its name and namespace; in ROS 2 they
+    /// Absolute name that the program gives its node, if known.
+    pub name_by_program: Option<String>,
+    /// Arguments for the node in the cloud, as the robot's ROS writes them. In ROS 1 they omit those that define its name and namespace; in ROS 2 they
     /// contain them, because a program may create several nodes. Parameters from files of the robot are expanded.
     pub argv: Vec<String>,
     /// Arguments for the local original.
@@ -58,10 +61,23 @@ pub enum RosLocation {
 /// Name of a node unless the robot sets one.
 #[derive(Debug, Clone, Copy)]
 pub struct DefaultName<'a> {
-    /// The name; in ROS 2 with the namespace that its program sets.
+    /// The name; with the namespace that its program sets, if it sets one (ROS 2).
     pub name: &'a str,
     /// The program sets this name itself, so it need not be passed.
     pub by_program: bool,
+}
+
+impl<'a> DefaultName<'a> {
+    /// Returns the namespace, which may be empty, and the name in it.
+    fn split(&self) -> (&'a str, &'a str) {
+        self.name.rsplit_once('/').unwrap_or(("", self.name))
+    }
+
+    /// Returns the absolute name, if the program sets it.
+    fn name_by_program(&self) -> Option<String> {
+        let (above, name) = self.split();
+        self.by_program.then(|| format!("{above}/{name}"))
+    }
 }
 
 impl LaunchedNode {
@@ -76,7 +92,7 @@ impl LaunchedNode {
         variable: Variable<'_>,
     ) -> anyhow::Result<Self> {
         match ros {
-            RosVersion::One => ros1::read(argv, usual.name, variable),
+            RosVersion::One => ros1::read(argv, usual, variable),
             RosVersion::Two => ros2::read(argv, usual, variable).await,
         }
     }
@@ -96,17 +112,19 @@ impl LaunchedNode {
         let made_of = Revision::read(share);
         let share = normalize(share);
         let directory = working_directory(&share, std::env::current_dir().unwrap_or_default());
+        let service = made_of.service_ros();
+        let argv = if service == self.ros { self.argv.clone() } else { other_ros::translate_arguments(self) };
         control::NodeLaunch {
             name: self.node.clone(),
             package: package.to_owned(),
             executable: executable.to_owned(),
-            argv: self.argv.clone(),
+            argv,
             namespace: self.node.rsplit_once('/').map_or("", |(parent, _)| parent).to_owned(),
             share: share.to_string_lossy().into_owned(),
             directory: directory.to_string_lossy().into_owned(),
             revision: made_of.revision,
             image: made_of.image,
-            named_by_argv: self.ros == RosVersion::Two,
+            named_by_argv: service == RosVersion::Two,
         }
     }
 }

@@ -39,6 +39,7 @@ use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
 use crate::robot::{DefaultName, LaunchedNode, RosLocation, default_node_name};
+use crate::setup::{self, RosSetup};
 
 /// Time without any data after which a link counts as down, unless T_max is set.
 const SILENT: Duration = Duration::from_secs(2);
@@ -62,6 +63,14 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
     let share = &asked.node.share;
     let config = config::load(share, std::env::vars())?;
     let made_of = Revision::read(share);
+    let ros = made_of.ros();
+    let variable = |name: &str| std::env::var(name).ok();
+    // Before anything joins the wrong network, where nobody would see it.
+    if let Some(found) = RosSetup::read(&variable)
+        && let Err(error) = found.check(ros)
+    {
+        bail!("{error}; {}", setup::advice(ros, &config.service));
+    }
     let executable = &asked.node.node;
     let found = made_of.names.get(executable);
     let set = config.nodes.get(executable);
@@ -71,8 +80,6 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
         by_program: found.is_some() && set.is_none_or(|set| Some(set) == found),
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let ros = made_of.ros();
-    let variable = |name: &str| std::env::var(name).ok();
     let robot = runtime.block_on(LaunchedNode::read(&asked.argv, usual, ros, &variable))?;
     let end = runtime.block_on(run_stub(asked, config.clone(), &robot))?;
     // Running blocking tasks (a codec, for example) are not waited for.

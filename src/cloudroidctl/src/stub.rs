@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use api::Stubs;
-use api::stub::{ARCHITECTURE, ARCHIVE, SIGNATURE, SIGNER, parse_architecture};
+use api::stub::{ARCHITECTURE, ARCHIVE, ROS, SIGNATURE, SIGNER, parse_architecture};
 use hyper::Method;
 use sign::PublicKey;
 
@@ -23,6 +23,10 @@ pub struct StubArgs {
     /// Architecture of the robot, as printed by `uname -m` (default: this machine's).
     #[arg(long, value_name = "ARCH")]
     arch: Option<String>,
+    /// ROS version of the robot (default: the one set up in this shell, by ROS_VERSION; otherwise the service's).
+    /// Messages are translated if it is not the service's.
+    #[arg(long, value_name = "1|2", value_parser = clap::value_parser!(u8).range(1..=2))]
+    ros: Option<u8>,
     /// Key that must have signed the archive ("ssh-ed25519 AAAA…"; default: the key that the server reports).
     #[arg(long, value_name = "KEY")]
     key: Option<PublicKey>,
@@ -33,6 +37,7 @@ pub struct StubArgs {
 struct FetchedStub {
     service: String,
     architecture: String,
+    ros: Option<u8>,
     path: PathBuf,
     bytes: u64,
     signature: PathBuf,
@@ -56,18 +61,21 @@ impl StubArgs {
             }
         };
         let asked = self.arch.as_deref().unwrap_or(std::env::consts::ARCH);
+        let ros = self.ros.or_else(|| ros_of_shell(std::env::var("ROS_VERSION").ok().as_deref()));
         let path = format!(
-            "/stubs/{}.tar.gz?arch={}",
+            "/stubs/{}.tar.gz?arch={}{}",
             percent_encode(service),
-            percent_encode(parse_architecture(asked).unwrap_or(asked))
+            percent_encode(parse_architecture(asked).unwrap_or(asked)),
+            ros.map(|ros| format!("&ros={ros}")).unwrap_or_default(),
         );
         let mut answer = client.send(Method::GET, &path, empty_body()).await?;
-        let architecture =
-            answer.headers().get(ARCHITECTURE).and_then(|value| value.to_str().ok()).unwrap_or(asked).to_owned();
-        let signature = answer
-            .headers()
-            .get(SIGNATURE)
-            .and_then(|value| value.to_str().ok())
+        let stated = |name: &str| answer.headers().get(name).and_then(|value| value.to_str().ok());
+        let architecture = stated(ARCHITECTURE).unwrap_or(asked).to_owned();
+        let made_for: Option<u8> = stated(ROS).and_then(|ros| ros.parse().ok());
+        if let Some(ros) = self.ros.filter(|ros| made_for != Some(*ros)) {
+            bail!("this server's version is too old to make archives for robots of ROS {ros}; update it");
+        }
+        let signature = stated(SIGNATURE)
             .map(sign::to_armoured_lines)
             .context("the archive is not signed: the server's version is too old; update it")?;
         let target = self.output.join(format!("{service}.tar.gz"));
@@ -101,6 +109,7 @@ impl StubArgs {
         let fetched = FetchedStub {
             service: service.clone(),
             architecture,
+            ros: made_for,
             path: target,
             bytes,
             signature: beside,
@@ -110,9 +119,10 @@ impl StubArgs {
             OutputFormat::Json => output::json(&fetched),
             OutputFormat::Table => {
                 output::line(&format!(
-                    "{} for {} ({})",
+                    "{} for {}{} ({})",
                     fetched.path.display(),
                     fetched.architecture,
+                    fetched.ros.map(|ros| format!(", ROS {ros}")).unwrap_or_default(),
                     api::Size(fetched.bytes)
                 ))?;
                 output::line(&format!("signed by {key}"))?;
@@ -121,6 +131,11 @@ impl StubArgs {
             }
         }
     }
+}
+
+/// Returns the ROS version that is set up in a shell, by its `ROS_VERSION`.
+fn ros_of_shell(version: Option<&str>) -> Option<u8> {
+    version.and_then(|version| version.parse().ok()).filter(|version| (1..=2).contains(version))
 }
 
 /// Returns the commands that verify the archive before any of it runs, and that use the same key for later updates.
@@ -150,5 +165,18 @@ async fn list(client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()>
             }
             output::line(&format!("missing        {} (make stub-cross builds them)", list(&stubs.lacking)))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ros_of_the_shell_is_a_number_or_none() {
+        for (variable, expected) in [("1", Some(1)), ("2", Some(2)), ("3", None), ("noetic", None), ("", None)] {
+            assert_eq!(ros_of_shell(Some(variable)), expected, "{variable:?}");
+        }
+        assert_eq!(ros_of_shell(None), None);
     }
 }

@@ -221,6 +221,25 @@ pub enum Error {
         /// ROS package.
         package: String,
     },
+    /// Types of the interface have no equivalent in the other ROS.
+    #[error("robots of ROS {robot} cannot use {service}: {}", .problems.join("; "))]
+    NoTwins {
+        /// ROS version of the robots.
+        robot: u8,
+        /// Name of the service.
+        service: String,
+        /// For each type, what it is used for, and its fields that have no equivalent.
+        problems: Vec<String>,
+    },
+    /// The types of the interface in the other ROS are not valid together.
+    #[error("the messages of {service} in the other ROS: {error}")]
+    BadTwins {
+        /// Name of the service.
+        service: String,
+        /// The problem.
+        #[source]
+        error: ros::schema::SchemaError,
+    },
 }
 
 fn describe_topics(direction: &str, topics: &[String]) -> String {

@@ -8,6 +8,7 @@
 //!   layers ──inventory::scan──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
 //!   interface, observed answers ──requests──▶ which outputs answer which input
+//!   interface ──twins──▶ the interface as robots of the other ROS see it
 //!   layers, inventory, interface ──stub──▶ the files that a robot installs instead of the package
 //! ```
 //!
@@ -41,6 +42,7 @@ pub mod requests;
 pub mod selection;
 pub mod stub;
 mod supplement;
+mod twins;
 pub mod workspace;
 
 pub use error::Error;

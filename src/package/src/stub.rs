@@ -13,8 +13,10 @@ mod ament;
 mod catkin;
 mod contents;
 mod manifest;
+mod message_packages;
 mod needed;
 mod nodelets;
+mod other_ros;
 mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -46,8 +48,10 @@ pub struct Portal {
 /// Properties of the service that a stub is built for.
 #[derive(Debug, Clone)]
 pub struct StubInfo<'a> {
-    /// ROS version of the service, which the robot must have as well.
+    /// ROS version of the robot.
     pub ros: RosVersion,
+    /// ROS version of the service.
+    pub service_ros: RosVersion,
     /// Name of the service.
     pub service: &'a str,
     /// ROS package.
@@ -64,7 +68,7 @@ pub struct StubInfo<'a> {
     pub outsourced: &'a BTreeSet<String>,
     /// Names that programs give their own nodes, by executable, as far as known.
     pub names: &'a BTreeMap<String, String>,
-    /// Interface of the service.
+    /// Interface of the service, with types of the robot's ROS.
     pub interface: &'a Interface,
     /// True if answers depend on earlier requests, as declared by the deployer.
     pub stateful: bool,
@@ -72,6 +76,13 @@ pub struct StubInfo<'a> {
     pub requests: &'a [ProgramRequest],
     /// Default T_desire and T_max in seconds, as set by the deployer.
     pub times: Option<(f64, f64)>,
+}
+
+impl StubInfo<'_> {
+    /// Returns whether robot and service have different versions of ROS.
+    pub fn is_for_other_ros(&self) -> bool {
+        self.ros != self.service_ros
+    }
 }
 
 /// Request pair of a node, with topics as its program names them.
@@ -99,6 +110,9 @@ pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Er
     if !contents.share.contains_key("package.xml") {
         return Err(Error::NoManifest { package: package.to_owned() });
     }
+    if about.is_for_other_ros() {
+        contents = other_ros::adapt_contents(about, contents);
+    }
     let mut files = match about.ros {
         RosVersion::One => {
             catkin::replace_plugin_lists(about, &mut contents);
@@ -106,6 +120,10 @@ pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Er
         }
         RosVersion::Two => ament::index_files(about, &contents),
     };
+    if about.is_for_other_ros() {
+        let sources = message_packages::source_files(about);
+        files.extend(sources.map_err(|error| Error::BadTwins { service: about.service.to_owned(), error })?);
+    }
     let names = launcher_names(about, &contents);
     files.insert("install.sh".to_owned(), text_file(&fill_template(INSTALL, about)));
     files.insert("README.md".to_owned(), text_file(&readme(about, &names)));
@@ -138,7 +156,7 @@ pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Er
 }
 
 fn is_shipped(about: &StubInfo<'_>, path: &str, content: &Content) -> bool {
-    if about.ros == RosVersion::Two && ament::belongs_to_install_space(path, content) {
+    if about.service_ros == RosVersion::Two && ament::belongs_to_install_space(path, content) {
         return false;
     }
     match content {
@@ -232,9 +250,33 @@ fn readme(about: &StubInfo<'_>, names: &BTreeSet<String>) -> String {
     let original = names.difference(about.outsourced).map(String::as_str);
     let example = about.outsourced.first().or(names.first());
     fill_template(README, about)
+        .replace("@OTHER@", &other_ros_notice(about))
         .replace("@OUTSOURCED@", &list(about.outsourced.iter().map(String::as_str).collect()))
         .replace("@ORIGINAL@", &list(original.collect()))
         .replace("@EXAMPLE@", example.map_or("NODE", String::as_str))
+}
+
+/// Returns what the owner of a robot of the other ROS has to know; empty for robots of the service's ROS.
+fn other_ros_notice(about: &StubInfo<'_>) -> String {
+    if !about.is_for_other_ros() {
+        return String::new();
+    }
+    let (ros, service_ros) = (about.ros.number(), about.service_ros.number());
+    let packages: Vec<String> = message_packages::package_names(about).into_iter().collect();
+    let sources = match &*packages {
+        [] => String::new(),
+        packages => format!(
+            " If this robot's nodes use the messages of {}, copy\n`share/{}/{}` into the robot's workspace and build \
+             it.",
+            packages.join(", "),
+            about.package,
+            message_packages::DIRECTORY
+        ),
+    };
+    format!(
+        "\nThe service is of ROS {service_ros}, this archive for robots of ROS {ros}: the server translates the \
+         messages, the stub the nodes' arguments.{sources}\n"
+    )
 }
 
 /// Returns the path of `pkg/msg/Type` in the install space, if it is of this package.

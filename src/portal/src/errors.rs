@@ -550,6 +550,7 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
         C::UnknownRevision { .. } => (S::NOT_FOUND, "unknown-revision", "unknown revision"),
         C::UnknownImage { .. } => (S::NOT_FOUND, "unknown-image", "unknown image"),
         C::NoStub { .. } => (S::UNPROCESSABLE_ENTITY, "no-stub", "no stub"),
+        C::NoTwins { .. } => (S::UNPROCESSABLE_ENTITY, "no-twin", "types without an equivalent in the other ROS"),
         C::UnknownArchitecture { .. } => (S::NOT_FOUND, "unknown-architecture", "unknown architecture"),
         C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
         C::Name(_) => (S::BAD_REQUEST, "bad-name", "invalid name"),

@@ -3,14 +3,15 @@
 use std::sync::Arc;
 
 use api::Stubs;
-use api::stub::{ARCHITECTURE, SIGNATURE};
+use api::stub::{ARCHITECTURE, ROS, SIGNATURE};
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
-use catalogue::stubs::{self, StubPrograms};
+use catalogue::stubs::{self, StubPrograms, TargetRobots};
 use package::stub::Portal;
+use ros::bus::RosVersion;
 use serde::Deserialize;
 use tokio::sync::Semaphore;
 
@@ -41,6 +42,26 @@ pub async fn list(State(app): State<Arc<App>>, Extension(caller): Extension<Call
 pub struct StubQuery {
     /// Architecture of the robot (default: this machine's).
     arch: Option<String>,
+    /// ROS version of the robot (default: the service's).
+    ros: Option<RobotRos>,
+}
+
+/// ROS version in a query.
+#[derive(Debug, Clone, Copy, Deserialize)]
+enum RobotRos {
+    #[serde(rename = "1")]
+    One,
+    #[serde(rename = "2")]
+    Two,
+}
+
+impl RobotRos {
+    fn to_version(self) -> RosVersion {
+        match self {
+            Self::One => RosVersion::One,
+            Self::Two => RosVersion::Two,
+        }
+    }
 }
 
 /// Returns the service of `NAME.tar.gz` or `NAME.tar.gz.sig`, and whether the file is the signature.
@@ -71,8 +92,12 @@ pub async fn archive(
     let inventory = app.catalogue.revision_contents(&revision).await?.inventory;
     let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
+    let ros = asked.ros.map_or_else(|| revision.flavour.ros.ros_version(), RobotRos::to_version);
     let key = Arc::clone(&app.signing);
-    let packing = move || stubs::build_archive(&store, &revision, &inventory, &program, &portal, &key);
+    let packing = move || {
+        let robots = TargetRobots { ros, program: &program, portal: &portal };
+        stubs::build_archive(&store, &revision, &inventory, &robots, &key)
+    };
     // The semaphore is never closed.
     let turn = PACKING.acquire().await;
     let archive = privilege::spawn_blocking(packing).await;
@@ -86,6 +111,7 @@ pub async fn archive(
         (header::CONTENT_TYPE, "application/gzip".to_owned()),
         (header::CONTENT_DISPOSITION, format!("attachment; filename=\"{name}.tar.gz\"")),
         (header::HeaderName::from_static(ARCHITECTURE), architecture.to_owned()),
+        (header::HeaderName::from_static(ROS), ros.number().to_string()),
         (header::HeaderName::from_static(SIGNATURE), sign::to_single_line(&archive.signature)),
     ];
     let stream = stream_file(archive.file);

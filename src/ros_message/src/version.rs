@@ -17,4 +17,12 @@ impl RosVersion {
             Self::Two => 2,
         }
     }
+
+    /// Returns the other version.
+    pub fn other(self) -> RosVersion {
+        match self {
+            Self::One => Self::Two,
+            Self::Two => Self::One,
+        }
+    }
 }

@@ -53,8 +53,8 @@ impl ExaminedStub {
     }
 
     /// Returns the service's revision that the stub was made of.
-    pub fn revision(&self) -> Option<u64> {
-        Revision::read(&self.share).revision
+    pub fn revision(&self) -> Revision {
+        Revision::read(&self.share)
     }
 }
 

@@ -120,11 +120,15 @@ impl PortalProbe {
             }
         }
         let there = body["revision"].as_u64();
-        match (there, stub.revision()) {
+        let made_of = stub.revision();
+        match (there, made_of.revision) {
             (Some(there), Some(here)) if there != here => Check::warning(
                 "service",
                 format!("{name} is at revision {there}, but this stub was made from revision {here}"),
-                format!("download it again: {}", self.url(&format!("/stubs/{name}.tar.gz"))),
+                format!(
+                    "download it again: {}",
+                    self.url(&format!("/stubs/{name}.tar.gz?ros={}", made_of.ros().number()))
+                ),
             ),
             _ => {
                 let by = match self.server.trust.identity {

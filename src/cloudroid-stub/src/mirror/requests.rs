@@ -177,6 +177,7 @@ mod tests {
                 ros,
                 place: crate::robot::RosLocation::Master { host: String::new(), port: 0, own: None },
                 node: now.to_owned(),
+                name_by_program: None,
                 argv: line.split_whitespace().map(str::to_owned).collect(),
                 original_argv: Vec::new(),
                 parameters: Default::default(),

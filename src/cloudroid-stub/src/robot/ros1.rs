@@ -6,17 +6,18 @@ use anyhow::{Context, bail};
 use ros::bus::RosVersion;
 use ros::ros1::names::{self, PeerUri};
 
-use super::{LaunchedNode, RosLocation};
+use super::{DefaultName, LaunchedNode, RosLocation};
 use crate::network::Variable;
 
 /// Default address of the Master.
 const MASTER: &str = "http://localhost:11311";
 
-/// Implements [`LaunchedNode::read`] for ROS 1.
-pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<LaunchedNode> {
+/// Implements [`LaunchedNode::read`] for ROS 1. The default name has a namespace if a program of ROS 2 sets one.
+pub fn read(argv: &[String], usual: DefaultName<'_>, variable: Variable<'_>) -> anyhow::Result<LaunchedNode> {
     let set = |name| variable(name).filter(|value| !value.is_empty());
-    let mut namespace = set("ROS_NAMESPACE").unwrap_or_default();
-    let mut name = usual.to_owned();
+    let (above, name) = usual.split();
+    let mut namespace = set("ROS_NAMESPACE").unwrap_or_else(|| above.to_owned());
+    let mut name = name.to_owned();
     let mut master = set("ROS_MASTER_URI").unwrap_or_else(|| MASTER.to_owned());
     let mut own = set("ROS_HOSTNAME").or_else(|| set("ROS_IP"));
     let mut passed = Vec::new();
@@ -45,6 +46,7 @@ pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Res
         ros: RosVersion::One,
         place: RosLocation::Master { host: place.host, port: place.port, own },
         node,
+        name_by_program: usual.name_by_program(),
         argv: passed,
         original_argv,
         parameters: BTreeMap::new(),
@@ -60,7 +62,8 @@ mod tests {
 
     fn read(argv: &[&str], environment: &[(&str, &str)]) -> anyhow::Result<LaunchedNode> {
         let argv: Vec<String> = argv.iter().map(|&argument| argument.to_owned()).collect();
-        super::read(&argv, "usual", &|name| {
+        let usual = DefaultName { name: "usual", by_program: false };
+        super::read(&argv, usual, &|name| {
             let found = environment.iter().find(|(variable, _)| *variable == name);
             found.map(|(_, value)| (*value).to_owned())
         })

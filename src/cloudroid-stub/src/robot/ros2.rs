@@ -23,7 +23,7 @@ const LOG_CONFIG_FILE: &str = "--log-config-file";
 /// sets one. For a program with several nodes it is the name of the first.
 pub async fn read(argv: &[String], usual: DefaultName<'_>, variable: Variable<'_>) -> anyhow::Result<LaunchedNode> {
     let parts = arguments::parse(argv)?;
-    let (above, name) = usual.name.rsplit_once('/').unwrap_or(("", usual.name));
+    let (above, name) = usual.split();
     let node = node_name(&parts, above, name)?;
     let sections = read_sections(&parts)?;
     let parameters = sections.for_node(&node);
@@ -33,6 +33,7 @@ pub async fn read(argv: &[String], usual: DefaultName<'_>, variable: Variable<'_
         place: RosLocation::Domain { id, network },
         argv: cloud_arguments(&parts, &node, !usual.by_program, &parameters),
         original_argv: original_arguments(parts),
+        name_by_program: usual.name_by_program(),
         sim_time: parameters.get("use_sim_time") == Some(&ParamValue::Bool(true)),
         node,
         parameters,

@@ -55,6 +55,6 @@ pub(super) fn unloadable_plugin_list(about: &StubInfo<'_>, content: Content) -> 
     Content::File { bytes: list.into_bytes(), executable: false }
 }
 
-fn escape_xml(text: &str) -> String {
+pub(super) fn escape_xml(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
 }

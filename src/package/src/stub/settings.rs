@@ -39,6 +39,8 @@ pub(super) fn revision_toml(about: &StubInfo<'_>, executables: &BTreeSet<String>
     #[derive(Serialize)]
     struct Revision<'a> {
         ros: u8,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        service_ros: Option<u8>,
         package: &'a str,
         service: &'a str,
         revision: u64,
@@ -61,6 +63,7 @@ pub(super) fn revision_toml(about: &StubInfo<'_>, executables: &BTreeSet<String>
     }
     let revision = Revision {
         ros: about.ros.number(),
+        service_ros: about.is_for_other_ros().then(|| about.service_ros.number()),
         package: about.package,
         service: about.service,
         revision: about.revision,

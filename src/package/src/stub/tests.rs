@@ -1,4 +1,5 @@
 mod ament;
+mod other_ros;
 
 use super::*;
 use crate::interface::{Direction, Topic};
@@ -50,6 +51,11 @@ fn compose_stub_from(outsourced: &[&str], contents: Contents) -> Files {
 }
 
 fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
+    compose_stub_of(ros, ros, outsourced, contents)
+}
+
+/// Composes the stub of a service of one ROS for robots of the same or the other one.
+fn compose_stub_of(service_ros: RosVersion, ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
     let outsourced = outsourced.iter().map(|name| (*name).to_owned()).collect();
     let mut interface = Interface {
         topics: vec![Topic {
@@ -69,6 +75,7 @@ fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) ->
     }
     let about = StubInfo {
         ros,
+        service_ros,
         service: "serves",
         package: "p",
         revision: 3,
@@ -179,6 +186,7 @@ fn without_a_manifest_there_is_no_stub() {
     let interface = Interface::default();
     let about = StubInfo {
         ros: RosVersion::One,
+        service_ros: RosVersion::One,
         service: "p",
         package: "p",
         revision: 1,
@@ -213,7 +221,7 @@ fn unpack_signed_by(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir 
 /// Writes the files of an unpacked archive.
 fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) {
     let mut files = files.clone();
-    files.insert(format!("lib/p/{PROGRAM}"), file(PROGRAM_OF_TESTS, true));
+    files.entry(format!("lib/p/{PROGRAM}")).or_insert_with(|| file(PROGRAM_OF_TESTS, true));
     let signer = format!("{}\n", key.public_key().allowed_signers_line());
     files.insert(SIGNER.into(), file(&signer, false));
     let list = manifest(&files);

@@ -356,6 +356,10 @@ fn catalogue_next_step(error: &catalogue::Error) -> String {
             format!("list them with: cloudroidctl services {service}")
         }
         C::NoStub { service, .. } => format!("fix the package and push {service} again"),
+        C::NoTwins { service, .. } => format!(
+            "change these fields of the package's messages and push {service} again, or request the archive for \
+             robots of the service's own ROS (without ?ros=)"
+        ),
         C::UnknownArchitecture { .. } => {
             "request an available one with ?arch=, or ask the operator to add others: make stub-cross".to_owned()
         }

@@ -269,6 +269,10 @@ stub=$here/lib/$package/cloudroid-stub
 if ! "$stub" --version > /dev/null 2>&1; then
   complain "$stub does not run on this machine ($(uname -m)): download the stub for its architecture (?arch= or cloudroidctl stub --arch)"
 fi
+# Before the line is redeemed, which is good for one robot.
+if ! "$stub" doctor --share "$here/share/$package" --package "$package" --only ros; then
+  $force || complain "nothing was installed: fix this, or install anyway with --force"
+fi
 
 if [ -n "$line" ]; then
   "$stub" pair "$line" || complain "nothing was installed: this robot could not be paired"

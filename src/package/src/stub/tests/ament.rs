@@ -6,7 +6,7 @@ use std::process::Command;
 use super::*;
 
 /// Share directory of an ament_cmake package, with the files of its install space.
-fn contents() -> Contents {
+pub(super) fn contents() -> Contents {
     let shared = [
         "package.xml",
         "launch/a.launch.py",
@@ -256,6 +256,7 @@ fn ros_2_s_own_tools_find_the_stub_before_the_original() {
     // Tools require names of at least two letters.
     let about = StubInfo {
         ros: RosVersion::Two,
+        service_ros: RosVersion::Two,
         service: "serves",
         package: "people",
         revision: 3,

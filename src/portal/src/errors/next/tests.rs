@@ -148,6 +148,7 @@ fn storage_errors() -> Vec<Error> {
         K::UnknownRevision { service: x(), revision: x(), exists: Vec::new() },
         K::UnknownImage { what: x() },
         K::NoStub { service: x(), reason: x() },
+        K::NoTwins { service: x(), reason: package::Error::NoManifest { package: x() } },
         K::UnknownArchitecture { asked: x(), exists: Vec::new() },
         K::Name(NameError::Service(x())),
         K::Name(NameError::Reserved(x())),

@@ -1,0 +1,240 @@
+//! Command lines for a node in the cloud that is of the other ROS than the robot
+//! (<http://wiki.ros.org/Remapping%20Arguments>, <https://design.ros2.org/articles/ros_command_line_arguments.html>).
+//!
+//! | ROS 1 | ROS 2 |
+//! |---|---|
+//! | `_p:=v`, `_a/b:=v` | `-p p:=v`, `-p a.b:=v` |
+//! | `from:=to`, `~from:=to` | `-r from:=to`, `-r ~/from:=to` |
+//! | `__name:=n`, `ROS_NAMESPACE` | `-r __node:=n`, `-r __ns:=/above` |
+//!
+//! What the other ROS does not know is left out: settings of logging, and with a warning what it cannot express.
+
+use ros::bus::{ParamValue, RosVersion};
+use ros::ros2::arguments::{self, BEGIN, END, Kind, RemapRule};
+use ros::ros2::process;
+
+use super::{LaunchedNode, ros2};
+use crate::params_file::value;
+
+/// Returns the arguments of a robot's node for a program of the other ROS.
+pub fn translate_arguments(robot: &LaunchedNode) -> Vec<String> {
+    match robot.ros {
+        RosVersion::One => to_two(robot),
+        RosVersion::Two => to_one(robot),
+    }
+}
+
+/// Translates arguments of ROS 1, from which those that define the node's name are already removed.
+fn to_two(robot: &LaunchedNode) -> Vec<String> {
+    let mut own = Vec::new();
+    let mut given = Vec::new();
+    for argument in &robot.argv {
+        let Some((name, text)) = argument.split_once(":=") else {
+            own.push(argument.clone());
+            continue;
+        };
+        let words = match name.strip_prefix('_') {
+            Some(parameter) => ["-p".to_owned(), format!("{}:={}", parameter.replace('/', "."), to_yaml(text))],
+            None => ["-r".to_owned(), format!("{}:={}", to_two_name(name), to_two_name(text))],
+        };
+        // A single invalid argument would end the node.
+        match arguments::parse(&[&[BEGIN.to_owned()], &words[..]].concat()) {
+            Ok(_) => given.extend(words),
+            Err(error) => tracing::warn!("{argument} does not reach the node in the cloud, which uses ROS 2: {error}"),
+        }
+    }
+    given.extend(naming_rules(robot));
+    if !given.is_empty() {
+        own.push(BEGIN.to_owned());
+        own.extend(given);
+        own.push(END.to_owned());
+    }
+    own
+}
+
+/// Returns the rules for the parts of the node's name that its program does not set in this way.
+fn naming_rules(robot: &LaunchedNode) -> Vec<String> {
+    let split = |node: &str| {
+        let (above, name) = node.rsplit_once('/').unwrap_or(("", node));
+        let above = if above.is_empty() { "/" } else { above };
+        (above.to_owned(), name.to_owned())
+    };
+    let (above, name) = split(&robot.node);
+    let by_program = robot.name_by_program.as_deref().map(split);
+    let mut rules = Vec::new();
+    if by_program.as_ref().is_none_or(|(_, by_program)| *by_program != name) {
+        rules.extend(["-r".to_owned(), format!("__node:={name}")]);
+    }
+    if by_program.is_none_or(|(by_program, _)| by_program != above) {
+        rules.extend(["-r".to_owned(), format!("__ns:={above}")]);
+    }
+    rules
+}
+
+/// Translates arguments of ROS 2, in which parameters from files are already expanded. The cloud sets the node's name.
+fn to_one(robot: &LaunchedNode) -> Vec<String> {
+    // They were parsed before.
+    let parts = arguments::parse(&robot.argv).unwrap_or_default();
+    let name = robot.node.rsplit('/').next().unwrap_or_default();
+    let mut argv = Vec::new();
+    for part in parts {
+        match part.kind {
+            Kind::Own => argv.extend(part.words),
+            Kind::Rule(rule) if rule.applies_to(name) => match to_one_rule(&rule) {
+                Ok(words) => argv.extend(words),
+                Err(pattern) => tracing::warn!(
+                    "{} does not reach the node in the cloud, which uses ROS 1: {pattern} is a pattern",
+                    part.words.join(" ")
+                ),
+            },
+            Kind::Parameter(given) if !given.is_for_other_node(&robot.node) => {
+                // Time is the cloud's matter.
+                if given.name != "use_sim_time" && !given.name.starts_with(ros2::SETTINGS) {
+                    argv.push(format!("_{}:={}", given.name.replace('.', "/"), to_one_text(&given.value)));
+                }
+            }
+            Kind::Rule(_) | Kind::Parameter(_) | Kind::File(_) | Kind::Setting | Kind::Mark => {}
+        }
+    }
+    argv
+}
+
+/// Returns a rule as ROS 1 writes it, none for those of the node's name. Fails for a pattern, which it returns.
+fn to_one_rule(rule: &RemapRule) -> Result<Option<String>, String> {
+    if !rule.of.is_name() {
+        return Ok(None);
+    }
+    let pattern = [&rule.from, &rule.to].into_iter().find(|name| name.contains(['*', '\\']));
+    match pattern {
+        Some(pattern) => Err(pattern.clone()),
+        None => Ok(Some(format!("{}:={}", to_one_name(&rule.from), to_one_name(&rule.to)))),
+    }
+}
+
+/// Returns a name as ROS 2 writes it: private ones have a slash.
+fn to_two_name(name: &str) -> String {
+    match name.strip_prefix('~') {
+        Some(private) => format!("~/{}", private.trim_start_matches('/')),
+        None => name.to_owned(),
+    }
+}
+
+/// Returns a name as ROS 1 writes it.
+fn to_one_name(name: &str) -> String {
+    match name.strip_prefix("~/") {
+        Some(private) => format!("~{private}"),
+        None => name.to_owned(),
+    }
+}
+
+/// Returns a value of ROS 1, where any text is one, in YAML as ROS 2 reads it.
+fn to_yaml(text: &str) -> String {
+    let value = value::parse_text(text).unwrap_or_else(|_| ParamValue::String(text.to_owned()));
+    process::yaml(&value)
+}
+
+/// Returns a value in YAML as ROS 1 reads it. A text has no quotes, which roscpp would take for a part of it, unless it
+/// looks like another value; then only rospy, which reads YAML, takes it for a text.
+fn to_one_text(yaml: &str) -> String {
+    match value::parse_text(yaml) {
+        Ok(ParamValue::String(text)) if value::parse_text(&text).ok() == Some(ParamValue::String(text.clone())) => text,
+        _ => yaml.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::DefaultName;
+    use super::*;
+
+    fn words(line: &str) -> Vec<String> {
+        line.split_whitespace().map(str::to_owned).collect()
+    }
+
+    /// Returns the command line in ROS 2 for one of ROS 1.
+    fn translate_to_two(usual: DefaultName<'_>, argv: &[&str], namespace: &str) -> Vec<String> {
+        let argv: Vec<String> = argv.iter().map(|&word| word.to_owned()).collect();
+        let variable = |name: &str| (name == "ROS_NAMESPACE").then(|| namespace.to_owned());
+        let robot = super::super::ros1::read(&argv, usual, &variable).expect("a robot");
+        translate_arguments(&robot)
+    }
+
+    async fn translate_to_one(argv: &[String]) -> Vec<String> {
+        let usual = DefaultName { name: "see", by_program: true };
+        let robot = ros2::read(argv, usual, &|_| None).await.expect("a robot");
+        translate_arguments(&robot)
+    }
+
+    const GUESSED: DefaultName<'_> = DefaultName { name: "usual", by_program: false };
+
+    #[test]
+    fn arguments_of_ros_1_become_those_of_ros_2() {
+        let argv = [
+            "3",
+            "image:=/camera/image",
+            "~told:=/told",
+            "_rate:=2",
+            "_frame:=base link",
+            "_text:=a: b",
+            "_none:=",
+            "_list:=[1, 2]",
+            "_gains/p:=0.5",
+            "__name:=people",
+            "__log:=/x.log",
+            "--fast",
+        ];
+        let expected = [
+            &["3", "--fast", "--ros-args"][..],
+            &["-r", "image:=/camera/image", "-r", "~/told:=/told"],
+            &["-p", "rate:=2", "-p", "frame:=\"base link\"", "-p", "text:=\"a: b\"", "-p", "none:=\"\""],
+            &["-p", "list:=[1, 2]", "-p", "gains.p:=0.5"],
+            &["-r", "__node:=people", "-r", "__ns:=/front", "--"],
+        ];
+        assert_eq!(translate_to_two(GUESSED, &argv, "/front"), expected.concat());
+    }
+
+    #[test]
+    fn a_name_that_the_program_gives_is_not_told() {
+        let usual = DefaultName { name: "/arm/gripper", by_program: true };
+        for (argv, namespace, expected) in [
+            ("", "", ""),
+            ("__name:=gripper", "/arm", ""),
+            ("__name:=hand", "", "--ros-args -r __node:=hand --"),
+            ("", "/left", "--ros-args -r __ns:=/left --"),
+            ("__ns:=/ __name:=hand", "", "--ros-args -r __node:=hand -r __ns:=/ --"),
+        ] {
+            let argv: Vec<&str> = argv.split_whitespace().collect();
+            assert_eq!(translate_to_two(usual, &argv, namespace).join(" "), expected, "{argv:?} {namespace}");
+        }
+    }
+
+    #[test]
+    fn what_ros_2_would_refuse_is_left_out() {
+        let argv = ["url:=http://x/?y", "_frame-id:=a", "a b:=c"];
+        let translated = translate_to_two(DefaultName { name: "see", by_program: true }, &argv, "");
+        assert!(translated.is_empty(), "{translated:?}");
+    }
+
+    #[tokio::test]
+    async fn arguments_of_ros_2_become_those_of_ros_1() {
+        let line = "--fast --ros-args -r __node:=people -r __ns:=/front -r image:=/camera/image -r ~/told:=/told -r \
+                    rostopic://a:=b -r people:c:=d -r other:e:=f --log-level debug -p rate:=2 -p gains.p:=0.5 -p \
+                    people_frame:=map -p use_sim_time:=true -p cloudroid.max:=0.3 -p other:rate:=9 -p ok:=yes -p \
+                    number:=\"1\" -p list:=[1,2] -- own";
+        let expected = "--fast own image:=/camera/image ~told:=/told a:=b c:=d _gains/p:=0.5 _list:=[1, 2] \
+                        _number:=\"1\" _ok:=true _people_frame:=map _rate:=2";
+        assert_eq!(translate_to_one(&words(line)).await.join(" "), expected);
+        let text = ["--ros-args", "-p", "title:=two words"].map(str::to_owned);
+        assert_eq!(translate_to_one(&text).await, ["_title:=two words"]);
+        let pattern = words("--ros-args -r *:=/x");
+        assert!(translate_to_one(&pattern).await.is_empty());
+    }
+
+    #[tokio::test]
+    async fn there_and_back_arguments_are_the_same() {
+        let line = "own image:=/camera/image ~told:=/told _flag:=true _gains/p:=0.5 _rate:=2";
+        let usual = DefaultName { name: "see", by_program: true };
+        let there = translate_to_two(usual, &words(line).iter().map(String::as_str).collect::<Vec<_>>(), "");
+        assert_eq!(translate_to_one(&there).await.join(" "), line);
+    }
+}
