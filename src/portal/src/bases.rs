@@ -4,15 +4,16 @@ use std::io;
 use std::sync::Arc;
 
 use api::bases::{BASE_ARCHIVE, BaseDetail, BaseSummary};
-use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use futures_util::{StreamExt, TryStreamExt};
 
 use crate::app::App;
-use crate::body::stream_file;
+use crate::body::file_body;
+use crate::caller::Caller;
 use crate::errors::Error;
 use crate::json::JsonResult;
 
@@ -27,15 +28,19 @@ pub async fn base(State(app): State<Arc<App>>, Path(name): Path<String>) -> Json
 }
 
 /// Returns a base as an archive, for another server.
-pub async fn export(State(app): State<Arc<App>>, Path(name): Path<String>) -> Result<Response, Error> {
+pub async fn export(
+    State(app): State<Arc<App>>,
+    Extension(caller): Extension<Caller>,
+    Path(name): Path<String>,
+) -> Result<Response, Error> {
     let (file, bytes) = app.pusher.export_base(&name).await?;
     let headers = [
         (header::CONTENT_TYPE, BASE_ARCHIVE.to_owned()),
         (header::CONTENT_LENGTH, bytes.to_string()),
         (header::CONTENT_DISPOSITION, format!("attachment; filename=\"{name}.oci.tar\"")),
     ];
-    let stream = stream_file(file);
-    Ok((headers, Body::from_stream(stream)).into_response())
+    // The download is cut off when the caller's credential becomes invalid.
+    Ok((headers, file_body(file, caller.wait_for_end(&app, ""))).into_response())
 }
 
 /// Removes an imported base.
