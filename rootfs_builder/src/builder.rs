@@ -159,9 +159,10 @@ impl Builder {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
-        let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
-            choice::choose_base(&self.config.bases_dir, request.base.as_deref(), &request.source)
-        })?;
+        let asked = Arc::new(request.clone());
+        let (bases, of) = (self.config.bases_dir.clone(), Arc::clone(&asked));
+        let choice::ChosenBase { base, note } =
+            blocking::spawn_reader(move || choice::choose_base(&bases, of.base.as_deref(), &of.source)).await??;
         if let Some(note) = note {
             progress.warn(note).await;
         }
@@ -175,12 +176,18 @@ impl Builder {
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
             PushSource::Tree(path) => {
-                let inspect = || pushed::inspect_pushed(path, &base, &request.package_query());
-                let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
-                if let PushedDirectory::Source(workspace) = &pushed {
-                    tell_selection(workspace, &left_out, progress).await;
-                    ask_what_to_run(request, workspace, &base)?;
-                    let problems = find_source_problems(request, workspace, &base)?;
+                let (tree, of, on) = (path.clone(), Arc::clone(&asked), base.clone());
+                let inspect = move || pushed::inspect_pushed(&tree, &on, &of.package_query());
+                let InspectedTree { mut pushed, left_out } = blocking::spawn_reader(inspect).await??;
+                if let PushedDirectory::Source(workspace) = pushed {
+                    tell_selection(&workspace, &left_out, progress).await;
+                    let (of, on) = (Arc::clone(&asked), base.clone());
+                    let read = move || {
+                        ask_what_to_run(&of, &workspace, &on)?;
+                        let problems = find_source_problems(&of, &workspace, &on)?;
+                        Ok::<_, Error>((workspace, problems))
+                    };
+                    let (workspace, problems) = blocking::spawn_reader(read).await??;
                     for problem in problems.iter().take(MOST_PROBLEMS) {
                         progress.warn(problem.to_string()).await;
                     }
@@ -189,6 +196,7 @@ impl Builder {
                     }
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;
+                    pushed = PushedDirectory::Source(workspace);
                 }
                 PushContent::Tree(pushed)
             }
@@ -337,13 +345,13 @@ impl Builder {
 }
 
 /// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
-/// file. Blocking.
+/// file. Blocking; reads what was pushed.
 fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
     let version = base.ros.ros_version();
     if let Some(launch) = &request.launch
-        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
+        && foreseen::lacks_launch_file(workspace, launch, version)
     {
-        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+        let foreseen = foreseen::scan_sources(workspace, version);
         return Err(Error::NotInPackage {
             what: "launch file",
             name: launch.clone(),
@@ -354,7 +362,7 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
     if request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+    let foreseen = foreseen::scan_sources(workspace, version);
     if !foreseen.must_be_chosen() {
         return Ok(());
     }
@@ -382,27 +390,25 @@ async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &P
     progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
 }
 
-/// Returns mistakes in build files; fails if no program is left because of them. Blocking.
+/// Returns mistakes in build files; fails if no program is left because of them. Blocking; reads what was pushed.
 fn find_source_problems(
     request: &PushRequest,
     workspace: &Workspace,
     base: &Base,
 ) -> Result<Vec<SourceProblem>, Error> {
     let version = base.ros.ros_version();
-    privilege::run_as_reader(|| {
-        let problems = foreseen::find_problems(workspace, version);
-        let is_own = |node: &String| {
-            let program = node.split_whitespace().next().unwrap_or_default();
-            let package = program.split_once('/').map(|(package, _)| package);
-            package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
-        };
-        let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
-        if runs_own && foreseen::has_no_programs(workspace, version) {
-            let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
-            return Err(Error::NoPrograms { problems: problems.join("; ") });
-        }
-        Ok(problems)
-    })
+    let problems = foreseen::find_problems(workspace, version);
+    let is_own = |node: &String| {
+        let program = node.split_whitespace().next().unwrap_or_default();
+        let package = program.split_once('/').map(|(package, _)| package);
+        package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
+    };
+    let runs_own = request.launch.is_none() && request.nodes.iter().all(is_own);
+    if runs_own && foreseen::has_no_programs(workspace, version) {
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        return Err(Error::NoPrograms { problems: problems.join("; ") });
+    }
+    Ok(problems)
 }
 
 /// Reports unresolvable dependencies now and not after minutes of preparation. In ROS 2 many may be in a base that does
