@@ -31,7 +31,8 @@ use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
 use crate::{
-    advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources, stock, unused, wheels,
+    advice, blocking, choice, imported, keys, launch, packaged, prebuilt, pushed, seal, source, sources, stock, unused,
+    wheels,
 };
 
 /// Default base for packages that support ROS 1.
@@ -49,6 +50,8 @@ pub struct Config {
     pub cache_bytes: u64,
     /// Directory of the base definitions.
     pub bases_dir: PathBuf,
+    /// Directory of the definitions of bases that were made from images, which are in the other one, too; outlives it.
+    pub imported_dir: PathBuf,
     /// Work directory, with a directory per build; cleaned up by the caller that starts the daemon.
     pub build_dir: PathBuf,
     /// Directory of the complete build logs.
@@ -143,6 +146,11 @@ impl Builder {
     /// Returns the directory of the base definitions.
     pub(crate) fn bases_dir(&self) -> &Path {
         &self.config.bases_dir
+    }
+
+    /// Returns the directory that keeps the definitions of bases that were made from images.
+    pub(crate) fn imported_dir(&self) -> &Path {
+        &self.config.imported_dir
     }
 
     /// Returns the work directory.
@@ -268,11 +276,12 @@ impl Builder {
     }
 
     /// Returns the layers that no image needs but the next build will, by diff-id: bases and toolchains. To be kept by
-    /// the store's garbage collector; otherwise they are imported from the cache again.
+    /// the store's garbage collector; otherwise they are imported from the cache again, but for those of bases that were
+    /// made from images, which only the store has.
     pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
         let notes = names.iter().filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
-        notes.flatten().collect()
+        notes.flatten().chain(imported::image_layers(&self.config.bases_dir)).collect()
     }
 
     async fn archive(&self, shop: &BuildContext, base: &Base, progress: &Progress) -> Result<Arc<Archive>, Error> {
@@ -281,6 +290,7 @@ impl Builder {
         let mut archives = self.archives.lock().await;
         if let Some(opened) = archives.get_mut(&base.name)
             && opened.archive.is_fresh()
+            && opened.base.image == base.image
         {
             opened.base = base.clone();
             return Ok(opened.archive.clone());
@@ -288,6 +298,9 @@ impl Builder {
         progress.step(&format!("reading the package lists of {}", base.name)).await;
         let scratch = shop.site.directory("sources")?;
         let opened = async {
+            if base.image.as_ref().is_some_and(|image| image.debian.is_empty()) {
+                return Err(Error::NoDpkg);
+            }
             let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
             Archive::open(&self.config.cache_dir, sources, false, progress).await
         };
@@ -303,6 +316,10 @@ impl Builder {
                 progress.warn(words).await;
                 archive
             }
+        };
+        let archive = match &base.image {
+            Some(image) => archive.with_installed(image),
+            None => archive,
         };
         let archive = Arc::new(archive);
         archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
@@ -411,15 +428,15 @@ fn find_source_problems(
     Ok(problems)
 }
 
-/// Reports unresolvable dependencies now and not after minutes of preparation. In ROS 2 many may be in a base that does
-/// not exist yet; there they are reported once it can be inspected.
+/// Reports unresolvable dependencies now and not after minutes of preparation. In install spaces many may be in a base
+/// that does not exist yet; there they are reported once it can be inspected.
 fn check_dependencies(
     archive: &Archive,
     base: &Base,
     request: &PushRequest,
     pushed: &PushedDirectory,
 ) -> Result<(), Error> {
-    if base.ros != Version::Ros1 {
+    if !base.has_distributions_ros() {
         return Ok(());
     }
     let own = pushed::names(pushed.packages());
@@ -470,12 +487,18 @@ pub(crate) mod tests {
 
     /// Creates a builder with the repository's bases, whose files are below `place` and which runs nothing.
     pub(crate) fn new_builder(place: &Path) -> Builder {
+        new_builder_with(place, Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"))
+    }
+
+    /// Creates a builder with the bases in a directory, whose files are below `place` and which runs nothing.
+    pub(crate) fn new_builder_with(place: &Path, bases_dir: PathBuf) -> Builder {
         let at = |name: &str| place.join(name);
         let store = Store::open(&at("images"), &at("layers")).expect("a store");
         Builder::new(Config {
             cache_dir: at("cache"),
             cache_bytes: u64::MAX,
-            bases_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"),
+            bases_dir,
+            imported_dir: at("imported"),
             build_dir: at("build"),
             logs_dir: at("logs"),
             sources: Sources::default(),
@@ -499,7 +522,7 @@ pub(crate) mod tests {
             &["setup.sh", ".catkin", "lib/p/node"],
         ];
         for (number, files) in trees.iter().enumerate() {
-            for base in [None, Some(DEFAULT_BASE), Some("noble-jazzy")] {
+            for base in [None, Some(DEFAULT_BASE), Some("bookworm-jazzy-wheels")] {
                 let tree = at(&format!("pushed-{number}-{}", base.unwrap_or("any")));
                 for file in *files {
                     let file = tree.join(file);

@@ -108,7 +108,7 @@ pub struct FoundSystem {
     pub python: String,
     /// dpkg's list of packages, if there is one.
     pub dpkg_status: Option<String>,
-    /// Names of the programs and Python modules that were looked for and are there.
+    /// Names of the programs, Python modules and headers that were looked for and are there.
     pub tools: BTreeSet<&'static str>,
 }
 
@@ -256,6 +256,9 @@ fn find_tools(view: &View, prefixes: &[String], python: &str) -> Result<BTreeSet
         format!("/usr/local/lib/python{python}/dist-packages"),
         format!("/usr/local/lib/python{python}/site-packages"),
     ];
+    if view.read("/usr/include/ros/ros.h", LARGEST_TEXT)?.is_some() {
+        found.insert("ros.h");
+    }
     let own = prefixes.iter().flat_map(|prefix| environment::python_directories(view, prefix));
     let mut modules = BTreeSet::new();
     for directory in own.chain(system) {

@@ -479,6 +479,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::NameTaken { .. } => (S::CONFLICT, "name-taken", "name taken"),
         P::Options(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
         P::UnknownBase { .. } => (S::NOT_FOUND, "unknown-base", "unknown base"),
+        P::BaseExists(_) => (S::CONFLICT, "base-exists", "base exists"),
         P::BaseNotImported(_) => (S::CONFLICT, "base-not-imported", "base not imported"),
         P::BaseNotSetUp(_) => (S::CONFLICT, "base-not-set-up", "base not set up"),
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),

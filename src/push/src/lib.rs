@@ -66,6 +66,7 @@ use reporter::Reporter;
 use store::{Journal, Plan, RevisionRecord, State};
 use told::PUSHED;
 
+pub use bases::NewBase;
 pub use deployer::Deployer;
 pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};

@@ -189,7 +189,7 @@ fn push_next_step(error: &push::Error) -> String {
         P::NameTaken { name, .. } => {
             format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
         }
-        P::UnknownBase { .. } | P::BaseNotImported(_) => "list them with: cloudroidctl bases".into(),
+        P::UnknownBase { .. } | P::BaseNotImported(_) | P::BaseExists(_) => "list them with: cloudroidctl bases".into(),
         P::BaseNotSetUp(_) => "push a package that uses it, then try again".into(),
         P::Options(_) => "correct the options and push again; see cloudroidctl push --help".into(),
         P::Failed { next, .. } => {
