@@ -34,8 +34,8 @@ impl Base {
         Flavour { base: self.name.clone(), ros: self.ros, distribution: self.ros_distribution.clone() }
     }
 
-    /// Returns whether its ROS is the distribution's own, of ROS 1 below `/usr`. Otherwise ROS is in install spaces, and
-    /// its Debian packages, if there are any, are named by its distribution (REP 2003: `ros-jazzy-std-msgs`).
+    /// Returns whether its ROS is the distribution's own, of ROS 1 below `/usr`. Otherwise ROS is in install spaces,
+    /// and its Debian packages, if there are any, are named by its distribution (REP 2003: `ros-jazzy-std-msgs`).
     pub(crate) fn has_distributions_ros(&self) -> bool {
         self.ros == Version::Ros1 && crate::indexed::install_prefixes(self).is_empty()
     }

@@ -189,8 +189,8 @@ impl Build<'_> {
             let undeclared = if base.has_distributions_ros() {
                 undeclared::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
             } else {
-                // Programs of ROS 2 are created by setuptools and import their packages by name, and the archive's index
-                // does not tell what is in install spaces.
+                // Programs of ROS 2 are created by setuptools and import their packages by name, and the archive's
+                // index does not tell what is in install spaces.
                 Vec::new()
             };
             Ok::<_, Error>((inventory, undeclared))

@@ -276,8 +276,8 @@ impl Builder {
     }
 
     /// Returns the layers that no image needs but the next build will, by diff-id: bases and toolchains. To be kept by
-    /// the store's garbage collector; otherwise they are imported from the cache again, but for those of bases that were
-    /// made from images, which only the store has.
+    /// the store's garbage collector; otherwise they are imported from the cache again, but for those of bases that
+    /// were made from images, which only the store has.
     pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
         let notes = names.iter().filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));

@@ -151,7 +151,8 @@ pub enum Error {
     NoDpkg,
     /// A base that was made from an image cannot compile, and what it lacks cannot be installed.
     #[error(
-        "base {base} cannot compile sources: its image lacks {missing}, which cannot be installed ({words}); push an             install space, name an archive ([archives] {base} = …), or import an image that has them"
+        "base {base} cannot compile sources: its image lacks {missing}, which cannot be installed ({words}); push an \
+            install space, name an archive ([archives] {base} = …), or import an image that has them"
     )]
     NoTools {
         /// Name of the base.

@@ -1,13 +1,13 @@
-//! Bases made from an image of a lab, or from a root file system: a definition that is written here, from what was found
-//! by looking, and the image's own layers, as they are.
+//! Bases made from an image of a lab, or from a root file system: a definition that is written here, from what was
+//! found by looking, and the image's own layers, as they are.
 //!
 //! ```text
 //!   podman save, docker save, skopeo ─▶ layers ─┐
-//!   tar of a root file system ──────▶ one layer ┴─▶ find_system ─▶ definition with an [image] ─▶ pushes, as on any base
+//!   tar of a root file system ──────▶ one layer ┴─▶ find_system ─▶ definition with an [image] ─▶ pushes upon it
 //! ```
 //!
-//! What the image lacks for compiling is installed by the first push of sources, in layers of its own, if the archive of
-//! its distribution can be reached.
+//! What the image lacks for compiling is installed by the first push of sources, in layers of its own, if the archive
+//! of its distribution can be reached.
 
 mod definition;
 mod findings;
@@ -105,8 +105,8 @@ impl Builder {
     ///
     /// # Errors
     /// [`Error::BaseName`] for a name that cannot be used, [`Error::BaseExists`] for one that is taken,
-    /// [`Error::System`] if packages of ROS cannot be built upon it, and [`image::Error`] for layers that are damaged or
-    /// exceed `limits`.
+    /// [`Error::System`] if packages of ROS cannot be built upon it, and [`image::Error`] for layers that are damaged
+    /// or exceed `limits`.
     pub fn import_image(&self, import: &BaseImport, limits: &Limits) -> Result<String, Error> {
         let name = import.name.as_str();
         self.check_new_name(name, import.replace)?;

@@ -1,5 +1,5 @@
-//! ROS packages that are already in the install spaces of layers: packages of a base, from wheels, apt or an image, need
-//! not be listed anywhere else.
+//! ROS packages that are already in the install spaces of layers: packages of a base, from wheels, apt or an image,
+//! need not be listed anywhere else.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -52,8 +52,8 @@ pub(crate) fn library_directories(base: &Base) -> Vec<String> {
     places
 }
 
-/// Returns the packages in the install spaces of trees, given lowest first: of ROS 2 by ament's index, of ROS 1 by their
-/// package.xml.
+/// Returns the packages in the install spaces of trees, given lowest first: of ROS 2 by ament's index, of ROS 1 by
+/// their package.xml.
 pub(crate) async fn find_packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
     let prefixes = install_prefixes(base);
     if prefixes.is_empty() {

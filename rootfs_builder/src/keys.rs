@@ -1,8 +1,8 @@
 //! Resolution of the names in a package.xml (rosdep keys and ROS packages) to Debian packages.
 //!
 //! In this order: the deployer's mapping (`--map`), packages of the same workspace, the base's table, existing ROS
-//! packages in install spaces (on a base made from an image before the table, which was not written for it), ROS packages
-//! of the archive, a Debian package of the same name.
+//! packages in install spaces (on a base made from an image before the table, which was not written for it), ROS
+//! packages of the archive, a Debian package of the same name.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -176,7 +176,8 @@ pub(crate) fn is_of_other_ros(archive: &Archive, base: &Base, deb: &str) -> bool
     !base.has_distributions_ros() && !deb.starts_with(&own) && !archive.contents.ros_packages_in(deb).is_empty()
 }
 
-/// Finds the Debian package for a name given on a base with install spaces: that of a ROS package, or the package itself.
+/// Finds the Debian package for a name given on a base with install spaces: that of a ROS package, or the package
+/// itself.
 pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Option<String> {
     let own = archive.candidates.contains(name) && !is_of_other_ros(archive, base, name);
     find_ros_deb(archive, base, name).or_else(|| own.then(|| name.to_owned()))

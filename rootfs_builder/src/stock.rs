@@ -408,8 +408,8 @@ impl Builder {
         Ok(base.name)
     }
 
-    /// Forgets that a base was imported: the next push that uses it sets it up; one that was made from an image is gone.
-    /// Blocking.
+    /// Forgets that a base was imported: the next push that uses it sets it up; one that was made from an image is
+    /// gone. Blocking.
     ///
     /// # Errors
     /// [`Error::UnknownBase`], and [`Error::BaseNotImported`] if it was set up here or not at all.

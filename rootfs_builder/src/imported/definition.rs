@@ -71,11 +71,11 @@ pub(super) fn version(system: &FoundSystem) -> Version {
     }
 }
 
-fn missing<'a>(system: &'a FoundSystem) -> impl Iterator<Item = &'static Tool> + 'a {
+fn missing(system: &FoundSystem) -> impl Iterator<Item = &'static Tool> {
     needed_tools(system).iter().filter(|tool| !system.has_any(tool.any))
 }
 
-fn missing_packages<'a>(system: &'a FoundSystem) -> impl Iterator<Item = &'static str> + 'a {
+fn missing_packages(system: &FoundSystem) -> impl Iterator<Item = &'static str> {
     needed_packages(system).iter().copied().filter(|name| system.first_package(&[*name]).is_none())
 }
 

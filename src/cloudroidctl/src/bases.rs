@@ -61,8 +61,8 @@ struct ExportBase {
 /// Import a base: an image, a root file system, or one that `cloudroidctl base export` has written.
 ///
 /// With --from, a new base is made of what a lab has: the archive of an image (podman save, docker save, skopeo copy to
-/// oci-archive or oci), or the root file system of a robot or of mmdebstrap as tar, gzip or zstd. Its layers are kept as
-/// they are; what they hold is found by looking and printed as a table.
+/// oci-archive or oci), or the root file system of a robot or of mmdebstrap as tar, gzip or zstd. Its layers are kept
+/// as they are; what they hold is found by looking and printed as a table.
 ///
 /// Without --from, the server must have the same definition of the base. Packages that need nothing else are pushed
 /// without any download.

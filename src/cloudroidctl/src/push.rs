@@ -337,8 +337,8 @@ pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
     Ok(PushSource::Archive(path.to_owned()).into_body().0)
 }
 
-/// Returns an image or a root file system as the body of a request: an archive, `-` for standard input, or the directory
-/// of an OCI image layout, which is packed.
+/// Returns an image or a root file system as the body of a request: an archive, `-` for standard input, or the
+/// directory of an OCI image layout, which is packed.
 pub fn image_body(path: &Path) -> anyhow::Result<RequestBody> {
     if path == Path::new("-") {
         return Ok(PushSource::Archive("/dev/stdin".into()).into_body().0);

@@ -1,5 +1,5 @@
-//! Base image definitions: those built in, so that the daemon works as a single file, those of the operator, and those of
-//! bases that were made from images.
+//! Base image definitions: those built in, so that the daemon works as a single file, those of the operator, and those
+//! of bases that were made from images.
 
 use std::path::{Path, PathBuf};
 

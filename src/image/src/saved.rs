@@ -23,7 +23,7 @@ use foreign::Tree;
 use crate::digest::HashingStream;
 use crate::gzip::{self, CompressError};
 use crate::layer::{Tee, check_gzip, run_as_reader, scan_layer};
-use crate::received::{MOST_LAYERS, unreceivable_error};
+use crate::received::unreceivable_error;
 use crate::{Digest, Error, LayerInfo, Limits, Store};
 
 use documents::SavedDocuments;

@@ -43,9 +43,9 @@ const MODULES: [&str; 7] = ["catkin_pkg", "em", "launch_ros", "numpy", "rospkg",
 pub enum SystemError {
     /// There is no ROS.
     #[error(
-        "no ROS was found: looked for install spaces (.catkin, or share/ament_index) in the image's environment, below \
-            /opt, /home, /usr/local and at most {depth} directories deep elsewhere, and for Debian's rospy{also}; import \
-            an image with ROS, such as ros:jazzy",
+        "no ROS was found: looked for install spaces (.catkin, share/ament_index) that the image's environment names, \
+            or that are at most {depth} directories deep, such as /opt/ros/jazzy, and for Debian's rospy{also}; \
+            import an image with ROS, such as ros:jazzy",
         depth = spaces::DEPTH
     )]
     NoRos {

@@ -73,7 +73,7 @@ mod tests {
             (&[(layer.as_str(), file)], ArchiveKind::Image),
             (&[(config.as_str(), file)], ArchiveKind::Image),
             (&[("./", directory), ("./bin", EntryType::Symlink)], ArchiveKind::Root),
-            (&[("/etc/hostname", file)], ArchiveKind::Root),
+            (&[("etc/hostname", file)], ArchiveKind::Root),
             (&[("usr/share/blobs/x", file)], ArchiveKind::Root),
         ] {
             let plain = beginning(names);

@@ -1,4 +1,5 @@
-//! Environment of the processes of a root file system: what sourcing the setup scripts of its install spaces would make.
+//! Environment of the processes of a root file system: what sourcing the setup scripts of its install spaces would
+//! make.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -55,11 +56,14 @@ pub fn make_environment<L: AsRef<Path>>(
         }
         add("CMAKE_PREFIX_PATH", prefix.clone());
         add("PATH", format!("{prefix}/bin"));
-        for path in python_directories(&view, &prefix) {
-            add("PYTHONPATH", path);
-        }
         for path in library_directories(&view, &prefix)? {
             add("LD_LIBRARY_PATH", path);
+        }
+        for path in python_directories(&view, &prefix) {
+            for libraries in wheel_directories(&view, &path)? {
+                add("LD_LIBRARY_PATH", libraries);
+            }
+            add("PYTHONPATH", path);
         }
     }
     let mut environment: BTreeMap<String, String> = given
@@ -95,6 +99,8 @@ pub fn make_environment<L: AsRef<Path>>(
         }
     }
     if system.ros == RosVersion::Two {
+        // Python packages of ROS start Python once more, to set LD_LIBRARY_PATH, unless this says that it is set.
+        set("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1");
         let own = given.get("RMW_IMPLEMENTATION").filter(|name| MIDDLEWARES.contains(&name.as_str()));
         match own.map(String::as_str).or(system.first_package(&MIDDLEWARES)) {
             Some(name) => set("RMW_IMPLEMENTATION", name),
@@ -129,6 +135,14 @@ pub(super) fn python_directories(view: &View, prefix: &str) -> Vec<String> {
         }
     }
     found
+}
+
+/// Returns the directories beside Python packages of ROS with the libraries that they were linked with
+/// (`ros_PACKAGE.libs`, as auditwheel names them).
+fn wheel_directories(view: &View, modules: &str) -> Result<Vec<String>, Error> {
+    let names = view.names(modules)?.into_iter();
+    let libraries = names.filter(|name| name.starts_with("ros_") && name.ends_with(".libs") && !name.contains(':'));
+    Ok(libraries.map(|name| format!("{modules}/{name}")).collect())
 }
 
 /// Returns the directories of a prefix with shared libraries: its own, those of an architecture, and those of vendored

@@ -184,6 +184,11 @@ fn wheels_below_a_prefix_of_any_name_are_of_the_distribution_that_is_said() {
     assert!(refused.contains("/opt/wheels does not say which") && refused.contains("--ros-distro"), "{refused}");
     assert_eq!(root.find(&[], Some("kilted")).expect("said").ros_distribution, "kilted");
     assert_eq!(root.find(&[("ROS_DISTRO", "rolling")], None).expect("said").ros_distribution, "rolling");
+    root.write("1", "opt/wheels/lib/python3.12/site-packages/ros_rclpy.libs/libssl-1.so", "");
+    let environment = root.environment(&[("ROS_DISTRO", "jazzy")]);
+    let modules = "/opt/wheels/lib/python3.12/site-packages";
+    assert_eq!(environment["LD_LIBRARY_PATH"], format!("/opt/wheels/lib:{modules}/ros_rclpy.libs"));
+    assert_eq!(environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"], "1");
     root.write("1", "opt/wheels/share/ros_environment/environment/1.ros_distro.sh", "export ROS_DISTRO=jazzy\n");
     assert_eq!(root.find(&[], None).expect("it says so itself").ros_distribution, "jazzy");
 }
