@@ -60,11 +60,11 @@ pub struct ImportedImage {
     pub source: String,
     /// Diff-ids of its layers, lowest first.
     pub layers: Vec<Digest>,
-    /// What sources are compiled with and the layers lack; empty if nothing is missing.
+    /// Names of tools for compiling sources that the layers lack.
     pub missing_tools: Vec<String>,
     /// True if packages of Python alone can be installed without these tools.
     pub installs_python: bool,
-    /// What was found, and what it means for pushes.
+    /// Table of what was found, and what it means for pushes.
     pub findings: Vec<Finding>,
     /// Packages of dpkg with their versions; empty if the system has no dpkg.
     pub debian: BTreeMap<String, String>,

@@ -71,20 +71,20 @@ pub(super) fn version(system: &FoundSystem) -> Version {
     }
 }
 
-fn missing(system: &FoundSystem) -> impl Iterator<Item = &'static Tool> {
+fn list_missing_tools(system: &FoundSystem) -> impl Iterator<Item = &'static Tool> {
     needed_tools(system).iter().filter(|tool| !system.has_any(tool.any))
 }
 
-fn missing_packages(system: &FoundSystem) -> impl Iterator<Item = &'static str> {
+fn list_missing_packages(system: &FoundSystem) -> impl Iterator<Item = &'static str> {
     needed_packages(system).iter().copied().filter(|name| system.first_package(&[*name]).is_none())
 }
 
 /// Returns the names of what sources are compiled with and the system lacks.
 pub(super) fn find_missing_tools(system: &FoundSystem) -> Vec<String> {
-    let tools = missing(system).map(|tool| tool.name);
+    let tools = list_missing_tools(system).map(|tool| tool.name);
     let lacks_headers = system.spaces.is_empty() && !system.has_any(&["ros.h"]);
     let own = lacks_headers.then_some("Debian's development packages of ROS");
-    tools.chain(missing_packages(system)).chain(own).map(str::to_owned).collect()
+    tools.chain(list_missing_packages(system)).chain(own).map(str::to_owned).collect()
 }
 
 /// Returns whether packages of ROS 2 in Python can be installed without any other tool.
@@ -97,7 +97,7 @@ fn tool_packages(system: &FoundSystem) -> Vec<String> {
     if system.dpkg_status.is_none() {
         return Vec::new();
     }
-    let mut debs: Vec<String> = missing(system).map(|tool| tool.deb.to_owned()).collect();
+    let mut debs: Vec<String> = list_missing_tools(system).map(|tool| tool.deb.to_owned()).collect();
     if debs.iter().any(|deb| deb == COLCON.deb) {
         if system.distribution == "debian" {
             debs.extend(COLCON_PARTS.map(str::to_owned));
@@ -107,7 +107,7 @@ fn tool_packages(system: &FoundSystem) -> Vec<String> {
         }
     }
     let of_ros = |name: &str| format!("ros-{}-{}", system.ros_distribution, name.replace('_', "-"));
-    debs.extend(missing_packages(system).map(of_ros));
+    debs.extend(list_missing_packages(system).map(of_ros));
     debs
 }
 

@@ -6,13 +6,13 @@ use serde::{Deserialize, Serialize};
 
 use super::definition::{find_missing_tools, installs_python, version};
 
-/// What was found of one subject, and what it means.
+/// Result of looking for one subject, and what it means.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Finding {
     /// Subject, such as `ROS` or `compiling`.
     pub subject: String,
-    /// What was found; begins with `missing` if it is not there.
+    /// Description of what was found; begins with `missing` if it is not there.
     pub found: String,
     /// Consequence for pushes; empty if there is none.
     pub consequence: String,
@@ -28,7 +28,7 @@ impl Finding {
 pub(super) fn list_findings(system: &FoundSystem, debs: usize) -> Vec<Finding> {
     let release = format!("{} ({} {})", system.title, system.distribution, system.suite);
     let mut all = vec![Finding::new("system", release, "")];
-    all.extend(ros_findings(system));
+    all.extend(describe_ros(system));
     for (path, why) in &system.unusable {
         all.push(Finding::new("left out", path.as_str(), *why));
     }
@@ -41,12 +41,12 @@ pub(super) fn list_findings(system: &FoundSystem, debs: usize) -> Vec<Finding> {
         ),
     });
     all.push(Finding::new("Python", system.python.as_str(), ""));
-    all.push(compiling(system, debs > 0));
-    all.push(launching(system));
+    all.push(describe_tools(system, debs > 0));
+    all.push(describe_launch(system));
     all
 }
 
-fn ros_findings(system: &FoundSystem) -> Vec<Finding> {
+fn describe_ros(system: &FoundSystem) -> Vec<Finding> {
     let named = format!("ROS {} {}", system.ros.number(), system.ros_distribution);
     if system.spaces.is_empty() {
         return vec![Finding::new("ROS", format!("{named}, Debian's own below /usr"), "")];
@@ -71,7 +71,7 @@ fn ros_findings(system: &FoundSystem) -> Vec<Finding> {
     all
 }
 
-fn compiling(system: &FoundSystem, has_dpkg: bool) -> Finding {
+fn describe_tools(system: &FoundSystem, has_dpkg: bool) -> Finding {
     let missing = find_missing_tools(system);
     if missing.is_empty() {
         return Finding::new("compiling", "all that sources need", "");
@@ -89,7 +89,7 @@ fn compiling(system: &FoundSystem, has_dpkg: bool) -> Finding {
     Finding::new("compiling", format!("missing: {}", missing.join(", ")), consequence)
 }
 
-fn launching(system: &FoundSystem) -> Finding {
+fn describe_launch(system: &FoundSystem) -> Finding {
     let (name, is_there) = match version(system) {
         Version::Ros1 => {
             let is_installed = system.first_package(&["roslaunch"]).is_some() || system.has_any(&["roslaunch"]);

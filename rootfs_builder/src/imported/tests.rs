@@ -49,7 +49,7 @@ impl ImportFixture {
     }
 
     /// Returns a request to import a tree as an image of one layer.
-    fn image_of(&self, name: &str, tree: &str) -> BaseImport {
+    fn save_image(&self, name: &str, tree: &str) -> BaseImport {
         let sender = self.place.path().join(format!("sender-{tree}"));
         let store = Store::open(&sender.join("images"), &sender.join("layers")).expect("a store");
         let layer = store.layer_from_tree(&self.place.path().join(tree), &TreeOptions::default()).expect("a layer");
@@ -68,7 +68,7 @@ impl ImportFixture {
         self.builder.import_image(import, &Limits::default())
     }
 
-    fn base(&self, name: &str) -> Base {
+    fn load_base(&self, name: &str) -> Base {
         base::load(self.builder.bases_dir(), name).expect("valid")
     }
 }
@@ -79,9 +79,9 @@ fn an_image_becomes_a_base_with_what_was_found_in_it() {
     lab.write_root("root", &["rclpy", "slam_toolbox", "rmw_fastrtps_cpp"]);
     lab.write("root", "var/lib/dpkg/status", STATUS);
     lab.write("root", "usr/bin/cmake", "");
-    let import = lab.image_of("lab", "root");
+    let import = lab.save_image("lab", "root");
     assert_eq!(lab.import(&import).expect("good"), "lab");
-    let base = lab.base("lab");
+    let base = lab.load_base("lab");
     assert_eq!((base.ros, &*base.ros_distribution, &*base.suite), (Version::Ros2, "jazzy", "noble"));
     assert!(base.summary.starts_with("Ubuntu 24.04 with ROS 2 jazzy, from image lab/ros:jazzy"), "{}", base.summary);
     assert_eq!(base.environment["MODEL"], "large");
@@ -139,14 +139,14 @@ fn an_image_with_all_tools_compiles_and_one_without_dpkg_is_as_it_is() {
     for module in ["setuptools", "catkin_pkg", "launch_ros"] {
         lab.write("whole", &format!("usr/lib/python3/dist-packages/{module}/__init__.py"), "");
     }
-    lab.import(&lab.image_of("whole", "whole")).expect("good");
+    lab.import(&lab.save_image("whole", "whole")).expect("good");
     let stock = lab.builder.base("whole").expect("valid").stock.expect("its layers");
-    assert_eq!(stock.tool_layers(), lab.base("whole").image.as_ref().map(|image| image.layers.clone()));
+    assert_eq!(stock.tool_layers(), lab.load_base("whole").image.as_ref().map(|image| image.layers.clone()));
 
     lab.write_root("bare", &["rclpy"]);
     lab.write("bare", "usr/lib/python3/dist-packages/setuptools/__init__.py", "");
-    lab.import(&lab.image_of("bare", "bare")).expect("good");
-    let bare = lab.base("bare");
+    lab.import(&lab.save_image("bare", "bare")).expect("good");
+    let bare = lab.load_base("bare");
     let image = bare.image.as_ref().expect("an image");
     assert!(image.installs_python && image.debian.is_empty() && bare.build.packages.is_empty());
     let compiling = image.findings.iter().find(|finding| finding.subject == "compiling").expect("a row");
@@ -157,7 +157,7 @@ fn an_image_with_all_tools_compiles_and_one_without_dpkg_is_as_it_is() {
 fn names_are_new_unless_an_imported_base_is_replaced() {
     let lab = new_fixture();
     lab.write_root("root", &["rclpy"]);
-    let good = lab.image_of("lab", "root");
+    let good = lab.save_image("lab", "root");
     let named = |name: &str, replace: bool| BaseImport { name: name.to_owned(), replace, ..good.clone() };
     for name in ["", "../lab", "a/b", ".hidden", "-x", "lab\n", &"x".repeat(65)] {
         assert!(matches!(lab.import(&named(name, true)), Err(Error::BaseName { .. })), "{name:?}");
@@ -170,25 +170,25 @@ fn names_are_new_unless_an_imported_base_is_replaced() {
     let refused = lab.import(&good).expect_err("taken").to_string();
     assert!(refused.contains("--replace"), "{refused}");
     lab.write_root("newer", &["rclpy", "nav2_msgs"]);
-    lab.import(&BaseImport { replace: true, ..lab.image_of("lab", "newer") }).expect("replaced");
-    assert!(lab.base("lab").image.expect("an image").ros.contains_key("nav2_msgs"));
+    lab.import(&BaseImport { replace: true, ..lab.save_image("lab", "newer") }).expect("replaced");
+    assert!(lab.load_base("lab").image.expect("an image").ros.contains_key("nav2_msgs"));
 }
 
 #[test]
 fn what_cannot_become_a_base_leaves_none() {
     let lab = new_fixture();
     lab.write_root("plain", &[]);
-    let refused = lab.import(&lab.image_of("lab", "plain")).expect_err("no ROS").to_string();
+    let refused = lab.import(&lab.save_image("lab", "plain")).expect_err("no ROS").to_string();
     assert!(refused.contains("no ROS was found"), "{refused}");
     let file = lab.place.path().join("archive");
     fs::write(&file, "hello").expect("written");
-    let root = BaseImport { source: ImportSource::Root(file), ..lab.image_of("lab", "plain") };
+    let root = BaseImport { source: ImportSource::Root(file), ..lab.save_image("lab", "plain") };
     assert!(matches!(lab.import(&root), Err(Error::Image(image::Error::Archive { .. }))));
     assert!(matches!(lab.builder.base("lab"), Err(Error::UnknownBase { .. })));
 
     lab.write_root("root", &["rclpy"]);
-    lab.import(&lab.image_of("lab", "root")).expect("good");
-    let base = lab.base("lab");
+    lab.import(&lab.save_image("lab", "root")).expect("good");
+    let base = lab.load_base("lab");
     // Nothing can bring its layers back.
     let images = lab.builder.layers().store().images_dir().to_owned();
     for entry in fs::read_dir(images.join("blobs/sha256")).expect("listed") {
@@ -206,8 +206,8 @@ fn robots_of_ros_1_have_their_own_way_of_compiling() {
     lab.write("robot", "opt/ros/noetic/share/roscpp/package.xml", "<package><version>1.16.0</version></package>");
     lab.write("robot", "opt/ros/noetic/lib/python3/dist-packages/rospy/__init__.py", "");
     lab.write("robot", "var/lib/dpkg/status", STATUS);
-    lab.import(&lab.image_of("robot", "robot")).expect("good");
-    let base = lab.base("robot");
+    lab.import(&lab.save_image("robot", "robot")).expect("good");
+    let base = lab.load_base("robot");
     assert_eq!((base.ros, base.has_distributions_ros()), (Version::Ros1, false));
     assert_eq!(base.environment["ROS_PACKAGE_PATH"], "/opt/ros/noetic/share");
     assert!(base.build.files.is_empty() && base.build.cmake.contains(&"-DCATKIN_ENABLE_TESTING=OFF".to_owned()));

@@ -59,17 +59,17 @@ pub struct BaseDetail {
     pub python_packages: BTreeMap<String, String>,
     /// Debian packages with their versions; empty if the base is not set up.
     pub debian_packages: BTreeMap<String, String>,
-    /// What was found in the image that it was made from; empty for other bases.
+    /// Table of what was found in the image that it was made from; empty for other bases.
     pub findings: Vec<BaseFinding>,
 }
 
-/// What was found of one subject in an image that became a base.
+/// Result of looking for one subject in an image that became a base.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct BaseFinding {
     /// Subject, such as `ROS` or `compiling`.
     pub subject: String,
-    /// What was found; begins with `missing` if it is not there.
+    /// Description of what was found; begins with `missing` if it is not there.
     pub found: String,
     /// Consequence for pushes; empty if there is none.
     pub consequence: String,

@@ -1,5 +1,5 @@
-//! What a root file system is: its distribution, its ROS, and what packages can be built with in it. Found by looking,
-//! since an image of a lab says nothing about itself.
+//! Inspection of a root file system: its distribution, its ROS, and what packages can be built with in it. All is found
+//! by looking, since an image of a lab says nothing about itself.
 //!
 //! ```text
 //!   layers ─┬─ os-release (os-release(5))         ─▶ distribution and release

@@ -21,7 +21,7 @@ const LARGEST_ENVIRONMENT: usize = 64 << 10;
 const MANIFESTS: [&str; 2] = [oci::MEDIA_MANIFEST, "application/vnd.docker.distribution.manifest.v2+json"];
 const INDEXES: [&str; 2] = [oci::MEDIA_INDEX, "application/vnd.docker.distribution.manifest.list.v2+json"];
 
-/// What is known of an image before its layers are read.
+/// An image before its layers are read.
 #[derive(Debug)]
 pub(super) struct SavedDocuments {
     /// Layers, lowest first.
@@ -127,7 +127,7 @@ impl SavedDocuments {
             return Err(wrong_architecture(&others.into_iter().collect::<Vec<_>>().join(", ")));
         };
         if wanted.len() > 1 {
-            let names: BTreeSet<&str> = images.iter().filter(|image| own(image)).map(FoundImage::shown).collect();
+            let names: BTreeSet<&str> = images.iter().filter(|image| own(image)).map(FoundImage::label).collect();
             return Err(several_images(names.into_iter()));
         }
         let manifest: SavedManifest = parse_json("its manifest", &read_layout_document(layout, &image.digest)?)?;
@@ -200,7 +200,7 @@ struct FoundImage {
 }
 
 impl FoundImage {
-    fn shown(&self) -> &str {
+    fn label(&self) -> &str {
         if self.name.is_empty() { "one without a name" } else { &self.name }
     }
 }

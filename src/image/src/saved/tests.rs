@@ -23,7 +23,7 @@ fn new_fixture() -> SavedFixture {
 type Member<'a> = (EntryType, &'a str, u32, &'a str);
 
 /// Returns the tar stream of a layer.
-fn layer_tar(members: &[Member<'_>]) -> Vec<u8> {
+fn make_layer(members: &[Member<'_>]) -> Vec<u8> {
     let mut archive = tar::Builder::new(Vec::new());
     for (kind, name, mode, text) in members {
         let mut header = tar::Header::new_gnu();
@@ -46,13 +46,13 @@ fn layer_tar(members: &[Member<'_>]) -> Vec<u8> {
     archive.into_inner().expect("into memory")
 }
 
-fn gzip(bytes: &[u8]) -> Vec<u8> {
+fn compress(bytes: &[u8]) -> Vec<u8> {
     let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     std::io::Write::write_all(&mut packed, bytes).expect("packed");
     packed.finish().expect("packed")
 }
 
-fn config_of(architecture: &str, layers: &[Vec<u8>]) -> serde_json::Value {
+fn make_config(architecture: &str, layers: &[Vec<u8>]) -> serde_json::Value {
     let diff_ids: Vec<String> = layers.iter().map(|layer| Digest::compute(layer).to_string()).collect();
     json!({
         "architecture": architecture,
@@ -81,14 +81,14 @@ impl SavedFixture {
 
     fn write_blob(&self, name: &str, bytes: &[u8]) -> serde_json::Value {
         let digest = Digest::compute(bytes);
-        self.write(name, &blob_of(&digest), bytes);
+        self.write(name, &blob_name(&digest), bytes);
         json!({"digest": digest.to_string(), "size": bytes.len()})
     }
 
     /// Writes a manifest with its parts; returns its entry in an index.
     fn write_manifest(&self, name: &str, architecture: &str, layers: &[(&str, Vec<u8>, Vec<u8>)]) -> serde_json::Value {
         let contents: Vec<Vec<u8>> = layers.iter().map(|(_, content, _)| content.clone()).collect();
-        let config = self.write_blob(name, config_of(architecture, &contents).to_string().as_bytes());
+        let config = self.write_blob(name, make_config(architecture, &contents).to_string().as_bytes());
         let layers: Vec<serde_json::Value> = layers
             .iter()
             .map(|(media, _, blob)| {
@@ -119,26 +119,26 @@ impl SavedFixture {
         self.store(&format!("store-{name}")).receive_saved(&archive, limits)
     }
 
-    fn refusal(&self, name: &str) -> String {
+    fn expect_refusal(&self, name: &str) -> String {
         self.receive(name).expect_err(name).to_string()
     }
 }
 
-fn blob_of(digest: &Digest) -> String {
+fn blob_name(digest: &Digest) -> String {
     format!("blobs/sha256/{}", digest.hex())
 }
 
 #[test]
 fn layers_of_a_layout_are_kept_whatever_they_are_compressed_with() {
     let place = new_fixture();
-    let layers = ["plain", "gzip", "zstd"].map(|name| layer_tar(&[(EntryType::Regular, name, 0o644, name)]));
+    let layers = ["plain", "gzip", "zstd"].map(|name| make_layer(&[(EntryType::Regular, name, 0o644, name)]));
     let packed_zstd = zstd::stream::encode_all(&layers[2][..], 1).expect("packed");
     let entry = place.write_manifest(
         "saved",
         architecture(),
         &[
             ("application/vnd.oci.image.layer.v1.tar", layers[0].clone(), layers[0].clone()),
-            (oci::MEDIA_LAYER_GZIP, layers[1].clone(), gzip(&layers[1])),
+            (oci::MEDIA_LAYER_GZIP, layers[1].clone(), compress(&layers[1])),
             ("application/vnd.oci.image.layer.v1.tar+zstd", layers[2].clone(), packed_zstd),
         ],
     );
@@ -149,7 +149,7 @@ fn layers_of_a_layout_are_kept_whatever_they_are_compressed_with() {
     let diff_ids: Vec<Digest> = image.layers.iter().map(|layer| layer.diff_id).collect();
     assert_eq!(diff_ids, expected);
     // That of gzip stays as it was sent.
-    assert_eq!(image.layers[1].digest, Digest::compute(gzip(&layers[1])));
+    assert_eq!(image.layers[1].digest, Digest::compute(compress(&layers[1])));
     let store = place.store("store-saved");
     for (layer, name) in diff_ids.iter().zip(["plain", "gzip", "zstd"]) {
         let tree = store.ensure_extracted(layer).expect("extracted");
@@ -162,8 +162,8 @@ fn layers_of_a_layout_are_kept_whatever_they_are_compressed_with() {
 #[test]
 fn of_several_architectures_that_of_this_machine_is_taken() {
     let place = new_fixture();
-    let layer = layer_tar(&[(EntryType::Regular, "f", 0o644, "own")]);
-    let other = layer_tar(&[(EntryType::Regular, "f", 0o644, "other")]);
+    let layer = make_layer(&[(EntryType::Regular, "f", 0o644, "own")]);
+    let other = make_layer(&[(EntryType::Regular, "f", 0o644, "other")]);
     let plain = |layer: &Vec<u8>| [(DOCKER_LAYER, layer.clone(), layer.clone())];
     let mut own = place.write_manifest("many", architecture(), &plain(&layer));
     own["mediaType"] = json!(DOCKER_MANIFEST);
@@ -185,7 +185,7 @@ fn of_several_architectures_that_of_this_machine_is_taken() {
         place.write_manifest("others", "s390x", &plain(&other)),
     ];
     place.write_layout("others", &foreign);
-    let refused = place.refusal("others");
+    let refused = place.expect_refusal("others");
     assert!(refused.contains("it is for riscv64, s390x, but this machine is"), "{refused}");
 
     let mut two = [
@@ -194,24 +194,24 @@ fn of_several_architectures_that_of_this_machine_is_taken() {
     ];
     two[0]["annotations"] = json!({"org.opencontainers.image.ref.name": "ros:jazzy"});
     place.write_layout("two", &two);
-    let refused = place.refusal("two");
+    let refused = place.expect_refusal("two");
     assert!(refused.contains("several images (one without a name, ros:jazzy); save one"), "{refused}");
     place.write_layout("none", &[]);
-    assert!(place.refusal("none").contains("it contains no image"));
+    assert!(place.expect_refusal("none").contains("it contains no image"));
 }
 
 #[test]
 fn an_archive_of_docker_is_read_with_its_links() {
     let place = new_fixture();
-    let lower = layer_tar(&[(EntryType::Regular, "etc/a", 0o644, "lower")]);
-    let upper = layer_tar(&[(EntryType::Regular, "etc/b", 0o644, "upper")]);
+    let lower = make_layer(&[(EntryType::Regular, "etc/a", 0o644, "lower")]);
+    let upper = make_layer(&[(EntryType::Regular, "etc/b", 0o644, "upper")]);
     let all = [lower.clone(), upper.clone(), lower.clone()];
     place.write("docker", "one/layer.tar", &lower);
     place.write("docker", "two/layer.tar", &upper);
     // Of equal layers docker packs one, and links to it.
     std::fs::create_dir(place.place.path().join("docker/three")).expect("made");
     symlink("../one/layer.tar", place.place.path().join("docker/three/layer.tar")).expect("linked");
-    place.write("docker", "config.json", config_of(architecture(), &all).to_string().as_bytes());
+    place.write("docker", "config.json", make_config(architecture(), &all).to_string().as_bytes());
     let image = json!({
         "Config": "config.json",
         "RepoTags": ["ros:jazzy"],
@@ -224,20 +224,20 @@ fn an_archive_of_docker_is_read_with_its_links() {
     let diff_ids: Vec<Digest> = received.layers.iter().map(|layer| layer.diff_id).collect();
     assert_eq!(diff_ids, [Digest::compute(&upper), Digest::compute(&lower)]);
     place.write("docker", "manifest.json", json!([image, image]).to_string().as_bytes());
-    assert!(place.refusal("docker").contains("several images (ros:jazzy, ros:jazzy)"));
+    assert!(place.expect_refusal("docker").contains("several images (ros:jazzy, ros:jazzy)"));
 }
 
 #[test]
 fn what_an_archive_cannot_be_is_refused_with_the_reason() {
     let place = new_fixture();
-    let layer = layer_tar(&[(EntryType::Regular, "f", 0o644, "x")]);
-    let config = config_of(architecture(), std::slice::from_ref(&layer)).to_string();
+    let layer = make_layer(&[(EntryType::Regular, "f", 0o644, "x")]);
+    let config = make_config(architecture(), std::slice::from_ref(&layer)).to_string();
     place.write("outside", "config.json", config.as_bytes());
     std::fs::write(place.place.path().join("secret"), &layer).expect("written");
     let with = |config: &str, layers: &[&str]| {
         let image = json!([{"Config": config, "RepoTags": null, "Layers": layers}]);
         place.write("outside", "manifest.json", image.to_string().as_bytes());
-        place.refusal("outside")
+        place.expect_refusal("outside")
     };
     for path in ["../secret", "/etc/passwd", "link"] {
         let link = place.place.path().join("outside/link");
@@ -252,14 +252,14 @@ fn what_an_archive_cannot_be_is_refused_with_the_reason() {
     assert!(refused.contains("gone.tar is missing"), "{refused}");
     let refused = with("config.json", &[]);
     assert!(refused.contains("0 layers and 1 diff-ids"), "{refused}");
-    place.write("outside", "other.tar", &layer_tar(&[(EntryType::Regular, "f", 0o644, "y")]));
+    place.write("outside", "other.tar", &make_layer(&[(EntryType::Regular, "f", 0o644, "y")]));
     let refused = with("config.json", &["other.tar"]);
     assert!(refused.contains("has the content of"), "{refused}");
     place.write("outside", "cut.tar", &layer[..600]);
     let refused = with("config.json", &["cut.tar"]);
     assert!(refused.contains("truncated"), "{refused}");
     std::fs::create_dir(place.place.path().join("empty")).expect("made");
-    assert!(place.refusal("empty").contains("neither oci-layout"));
+    assert!(place.expect_refusal("empty").contains("neither oci-layout"));
     // Nothing of it stays.
     let left = std::fs::read_dir(place.place.path().join("store-outside/images/blobs/sha256")).expect("listed");
     assert_eq!(left.count(), 0);
@@ -268,10 +268,10 @@ fn what_an_archive_cannot_be_is_refused_with_the_reason() {
 #[test]
 fn layers_hold_no_more_than_is_allowed_in_all() {
     let place = new_fixture();
-    let layer = |name: &str| layer_tar(&[(EntryType::Regular, name, 0o644, &"x".repeat(100_000))]);
+    let layer = |name: &str| make_layer(&[(EntryType::Regular, name, 0o644, &"x".repeat(100_000))]);
     let (one, two) = (layer("one"), layer("two"));
     let packed = zstd::stream::encode_all(&two[..], 1).expect("packed");
-    let entry = place.write_manifest("big", architecture(), &[("x", one.clone(), gzip(&one)), ("x", two, packed)]);
+    let entry = place.write_manifest("big", architecture(), &[("x", one.clone(), compress(&one)), ("x", two, packed)]);
     place.write_layout("big", &[entry]);
     for (limits, is_size) in
         [(Limits { bytes: 150_000, ..Limits::default() }, true), (Limits { entries: 1, ..Limits::default() }, false)]
@@ -287,7 +287,7 @@ fn layers_hold_no_more_than_is_allowed_in_all() {
 #[test]
 fn a_root_file_system_is_taken_with_all_that_one_has_but_devices() {
     let place = new_fixture();
-    let tar = layer_tar(&[
+    let tar = make_layer(&[
         (EntryType::Directory, "./", 0o755, ""),
         (EntryType::Directory, "./usr/", 0o755, ""),
         (EntryType::Regular, "./usr/bin/tool", 0o4755, "#!/bin/sh\n"),
@@ -302,7 +302,7 @@ fn a_root_file_system_is_taken_with_all_that_one_has_but_devices() {
     let store = place.store("store");
     for (name, bytes) in [
         ("plain.tar", tar.clone()),
-        ("root.tar.gz", gzip(&tar)),
+        ("root.tar.gz", compress(&tar)),
         ("root.tar.zst", zstd::stream::encode_all(&tar[..], 1).expect("packed")),
     ] {
         place.write("given", name, &bytes);
@@ -319,7 +319,7 @@ fn a_root_file_system_is_taken_with_all_that_one_has_but_devices() {
     assert!(tree.join("dev").is_dir() && tree.join("dev/null").symlink_metadata().is_err());
     // Nothing is written through a link, which stays inside the tree.
     assert!(std::fs::read_to_string("/etc/passwd").expect("the host's") != "mine");
-    let mut up = layer_tar(&[(EntryType::Regular, "a", 0o644, "")]);
+    let mut up = make_layer(&[(EntryType::Regular, "a", 0o644, "")]);
     up[..7].copy_from_slice(b"../../x");
     // The checksum of the changed header.
     up[148..156].copy_from_slice(b"        ");

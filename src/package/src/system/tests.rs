@@ -7,7 +7,7 @@ struct RootFixture {
     place: tempfile::TempDir,
 }
 
-fn manifest(version: &str) -> String {
+fn make_manifest(version: &str) -> String {
     format!("<package><name>x</name><version>{version}</version></package>")
 }
 
@@ -21,7 +21,7 @@ impl RootFixture {
         root
     }
 
-    fn ubuntu() -> Self {
+    fn new_ubuntu() -> Self {
         Self::new("ID=ubuntu\nVERSION_CODENAME=noble\nPRETTY_NAME=\"Ubuntu 24.04.1 LTS\"\n", "3.12")
     }
 
@@ -32,17 +32,17 @@ impl RootFixture {
     }
 
     /// Writes a package of ROS 2 into a prefix.
-    fn ament(&self, layer: &str, prefix: &str, name: &str, version: &str) {
+    fn write_ament(&self, layer: &str, prefix: &str, name: &str, version: &str) {
         self.write(layer, &format!("{prefix}/share/ament_index/resource_index/packages/{name}"), "");
-        self.write(layer, &format!("{prefix}/share/{name}/package.xml"), &manifest(version));
+        self.write(layer, &format!("{prefix}/share/{name}/package.xml"), &make_manifest(version));
     }
 
-    fn catkin(&self, layer: &str, prefix: &str, name: &str) {
+    fn write_catkin(&self, layer: &str, prefix: &str, name: &str) {
         self.write(layer, &format!("{prefix}/.catkin"), "");
-        self.write(layer, &format!("{prefix}/share/{name}/package.xml"), &manifest("1.16.0"));
+        self.write(layer, &format!("{prefix}/share/{name}/package.xml"), &make_manifest("1.16.0"));
     }
 
-    fn layers(&self) -> Vec<std::path::PathBuf> {
+    fn list_layers(&self) -> Vec<std::path::PathBuf> {
         let entries = std::fs::read_dir(self.place.path()).expect("listed");
         let mut all: Vec<_> = entries.map(|entry| entry.expect("an entry").path()).collect();
         all.sort();
@@ -50,24 +50,24 @@ impl RootFixture {
     }
 
     fn find(&self, environment: &[(&str, &str)], wanted: Option<&str>) -> Result<FoundSystem, SystemError> {
-        find_system(&self.layers(), &variables(environment), wanted)
+        find_system(&self.list_layers(), &make_variables(environment), wanted)
     }
 
-    fn environment(&self, given: &[(&str, &str)]) -> BTreeMap<String, String> {
+    fn make_environment(&self, given: &[(&str, &str)]) -> BTreeMap<String, String> {
         let found = self.find(given, None).expect("a system");
-        make_environment(&self.layers(), &found, &variables(given)).expect("read")
+        make_environment(&self.list_layers(), &found, &make_variables(given)).expect("read")
     }
 }
 
-fn variables(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
+fn make_variables(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
     pairs.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect()
 }
 
 #[test]
 fn an_image_of_ros_2_is_known_by_its_index() {
-    let root = RootFixture::ubuntu();
+    let root = RootFixture::new_ubuntu();
     for name in ["rclpy", "rmw_fastrtps_cpp", "gone"] {
-        root.ament("1", "opt/ros/jazzy", name, "7.1.5");
+        root.write_ament("1", "opt/ros/jazzy", name, "7.1.5");
     }
     root.write("1", "opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py", "");
     root.write("1", "opt/ros/jazzy/lib/x86_64-linux-gnu/librcl.so", "");
@@ -75,7 +75,7 @@ fn an_image_of_ros_2_is_known_by_its_index() {
     root.write("1", "var/lib/dpkg/status", "Package: a\nStatus: install ok installed\nVersion: 1\nArchitecture: all\n");
     root.write("1", "usr/bin/cmake", "");
     // A later layer replaces the whole list.
-    root.ament("2", "opt/ros/jazzy", "nav2_msgs", "1.3.4");
+    root.write_ament("2", "opt/ros/jazzy", "nav2_msgs", "1.3.4");
     let found = root.find(&[], None).expect("a system");
     let about = (&*found.distribution, &*found.suite, &*found.title, &*found.python);
     assert_eq!(about, ("ubuntu", "noble", "Ubuntu 24.04.1 LTS", "3.12"));
@@ -87,7 +87,7 @@ fn an_image_of_ros_2_is_known_by_its_index() {
     assert!(found.dpkg_status.is_some_and(|status| status.starts_with("Package: a")));
 
     let given = [("PATH", "/usr/bin:/opt/tool/bin"), ("ROS_DOMAIN_ID", "7"), ("LD_PRELOAD", "/x"), ("MY_MODEL", "a b")];
-    let environment = root.environment(&given);
+    let environment = root.make_environment(&given);
     for (name, value) in [
         ("AMENT_PREFIX_PATH", "/opt/ros/jazzy"),
         ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy"),
@@ -111,9 +111,9 @@ fn an_image_of_ros_2_is_known_by_its_index() {
 
 #[test]
 fn what_an_upper_layer_deletes_is_not_there() {
-    let root = RootFixture::ubuntu();
-    root.ament("1", "opt/ros/jazzy", "rclpy", "1");
-    root.ament("1", "opt/ros/humble", "rclpy", "1");
+    let root = RootFixture::new_ubuntu();
+    root.write_ament("1", "opt/ros/jazzy", "rclpy", "1");
+    root.write_ament("1", "opt/ros/humble", "rclpy", "1");
     std::fs::create_dir_all(root.place.path().join("2/opt/ros")).expect("made");
     let mark = rustix::fs::mknodat(
         rustix::fs::CWD,
@@ -129,18 +129,18 @@ fn what_an_upper_layer_deletes_is_not_there() {
 #[test]
 fn a_robot_of_ros_1_is_known_by_catkins_marker() {
     let root = RootFixture::new("ID=debian\nVERSION_ID=\"11\"\n", "3.9");
-    root.catkin("1", "opt/ros/noetic", "roscpp");
+    root.write_catkin("1", "opt/ros/noetic", "roscpp");
     root.write("1", "opt/ros/noetic/lib/python3/dist-packages/rospy/__init__.py", "");
-    root.catkin("1", "home/robot/ws/install", "my_driver");
+    root.write_catkin("1", "home/robot/ws/install", "my_driver");
     root.write("1", "home/robot/ws/devel/.catkin", "/home/robot/ws/src");
-    root.catkin("1", "root/ws/install", "secret");
+    root.write_catkin("1", "root/ws/install", "secret");
     let found = root.find(&[], None).expect("a system");
     assert_eq!((found.ros, &*found.ros_distribution, &*found.suite), (RosVersion::One, "noetic", "11"));
     let spaces: Vec<&str> = found.spaces.iter().map(|space| &*space.path).collect();
     assert_eq!(spaces, ["/home/robot/ws/install", "/opt/ros/noetic"]);
     let unusable: Vec<&str> = found.unusable.iter().map(|(path, _)| &**path).collect();
     assert_eq!(unusable, ["/home/robot/ws/devel", "/root/ws/install"]);
-    let environment = root.environment(&[]);
+    let environment = root.make_environment(&[]);
     assert_eq!(environment["ROS_PACKAGE_PATH"], "/home/robot/ws/install/share:/opt/ros/noetic/share");
     assert_eq!(environment["ROS_ROOT"], "/opt/ros/noetic/share/ros");
     assert_eq!(environment["PYTHONPATH"], "/opt/ros/noetic/lib/python3/dist-packages");
@@ -153,39 +153,39 @@ fn the_distributions_own_ros_has_no_space() {
     root.write("1", "usr/lib/python3/dist-packages/rospy/__init__.py", "");
     let found = root.find(&[], None).expect("a system");
     assert_eq!((found.ros, &*found.ros_distribution, found.spaces.len()), (RosVersion::One, "noetic", 0));
-    assert!(!root.environment(&[]).contains_key("ROS_DISTRO"));
+    assert!(!root.make_environment(&[]).contains_key("ROS_DISTRO"));
 }
 
 #[test]
 fn a_workspace_is_an_overlay_whether_merged_or_isolated() {
-    let root = RootFixture::ubuntu();
-    root.ament("1", "opt/ros/jazzy", "rclpy", "1");
-    root.ament("1", "opt/ros/jazzy", "talker", "1");
+    let root = RootFixture::new_ubuntu();
+    root.write_ament("1", "opt/ros/jazzy", "rclpy", "1");
+    root.write_ament("1", "opt/ros/jazzy", "talker", "1");
     root.write("2", "ws/install/.colcon_install_layout", "isolated\n");
     for name in ["talker", "listener"] {
-        root.ament("2", &format!("ws/install/{name}"), name, "2");
+        root.write_ament("2", &format!("ws/install/{name}"), name, "2");
     }
-    root.ament("2", "opt/merged", "extra", "3");
+    root.write_ament("2", "opt/merged", "extra", "3");
     let found = root.find(&[("AMENT_PREFIX_PATH", "/ws/install/talker:/opt/ros/jazzy")], None).expect("a system");
     let spaces: Vec<(&str, SpaceLayout)> = found.spaces.iter().map(|space| (&*space.path, space.layout)).collect();
     let (merged, isolated) = (SpaceLayout::Merged, SpaceLayout::Isolated);
     assert_eq!(spaces, [("/ws/install", isolated), ("/opt/merged", merged), ("/opt/ros/jazzy", merged)]);
     assert_eq!(found.packages()["talker"], "2");
-    let environment = root.environment(&[]);
+    let environment = root.make_environment(&[]);
     let expected = "/opt/merged:/ws/install/listener:/ws/install/talker:/opt/ros/jazzy";
     assert_eq!(environment["AMENT_PREFIX_PATH"], expected);
 }
 
 #[test]
 fn wheels_below_a_prefix_of_any_name_are_of_the_distribution_that_is_said() {
-    let root = RootFixture::ubuntu();
-    root.ament("1", "opt/wheels", "rclpy", "7");
+    let root = RootFixture::new_ubuntu();
+    root.write_ament("1", "opt/wheels", "rclpy", "7");
     let refused = root.find(&[], None).expect_err("nothing says which").to_string();
     assert!(refused.contains("/opt/wheels does not say which") && refused.contains("--ros-distro"), "{refused}");
     assert_eq!(root.find(&[], Some("kilted")).expect("said").ros_distribution, "kilted");
     assert_eq!(root.find(&[("ROS_DISTRO", "rolling")], None).expect("said").ros_distribution, "rolling");
     root.write("1", "opt/wheels/lib/python3.12/site-packages/ros_rclpy.libs/libssl-1.so", "");
-    let environment = root.environment(&[("ROS_DISTRO", "jazzy")]);
+    let environment = root.make_environment(&[("ROS_DISTRO", "jazzy")]);
     let modules = "/opt/wheels/lib/python3.12/site-packages";
     assert_eq!(environment["LD_LIBRARY_PATH"], format!("/opt/wheels/lib:{modules}/ros_rclpy.libs"));
     assert_eq!(environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"], "1");
@@ -195,9 +195,9 @@ fn wheels_below_a_prefix_of_any_name_are_of_the_distribution_that_is_said() {
 
 #[test]
 fn of_several_ros_one_is_named() {
-    let root = RootFixture::ubuntu();
-    root.ament("1", "opt/ros/humble", "rclpy", "1");
-    root.catkin("1", "opt/ros/noetic", "roscpp");
+    let root = RootFixture::new_ubuntu();
+    root.write_ament("1", "opt/ros/humble", "rclpy", "1");
+    root.write_catkin("1", "opt/ros/noetic", "roscpp");
     let refused = root.find(&[], None).expect_err("two").to_string();
     assert!(refused.contains("humble (ROS 2), noetic (ROS 1)"), "{refused}");
     let found = root.find(&[], Some("noetic")).expect("named");
@@ -210,13 +210,13 @@ fn of_several_ros_one_is_named() {
 
 #[test]
 fn what_cannot_be_used_is_refused_with_the_reason() {
-    let root = RootFixture::ubuntu();
-    root.catkin("1", "root/ws/install", "mine");
+    let root = RootFixture::new_ubuntu();
+    root.write_catkin("1", "root/ws/install", "mine");
     let refused = root.find(&[], None).expect_err("hidden").to_string();
     assert!(refused.contains("no ROS was found") && refused.contains("/root/ws/install is hidden"), "{refused}");
 
-    let root = RootFixture::ubuntu();
-    root.catkin("1", "opt/ros/melodic", "roscpp");
+    let root = RootFixture::new_ubuntu();
+    root.write_catkin("1", "opt/ros/melodic", "roscpp");
     root.write("1", "opt/ros/melodic/lib/python2.7/dist-packages/rospy/__init__.py", "");
     let refused = root.find(&[], None).expect_err("Python 2").to_string();
     assert!(refused.contains("ROS melodic in it is for Python 2"), "{refused}");
@@ -234,10 +234,10 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
 
 #[test]
 fn hostile_names_and_links_lead_nowhere() {
-    let root = RootFixture::ubuntu();
+    let root = RootFixture::new_ubuntu();
     root.write("0", "usr/lib/os-release", "ID=\"u\u{1b}[31mx\"\nVERSION_CODENAME=-$(reboot)\nPRETTY_NAME='a\\nb'\n");
-    root.ament("1", "opt/ros/jazzy", "rclpy", "1");
-    root.ament("1", "opt/a:b", "injected", "1");
+    root.write_ament("1", "opt/ros/jazzy", "rclpy", "1");
+    root.write_ament("1", "opt/a:b", "injected", "1");
     root.write("1", "opt/ros/jazzy/share/rclpy/package.xml", "<package><version>1$(x)</version></package>");
     symlink("/etc", root.place.path().join("1/opt/link")).expect("linked");
     let path = [("AMENT_PREFIX_PATH", "/opt/../../etc:/opt/ros/jazzy:relative")];
