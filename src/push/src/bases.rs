@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use api::Size;
 use api::bases::{BaseDetail, BaseFinding, BaseState, BaseSummary};
@@ -78,8 +79,11 @@ impl Pusher {
         let receiving = receive(Arc::clone(self), directory.clone());
         let pusher = Arc::clone(self);
         let work = async move {
+            let limit = pusher.options.time;
             let outcome = tokio::select! {
-                outcome = blocking::cancellable(receiving) => outcome,
+                outcome = tokio::time::timeout(limit, blocking::cancellable(receiving)) => {
+                    outcome.unwrap_or_else(|_| Err(too_long_error(limit)))
+                }
                 () = pusher.cancel.cancelled() => Err(Error::Ending),
             };
             let removed = privilege::spawn_blocking(move || foreign::remove(&directory)).await;
@@ -170,6 +174,14 @@ impl Pusher {
             E::BaseNotSetUp { .. } => Error::BaseNotSetUp(error.to_string()),
             error => to_push_error(&error, &self.home, "the file"),
         }
+    }
+}
+
+fn too_long_error(limit: Duration) -> Error {
+    Error::Failed {
+        message: format!("importing the base took longer than {} s", limit.as_secs()),
+        next: Some("import a smaller image, or raise time in [push] of the configuration".to_owned()),
+        log: Vec::new(),
     }
 }
 
