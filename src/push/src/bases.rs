@@ -130,14 +130,17 @@ impl Pusher {
         self.disks.check().await?;
         // Before hundreds of megabytes are received for it.
         let (name, replace) = (request.name.clone(), request.replace);
-        self.ask_builder(move |builder| builder.check_new_name(&name, replace)).await?;
+        if let Err(error) = self.ask_builder(move |builder| builder.check_new_name(&name, replace)).await {
+            self.discard(archive);
+            return Err(error);
+        }
         let tree = directory.join(PUSHED);
         let (events, _) = mpsc::channel(1);
         let report = Reporter::new(events);
         let (kind, archive) = receive::detect_kind(archive, &self.options).await?;
         let source = match kind {
             ArchiveKind::Image => {
-                receive::unpack(archive, &tree, &self.options, &report).await?;
+                receive::unpack_image(archive, &tree, &self.options, &report).await?;
                 ImportSource::Image(tree)
             }
             ArchiveKind::Root => ImportSource::Root(receive::store(archive, &tree, &self.options, &report).await?),

@@ -36,11 +36,37 @@ const MANIFEST: u64 = 1 << 20;
 /// Body of an archive, in chunks.
 pub type Archive = BoxStream<'static, io::Result<Bytes>>;
 
+/// Next step for an archive that cannot be read.
+const PACK_AGAIN: &str = "push a tar archive of a package, workspace or install space whose links stay inside it";
+/// Next step for an archive of an image that cannot be read.
+const SAVE_AGAIN: &str = "send an archive of podman save, docker save or skopeo copy to oci-archive, or a root file \
+    system as tar";
+
 /// Unpacks the archive into `tree`, which is created.
 pub(super) async fn unpack(archive: Archive, tree: &Path, limits: &Options, report: &Reporter) -> Result<(), Error> {
+    unpack_or_advise(archive, tree, limits, report, PACK_AGAIN).await
+}
+
+/// Unpacks the archive of an image into `tree`, which is created.
+pub(super) async fn unpack_image(
+    archive: Archive,
+    tree: &Path,
+    limits: &Options,
+    report: &Reporter,
+) -> Result<(), Error> {
+    unpack_or_advise(archive, tree, limits, report, SAVE_AGAIN).await
+}
+
+async fn unpack_or_advise(
+    archive: Archive,
+    tree: &Path,
+    limits: &Options,
+    report: &Reporter,
+    advice: &'static str,
+) -> Result<(), Error> {
     let unpacked = image::Limits { entries: limits.entries, bytes: limits.unpacked.0, ..image::Limits::default() };
     let unpack = move |content: &mut dyn Read, inside: &Path| {
-        image::unpack(content, inside, &unpacked).map(drop).map_err(refusal)
+        image::unpack(content, inside, &unpacked).map(drop).map_err(|error| refusal(error, advice))
     };
     take(archive, tree, limits, report, unpack).await
 }
@@ -227,7 +253,7 @@ fn too_slow_error(why: TooSlow, pause: Duration, rate: Size) -> Error {
     Error::Failed { message, next: Some(next.to_owned()), log: Vec::new() }
 }
 
-fn refusal(error: image::Error) -> Error {
+fn refusal(error: image::Error, advice: &str) -> Error {
     let next = match &error {
         image::Error::Archive { problem: Refusal::TooManyEntries { .. }, .. } => {
             Some("push fewer files, or raise entries in [push] of the configuration".to_owned())
@@ -238,9 +264,7 @@ fn refusal(error: image::Error) -> Error {
         image::Error::Archive { problem: Refusal::LinkLeaves { .. }, .. } => Some(
             "replace the link with a copy; build install spaces without 'colcon build --symlink-install'".to_owned(),
         ),
-        image::Error::Archive { .. } => {
-            Some("push a tar archive of a package, workspace or install space whose links stay inside it".to_owned())
-        }
+        image::Error::Archive { .. } => Some(advice.to_owned()),
         _ => None,
     };
     Error::Failed { message: error.to_string(), next, log: Vec::new() }
