@@ -8,7 +8,6 @@ use std::sync::Arc;
 use image::{Digest, Store};
 use package::foreseen::{self, SourceProblem};
 use package::workspace::{PushedDirectory, Workspace};
-use ros::flavour::Version;
 use servant::sandbox::Sandbox;
 use servant::spec::Limits;
 use tokio::sync::mpsc;

@@ -171,7 +171,8 @@ fn names_are_new_unless_an_imported_base_is_replaced() {
     assert!(refused.contains("--replace"), "{refused}");
     lab.write_root("newer", &["rclpy", "nav2_msgs"]);
     lab.import(&BaseImport { replace: true, ..lab.save_image("lab", "newer") }).expect("replaced");
-    assert!(lab.load_base("lab").image.expect("an image").ros.contains_key("nav2_msgs"));
+    let image = lab.load_base("lab").definition.image.expect("an image");
+    assert!(image.ros.contains_key("nav2_msgs"));
 }
 
 #[test]

@@ -57,7 +57,7 @@ impl Pusher {
         let receive = |pusher: Arc<Self>, directory: PathBuf| {
             async move { pusher.receive_base(archive, &directory).await }.boxed()
         };
-        self.import(receive, |base| format!("base {} was imported", base.name)).await
+        self.run_import(receive, |base| format!("base {} was imported", base.name)).await
     }
 
     /// Makes a base from an image or a root file system; runs to completion even if the caller stops waiting.
@@ -65,12 +65,12 @@ impl Pusher {
         let receive = |pusher: Arc<Self>, directory: PathBuf| {
             async move { pusher.receive_image(archive, &directory, request).await }.boxed()
         };
-        self.import(receive, |base| format!("base {} was made of {}", base.name, base.summary)).await
+        self.run_import(receive, |base| format!("base {} was made of {}", base.name, base.summary)).await
     }
 
     /// Runs `receive` with the path of a directory of its own, which is removed at the end, and tells of the base that
     /// it names.
-    async fn import(
+    async fn run_import(
         self: &Arc<Self>,
         receive: impl FnOnce(Arc<Self>, PathBuf) -> BoxFuture<'static, Result<String, Error>>,
         message: fn(&BaseSummary) -> String,
