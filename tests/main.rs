@@ -319,6 +319,8 @@ fn main() -> ExitCode {
             skopeo_and_umoci_read_the_store,
             an_exported_service_is_published_on_another_server,
             a_base_is_moved_to_a_server_without_network,
+            a_saved_image_becomes_a_base,
+            a_root_file_system_made_by_hand_becomes_a_base,
             what_nobody_refers_to_is_collected,
         ],
         stories![underlays:

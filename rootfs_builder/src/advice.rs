@@ -2,8 +2,6 @@
 
 use std::collections::BTreeSet;
 
-use ros::flavour::Version;
-
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::contents::Contents;
@@ -29,7 +27,7 @@ enum MissingDependency<'a> {
 #[derive(Clone, Copy)]
 pub(crate) struct AdviceIndex<'a> {
     contents: &'a Contents,
-    /// Set for a base of ROS 2, where the distribution's own ROS 1 packages must be ignored.
+    /// Set for a base with install spaces, where the distribution's own ROS 1 packages must be ignored.
     two: Option<Ros2Base<'a>>,
 }
 
@@ -42,7 +40,7 @@ struct Ros2Base<'a> {
 impl<'a> AdviceIndex<'a> {
     /// Returns the index of a base and its archive.
     pub(crate) fn for_base(archive: &'a Archive, base: &'a Base) -> Self {
-        Self { contents: &archive.contents, two: (base.ros != Version::Ros1).then_some(Ros2Base { archive, base }) }
+        Self { contents: &archive.contents, two: (!base.has_distributions_ros()).then_some(Ros2Base { archive, base }) }
     }
 
     /// Returns the index of an archive for a base of ROS 1.
@@ -221,6 +219,8 @@ fn parse_missing(line: &str) -> Option<MissingDependency<'_>> {
 
 #[cfg(test)]
 mod tests {
+    use ros::flavour::Version;
+
     use super::*;
     use crate::contents::tests::list;
 

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use ros::flavour::{Flavour, Version};
 use serde::{Deserialize, Serialize};
 
+use crate::imported::ImportedImage;
+
 pub use crate::base_file_error::{BaseFileError, BaseFileProblem, WheelsError};
 use crate::error::{Error, IoContext};
 
@@ -30,6 +32,12 @@ impl Base {
     /// Returns the ROS flavour recorded with revisions.
     pub fn flavour(&self) -> Flavour {
         Flavour { base: self.name.clone(), ros: self.ros, distribution: self.ros_distribution.clone() }
+    }
+
+    /// Returns whether its ROS is the distribution's own, of ROS 1 below `/usr`. Otherwise ROS is in install spaces,
+    /// and its Debian packages, if there are any, are named by its distribution (REP 2003: `ros-jazzy-std-msgs`).
+    pub(crate) fn has_distributions_ros(&self) -> bool {
+        self.ros == Version::Ros1 && crate::indexed::install_prefixes(self).is_empty()
     }
 
     /// Returns the properties that affect installed trees, as a part of their cache keys. A new rosdep key does not
@@ -61,7 +69,7 @@ impl std::ops::Deref for Base {
 }
 
 /// Content of a base definition.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Definition {
     /// One-line summary.
@@ -74,6 +82,8 @@ pub struct Definition {
     pub ros: Version,
     /// ROS distribution, as in `$ROS_DISTRO` in the conditions of a package.xml: `noetic`.
     pub ros_distribution: String,
+    /// Another base whose `keys` are inherited; those of this base take precedence.
+    pub keys_of: Option<String>,
     /// Content of every image.
     pub runtime: Runtime,
     /// Environment of every process.
@@ -89,11 +99,11 @@ pub struct Definition {
     /// Settings for individual ROS packages.
     #[serde(default)]
     pub ros_packages: RosPackages,
-    /// Another base whose `keys` are inherited; those of this base take precedence.
-    pub keys_of: Option<String>,
     /// rosdep key → Debian packages.
     #[serde(default)]
     pub keys: BTreeMap<String, Vec<String>>,
+    /// Image that it was made from; written by [`crate::Builder::import_image`].
+    pub image: Option<ImportedImage>,
 }
 
 /// Content of every image.
@@ -134,7 +144,7 @@ pub struct Build {
 }
 
 /// Settings for individual ROS packages.
-#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RosPackages {
     /// Packages not needed at run time: neither installed nor reported as missing.
@@ -204,7 +214,7 @@ fn parse(text: &str) -> Result<Definition, BaseFileError> {
             return Err(wrong(&format!("{package:?}"), problem));
         }
     }
-    if definition.runtime.packages.is_empty() {
+    if definition.runtime.packages.is_empty() && definition.image.is_none() {
         return Err(wrong("[runtime]", BaseFileProblem::NoPackages));
     }
     for rule in &definition.strip.unpacked {

@@ -8,7 +8,6 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use image::{Digest, ImageSpec};
 use package::inventory::{Inventory, SearchHints};
-use ros::flavour::Version;
 
 use crate::advice::{self, AdviceIndex};
 use crate::archive::Archive;
@@ -67,7 +66,7 @@ impl Build<'_> {
         self.base_layer.diff_ids().collect()
     }
 
-    /// Returns the ROS 2 packages in these layers.
+    /// Returns the ROS packages in the install spaces of these layers.
     pub(crate) async fn indexed_packages(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
         let trees = self.shop.extract_layers(layers).await?;
         indexed::find_packages(&self.base, trees).await
@@ -113,8 +112,8 @@ impl Build<'_> {
 
     /// Returns the names given with `--with`: first ROS packages, then Debian packages.
     pub(crate) async fn extra_packages(&self) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
-        if self.base.ros != Version::Ros1 {
-            return Ok((BTreeSet::new(), self.ros2_extra_packages().await?));
+        if !self.base.has_distributions_ros() {
+            return Ok((BTreeSet::new(), self.extra_debs().await?));
         }
         let (mut ros, mut debs) = (BTreeSet::new(), BTreeSet::new());
         let mut missing = Vec::new();
@@ -131,9 +130,9 @@ impl Build<'_> {
         if missing.is_empty() { Ok((ros, debs)) } else { Err(Error::Unresolved(missing)) }
     }
 
-    /// Returns the names given with `--with` on a base of ROS 2: Debian packages, without ROS packages that are already
-    /// there.
-    async fn ros2_extra_packages(&self) -> Result<BTreeSet<String>, Error> {
+    /// Returns the names given with `--with` on a base with install spaces: Debian packages, without ROS packages that
+    /// are already there.
+    async fn extra_debs(&self) -> Result<BTreeSet<String>, Error> {
         if self.request.with.is_empty() {
             return Ok(BTreeSet::new());
         }
@@ -199,12 +198,12 @@ impl Build<'_> {
             let of = SearchHints { package: &package, environment: &environment, commands: &commands };
             let inventory = Inventory::scan(&trees, of)?;
             let (archive, base) = known;
-            let undeclared = match base.ros {
-                Version::Ros1 => {
-                    undeclared::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
-                }
-                // Its programs are created by setuptools and import their packages by name.
-                Version::Ros2 => Vec::new(),
+            let undeclared = if base.has_distributions_ros() {
+                undeclared::missing_module_advice(&trees, &inventory, AdviceIndex::for_base(&archive, &base))
+            } else {
+                // Programs of ROS 2 are created by setuptools and import their packages by name, and the archive's
+                // index does not tell what is in install spaces.
+                Vec::new()
             };
             Ok::<_, Error>((inventory, undeclared))
         })

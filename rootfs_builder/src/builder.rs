@@ -27,7 +27,9 @@ use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{advice, blocking, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
+use crate::{
+    advice, blocking, imported, packaged, prebuilt, seal, source, sources, stock, unused, wheels,
+};
 
 /// Default base for packages that support ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
@@ -44,6 +46,8 @@ pub struct Config {
     pub cache_bytes: u64,
     /// Directory of the base definitions.
     pub bases_dir: PathBuf,
+    /// Directory of the definitions of bases that were made from images, which are in the other one, too; outlives it.
+    pub imported_dir: PathBuf,
     /// Work directory, with a directory per build; cleaned up by the caller that starts the daemon.
     pub build_dir: PathBuf,
     /// Directory of the complete build logs.
@@ -126,6 +130,11 @@ impl Builder {
     /// Returns the directory of the base definitions.
     pub(crate) fn bases_dir(&self) -> &Path {
         &self.config.bases_dir
+    }
+
+    /// Returns the directory that keeps the definitions of bases that were made from images.
+    pub(crate) fn imported_dir(&self) -> &Path {
+        &self.config.imported_dir
     }
 
     /// Returns the work directory.
@@ -227,11 +236,12 @@ impl Builder {
     }
 
     /// Returns the layers that no image needs but the next build will, by diff-id: bases and toolchains. To be kept by
-    /// the store's garbage collector; otherwise they are imported from the cache again.
+    /// the store's garbage collector; otherwise they are imported from the cache again, but for those of bases that
+    /// were made from images, which only the store has.
     pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
         let notes = names.iter().filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
-        notes.flatten().collect()
+        notes.flatten().chain(imported::image_layers(&self.config.bases_dir)).collect()
     }
 
     /// Returns the archive of a base for a push, which reads the package lists if they are old.
@@ -245,6 +255,7 @@ impl Builder {
         let _turn = self.turns.lock(&format!("archive of {}", base.name), push, progress).await;
         if let Some(opened) = self.archives.lock().await.get_mut(&base.name)
             && opened.archive.is_fresh()
+            && opened.base.image == base.image
         {
             opened.base = base.clone();
             return Ok(opened.archive.clone());
@@ -253,6 +264,9 @@ impl Builder {
         let scratch = sandbox::create_build_directory(&self.config.build_dir, &push.id)?.join("sources");
         fs::create_dir_all(&scratch).io_context("making", &scratch)?;
         let opened = async {
+            if base.image.as_ref().is_some_and(|image| image.debian.is_empty()) {
+                return Err(Error::NoDpkg);
+            }
             let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
             Archive::open(&self.config.cache_dir, sources, false, progress).await
         };
@@ -268,6 +282,10 @@ impl Builder {
                 progress.warn(words).await;
                 archive
             }
+        };
+        let archive = match &base.image {
+            Some(image) => archive.with_installed(image),
+            None => archive,
         };
         let archive = Arc::new(archive);
         self.archives.lock().await.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
@@ -347,12 +365,18 @@ pub(crate) mod tests {
 
     /// Creates a builder with the repository's bases, whose files are below `place` and which runs nothing.
     pub(crate) fn new_builder(place: &Path) -> Builder {
+        new_builder_with(place, Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"))
+    }
+
+    /// Creates a builder with the bases in a directory, whose files are below `place` and which runs nothing.
+    pub(crate) fn new_builder_with(place: &Path, bases_dir: PathBuf) -> Builder {
         let at = |name: &str| place.join(name);
         let store = Store::open(&at("images"), &at("layers")).expect("a store");
         Builder::new(Config {
             cache_dir: at("cache"),
             cache_bytes: u64::MAX,
-            bases_dir: Path::new(env!("CARGO_MANIFEST_DIR")).join("../images"),
+            bases_dir,
+            imported_dir: at("imported"),
             build_dir: at("build"),
             logs_dir: at("logs"),
             sources: Sources::default(),
@@ -407,7 +431,7 @@ pub(crate) mod tests {
             &["setup.sh", ".catkin", "lib/p/node"],
         ];
         for (number, files) in trees.iter().enumerate() {
-            for base in [None, Some(DEFAULT_BASE), Some("noble-jazzy")] {
+            for base in [None, Some(DEFAULT_BASE), Some("bookworm-jazzy-wheels")] {
                 let tree = at(&format!("pushed-{number}-{}", base.unwrap_or("any")));
                 for file in *files {
                     let file = tree.join(file);

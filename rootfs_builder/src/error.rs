@@ -111,6 +111,57 @@ pub enum Error {
         /// Name of the base.
         base: String,
     },
+    /// The name of a new base cannot be used.
+    #[error(
+        "{name:?} is no name of a base: use letters, digits, '-', '_' and '.', at most 64, the first a letter or digit"
+    )]
+    BaseName {
+        /// Name that was given.
+        name: String,
+    },
+    /// The name of a new base is taken.
+    #[error("there is a base {name} already; {next}")]
+    BaseExists {
+        /// Name that was given.
+        name: String,
+        /// Next step.
+        next: &'static str,
+    },
+    /// The definition of a new base cannot be written.
+    #[error("the definition of base {base} cannot be written as TOML: {error}")]
+    BaseText {
+        /// Name of the base.
+        base: String,
+        /// Error of the serializer.
+        error: toml::ser::Error,
+    },
+    /// No base can be made from an image.
+    #[error(transparent)]
+    System(#[from] package::system::SystemError),
+    /// Layers of a base that was made from an image are missing.
+    #[error("layer {layer} of base {base} is missing in the image store; import its image again, with --replace")]
+    ImageGone {
+        /// Name of the base.
+        base: String,
+        /// Diff-id of the layer.
+        layer: String,
+    },
+    /// No packages can be added to a base.
+    #[error("it has no dpkg")]
+    NoDpkg,
+    /// A base that was made from an image cannot compile, and what it lacks cannot be installed.
+    #[error(
+        "base {base} cannot compile sources: its image lacks {missing}, which cannot be installed ({words}); push an \
+            install space, name an archive ([archives] {base} = …), or import an image that has them"
+    )]
+    NoTools {
+        /// Name of the base.
+        base: String,
+        /// What is missing.
+        missing: String,
+        /// Reason why it cannot be installed.
+        words: String,
+    },
     /// A file to import is not an exported base.
     #[error("the file is not an exported base: {problem}; create one with `cloudroidctl base export`")]
     NotABase {

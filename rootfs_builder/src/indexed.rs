@@ -1,5 +1,5 @@
-//! ROS 2 packages that are already in layers, according to ament's index: packages of a base, from wheels or apt, need
-//! not be listed anywhere else.
+//! ROS packages that are already in the install spaces of layers: packages of a base, from wheels, apt or an image,
+//! need not be listed anywhere else.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -28,11 +28,8 @@ pub(crate) struct IndexedPackages {
 }
 
 /// Returns the install spaces of a base as absolute paths: those in the environment of all processes and of compilers.
-/// Empty for ROS 1.
+/// Empty for the distribution's own ROS 1, which is below `/usr`.
 pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
-    if base.ros == Version::Ros1 {
-        return Vec::new();
-    }
     let mut named: Vec<String> = Vec::new();
     for environment in [&base.environment, &base.build.environment] {
         for variable in ["AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"] {
@@ -40,9 +37,13 @@ pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
             named.extend(value.split(':').map(str::to_owned));
         }
     }
-    named.push(format!("/opt/ros/{}", base.ros_distribution));
+    if base.ros == Version::Ros2 {
+        named.push(format!("/opt/ros/{}", base.ros_distribution));
+    }
     let mut seen = BTreeSet::new();
-    named.retain(|prefix| prefix.len() > 1 && prefix.starts_with('/') && seen.insert(prefix.clone()));
+    named.retain(|prefix| {
+        prefix.len() > 1 && prefix.starts_with('/') && prefix != "/usr" && seen.insert(prefix.clone())
+    });
     named
 }
 
@@ -50,7 +51,7 @@ pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
 pub(crate) fn library_directories(base: &Base) -> Vec<String> {
     let mut places: Vec<String> =
         install_prefixes(base).iter().map(|prefix| format!("{}/lib", prefix.trim_matches('/'))).collect();
-    if base.ros != Version::Ros1 {
+    if !places.is_empty() {
         let given = base.environment.get("LD_LIBRARY_PATH");
         let given = given.map_or("", String::as_str).split(':');
         let given = given.map(|place| place.trim_matches('/'));
@@ -104,14 +105,23 @@ pub(crate) async fn find_modules(build: &Build<'_>, layers: &[Digest]) -> Result
     Ok(blocking::spawn_reader(move || package::ament::modules(&trees, &prefixes)).await??)
 }
 
-/// Returns the packages in the indexes of trees, given lowest first.
+/// Returns the packages in the install spaces of trees, given lowest first: of ROS 2 by ament's index, of ROS 1 by
+/// their package.xml.
 pub(crate) async fn find_packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
     let prefixes = install_prefixes(base);
     if prefixes.is_empty() {
         return Ok(BTreeSet::new());
     }
-    let look = move || package::ament::packages(&trees, &prefixes);
-    Ok(blocking::spawn_reader(look).await??)
+    let ros = base.ros;
+    blocking::spawn_reader(move || list_packages(ros, &trees, &prefixes)).await?
+}
+
+/// Returns the packages in install spaces of trees, given lowest first. Blocking.
+pub(crate) fn list_packages(ros: Version, trees: &[PathBuf], prefixes: &[String]) -> Result<BTreeSet<String>, Error> {
+    Ok(match ros {
+        Version::Ros1 => package::inventory::find_manifests(trees, prefixes)?,
+        Version::Ros2 => package::ament::packages(trees, prefixes)?,
+    })
 }
 
 #[cfg(test)]
@@ -141,8 +151,16 @@ mod tests {
             library_directories(&two),
             ["opt/wheels/lib", "opt/tools/lib", "opt/ros/jazzy/lib", "opt/wheels/lib", "opt/more"]
         );
-        let one = base(Version::Ros1);
+        let mut one = base(Version::Ros1);
+        one.definition.build.environment.clear();
+        let prefix = |prefix: &str| [("CMAKE_PREFIX_PATH".to_owned(), prefix.to_owned())].into();
+        one.definition.environment = prefix("/usr");
         assert!(install_prefixes(&one).is_empty() && library_directories(&one).is_empty());
+        assert!(one.has_distributions_ros());
+        one.definition.environment = prefix("/home/robot/install:/opt/ros/noetic");
+        assert_eq!(install_prefixes(&one), ["/home/robot/install", "/opt/ros/noetic"]);
+        assert_eq!(library_directories(&one), ["home/robot/install/lib", "opt/ros/noetic/lib"]);
+        assert!(!one.has_distributions_ros());
     }
 
     #[tokio::test]
@@ -157,6 +175,12 @@ mod tests {
         let found = find_packages(&base(Version::Ros2), trees.clone()).await.expect("read");
         let names: Vec<&str> = found.iter().map(String::as_str).collect();
         assert_eq!(names, ["rclpy", "std_msgs"]);
-        assert!(find_packages(&base(Version::Ros1), trees).await.expect("read").is_empty());
+        for (path, text) in [("roscpp/package.xml", "<package/>"), ("doc/readme", "")] {
+            let path = tree.path().join("opt/wheels/share").join(path);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        let found = find_packages(&base(Version::Ros1), trees).await.expect("read");
+        assert_eq!(found.into_iter().collect::<Vec<_>>(), ["roscpp"]);
     }
 }

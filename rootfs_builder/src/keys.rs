@@ -1,12 +1,11 @@
 //! Resolution of the names in a package.xml (rosdep keys and ROS packages) to Debian packages.
 //!
 //! In this order: the deployer's mapping (`--map`), packages of the same workspace, the base's table, existing ROS
-//! packages (ROS 2), ROS packages of the archive, a Debian package of the same name, an existing Python module of that
-//! name, if no more is needed.
+//! packages in install spaces (on a base made from an image before the table, which was not written for it), ROS
+//! packages of the archive, a Debian package of the same name, an existing Python module of that name, if no more is
+//! needed.
 
 use std::collections::{BTreeMap, BTreeSet};
-
-use ros::flavour::Version;
 
 use crate::archive::Archive;
 use crate::base::Base;
@@ -70,22 +69,21 @@ pub(crate) fn resolve_keys(
             let debs = split_names(names).filter(|name| !is_there(name));
             return KeyProvider::Debs(debs.map(str::to_owned).collect());
         }
+        if base.image.is_some() && there.contains(key) {
+            return KeyProvider::There;
+        }
         if let Some(debs) = base.keys.get(key) {
             return KeyProvider::Debs(debs.clone());
         }
         if there.contains(key) {
             return KeyProvider::There;
         }
-        match base.ros {
-            Version::Ros1 if !archive.contents.ros_package(key).is_empty() => {
+        if base.has_distributions_ros() {
+            if !archive.contents.ros_package(key).is_empty() {
                 return KeyProvider::Ros;
             }
-            Version::Ros2 => {
-                if let Some(deb) = find_ros_deb(archive, base, key) {
-                    return KeyProvider::Debs(vec![deb]);
-                }
-            }
-            Version::Ros1 => {}
+        } else if let Some(deb) = find_ros_deb(archive, base, key) {
+            return KeyProvider::Debs(vec![deb]);
         }
         if archive.candidates.contains(key) && !is_of_other_ros(archive, base, key) {
             return KeyProvider::Debs(vec![key.to_owned()]);
@@ -187,13 +185,14 @@ fn refuse_missing(
     Err(Error::Unresolved(unresolved.collect()))
 }
 
-/// Returns whether, on a base of ROS 2, a Debian package belongs to the distribution's own ROS 1.
+/// Returns whether, on a base with install spaces, a Debian package belongs to the distribution's own ROS 1.
 pub(crate) fn is_of_other_ros(archive: &Archive, base: &Base, deb: &str) -> bool {
     let own = format!("ros-{}-", base.ros_distribution);
-    base.ros != Version::Ros1 && !deb.starts_with(&own) && !archive.contents.ros_packages_in(deb).is_empty()
+    !base.has_distributions_ros() && !deb.starts_with(&own) && !archive.contents.ros_packages_in(deb).is_empty()
 }
 
-/// Finds the Debian package for a name given on a base of ROS 2: that of a ROS package, or the package itself.
+/// Finds the Debian package for a name given on a base with install spaces: that of a ROS package, or the package
+/// itself.
 pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Option<String> {
     let own = archive.candidates.contains(name) && !is_of_other_ros(archive, base, name);
     find_ros_deb(archive, base, name).or_else(|| own.then(|| name.to_owned()))
@@ -209,14 +208,14 @@ pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, there:
 /// Maximum number of similar names.
 const MOST_SIMILAR: usize = 3;
 
-/// Returns names similar to a key: keys that the base knows first. On a base of ROS 2 these are not of the
+/// Returns names similar to a key: keys that the base knows first. On a base with install spaces these are not of the
 /// distribution's own ROS 1, and ROS packages of the base (`there`) and its archive come before others.
 fn similar(archive: &Archive, base: &Base, key: &str, there: &BTreeSet<String>) -> Vec<String> {
     let mut similar = archive.similar(key);
     // Names of libraries are short and alike: of keys, one slip is enough.
     let is_near = |name: &&String| spelling::slips(key, name).is_some_and(|slips| slips < 2);
     let mut known: BTreeSet<String> = base.keys.keys().filter(is_near).cloned().collect();
-    if base.ros != Version::Ros1 {
+    if !base.has_distributions_ros() {
         let is_ros1 = |name: &str| !archive.contents.ros_package(name).is_empty();
         let own = format!("ros-{}-", base.ros_distribution);
         let of_one = is_ros1(key);
@@ -238,6 +237,7 @@ fn similar(archive: &Archive, base: &Base, key: &str, there: &BTreeSet<String>) 
 mod tests {
     use super::*;
     use crate::contents::{Contents, tests::list};
+    use ros::flavour::Version;
     use std::path::Path;
     use std::sync::Arc;
 

@@ -205,7 +205,7 @@ pub(crate) async fn query_plan(
     let Some(text) = text else {
         return Err(Error::Inside { what: "resolving what to run", last_lines: finished.last_output() });
     };
-    let answer = privilege::run_as_reader(|| parse_reply(&text, ros))?;
+    let answer = blocking::spawn_reader(move || parse_reply(&text, ros)).await??;
     plan::check_plan(&answer)?;
     Ok(answer)
 }

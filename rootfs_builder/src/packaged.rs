@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 
 use crate::archive::Archive;
@@ -19,8 +18,8 @@ use crate::request::{PushRequest, PushSource};
 
 /// Builds from `name`: a ROS package, or a Debian package that contains some.
 pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> {
-    if build.base.ros != Version::Ros1 {
-        return build_ros2(build, name).await;
+    if !build.base.has_distributions_ros() {
+        return build_in_space(build, name).await;
     }
     let archive = &build.archive;
     let mapped = keys::mapped_packages(archive, &build.base, &build.request.map)?;
@@ -53,16 +52,24 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, E
     Ok(BuildParts { packages, versions, dependencies, package: LayerSet::default(), prefix: None, contents: None })
 }
 
-/// Builds on ROS 2, whose archive has a Debian package with all dependencies for each ROS package.
-async fn build_ros2(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> {
-    let ArchivePackage { package, deb } = find_in_archive(&build.archive, &build.base, name)?;
+/// Builds on a base with install spaces: from a package in one of them, which an image may have brought, or else from
+/// ROS's archive, which has a Debian package with all dependencies for each ROS package.
+async fn build_in_space(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> {
     let (_, mut debs) = build.extra_packages().await?;
-    let version = build.archive.candidates.get(&deb);
-    debs.insert(deb);
     debs.extend(keys::mapped_packages(&build.archive, &build.base, &build.request.map)?);
+    let there = build.indexed_packages(&build.base_diff_ids()).await?;
+    let (package, version) = if there.contains(name) {
+        let image = build.base.image.as_ref();
+        (name.to_owned(), image.and_then(|image| image.ros.get(name).cloned()).unwrap_or_default())
+    } else {
+        let ArchivePackage { package, deb } = find_in_archive(&build.archive, &build.base, name)?;
+        let version = build.archive.candidates.get(&deb).map_or_else(String::new, |deb| deb.version);
+        debs.insert(deb);
+        (package, version)
+    };
     let dependencies = build.add_packages("dependencies", &build.base_diff_ids(), &debs, Vec::new()).await?;
     Ok(BuildParts {
-        versions: BTreeMap::from([(package.clone(), version.map_or_else(String::new, |deb| deb.version))]),
+        versions: BTreeMap::from([(package.clone(), version)]),
         packages: vec![package],
         dependencies,
         package: LayerSet::default(),
@@ -194,7 +201,7 @@ mod tests {
             sources: String::new(),
         };
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
-        let base = crate::base::load(&images, "noble-jazzy").expect("valid");
+        let base = crate::base::load(&images, "bookworm-jazzy-wheels").expect("valid");
         for name in ["demo_nodes_py", "demo-nodes-py", "ros-jazzy-demo-nodes-py"] {
             let found = find_in_archive(&archive, &base, name);
             let expected =
@@ -205,7 +212,7 @@ mod tests {
         for name in ["turtlesim", "ros-humble-turtlesim", "python3-six", "frob"] {
             let refused = find_in_archive(&archive, &base, name).expect_err("it is not there");
             let refused = refused.to_string();
-            assert!(refused.contains(name) && refused.contains("noble-jazzy"), "{refused}");
+            assert!(refused.contains(name) && refused.contains("bookworm-jazzy-wheels"), "{refused}");
         }
     }
 }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use package::system::HIDDEN;
 use package::workspace::{InstallSpace, Layout};
 
 use crate::build::{Build, BuildParts};
@@ -16,9 +17,6 @@ use crate::keys::{self, RequiredKeys};
 use crate::modes::set_mode;
 use crate::workshop::PackJob;
 use crate::{indexed, pushed, source};
-
-/// Directories that are replaced by scratch space in a servant, so that files of the image there are not visible.
-const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
 
 /// Packs the install space and finds its dependencies.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<BuildParts, Error> {

@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use crate::build::{Build, BuildParts};
 use crate::builder::keep_note_key;
 use crate::error::Error;
+use crate::imported::ImportedImage;
 use crate::install::LayerSet;
 use crate::keys::{self, ResolvedKeys};
 use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
@@ -31,7 +32,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
         pushed::versions(&workspace.packages),
         pushed::has_python(&workspace.root),
     );
-    let tools = toolchain(build).await?;
+    let tools = toolchain(build, &workspace).await?;
     let mut there = indexed::find_known(build, &tools).await?;
     build.foundation.add_to(&mut there);
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
@@ -57,13 +58,31 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
 }
 
 /// Returns the layers of base and toolchain.
-async fn toolchain(build: &Build<'_>) -> Result<Vec<Digest>, Error> {
+async fn toolchain(build: &Build<'_>, workspace: &Workspace) -> Result<Vec<Digest>, Error> {
     if let Some(tools) = &build.tools {
         return Ok(tools.clone());
     }
     let mut below = build.base_diff_ids();
+    let image = build.base.image.as_ref();
+    let is_python = workspace.packages.iter().all(|package| package.manifest.build_type == "ament_python");
+    if is_python && image.is_some_and(|image| image.installs_python) {
+        return Ok(below);
+    }
+    let no_tools = |image: &ImportedImage, words: String| Error::NoTools {
+        base: build.base.name.clone(),
+        missing: image.missing_tools.join(", "),
+        words,
+    };
+    if let Some(image) = image.filter(|_| build.base.build.packages.is_empty()) {
+        return Err(no_tools(image, "it has no dpkg".to_owned()));
+    }
     let toolchain = build.base.build.packages.iter().cloned().collect();
-    let toolchain = build.add_packages("toolchain", &below, &toolchain, Vec::new()).await?;
+    let toolchain = match (build.add_packages("toolchain", &below, &toolchain, Vec::new()).await, image) {
+        (Err(error @ (Error::Unsolvable { .. } | Error::Download { .. })), Some(image)) => {
+            return Err(no_tools(image, error.to_string()));
+        }
+        (made, _) => made?,
+    };
     below.extend(toolchain.diff_ids());
     let tools = wheels::add_build_wheels(&build.shop, &build.base, &below, build.progress).await?;
     below.extend(tools.diff_ids());

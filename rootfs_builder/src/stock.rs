@@ -17,7 +17,6 @@ use std::sync::Arc;
 
 use foreign::Tree;
 use image::{Digest, ImageSpec, LayerInfo};
-use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 
 use crate::apt::Apt;
@@ -31,6 +30,7 @@ use crate::cache::{LayerCache, LayerEntry};
 use crate::candidates::Candidates;
 use crate::contents::Contents;
 use crate::error::{Error, IoContext};
+use crate::imported::ImportedImage;
 use crate::indexed;
 use crate::install::LayerSet;
 use crate::key::Key;
@@ -58,20 +58,38 @@ pub struct BaseStock {
     layers: Vec<Digest>,
     /// Layers above them that are present only while compiling; empty until sources were pushed.
     toolchain: Vec<Digest>,
+    /// True if the layers of every image have all that sources are compiled with.
+    #[serde(default)]
+    compiles: bool,
     /// Installed Debian packages with their versions.
     pub debian: BTreeMap<String, String>,
     /// Python packages from wheels with their versions.
     pub python: BTreeMap<String, String>,
     /// ROS packages with their versions.
     pub ros: BTreeMap<String, String>,
-    /// True if another server exported the layers.
+    /// True if the layers were imported: exported by another server, or of an image.
     pub is_imported: bool,
 }
 
 impl BaseStock {
     /// Returns whether sources can be compiled without setting up the toolchain first.
     pub fn has_toolchain(&self) -> bool {
-        !self.toolchain.is_empty()
+        self.compiles || !self.toolchain.is_empty()
+    }
+
+    /// Returns what an image that became a base has.
+    fn from_image(base: &Base, image: &ImportedImage) -> Self {
+        Self {
+            made_for: definition_key(base),
+            lists: String::new(),
+            layers: image.layers.clone(),
+            toolchain: Vec::new(),
+            compiles: image.missing_tools.is_empty(),
+            debian: image.debian.clone(),
+            python: BTreeMap::new(),
+            ros: image.ros.clone(),
+            is_imported: true,
+        }
     }
 
     /// Returns the layers of every image, as a part of a build.
@@ -118,7 +136,7 @@ struct BaseRecord {
 }
 
 /// Package index of a base's archive.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 struct PackageIndex {
     contents: String,
     candidates: String,
@@ -150,15 +168,25 @@ fn definition_key(base: &Base) -> String {
 
 /// Returns what was recorded for this definition, regardless of whether the layers still exist.
 fn read_stock(layers: &LayerCache, base: &Base) -> Option<BaseStock> {
+    if let Some(image) = &base.image {
+        return Some(BaseStock::from_image(base, image));
+    }
     let stock = layers.read_note::<BaseStock>(&stock_key(&base.name))?;
     (stock.made_for == definition_key(base)).then_some(stock)
 }
 
 /// Returns the stock of an imported base whose layers are there. Blocking.
+///
+/// # Errors
+/// [`Error::ImageGone`] if layers of an image are missing, which nothing can set up again.
 pub(crate) fn find_imported(layers: &LayerCache, base: &Base) -> Result<Option<BaseStock>, Error> {
     let Some(stock) = read_stock(layers, base).filter(|stock| stock.is_imported) else {
         return Ok(None);
     };
+    if let Some(image) = &base.image {
+        image.check_layers(layers.store(), &base.name)?;
+        return Ok(Some(stock));
+    }
     for layer in stock.all_layers() {
         if layers.get(&imported_layer_key(layer))?.is_none() {
             tracing::warn!("layer {layer} of the imported base {} is missing; the base is set up again", base.name);
@@ -174,8 +202,11 @@ pub(crate) fn open_index(layers: &LayerCache, base: &Base) -> Result<Option<Arch
     if !read_stock(layers, base).is_some_and(|stock| stock.is_imported) {
         return Ok(None);
     }
-    let Some(index) = layers.read_note::<PackageIndex>(&index_key(&base.name)) else {
-        return Ok(None);
+    let index = match (layers.read_note::<PackageIndex>(&index_key(&base.name)), &base.image) {
+        (Some(index), _) => index,
+        // What is installed in it is all that there is.
+        (None, Some(_)) => PackageIndex::default(),
+        (None, None) => return Ok(None),
     };
     Ok(Some(Archive {
         apt: Apt::open(&layers.cache().join("apt").join("imported"), "")?,
@@ -212,6 +243,7 @@ pub(crate) async fn record(build: &Build<'_>) -> Result<(), Error> {
             lists: archive.stamp.clone(),
             layers: below,
             toolchain,
+            compiles: false,
             python: python.collect(),
             debian,
             ros,
@@ -240,20 +272,20 @@ fn debian_packages(trees: &[PathBuf]) -> Result<BTreeMap<String, String>, Error>
     Ok(BTreeMap::new())
 }
 
-/// Returns the ROS packages with their versions: of ROS 1 those in installed Debian packages, of ROS 2 those in ament's
-/// index.
+/// Returns the ROS packages with their versions: those in installed Debian packages if ROS is the distribution's own,
+/// otherwise those in install spaces.
 fn ros_packages(
     base: &Base,
     archive: &Archive,
     debian: &BTreeMap<String, String>,
     trees: &[PathBuf],
 ) -> Result<BTreeMap<String, String>, Error> {
-    if base.ros == Version::Ros1 {
+    if base.has_distributions_ros() {
         let carried = archive.contents.ros_packages_by_deb(&debian.keys().map(String::as_str).collect());
         return Ok(carried.into_iter().map(|(package, deb)| (package, debian[&deb].clone())).collect());
     }
     let prefixes = indexed::install_prefixes(base);
-    let names: BTreeSet<String> = package::ament::packages(trees, &prefixes)?;
+    let names: BTreeSet<String> = indexed::list_packages(base.ros, trees, &prefixes)?;
     let version = |name: &str| {
         let mut places = prefixes.iter().flat_map(|prefix| trees.iter().map(move |tree| (prefix, tree)));
         places.find_map(|(prefix, tree)| manifest_version(tree, prefix, name)).unwrap_or_default()
@@ -376,12 +408,16 @@ impl Builder {
         Ok(base.name)
     }
 
-    /// Forgets that a base was imported: the next push that uses it sets it up. Blocking.
+    /// Forgets that a base was imported: the next push that uses it sets it up; one that was made from an image is
+    /// gone. Blocking.
     ///
     /// # Errors
     /// [`Error::UnknownBase`], and [`Error::BaseNotImported`] if it was set up here or not at all.
     pub fn forget_base(&self, name: &str) -> Result<(), Error> {
         let base = base::load(self.bases_dir(), name)?;
+        if self.forget_image(&base)? {
+            return Ok(());
+        }
         if !read_stock(self.layers(), &base).is_some_and(|stock| stock.is_imported) {
             return Err(Error::BaseNotImported { base: base.name });
         }
@@ -418,6 +454,7 @@ mod tests {
             lists: "today".to_owned(),
             layers: vec![layer("base")],
             toolchain: vec![layer("tools")],
+            compiles: false,
             debian: versions("python3-rospy"),
             python: BTreeMap::new(),
             ros: versions("rospy"),
@@ -486,7 +523,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let builder = new_builder(place.path());
         let stock = set_up(&builder, place.path());
-        let refused = builder.export_base("noble-jazzy").expect_err("not set up");
+        let refused = builder.export_base("bookworm-jazzy-wheels").expect_err("not set up");
         assert!(matches!(refused, Error::BaseNotSetUp { .. }), "{refused}");
         let refused = builder.export_base("../images").expect_err("no name");
         assert!(matches!(refused, Error::UnknownBase { .. }), "{refused}");

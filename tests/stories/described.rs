@@ -48,6 +48,7 @@ const NOT_DONE: &[(&str, &str)] = &[
     ("trial", "the service listens to no topic"),
     ("cancelPush", "every push has ended"),
     ("importBase", "no base is sent"),
+    ("makeBase", "no image is sent"),
     ("removeBase", "no base was imported"),
 ];
 

@@ -1,13 +1,16 @@
 //! The image store, checked with independent tools.
 
 use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
+use support::binaries;
+use support::daemon::{Daemon, DaemonSetup};
 use support::deployer::run;
-use support::world::{ADDER, LOCALISER_TWO, world};
+use support::world::{ADDER, COURIER, HERALD, LOCALISER_TWO, world};
 
 use crate::access::create_token;
 
@@ -147,30 +150,178 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     Ok(())
 }
 
+/// File that lists the programs that would have set up a base.
+const CALLED: &str = "called";
+
+/// Returns the setup of a daemon where nothing is cached, nothing answers where packages of a base come from, and what
+/// would set a base up does not.
+fn offline_setup(name: &str, place: &Path, base: &str) -> anyhow::Result<DaemonSetup> {
+    let programs = place.join("bin");
+    std::fs::create_dir(&programs)?;
+    for program in ["mmdebstrap", "pip3"] {
+        let path = programs.join(program);
+        std::fs::write(&path, format!("#!/bin/sh\necho $0 >> {}\nexit 1\n", place.join(CALLED).display()))?;
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755))?;
+    }
+    Ok(world()
+        .setup(name)
+        .environment("PATH", &format!("{}:{}", programs.display(), std::env::var("PATH")?))
+        .environment("XDG_CACHE_HOME", &place.join("cache").display().to_string())
+        .config(&format!("[archives]\n{base} = [\"deb http://127.0.0.1:9/debian bookworm main\"]\n")))
+}
+
+/// Returns what was found of a subject in the image of a base, and its consequence.
+fn finding(base: &Value, subject: &str) -> anyhow::Result<[String; 2]> {
+    let mut all = base["findings"].as_array().context("findings")?.iter();
+    let found = all.find(|one| one["subject"] == subject).with_context(|| format!("no {subject} in {base:#}"))?;
+    Ok(["found", "consequence"].map(|field| found[field].as_str().unwrap_or_default().to_owned()))
+}
+
+/// Checks that a robot hears the node of the courier.
+fn hear_courier(daemon: &Daemon, service: &str) -> Verdict {
+    let mut robot = daemon.robot(&format!("{service}?robot=of-{service}"))?;
+    robot.send(json!({"op": "subscribe", "topic": "/home",
+        "qos": {"reliability": "reliable", "durability": "transient_local", "depth": 1}}))?;
+    let told = robot.next_message_on("/home")?;
+    ensure!(told["data"] == "in the clouds", "{told}");
+    robot.leave()
+}
+
+pub fn a_saved_image_becomes_a_base() -> Verdict {
+    const BASE: &str = "bookworm-jazzy-wheels";
+    let one = world().daemon_with(COURIER)?;
+    let place = world().directory("saved")?;
+    let at = |name: &str| place.path().join(name).display().to_string();
+    // As `podman save` and `skopeo copy` write an image: with layers that are not compressed, and as a directory.
+    one.deployer().run(&["base", "export", BASE, "-o", &at("base.oci.tar")])?.expect_success()?;
+    let from = format!("oci-archive:{}", at("base.oci.tar"));
+    for to in [format!("docker-archive:{}:lab/ros:jazzy", at("image.tar")), format!("oci:{}:jazzy", at("layout"))] {
+        run(Command::new("skopeo").args(["--insecure-policy", "copy", &from, &to]))?.expect_success()?;
+    }
+    let setup = offline_setup("base-of-an-image", place.path(), "lab")?;
+    let other = setup.start()?;
+    let types = |words: &[&str]| other.deployer().run(words);
+    // What is no image, what is no name, and a name that is taken, are refused.
+    std::fs::write(at("text"), "hello")?;
+    let bytes = std::fs::read(at("image.tar"))?;
+    std::fs::write(at("torn.tar"), &bytes[..bytes.len() / 2])?;
+    drop(bytes);
+    let rows: [(&[&str], &[&str]); 5] = [
+        (&["base", "import", "lab", "--from", &at("text")], &["next:"]),
+        (&["base", "import", "lab", "--from", &at("torn.tar")], &["truncated"]),
+        (&["base", "import", "../lab", "--from", &at("image.tar")], &["is no name of a base"]),
+        (&["base", "import", BASE, "--from", &at("image.tar")], &["there is a base", "choose another name"]),
+        (&["base", "import", "lab", "--from", "docker://ros:jazzy"], &["skopeo copy docker://", "oci-archive:"]),
+    ];
+    for (words, expected) in rows {
+        types(words)?.expect_failure(expected)?;
+    }
+    types(&["bases", "show", "lab"])?.expect_failure(&["no base \"lab\""])?;
+
+    let imported = types(&["base", "import", "lab", "--from", &at("image.tar")])?.expect_success()?;
+    for words in ["with the toolchain", "CONSEQUENCE", "ROS 2 jazzy in /opt/ros/jazzy", "rmw_fastrtps_cpp"] {
+        ensure!(imported.stdout.contains(words), "{words}: {}", imported.output());
+    }
+    let base = other.deployer().run_json(&["bases", "show", "lab"])?;
+    ensure!(base["state"] == "imported" && base["system"] == "debian bookworm", "{base:#}");
+    let summary = base["summary"].as_str().unwrap_or_default();
+    ensure!(summary.contains("lab/ros:jazzy"), "{summary}");
+    ensure!(base["ros_packages"]["rclpy"].as_str().is_some_and(|version| version.starts_with("7.")), "{base:#}");
+    ensure!(base["debian_packages"]["python3"].is_string(), "{base:#}");
+    types(&["base", "import", "lab", "--from", &at("layout")])?.expect_failure(&["--replace"])?;
+
+    // Its own layers are those of the services upon it, and nothing is fetched.
+    let arguments = [&["--base", "lab", "--format", "json"][..], COURIER.arguments].concat();
+    let pushed = other.deployer().push("courier_ros2", &arguments)?.expect_success()?;
+    let events = pushed.stdout.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+    let done = events.into_iter().find(|event| event["type"] == "done").context("a done event")?;
+    let layers = done["layers"].as_array().context("layers")?;
+    ensure!(layers.iter().any(|layer| layer["name"] == "base"), "{layers:#?}");
+    ensure!(!place.path().join(CALLED).exists(), "{}", std::fs::read_to_string(place.path().join(CALLED))?);
+    hear_courier(&other, "courier_ros2")?;
+
+    // It outlives the daemon, and is replaced by what is sent as a directory; the service keeps its layers.
+    other.stop()?;
+    let other = setup.start()?;
+    let types = |words: &[&str]| other.deployer().run(words);
+    types(&["base", "import", "lab", "--from", &at("layout"), "--replace"])?.expect_success()?;
+    let again = other.deployer().run_json(&["bases", "show", "lab"])?;
+    ensure!(again["ros_packages"] == base["ros_packages"], "{again:#}");
+    let removed = types(&["base", "rm", "lab"])?.expect_success()?;
+    ensure!(removed.stdout.contains("is removed"), "{}", removed.output());
+    types(&["base", "rm", "lab"])?.expect_failure(&["no base \"lab\""])?;
+    hear_courier(&other, "courier_ros2")?;
+    let recorded = types(&["--format", "json", "audit", "-n", "100"])?.expect_success()?.stdout;
+    ensure!(recorded.contains("\"base lab\""), "{recorded}");
+    other.stop()?;
+    Ok(())
+}
+
+pub fn a_root_file_system_made_by_hand_becomes_a_base() -> Verdict {
+    let place = world().directory("by-hand")?;
+    let at = |name: &str| place.path().join(name).display().to_string();
+    let include = "python3,python3-setuptools,libstdc++6,zlib1g";
+    let root = at("root");
+    // As for robots: its mounts are invisible to others, and disappear when it is killed.
+    run(Command::new("unshare")
+        .args(["--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc", "mmdebstrap"])
+        .args(["--quiet", "--mode=root", "--variant=minbase", &format!("--include={include}")])
+        .args(["--aptopt=APT::Install-Recommends \"false\"", "--aptopt=APT::Sandbox::User \"root\""])
+        .args(["bookworm", &root]))?
+    .expect_success()?;
+    let pack = |file: &str| -> Verdict {
+        run(Command::new("tar").args(["--numeric-owner", "-C", &root, "-cf", file, "."]))?.expect_success()?;
+        Ok(())
+    };
+    // Without ROS there is nothing to run packages with.
+    pack(&at("plain.tar"))?;
+    let wheels = place.path().join("root/opt/ros/jazzy");
+    std::fs::create_dir_all(&wheels)?;
+    for part in ["lib", "share"] {
+        run(Command::new("cp").arg("-a").arg(binaries::ros2().join(part)).arg(&wheels))?.expect_success()?;
+    }
+    pack(&at("robot.tar"))?;
+
+    let daemon = offline_setup("base-by-hand", place.path(), "robot")?.start()?;
+    let types = |words: &[&str]| daemon.deployer().run(words);
+    let refused = types(&["base", "import", "robot", "--from", &at("plain.tar")])?;
+    refused.expect_failure(&["no ROS was found", "share/ament_index", "/opt"])?;
+    types(&["base", "import", "robot", "--from", &root])?.expect_failure(&["tar --numeric-owner"])?;
+    let wrong = ["base", "import", "robot", "--ros-distro", "humble", "--from", &at("robot.tar")];
+    types(&wrong)?.expect_failure(&["it has no ROS humble; found: jazzy (ROS 2)"])?;
+    let imported = types(&["base", "import", "robot", "--from", &at("robot.tar")])?.expect_success()?;
+    ensure!(imported.stdout.contains("without the toolchain"), "{}", imported.output());
+    let base = daemon.deployer().run_json(&["bases", "show", "robot"])?;
+    let [found, consequence] = finding(&base, "compiling")?;
+    ensure!(found.contains("missing: g++, cmake") && found.contains("colcon"), "{found}");
+    ensure!(consequence.contains("packages in Python and install spaces"), "{consequence}");
+    let [found, _] = finding(&base, "Python")?;
+    ensure!(found == "3.11", "{found}");
+    let [found, consequence] = finding(&base, "launch files")?;
+    ensure!(found.contains("missing") && consequence.contains("--node"), "{found}: {consequence}");
+
+    // A package in Python needs no colcon; one that is compiled is refused with what is missing.
+    let arguments = [&["--base", "robot"][..], COURIER.arguments].concat();
+    daemon.deployer().push("courier_ros2", &arguments)?.expect_success()?;
+    hear_courier(&daemon, "courier_ros2")?;
+    let arguments = [&["--base", "robot"][..], HERALD.arguments].concat();
+    let refused = daemon.deployer().push("herald_ros2", &arguments)?;
+    refused.expect_failure(&["base robot cannot compile sources", "g++", "push an install space"])?;
+    ensure!(!place.path().join(CALLED).exists(), "{}", std::fs::read_to_string(place.path().join(CALLED))?);
+    daemon.stop()?;
+    Ok(())
+}
+
 pub fn a_base_is_moved_to_a_server_without_network() -> Verdict {
     const BASE: &str = "bookworm-jazzy-wheels";
     let one = world().daemon_with(LOCALISER_TWO)?;
     let place = world().directory("base")?;
     let at = |name: &str| place.path().join(name).display().to_string();
-    let (file, called) = (at("base.oci.tar"), place.path().join("called"));
+    let (file, called) = (at("base.oci.tar"), place.path().join(CALLED));
     one.deployer().run(&["base", "export", BASE, "-o", &file])?.expect_success()?;
     let before = one.deployer().run_json(&["bases", "show", BASE])?;
 
-    // Nothing is cached there, nothing answers where packages come from, and what would set a base up does not.
-    let programs = place.path().join("bin");
-    std::fs::create_dir(&programs)?;
-    for program in ["mmdebstrap", "pip3"] {
-        let path = programs.join(program);
-        std::fs::write(&path, format!("#!/bin/sh\necho $0 >> {}\nexit 1\n", called.display()))?;
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755))?;
-    }
-    let path = format!("{}:{}", programs.display(), std::env::var("PATH")?);
-    let other = world()
-        .setup("base-imported")
-        .environment("PATH", &path)
-        .environment("XDG_CACHE_HOME", &at("cache"))
-        .config(&format!("[archives]\n{BASE} = [\"deb http://127.0.0.1:9/debian bookworm main\"]\n"))
-        .start()?;
+    let other = offline_setup("base-imported", place.path(), BASE)?.start()?;
     let types = |words: &[&str]| other.deployer().run(words);
     ensure!(types(&["bases", "show", BASE])?.expect_success()?.stdout.contains("not set up yet"));
     types(&["base", "export", BASE, "-o", &at("none")])?.expect_failure(&["was not set up on this server"])?;

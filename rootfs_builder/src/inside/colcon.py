@@ -50,6 +50,10 @@ def environment_of(prefix, given):
     return environment
 
 
+def has_colcon(environment):
+    return shutil.which("colcon", path=environment.get("PATH")) is not None
+
+
 def colcon(environment):
     program = shutil.which("colcon", path=environment.get("PATH"))
     if program is None:
@@ -85,14 +89,27 @@ def invalid(packages, given):
 
 
 def check(job, given):
-    problems = invalid(job["packages"], given)
+    problems = invalid(job["packages"], given) if has_colcon(given) else {}
     for name, words in problems.items():
         print("::failed " + name, flush=True)
         print(words, flush=True)
     sys.exit(1 if problems else 0)
 
 
+def install_python(package, prefix, environment):
+    """What colcon does for a package of Python, by setuptools alone: for an image that has no colcon."""
+    version = "python%d.%d" % sys.version_info[:2]
+    argv = [sys.executable, "setup.py", "install", "--single-version-externally-managed", "--record", "/build/record"]
+    argv += ["--prefix", prefix, "--install-data", prefix]
+    argv += ["--install-lib", os.path.join(prefix, "lib", version, "site-packages")]
+    argv += ["--install-scripts", os.path.join(prefix, "lib", package["name"])]
+    run(argv, source_of(package), environment)
+
+
 def build(package, job, given):
+    if package["build_type"] == "ament_python" and not has_colcon(given):
+        install_python(package, job["prefix"], environment_of(job["prefix"], given))
+        return
     for words in invalid([package], given).values():
         print(words, flush=True)
         sys.exit(1)

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::size::Size;
 
-/// Media type of an exported base, a tar archive of an OCI image layout.
+/// Media type of an exported base, a tar archive of an OCI image layout, and of other archives that become bases.
 pub const BASE_ARCHIVE: &str = "application/x-tar";
 
 /// State of the layers of a base.
@@ -18,7 +18,7 @@ pub enum BaseState {
     NotSetUp,
     /// It was set up on this server.
     Ready,
-    /// It was imported from another server.
+    /// It was imported: from another server, or as an image.
     Imported,
 }
 
@@ -59,4 +59,18 @@ pub struct BaseDetail {
     pub python_packages: BTreeMap<String, String>,
     /// Debian packages with their versions; empty if the base is not set up.
     pub debian_packages: BTreeMap<String, String>,
+    /// Table of what was found in the image that it was made from; empty for other bases.
+    pub findings: Vec<BaseFinding>,
+}
+
+/// Result of looking for one subject in an image that became a base.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
+pub struct BaseFinding {
+    /// Subject, such as `ROS` or `compiling`.
+    pub subject: String,
+    /// Description of what was found; begins with `missing` if it is not there.
+    pub found: String,
+    /// Consequence for pushes; empty if there is none.
+    pub consequence: String,
 }

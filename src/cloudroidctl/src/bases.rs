@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use anyhow::Context;
 use api::Size;
 use api::bases::{BaseDetail, BaseState, BaseSummary};
 use hyper::Method;
@@ -11,10 +12,10 @@ use crate::client::{self, DaemonClient, percent_encode};
 use crate::output::{self, OutputFormat, Table};
 use crate::push;
 
-/// List bases, what each has, and move one to another server.
+/// List bases and what each has, move one to another server, and make one of your own image.
 ///
 /// A base is the operating system and ROS below an image. The first push that uses it sets it up and downloads packages
-/// for that; a base that another server has exported is there at once.
+/// for that; a base that another server has exported, and one made of an image, are there at once.
 #[derive(Debug, clap::Args)]
 pub struct BasesArgs {
     #[command(subcommand)]
@@ -57,17 +58,31 @@ struct ExportBase {
     output: Option<PathBuf>,
 }
 
-/// Import a base that `cloudroidctl base export` has written on another server.
+/// Import a base: an image, a root file system, or one that `cloudroidctl base export` has written.
 ///
-/// The server must have the same definition of it. Its layers are used as they are, until the definition changes.
-/// Packages that need nothing else are pushed without any download.
+/// With --from, a new base is made of what a lab has: the archive of an image (podman save, docker save, skopeo copy to
+/// oci-archive or oci), or the root file system of a robot or of mmdebstrap as tar, gzip or zstd. Its layers are kept
+/// as they are; what they hold is found by looking and printed as a table.
+///
+/// Without --from, the server must have the same definition of the base. Packages that need nothing else are pushed
+/// without any download.
 #[derive(Debug, clap::Args)]
 struct ImportBase {
-    /// File written by base export.
-    file: PathBuf,
+    /// Name of the new base with --from, else the file written by base export.
+    #[arg(value_name = "NAME|FILE")]
+    what: PathBuf,
+    /// Image or root file system: an archive, the directory of an OCI image layout, or - for standard input.
+    #[arg(long, value_name = "FILE")]
+    from: Option<PathBuf>,
+    /// Replace an imported base of this name. Services keep the layers that they were built on.
+    #[arg(long, requires = "from")]
+    replace: bool,
+    /// ROS distribution that counts, if there are several or if nothing says which it is, such as jazzy.
+    #[arg(long, value_name = "NAME", requires = "from")]
+    ros_distro: Option<String>,
 }
 
-/// Remove an imported base: the next push that uses it sets it up with what the package archive has then.
+/// Remove an imported base. If the server has a definition of it, the next push that uses it sets it up.
 #[derive(Debug, clap::Args)]
 struct RemoveBase {
     /// Name of the base.
@@ -111,18 +126,42 @@ impl ExportBase {
 
 impl ImportBase {
     async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
-        let body = push::file_body(&self.file)?;
-        let answer = client.send(Method::POST, "/api/v1/bases", body).await?;
+        let answer = match &self.from {
+            Some(from) => {
+                let name = self.what.to_str().context("the name of a base is letters, digits, '-', '_' and '.'")?;
+                let mut path = format!("/api/v1/bases/{}?replace={}", percent_encode(name), self.replace);
+                if let Some(distribution) = &self.ros_distro {
+                    path += &format!("&ros_distro={}", percent_encode(distribution));
+                }
+                client.send(Method::PUT, &path, push::image_body(from)?).await?
+            }
+            None => client.send(Method::POST, "/api/v1/bases", push::file_body(&self.what)?).await?,
+        };
         let base: BaseDetail = client::read_json(answer).await?;
         match format {
             OutputFormat::Json => output::json(&base),
             OutputFormat::Table => {
                 let tools = if base.summary.toolchain { "with" } else { "without" };
                 let name = &base.summary.name;
-                output::line(&format!("base {name} is imported, {tools} the toolchain for compiling"))
+                output::line(&format!("base {name} is imported, {tools} the toolchain for compiling"))?;
+                print_findings(&base)
             }
         }
     }
+}
+
+/// Prints what was found in the image of a base; nothing for other bases.
+fn print_findings(base: &BaseDetail) -> anyhow::Result<()> {
+    if base.findings.is_empty() {
+        return Ok(());
+    }
+    output::line("")?;
+    let mut table = Table::new(&["WHAT", "FOUND", "CONSEQUENCE"]);
+    for finding in &base.findings {
+        table.row([finding.subject.clone(), finding.found.clone(), finding.consequence.clone()]);
+    }
+    table.print()?;
+    output::line("")
 }
 
 fn state_word(state: BaseState) -> &'static str {
@@ -166,6 +205,7 @@ fn show(base: &BaseDetail, all: bool, format: OutputFormat) -> anyhow::Result<()
     }
     let tools = if about.toolchain { "with" } else { "without" };
     output::line(&format!("{}, {}, {tools} the toolchain for compiling\n", state_word(about.state), about.bytes))?;
+    print_findings(base)?;
     let kinds = [("ROS PACKAGE", &base.ros_packages), ("PYTHON PACKAGE", &base.python_packages)];
     let debian = all.then_some(("DEBIAN PACKAGE", &base.debian_packages));
     for (title, packages) in kinds.into_iter().chain(debian) {
@@ -207,5 +247,10 @@ mod tests {
         assert!(parse(&[]).expect("valid").is_none());
         assert!(matches!(parse(&["show", "x", "--all"]).expect("valid"), Some(BasesCommand::Show(show)) if show.all));
         assert_eq!(parse(&["show"]).expect_err("no name").exit_code(), 2);
+        for alone in [&["import", "x", "--replace"][..], &["import", "x", "--ros-distro", "jazzy"], &["import"]] {
+            assert_eq!(parse(alone).expect_err("nothing to make it from").exit_code(), 2);
+        }
+        let import = parse(&["import", "mine", "--from", "image.tar", "--replace"]).expect("valid");
+        assert!(matches!(import, Some(BasesCommand::Import(import)) if import.replace));
     }
 }

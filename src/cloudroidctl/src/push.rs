@@ -347,6 +347,32 @@ pub fn file_body(path: &Path) -> anyhow::Result<RequestBody> {
     Ok(PushSource::Archive(path.to_owned()).into_body().0)
 }
 
+/// Returns an image or a root file system as the body of a request: an archive, `-` for standard input, or the
+/// directory of an OCI image layout, which is packed.
+pub fn image_body(path: &Path) -> anyhow::Result<RequestBody> {
+    if path == Path::new("-") {
+        return Ok(PushSource::Archive("/dev/stdin".into()).into_body().0);
+    }
+    let about = match std::fs::metadata(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => bail!(
+            "{name} is not a file here; an image of a registry is saved first: skopeo copy docker://NAME \
+                oci-archive:image.tar (or podman pull NAME; podman save NAME > image.tar)",
+            name = path.display()
+        ),
+        about => about.with_context(|| format!("cannot read {}", path.display()))?,
+    };
+    if !about.is_dir() {
+        return Ok(PushSource::Archive(path.to_owned()).into_body().0);
+    }
+    ensure!(
+        path.join("oci-layout").is_file() && path.join("index.json").is_file(),
+        "{name} is a directory without oci-layout and index.json; pack a root file system as root: tar --numeric-owner \
+            --one-file-system -C {name} -cf root.tar .",
+        name = path.display()
+    );
+    Ok(PushSource::Layout(path.to_owned()).into_body().0)
+}
+
 /// Message for a push that was stopped from here.
 const CANCELLED: &str = "cancelled; nothing was published";
 

@@ -1,6 +1,7 @@
-//! Base image definitions: those built in, so that the daemon works as a single file, and those of the operator.
+//! Base image definitions: those built in, so that the daemon works as a single file, those of the operator, and those
+//! of bases that were made from images.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
@@ -9,7 +10,7 @@ use crate::home::Home;
 use store::private;
 
 /// Files of `images/` in the source tree.
-const BUILT_IN: [(&str, &str); 6] = [
+const BUILT_IN: [(&str, &str); 4] = [
     (
         "bookworm-jazzy-wheels.build.requirements.txt",
         include_str!("../../../images/bookworm-jazzy-wheels.build.requirements.txt"),
@@ -17,9 +18,10 @@ const BUILT_IN: [(&str, &str); 6] = [
     ("bookworm-jazzy-wheels.requirements.txt", include_str!("../../../images/bookworm-jazzy-wheels.requirements.txt")),
     ("bookworm-jazzy-wheels.toml", include_str!("../../../images/bookworm-jazzy-wheels.toml")),
     ("bookworm-ros1.toml", include_str!("../../../images/bookworm-ros1.toml")),
-    ("jammy-humble.toml", include_str!("../../../images/jammy-humble.toml")),
-    ("noble-jazzy.toml", include_str!("../../../images/noble-jazzy.toml")),
 ];
+
+/// Directory of the home with the definitions of bases that were made from images.
+pub const IMPORTED: &str = "bases";
 
 /// Returns whether a file is a definition or the requirements of one.
 fn is_definition_file(name: &str) -> bool {
@@ -27,7 +29,7 @@ fn is_definition_file(name: &str) -> bool {
 }
 
 /// Writes all definitions to a directory of the home and returns its path. A definition of the operator replaces a
-/// built-in one of the same name.
+/// built-in one of the same name, and both replace that of an imported base.
 pub fn write_definitions(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
     let directory = home.path().join("definitions");
     let made = || format!("cannot write the base definitions to {}", directory.display());
@@ -35,22 +37,39 @@ pub fn write_definitions(config: &Config, home: &Home) -> anyhow::Result<PathBuf
         std::fs::remove_dir_all(&directory).with_context(made)?;
     }
     private::make_directory(&directory).with_context(made)?;
+    let imported = home.path().join(IMPORTED);
+    private::make_directory(&imported).with_context(made)?;
+    let copied = copy_definitions(&imported, &directory)?;
     for (name, text) in BUILT_IN {
         std::fs::write(directory.join(name), text).with_context(made)?;
     }
-    if let Some(theirs) = &config.definitions {
-        let unread = || format!("cannot read the base definitions in {}", theirs.display());
-        for entry in std::fs::read_dir(theirs).with_context(unread)? {
-            let path = entry.with_context(unread)?.path();
-            if let Some(name) = path.file_name().and_then(|name| name.to_str())
-                && is_definition_file(name)
-            {
-                std::fs::copy(&path, directory.join(name)).with_context(unread)?;
-            }
+    let theirs = match &config.definitions {
+        Some(theirs) => copy_definitions(theirs, &directory)?,
+        None => Vec::new(),
+    };
+    for name in copied {
+        if theirs.contains(&name) || BUILT_IN.iter().any(|(built_in, _)| *built_in == name) {
+            tracing::warn!("the imported base {name} is hidden by a definition of the same name");
         }
     }
     private::restrict_tree(&directory, 1, &|_| false).with_context(made)?;
     Ok(directory)
+}
+
+/// Copies the definitions of a directory and returns the names of the files.
+fn copy_definitions(from: &Path, to: &Path) -> anyhow::Result<Vec<String>> {
+    let unread = || format!("cannot read the base definitions in {}", from.display());
+    let mut copied = Vec::new();
+    for entry in std::fs::read_dir(from).with_context(unread)? {
+        let path = entry.with_context(unread)?.path();
+        if let Some(name) = path.file_name().and_then(|name| name.to_str())
+            && is_definition_file(name)
+        {
+            std::fs::copy(&path, to.join(name)).with_context(unread)?;
+            copied.push(name.to_owned());
+        }
+    }
+    Ok(copied)
 }
 
 #[cfg(test)]
@@ -78,12 +97,18 @@ mod tests {
         std::fs::write(theirs.path().join("notes.txt"), "no definition").expect("written");
         let parent = tempfile::tempdir().expect("a directory");
         let home = Home::open(parent.path()).expect("free");
+        let imported = home.path().join(IMPORTED);
+        std::fs::create_dir(&imported).expect("made");
+        for name in ["bookworm-ros1.toml", "other.toml", "robot.toml"] {
+            std::fs::write(imported.join(name), "imported").expect("written");
+        }
         let config = Config { definitions: Some(theirs.path().to_owned()), ..Config::default() };
         let directory = super::write_definitions(&config, &home).expect("made");
         let read = |name: &str| std::fs::read_to_string(directory.join(name)).ok();
         assert_eq!(read("bookworm-ros1.toml").as_deref(), Some("mine"));
         assert_eq!(read("other.toml").as_deref(), Some("other"));
         assert_eq!(read("other.requirements.txt").as_deref(), Some("theirs"));
+        assert_eq!(read("robot.toml").as_deref(), Some("imported"));
         assert_eq!(read("notes.txt"), None);
     }
 }

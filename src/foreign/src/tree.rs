@@ -14,6 +14,8 @@ use crate::Error;
 /// Resolves paths inside the tree only, and through no link.
 pub(crate) const INSIDE: ResolveFlags =
     ResolveFlags::BENEATH.union(ResolveFlags::NO_SYMLINKS).union(ResolveFlags::NO_MAGICLINKS);
+/// Resolves paths inside the tree only, through links that stay in it.
+const FOLLOWING: ResolveFlags = ResolveFlags::BENEATH.union(ResolveFlags::NO_MAGICLINKS);
 /// Non-blocking, because opening a pipe would wait for its other end.
 pub(crate) const FILE: OFlags =
     OFlags::RDONLY.union(OFlags::NOFOLLOW).union(OFlags::NONBLOCK).union(OFlags::NOCTTY).union(OFlags::CLOEXEC);
@@ -112,8 +114,7 @@ impl Tree {
 
     /// Reads a file like [`Tree::read_file`], but follows symbolic links that stay in the tree.
     pub fn read_file_following(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
-        let resolve = ResolveFlags::BENEATH | ResolveFlags::NO_MAGICLINKS;
-        self.open_and_read(path.as_ref(), limit, resolve)
+        self.open_and_read(path.as_ref(), limit, FOLLOWING)
     }
 
     /// Opens the regular file at `path` for reading; `None` if there is no such entry.
@@ -121,8 +122,16 @@ impl Tree {
     /// # Errors
     /// The same as those of [`Tree::read_file`].
     pub fn open_file(&self, path: impl AsRef<Path>) -> Result<Option<OwnedFd>, Error> {
-        let path = path.as_ref();
-        let Some(file) = self.open_beneath(path, INSIDE)? else {
+        self.open_regular(path.as_ref(), INSIDE)
+    }
+
+    /// Opens a file like [`Tree::open_file`], but follows symbolic links that stay in the tree.
+    pub fn open_file_following(&self, path: impl AsRef<Path>) -> Result<Option<OwnedFd>, Error> {
+        self.open_regular(path.as_ref(), FOLLOWING)
+    }
+
+    fn open_regular(&self, path: &Path, resolve: ResolveFlags) -> Result<Option<OwnedFd>, Error> {
+        let Some(file) = self.open_beneath(path, resolve)? else {
             return Ok(None);
         };
         let shown = self.path.join(path);

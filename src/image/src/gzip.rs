@@ -1,4 +1,4 @@
-//! Parallel gzip compression, and decompression on a thread of its own.
+//! Parallel gzip compression, and decompression (gzip, zstd) on a thread of its own.
 //!
 //! The stream is split into pieces of a fixed size, each a gzip member of its own (RFC 1952, 2.2: members may be
 //! concatenated; all readers of image layers support that). So the output does not depend on the number of threads.
@@ -27,7 +27,7 @@ type Job = (Vec<u8>, SyncSender<Vec<u8>>);
 pub(crate) fn compress<W, T, E>(
     output: W,
     level: u32,
-    fill: impl FnOnce(&mut dyn Write) -> Result<T, E>,
+    fill: impl FnOnce(&mut (dyn Write + Send)) -> Result<T, E>,
 ) -> Result<(W, T), CompressError<E>>
 where
     W: Write + Send,
@@ -139,15 +139,14 @@ pub(crate) fn detect_format(input: &mut impl BufRead) -> io::Result<Format> {
     })
 }
 
-/// Returns a reader of the decompressed content of a stream, gzip or plain.
+/// Returns a reader of the decompressed content of a stream: gzip, zstd (RFC 8878) or plain. A zstd stream whose window
+/// exceeds 128 MiB is an error, which bounds the memory that a sender can have taken.
 pub(crate) fn decoder<'a>(input: impl Read + Send + 'a) -> io::Result<Box<dyn Read + Send + 'a>> {
     let mut input = BufReader::with_capacity(CHUNK, input);
     match detect_format(&mut input)? {
         Format::Gzip => Ok(Box::new(MultiGzDecoder::new(input))),
         Format::Plain => Ok(Box::new(input)),
-        Format::Zstd => {
-            Err(io::Error::new(io::ErrorKind::InvalidData, "it is compressed with zstd; only gzip is supported"))
-        }
+        Format::Zstd => Ok(Box::new(zstd::stream::read::Decoder::with_buffer(input)?)),
     }
 }
 
@@ -287,8 +286,13 @@ mod tests {
     }
 
     #[test]
-    fn zstd_is_told_apart() {
-        let error = decoder(&[0x28, 0xb5, 0x2f, 0xfd, 0][..]).err().unwrap();
-        assert!(error.to_string().contains("zstd"), "{error}");
+    fn zstd_is_read_like_gzip() {
+        let bytes = pattern(100_000);
+        let packed = zstd::stream::encode_all(&bytes[..], 1).unwrap();
+        let mut back = Vec::new();
+        decoder(&packed[..]).unwrap().read_to_end(&mut back).unwrap();
+        assert!(back == bytes);
+        let cut = decoder(&packed[..packed.len() / 2]).unwrap().read_to_end(&mut back).unwrap_err();
+        assert_eq!(cut.kind(), io::ErrorKind::UnexpectedEof);
     }
 }

@@ -146,9 +146,9 @@ impl Store {
         let needed = file.metadata().map_or(0, |metadata| metadata.len());
         check_gzip(&file, archive)?;
         let blob = self.new_blob()?;
-        let mut copy = Tee { from: file, to: HashingStream::new(&blob), failed: None };
+        let mut copy = Tee::new(file, HashingStream::new(&blob));
         let read = read(&mut copy);
-        if let Some(error) = copy.failed.take() {
+        if let Some(error) = copy.failure() {
             return Err(Error::file("write a layer to", self.images_dir(), error).with_needed_bytes(needed));
         }
         // Blob and tree are written at the same time: either may be the first to find no room.
@@ -225,7 +225,7 @@ impl Store {
 
     /// Publishes the blob before the record, so that a record never names a missing blob. An existing record is kept:
     /// other blobs of the same content would change the digests of images built from it later.
-    fn publish_layer(&self, blob: NewFile, layer: &LayerInfo) -> Result<(), Error> {
+    pub(crate) fn publish_layer(&self, blob: NewFile, layer: &LayerInfo) -> Result<(), Error> {
         self.publish_blob(blob, &layer.digest)?;
         let known = self.layer_record(&layer.diff_id)?;
         if known.is_some_and(|known| self.blob_path(&known.digest).exists()) {
@@ -255,7 +255,7 @@ pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, 
 
 /// Reads the content of an untrusted layer to its end; returns the digest and size of the tar stream and the number of
 /// its headers.
-fn scan_layer(content: &mut dyn Read, label: &Path, limits: &Limits) -> Result<(Digest, u64, u64), Error> {
+pub(crate) fn scan_layer(content: &mut dyn Read, label: &Path, limits: &Limits) -> Result<(Digest, u64, u64), Error> {
     let refused = |problem| Error::Archive { archive: label.display().to_string(), problem };
     let most = limits.bytes.saturating_add(1);
     let mut reader = TarReader::new(HashingStream::new(content.take(most)));
@@ -286,7 +286,7 @@ fn scan_layer(content: &mut dyn Read, label: &Path, limits: &Limits) -> Result<(
 }
 
 /// Accepts only gzip, since the media type promises it.
-fn check_gzip(file: &File, path: &Path) -> Result<(), Error> {
+pub(crate) fn check_gzip(file: &File, path: &Path) -> Result<(), Error> {
     let mut start = [0; 2];
     let read = std::os::unix::fs::FileExt::read_at(file, &mut start, 0);
     match read.map_err(|error| Error::file("read", path, error))? {
@@ -312,6 +312,17 @@ pub(crate) struct Tee<R, W> {
     to: W,
     /// Error of the writer; the reader sees it as a failed read.
     failed: Option<io::Error>,
+}
+
+impl<R, W> Tee<R, W> {
+    pub(crate) fn new(from: R, to: W) -> Self {
+        Self { from, to, failed: None }
+    }
+
+    /// Returns the error of the writer, if it failed.
+    pub(crate) fn failure(&mut self) -> Option<io::Error> {
+        self.failed.take()
+    }
 }
 
 impl<R: Read, W: Write> Read for Tee<R, W> {

@@ -4,7 +4,7 @@
 //! ```text
 //!   tree ──layer_from_tree──▶ blobs/sha256/<digest> ──ensure_extracted──▶ layers/<diff-id>/  (shared, read-only)
 //!     │  ╰───────────stage_tree───────────────────────────────────────────▲   (the tree at once, the blob later)
-//!   tar.gz ──import_layer───▶        ▲   (a whole image of another store: receive)
+//!   tar.gz ──import_layer───▶        ▲   (a whole image of another store: receive; of other tools: receive_saved)
 //!                          put_image ┴ tag ──▶ index.json      gc: removes what no tag and no caller uses
 //!   upload ──unpack──▶ directory     (rejects entries that would escape from it)
 //! ```
@@ -34,6 +34,7 @@ pub mod oci;
 mod pipe;
 mod received;
 mod refusal;
+mod saved;
 mod store;
 mod tar_reader;
 mod tar_writer;
@@ -48,6 +49,7 @@ pub use images::{Image, ImageSpec, Manifest};
 pub use layer::{LayerInfo, Mtime, TreeOptions};
 pub use received::{ReceivedImage, is_layout, read_layout_document};
 pub use refusal::Refusal;
+pub use saved::{ArchiveKind, BEGINNING, SavedImage, detect_archive};
 pub use store::{Blob, GcHold, Store};
 pub use unpack::{Limits, UnpackStats, unpack};
 

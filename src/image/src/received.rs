@@ -16,7 +16,7 @@ use crate::{Digest, Error, Image, ImageSpec, LayerInfo, Limits, Store};
 /// Maximum size of a document of a layout, in bytes.
 const LARGEST: u64 = 16 << 20;
 /// Maximum number of layers of an image; an overlay mount supports only a few hundred.
-const MOST_LAYERS: usize = 128;
+pub(crate) const MOST_LAYERS: usize = 128;
 
 /// A received image.
 #[derive(Debug, Clone, PartialEq)]
@@ -170,7 +170,7 @@ impl LayoutDocuments {
     }
 }
 
-fn blob_path(digest: &Digest) -> String {
+pub(crate) fn blob_path(digest: &Digest) -> String {
     format!("blobs/sha256/{}", digest.hex())
 }
 
@@ -192,12 +192,12 @@ fn open(layout: &Tree, path: &str) -> Result<File, Error> {
     file.map(File::from).ok_or_else(|| missing_file(path))
 }
 
-fn read(layout: &Tree, path: &str) -> Result<Vec<u8>, Error> {
+pub(crate) fn read(layout: &Tree, path: &str) -> Result<Vec<u8>, Error> {
     let file = layout.read_file(path, LARGEST).map_err(tree_error)?;
     Ok(file.ok_or_else(|| missing_file(path))?.bytes)
 }
 
-fn parse_json<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
+pub(crate) fn parse_json<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
     serde_json::from_slice(bytes).map_err(|error| unreceivable_error(format!("{what} cannot be read: {error}")))
 }
 
@@ -209,7 +209,7 @@ fn tree_error(error: foreign::Error) -> Error {
     unreceivable_error(error.to_string())
 }
 
-fn unreceivable_error(problem: String) -> Error {
+pub(crate) fn unreceivable_error(problem: String) -> Error {
     Error::Unreceivable { problem }
 }
 

@@ -74,6 +74,24 @@ impl Inventory {
     }
 }
 
+/// Returns the names of the packages with a package.xml in these install spaces (absolute paths in the layers).
+/// `layers` are extracted trees, lowest first. Blocking.
+pub fn find_manifests<L: AsRef<Path>, P: AsRef<str>>(layers: &[L], prefixes: &[P]) -> Result<BTreeSet<String>, Error> {
+    let stack = merged::open_layers(layers)?;
+    let mut found = BTreeSet::new();
+    for prefix in prefixes {
+        let share = MergedDirectory::open_path(&stack, &format!("{}/share", prefix.as_ref()))?;
+        for name in share.names()?.into_keys().filter_map(|name| String::from_utf8(name).ok()) {
+            if names::is_package(&name)
+                && share.open_child(name.as_bytes())?.names()?.contains_key(b"package.xml".as_slice())
+            {
+                found.insert(name);
+            }
+        }
+    }
+    Ok(found)
+}
+
 /// Returns the install spaces: those named by the environment and the nodes, then `/usr`, then others below `/opt`.
 fn find_prefixes(stack: &[LayerDirectory], of: SearchHints<'_>) -> Result<Vec<String>, Error> {
     let variable = |name| of.environment.get(name).map_or("", String::as_str).split(':');

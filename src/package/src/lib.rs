@@ -6,6 +6,7 @@
 //!   sources ──selection──▶ packages that are built
 //!   sources ──foreseen──▶ programs and launch files that can be found
 //!   layers ──inventory::scan──▶ install spaces, packages, programs, definitions
+//!   layers of an image ──system::find_system──▶ distribution, ROS, what packages can be built with
 //!   running package, supplement ──interface──▶ Interface, compared by difference
 //!   interface, observed answers ──requests──▶ which outputs answer which input
 //!   interface ──twins──▶ the interface as robots of the other ROS see it
@@ -42,6 +43,7 @@ pub mod requests;
 pub mod selection;
 pub mod stub;
 mod supplement;
+pub mod system;
 mod twins;
 pub mod workspace;
 

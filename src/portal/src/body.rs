@@ -1,6 +1,7 @@
 //! Reads request bodies into memory, within the client's budget and a timeout, and files into those of responses.
 
 use std::fs::File;
+use std::future::Future;
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
@@ -23,9 +24,11 @@ pub const LARGEST_WORDS: usize = 64 << 10;
 /// Bytes of a file that are sent at a time.
 const CHUNK: usize = 256 << 10;
 
-/// Returns the content of a file, for the body of a response.
-pub fn stream_file(file: File) -> ReaderStream<tokio::fs::File> {
-    ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK)
+/// Returns the content of a file as the body of a response. It is cut off when `ended` completes, which is when the
+/// caller may no longer have it.
+pub fn file_body(file: File, ended: impl Future<Output = ()> + Send + 'static) -> Body {
+    let content = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
+    Body::from_stream(content.take_until(Box::pin(ended)))
 }
 
 /// A body in memory, with its budget permit.
@@ -135,6 +138,32 @@ mod tests {
         let budget = Budget::new("client x", most);
         let held = read(Body::from(vec![7; most]), most, &budget, LONG).await;
         assert_eq!(held.expect("it fits").bytes.len(), most);
+    }
+
+    #[tokio::test]
+    async fn a_file_is_sent_no_further_once_its_reader_may_no_longer_have_it() {
+        use std::io::{Seek, SeekFrom, Write};
+        let mut file = tempfile::tempfile().expect("a file");
+        file.write_all(&vec![7; 4 * CHUNK]).expect("written");
+        let mut sent = async |ended: futures_util::future::BoxFuture<'static, ()>, revoke: Option<_>| {
+            file.seek(SeekFrom::Start(0)).expect("a file");
+            let mut parts = file_body(file.try_clone().expect("a file"), ended).into_data_stream();
+            let mut bytes = parts.next().await.expect("a part").expect("read").len();
+            if let Some(revoke) = revoke {
+                let revoke: tokio::sync::oneshot::Sender<()> = revoke;
+                revoke.send(()).expect("it is awaited");
+            }
+            while let Some(part) = parts.next().await {
+                bytes += part.expect("read").len();
+            }
+            bytes
+        };
+        assert_eq!(sent(Box::pin(std::future::pending()), None).await, 4 * CHUNK);
+        let (revoke, revoked) = tokio::sync::oneshot::channel();
+        let ended = async move {
+            let _ = revoked.await;
+        };
+        assert_eq!(sent(Box::pin(ended), Some(revoke)).await, CHUNK);
     }
 
     #[tokio::test]

@@ -481,6 +481,7 @@ fn kind_of_push(error: &push::Error) -> Kind {
         P::UnknownBase { .. } => (S::NOT_FOUND, "unknown-base", "unknown base"),
         P::UnknownUnderlay { .. } => (S::NOT_FOUND, "unknown-underlay", "unknown underlay"),
         P::UnderlayInUse { .. } => (S::CONFLICT, "underlay-in-use", "underlay in use"),
+        P::BaseExists(_) => (S::CONFLICT, "base-exists", "base exists"),
         P::BaseNotImported(_) => (S::CONFLICT, "base-not-imported", "base not imported"),
         P::BaseNotSetUp(_) => (S::CONFLICT, "base-not-set-up", "base not set up"),
         P::Failed { .. } => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),

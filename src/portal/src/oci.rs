@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
@@ -10,7 +9,7 @@ use axum::{Extension, Json};
 use serde_json::json;
 
 use crate::app::App;
-use crate::body::stream_file;
+use crate::body::file_body;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::registry_clients::error_response;
@@ -102,13 +101,13 @@ pub async fn blob(
     let Some(blob) = found else {
         return Ok(not_found("BLOB_UNKNOWN", &format!("there is no blob {digest}")));
     };
-    let stream = stream_file(blob.file);
+    let body = file_body(blob.file, caller.wait_for_end(&app, &name));
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
         (header::CONTENT_LENGTH, blob.size.to_string()),
         (CONTENT_DIGEST, digest),
     ];
-    Ok((headers, Body::from_stream(stream)).into_response())
+    Ok((headers, body).into_response())
 }
 
 /// Any other path; pushing through this interface is not supported.

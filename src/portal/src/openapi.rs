@@ -71,6 +71,7 @@ const MORE: &[(&str, &[u16])] = &[
     ("importBase", &[404, 422]),
     ("inside", &[409, 426]),
     ("logs", &[409]),
+    ("makeBase", &[409, 422]),
     ("oidcCallback", &[404, 502, 503]),
     ("oidcLogin", &[404, 502, 503]),
     ("orderRollout", &[409]),

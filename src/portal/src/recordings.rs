@@ -7,13 +7,11 @@ use std::sync::Arc;
 
 use access::{AccessAction, Grants, Operation};
 use api::recordings::Recording;
-use axum::body::Body;
 use axum::extract::{Path, State};
 use axum::http::{HeaderValue, header};
 use axum::response::Response;
 use axum::{Extension, Json};
 use choreographer::{Handle, Quota, QuotaFile, find_files_to_evict};
-use futures_util::StreamExt;
 use recording::RecordingWriter;
 use serde::Deserialize;
 use store::{NewEvent, RecordingRecord};
@@ -21,7 +19,7 @@ use tokio_util::task::TaskTracker;
 use utoipa::IntoParams;
 
 use crate::app::App;
-use crate::body::stream_file;
+use crate::body::file_body;
 use crate::caller::Caller;
 use crate::errors::Error;
 use crate::inside::{self, InsideTarget};
@@ -322,14 +320,8 @@ pub async fn file(
     });
     // The file may have been removed by hand.
     let (file, size) = opened.await.map_err(|_| Error::UnknownRecording(number.clone()))?;
-    let stream = stream_file(file);
     // The download is cut off when the caller's credential becomes invalid.
-    let ended = {
-        let (app, service) = (Arc::clone(&app), record.service.clone());
-        async move { app.principals.wait_for_end(&caller.who, &service, false).await }
-    };
-    let stream = stream.take_until(Box::pin(ended));
-    let mut response = Response::new(Body::from_stream(stream));
+    let mut response = Response::new(file_body(file, caller.wait_for_end(&app, &record.service)));
     let headers = response.headers_mut();
     let kind = HeaderValue::from_static("application/octet-stream");
     headers.insert(header::CONTENT_TYPE, kind);

@@ -495,8 +495,19 @@ pub const ROUTES: &[Route] = &[
         }),
     route("GET", "/api/v1/bases/{name}", ENTER, || get(bases::base))
         .with_operation(|| operation("base", "A base with its packages.").answers::<api::bases::BaseDetail>()),
+    route("PUT", "/api/v1/bases/{name}", KEEP_BASES, || put(bases::make).layer(DefaultBodyLimit::disable()))
+        .with_operation(|| {
+            operation("makeBase", "Makes a base from an image or a root file system, whose layers are kept.")
+                .asks::<bases::NewBaseQuery>()
+                .takes_file(
+                    api::bases::BASE_ARCHIVE,
+                    "An OCI image layout or docker archive as tar; or the root file system as tar, gzip or zstd.",
+                    Required::True,
+                )
+                .answers::<api::bases::BaseDetail>()
+        }),
     route("DELETE", "/api/v1/bases/{name}", KEEP_BASES, || delete(bases::remove)).with_operation(|| {
-        operation("removeBase", "Removes an imported base: the next push that uses it sets it up.")
+        operation("removeBase", "Removes an imported base; one with a definition is set up by the next push.")
             .answers::<api::bases::BaseDetail>()
     }),
     route("GET", "/api/v1/bases/{name}/archive", KEEP_BASES, || get(bases::export)).with_operation(|| {

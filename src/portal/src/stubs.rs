@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use api::Stubs;
 use api::stub::{ARCHITECTURE, ROS, SIGNATURE};
-use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
@@ -16,7 +15,7 @@ use serde::Deserialize;
 use tokio::sync::Semaphore;
 
 use crate::app::App;
-use crate::body::stream_file;
+use crate::body::file_body;
 use crate::caller::{Caller, ConnectionPeer};
 use crate::errors::Error;
 use crate::query::Query;
@@ -114,8 +113,7 @@ pub async fn archive(
         (header::HeaderName::from_static(ROS), ros.number().to_string()),
         (header::HeaderName::from_static(SIGNATURE), sign::to_single_line(&archive.signature)),
     ];
-    let stream = stream_file(archive.file);
-    Ok((headers, Body::from_stream(stream)).into_response())
+    Ok((headers, file_body(archive.file, caller.wait_for_end(&app, name))).into_response())
 }
 
 /// Returns where the robot reaches this portal: as the caller reached it, provided that this cannot mean another

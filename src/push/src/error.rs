@@ -72,6 +72,9 @@ pub enum Error {
     /// The base was not imported.
     #[error("{0}")]
     BaseNotImported(String),
+    /// The name of a new base is taken.
+    #[error("{0}")]
+    BaseExists(String),
     /// The archive is too large.
     #[error("the archive is larger than {limit}")]
     TooLarge {

@@ -69,6 +69,7 @@ use reporter::Reporter;
 use store::{Journal, Plan, RevisionRecord, State};
 use told::PUSHED;
 
+pub use bases::NewBase;
 pub use deployer::{Deployer, UnderlayUse};
 pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};

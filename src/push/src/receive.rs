@@ -12,7 +12,7 @@ use api::{PushEvent, Size};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use futures_util::stream::BoxStream;
-use image::Refusal;
+use image::{ArchiveKind, Refusal};
 use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
@@ -28,14 +28,98 @@ const TOLD_EVERY: Duration = Duration::from_millis(500);
 const DISCARD_FOR: Duration = Duration::from_secs(60);
 /// Maximum depth at which a package.xml is searched.
 const DEPTH: usize = 6;
+/// Name of an archive that is stored as it is.
+const STORED: &str = "archive";
 /// Maximum size of a package.xml, in bytes.
 const MANIFEST: u64 = 1 << 20;
 
 /// Body of an archive, in chunks.
 pub type Archive = BoxStream<'static, io::Result<Bytes>>;
 
+/// Next step for an archive that cannot be read.
+const PACK_AGAIN: &str = "push a tar archive of a package, workspace or install space whose links stay inside it";
+/// Next step for an archive of an image that cannot be read.
+const SAVE_AGAIN: &str = "send an archive of podman save, docker save or skopeo copy to oci-archive, or a root file \
+    system as tar";
+
 /// Unpacks the archive into `tree`, which is created.
 pub(super) async fn unpack(archive: Archive, tree: &Path, limits: &Options, report: &Reporter) -> Result<(), Error> {
+    unpack_or_advise(archive, tree, limits, report, PACK_AGAIN).await
+}
+
+/// Unpacks the archive of an image into `tree`, which is created.
+pub(super) async fn unpack_image(
+    archive: Archive,
+    tree: &Path,
+    limits: &Options,
+    report: &Reporter,
+) -> Result<(), Error> {
+    unpack_or_advise(archive, tree, limits, report, SAVE_AGAIN).await
+}
+
+async fn unpack_or_advise(
+    archive: Archive,
+    tree: &Path,
+    limits: &Options,
+    report: &Reporter,
+    advice: &'static str,
+) -> Result<(), Error> {
+    let unpacked = image::Limits { entries: limits.entries, bytes: limits.unpacked.0, ..image::Limits::default() };
+    let unpack = move |content: &mut dyn Read, inside: &Path| {
+        image::unpack(content, inside, &unpacked).map(drop).map_err(|error| refusal(error, advice))
+    };
+    take(archive, tree, limits, report, unpack).await
+}
+
+/// Stores the archive as it is in `directory`, which is created, and returns the path of the file.
+pub(super) async fn store(
+    archive: Archive,
+    directory: &Path,
+    limits: &Options,
+    report: &Reporter,
+) -> Result<PathBuf, Error> {
+    let copy = |content: &mut dyn Read, inside: &Path| {
+        std::fs::create_dir(inside).map_err(file_error("make", inside))?;
+        let path = inside.join(STORED);
+        let mut file = File::create_new(&path).map_err(file_error("make", &path))?;
+        io::copy(content, &mut file).map(drop).map_err(file_error("write", &path))
+    };
+    take(archive, directory, limits, report, copy).await?;
+    Ok(directory.join(STORED))
+}
+
+/// Waits for the beginning of an archive and returns its kind, and the whole archive.
+pub(super) async fn detect_kind(mut archive: Archive, limits: &Options) -> Result<(ArchiveKind, Archive), Error> {
+    let mut chunks: Vec<Bytes> = Vec::new();
+    let fill = async {
+        let mut length = 0;
+        while length < image::BEGINNING {
+            let Some(chunk) = archive.next().await else { break };
+            let chunk = chunk.map_err(|error| body_error(&error))?;
+            length += chunk.len();
+            chunks.push(chunk);
+        }
+        Ok::<_, Error>(())
+    };
+    let filled = tokio::time::timeout(limits.stall, fill).await;
+    filled.map_err(|_| too_slow_error(TooSlow::Paused, limits.stall, limits.min_rate))??;
+    let mut beginning = chunks.concat();
+    beginning.truncate(image::BEGINNING);
+    let detect = move || image::detect_archive(&beginning);
+    let kind = blocking::spawn(detect).await.map_err(|_| Error::Internal("looking at the archive"))?;
+    let first = futures_util::stream::iter(chunks.into_iter().map(Ok));
+    Ok((kind, first.chain(archive).boxed()))
+}
+
+/// Takes an archive while it arrives: `consume` reads it on a thread that may write nowhere but below the path that it
+/// is given, which becomes `tree`.
+async fn take(
+    archive: Archive,
+    tree: &Path,
+    limits: &Options,
+    report: &Reporter,
+    consume: impl FnOnce(&mut dyn Read, &Path) -> Result<(), Error> + Send + 'static,
+) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
     // Cancels the reading thread however this function is left.
     let ended = CancellationToken::new();
@@ -50,7 +134,6 @@ pub(super) async fn unpack(archive: Archive, tree: &Path, limits: &Options, repo
         limit: limits.archive.0,
         exceeded: false,
     };
-    let unpacked = image::Limits { entries: limits.entries, bytes: limits.unpacked.0, ..image::Limits::default() };
     let (limit, slowest) = (limits.archive, limits.min_rate);
     let destination = tree.to_owned();
     let place = privilege::spawn_blocking(move || UnpackDirectory::create(&destination))
@@ -58,14 +141,14 @@ pub(super) async fn unpack(archive: Archive, tree: &Path, limits: &Options, repo
         .map_err(|_| Error::Internal("creating a directory for the archive"))??;
     let inside = place.confined_path();
     let work = blocking::spawn(move || {
-        let outcome = image::unpack(&mut counted, &inside, &unpacked);
+        let outcome = consume(&mut counted, &inside);
         if counted.exceeded {
             return Err(Error::TooLarge { limit });
         }
         if let Some(why) = stalled.reason() {
             return Err(too_slow_error(why, patience.pause, slowest));
         }
-        outcome.map(|_| ()).map_err(refusal)
+        outcome
     });
     let told = async {
         let mut ticks = tokio::time::interval(TOLD_EVERY);
@@ -147,6 +230,10 @@ fn chown_tree(tree: &Path) -> Result<(), foreign::Error> {
     })
 }
 
+fn body_error(error: &io::Error) -> Error {
+    Error::Failed { message: format!("the archive did not arrive: {error}"), next: None, log: Vec::new() }
+}
+
 fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     let path = path.display().to_string();
     move |error| Error::Failed { message: format!("cannot {action} {path}: {error}"), next: None, log: Vec::new() }
@@ -166,7 +253,7 @@ fn too_slow_error(why: TooSlow, pause: Duration, rate: Size) -> Error {
     Error::Failed { message, next: Some(next.to_owned()), log: Vec::new() }
 }
 
-fn refusal(error: image::Error) -> Error {
+fn refusal(error: image::Error, advice: &str) -> Error {
     let next = match &error {
         image::Error::Archive { problem: Refusal::TooManyEntries { .. }, .. } => {
             Some("push fewer files, or raise entries in [push] of the configuration".to_owned())
@@ -177,9 +264,7 @@ fn refusal(error: image::Error) -> Error {
         image::Error::Archive { problem: Refusal::LinkLeaves { .. }, .. } => Some(
             "replace the link with a copy; build install spaces without 'colcon build --symlink-install'".to_owned(),
         ),
-        image::Error::Archive { .. } => {
-            Some("push a tar archive of a package, workspace or install space whose links stay inside it".to_owned())
-        }
+        image::Error::Archive { .. } => Some(advice.to_owned()),
         _ => None,
     };
     Error::Failed { message: error.to_string(), next, log: Vec::new() }
@@ -341,6 +426,32 @@ mod tests {
         waiting.await.expect("it reads");
         push.abort();
         dropped.await.expect_err("the body is let go");
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn an_archive_of_a_system_is_kept_as_it_was_sent() {
+        let place = tempfile::tempdir().expect("a directory");
+        std::fs::create_dir(place.path().join("build")).expect("made");
+        let bytes = archive(&[("etc/hostname", "robot"), ("usr/big", &"x".repeat(200_000))]);
+        let sent = || {
+            let chunks: Vec<_> = bytes.chunks(1000).map(|chunk| Ok(Bytes::copy_from_slice(chunk))).collect();
+            futures_util::stream::iter(chunks).boxed()
+        };
+        let (sender, _receiver) = mpsc::channel(16);
+        let report = Reporter::new(sender);
+        let limits = Options::unlimited();
+        let (kind, whole) = detect_kind(sent(), &limits).await.expect("good");
+        assert_eq!(kind, ArchiveKind::Root);
+        let stored = store(whole, &place.path().join("build/taken"), &limits, &report).await.expect("stored");
+        assert_eq!(std::fs::read(stored).expect("there"), bytes);
+        let small = Options { archive: Size(2000), ..Options::unlimited() };
+        let refused = store(sent(), &place.path().join("build/more"), &small, &report).await.expect_err("too big");
+        assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
+        // A sender that stops after a few bytes is not waited for.
+        let begun = futures_util::stream::iter([Ok(Bytes::from_static(b"x"))]).chain(futures_util::stream::pending());
+        let impatient = Options { stall: Duration::from_millis(50), ..Options::unlimited() };
+        let refused = detect_kind(begun.boxed(), &impatient).await.map(|(kind, _)| kind).expect_err("it never ends");
+        assert!(refused.to_string().contains("no data of the archive arrived"), "{refused}");
     }
 
     #[tokio::test(flavor = "multi_thread")]

@@ -56,9 +56,16 @@ export interface BackOff {
 
 export interface BaseDetail extends BaseSummary {
   debian_packages: Record<string, string>;
+  findings: BaseFinding[];
   includes: string[];
   python_packages: Record<string, string>;
   ros_packages: Record<string, string>;
+}
+
+export interface BaseFinding {
+  consequence: string;
+  found: string;
+  subject: string;
 }
 
 export type BaseState =

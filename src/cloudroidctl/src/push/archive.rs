@@ -41,6 +41,8 @@ pub enum PushSource {
     Directory(PathBuf, Selection),
     /// An archive.
     Archive(PathBuf),
+    /// Directory of an OCI image layout, of which only files of the specification are sent.
+    Layout(PathBuf),
 }
 
 impl PushSource {
@@ -75,6 +77,7 @@ impl PushSource {
             let (path, outcome) = match &self {
                 PushSource::Directory(path, selection) => (path, pack(selection, &chunks)),
                 PushSource::Archive(path) => (path, copy(path, &chunks)),
+                PushSource::Layout(path) => (path, pack_layout(path, &chunks)),
             };
             if let Err(error) = outcome {
                 let error = error.context(format!("cannot pack {}", path.display()));
@@ -135,6 +138,28 @@ fn pack(selection: &Selection, chunks: &Chunks) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Packs an image layout as skopeo's `oci-archive` does. Its layers are compressed already.
+fn pack_layout(layout: &Path, chunks: &Chunks) -> anyhow::Result<()> {
+    let mut archive = tar::Builder::new(ChunkWriter::new(chunks));
+    archive.mode(tar::HeaderMode::Deterministic);
+    archive.sparse(false);
+    for name in ["oci-layout", "index.json"] {
+        archive.append_path_with_name(layout.join(name), name).with_context(|| name.to_owned())?;
+    }
+    let blobs = Path::new("blobs/sha256");
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(layout.join(blobs)).context("blobs/sha256")? {
+        names.push(entry?.file_name());
+    }
+    names.sort();
+    for name in names.iter().filter(|name| name.len() == 64) {
+        let inside = blobs.join(name);
+        archive.append_path_with_name(layout.join(&inside), &inside).with_context(|| inside.display().to_string())?;
+    }
+    archive.into_inner()?.flush()?;
+    Ok(())
+}
+
 /// Collects writes into chunks and sends them; blocks while too many are pending.
 struct ChunkWriter<'a> {
     chunks: &'a Chunks,
@@ -172,6 +197,31 @@ mod tests {
     use std::os::unix::fs::FileExt;
 
     use super::*;
+
+    #[test]
+    fn of_a_layout_its_documents_and_blobs_are_packed() {
+        let place = tempfile::tempdir().expect("a directory");
+        let blob = format!("blobs/sha256/{}", "a".repeat(64));
+        for (name, text) in [("oci-layout", "{}"), ("index.json", "[]"), (&blob, "layer"), ("blobs/sha256/tmp-1", "x")]
+        {
+            let path = place.path().join(name);
+            std::fs::create_dir_all(path.parent().expect("below")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        let (chunks, mut received) = mpsc::channel(1 << 10);
+        pack_layout(place.path(), &chunks).expect("packed");
+        drop(chunks);
+        let mut packed = Vec::new();
+        while let Some(chunk) = received.blocking_recv() {
+            packed.extend_from_slice(&chunk.expect("data"));
+        }
+        let mut archive = tar::Archive::new(&packed[..]);
+        let names = archive.entries().expect("a tar").map(|entry| {
+            let entry = entry.expect("an entry");
+            entry.path().expect("a path").display().to_string()
+        });
+        assert_eq!(names.collect::<Vec<_>>(), ["oci-layout", "index.json", blob.as_str()]);
+    }
 
     #[test]
     fn a_sparse_file_is_packed_with_its_holes_as_zeros() {

@@ -189,7 +189,7 @@ fn push_next_step(error: &push::Error) -> String {
         P::NameTaken { name, .. } => {
             format!("choose another name with --name, or remove the service with: cloudroidctl rm {name}")
         }
-        P::UnknownBase { .. } | P::BaseNotImported(_) => "list them with: cloudroidctl bases".into(),
+        P::UnknownBase { .. } | P::BaseNotImported(_) | P::BaseExists(_) => "list them with: cloudroidctl bases".into(),
         P::UnknownUnderlay { .. } => {
             "list them with: cloudroidctl underlays; publish one with: cloudroidctl push WORKSPACE --as-underlay NAME"
                 .into()

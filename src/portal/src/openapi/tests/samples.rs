@@ -7,7 +7,7 @@ mod pushes;
 use std::sync::Arc;
 
 use api::access::{Audited, NewRule, NewToken, Rule, Secret, Token, Whoami};
-use api::bases::{BaseDetail, BaseState, BaseSummary};
+use api::bases::{BaseDetail, BaseFinding, BaseState, BaseSummary};
 use api::calibration::{Calibration, Point, Source, TimeSpread};
 use api::dictionary::{Considered, Explained, ExplainedGoal, NewRows, Row, Spread};
 use api::explain::{Cause, Explanation, Link, Part, Served, Weight};
@@ -354,7 +354,12 @@ fn base() -> BaseDetail {
         ros_packages: versions(),
         python_packages: versions(),
         debian_packages: versions(),
+        findings: vec![finding()],
     }
+}
+
+fn finding() -> BaseFinding {
+    BaseFinding { subject: "x".into(), found: "x".into(), consequence: "x".into() }
 }
 
 fn problem() -> Problem {
@@ -695,6 +700,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("StandingService", underlay().services.remove(0)),
         sample("Underlay", underlay()),
         sample("BaseDetail", base()),
+        sample("BaseFinding", finding()),
         sample("BaseSummary", base().summary),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),

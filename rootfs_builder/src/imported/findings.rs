@@ -1,0 +1,105 @@
+//! The table of what was found in an image, in words for the person who imports it.
+
+use package::system::{FoundSystem, MIDDLEWARES, RosSpace};
+use ros::flavour::Version;
+use serde::{Deserialize, Serialize};
+
+use super::definition::{find_missing_tools, installs_python, version};
+
+/// Result of looking for one subject, and what it means.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Finding {
+    /// Subject, such as `ROS` or `compiling`.
+    pub subject: String,
+    /// Description of what was found; begins with `missing` if it is not there.
+    pub found: String,
+    /// Consequence for pushes; empty if there is none.
+    pub consequence: String,
+}
+
+impl Finding {
+    fn new(subject: &str, found: impl Into<String>, consequence: impl Into<String>) -> Self {
+        Self { subject: subject.to_owned(), found: found.into(), consequence: consequence.into() }
+    }
+}
+
+/// Returns the table. `debs`: number of packages of dpkg.
+pub(super) fn list_findings(system: &FoundSystem, debs: usize) -> Vec<Finding> {
+    let release = format!("{} ({} {})", system.title, system.distribution, system.suite);
+    let mut all = vec![Finding::new("system", release, "")];
+    all.extend(describe_ros(system));
+    for (path, why) in &system.unusable {
+        all.push(Finding::new("left out", path.as_str(), *why));
+    }
+    all.push(match debs {
+        0 => Finding::new("packages", "missing: dpkg", "nothing can be added: packages need what is in the image"),
+        debs => Finding::new(
+            "packages",
+            format!("{debs} of dpkg"),
+            format!("others are installed from the archive of {} ([archives] in the configuration)", system.suite),
+        ),
+    });
+    all.push(Finding::new("Python", system.python.as_str(), ""));
+    all.push(describe_tools(system, debs > 0));
+    all.push(describe_launch(system));
+    all
+}
+
+fn describe_ros(system: &FoundSystem) -> Vec<Finding> {
+    let named = format!("ROS {} {}", system.ros.number(), system.ros_distribution);
+    if system.spaces.is_empty() {
+        return vec![Finding::new("ROS", format!("{named}, Debian's own below /usr"), "")];
+    }
+    let mut all = Vec::new();
+    for space in system.spaces.iter().rev() {
+        let RosSpace { path, packages, .. } = space;
+        let subject = if all.is_empty() { "ROS" } else { "overlay" };
+        let named = if all.is_empty() { format!("{named} in ") } else { String::new() };
+        all.push(Finding::new(subject, format!("{named}{path}, {} packages", packages.len()), ""));
+    }
+    if version(system) == Version::Ros2 {
+        all.push(match system.first_package(&MIDDLEWARES) {
+            Some(name) => Finding::new("middleware", name, ""),
+            None => Finding::new(
+                "middleware",
+                format!("missing: {}", MIDDLEWARES.join(" or ")),
+                "nodes cannot be reached by robots: add one to the image",
+            ),
+        });
+    }
+    all
+}
+
+fn describe_tools(system: &FoundSystem, has_dpkg: bool) -> Finding {
+    let missing = find_missing_tools(system);
+    if missing.is_empty() {
+        return Finding::new("compiling", "all that sources need", "");
+    }
+    let without = if installs_python(system) {
+        "packages in Python and install spaces can be pushed"
+    } else {
+        "only install spaces can be pushed"
+    };
+    let consequence = if has_dpkg {
+        format!("the first push of sources installs it from the archive of {}; without that, {without}", system.suite)
+    } else {
+        without.to_owned()
+    };
+    Finding::new("compiling", format!("missing: {}", missing.join(", ")), consequence)
+}
+
+fn describe_launch(system: &FoundSystem) -> Finding {
+    let (name, is_there) = match version(system) {
+        Version::Ros1 => {
+            let is_installed = system.first_package(&["roslaunch"]).is_some() || system.has_any(&["roslaunch"]);
+            ("roslaunch", is_installed && system.has_any(&["rospkg"]))
+        }
+        Version::Ros2 => ("launch_ros", system.has_any(&["launch_ros"])),
+    };
+    if is_there {
+        return Finding::new("launch files", name, "");
+    }
+    let consequence = "launch files cannot be read: push with --node, or add it to the image";
+    Finding::new("launch files", format!("missing: {name}"), consequence)
+}
