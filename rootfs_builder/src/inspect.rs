@@ -1,6 +1,8 @@
 //! What can be said of a push before it is built, and before it waits for a place among the builds: whether it is a
 //! package, on which base, what it will run, and which dependencies nothing provides.
 
+use std::sync::Arc;
+
 use package::foreseen::{self, SourceProblem};
 use package::workspace::{PushedDirectory, Workspace};
 use ros::flavour::Version;
@@ -77,8 +79,11 @@ impl Builder {
     }
 
     async fn look_at(&self, request: &PushRequest, progress: &Progress) -> Result<InspectedPush, Error> {
-        let choice::ChosenBase { base, note } =
-            privilege::run_as_reader(|| choice::choose_base(self.bases_dir(), request.base_name(), &request.source))?;
+        // What was pushed may have hundreds of thousands of files: it is read on blocking threads.
+        let asked = Arc::new(request.clone());
+        let (bases, of) = (self.bases_dir().to_owned(), Arc::clone(&asked));
+        let choose = move || choice::choose_base(&bases, of.base_name(), &of.source);
+        let choice::ChosenBase { base, note } = blocking::spawn_reader(choose).await??;
         if let Some(note) = note {
             progress.warn(note).await;
         }
@@ -86,13 +91,21 @@ impl Builder {
         // Before anything is downloaded: what was pushed may not be a package at all.
         let content = match &request.source {
             PushSource::Tree(path) => {
-                let inspect = || pushed::inspect_pushed(path, &base, &request.package_query());
-                let InspectedTree { pushed, left_out } = privilege::run_as_reader(inspect)?;
-                if let PushedDirectory::Source(workspace) = &pushed {
-                    tell_selection(workspace, &left_out, progress).await;
+                let (tree, of, on) = (path.clone(), Arc::clone(&asked), base.clone());
+                let inspect = move || pushed::inspect_pushed(&tree, &on, &of.package_query());
+                let InspectedTree { mut pushed, left_out } = blocking::spawn_reader(inspect).await??;
+                if let PushedDirectory::Source(workspace) = pushed {
+                    tell_selection(&workspace, &left_out, progress).await;
                     foundation.check_packages(&workspace.packages)?;
-                    ask_what_to_run(request, workspace, &base)?;
-                    tell_source_problems(request, workspace, &base, progress).await?;
+                    let (of, on) = (Arc::clone(&asked), base.clone());
+                    let read = move || {
+                        ask_what_to_run(&of, &workspace, &on)?;
+                        let problems = find_source_problems(&of, &workspace, &on)?;
+                        Ok::<_, Error>((workspace, problems))
+                    };
+                    let (workspace, problems) = blocking::spawn_reader(read).await??;
+                    tell_source_problems(&problems, progress).await;
+                    pushed = PushedDirectory::Source(workspace);
                 }
                 PushContent::Tree(pushed)
             }
@@ -102,27 +115,32 @@ impl Builder {
             return Err(Error::NothingToCompile);
         }
         let inspected = InspectedPush { base, content, foundation };
-        let (base, label) = (&inspected.base, inspected.label(request));
-        let archive = self.archive(&label, base, progress).await?;
-        match &inspected.content {
-            PushContent::Tree(pushed) => {
-                let there = indexed::read_known(self.layers(), base, &archive);
-                check_dependencies((&archive, base), request, pushed, (there, &inspected.foundation))?;
+        let label = inspected.label(request);
+        let archive = self.archive(&label, &inspected.base, progress).await?;
+        let layers = self.layers().clone();
+        let check = move || {
+            let base = &inspected.base;
+            match &inspected.content {
+                PushContent::Tree(pushed) => {
+                    let there = indexed::read_known(&layers, base, &archive);
+                    check_dependencies((&archive, base), &asked, pushed, (there, &inspected.foundation))?;
+                }
+                PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, base, &asked.map)?),
             }
-            PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, base, &request.map)?),
-        }
-        Ok(inspected)
+            Ok::<_, Error>(inspected)
+        };
+        blocking::spawn(check).await?
     }
 }
 
 /// Fails before compiling if the sources show that the push must state what to run, or that there is no such launch
-/// file. Blocking.
+/// file. Blocking; reads what was pushed.
 fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
     let version = base.ros.ros_version();
     if let Some(launch) = &request.launch
-        && privilege::run_as_reader(|| foreseen::lacks_launch_file(workspace, launch, version))
+        && foreseen::lacks_launch_file(workspace, launch, version)
     {
-        let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+        let foreseen = foreseen::scan_sources(workspace, version);
         return Err(Error::NotInPackage {
             what: "launch file",
             name: launch.clone(),
@@ -133,7 +151,7 @@ fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) ->
     if request.as_underlay || request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen = privilege::run_as_reader(|| foreseen::scan_sources(workspace, version));
+    let foreseen = foreseen::scan_sources(workspace, version);
     if !foreseen.must_be_chosen() {
         return Ok(());
     }
@@ -156,48 +174,40 @@ async fn tell_selection(workspace: &Workspace, left_out: &[String], progress: &P
     progress.step(&format!("building {built} of {all} packages; not needed, or skipped: {names}{more}")).await;
 }
 
-/// Warns of mistakes in build files; fails if no program is left because of them.
-async fn tell_source_problems(
-    request: &PushRequest,
-    workspace: &Workspace,
-    base: &Base,
-    progress: &Progress,
-) -> Result<(), Error> {
-    let problems = find_source_problems(request, workspace, base)?;
+/// Warns of mistakes in build files.
+async fn tell_source_problems(problems: &[SourceProblem], progress: &Progress) {
     for problem in problems.iter().take(MOST_PROBLEMS) {
         progress.warn(problem.to_string()).await;
     }
     if problems.len() > MOST_PROBLEMS {
         progress.warn(format!("{} more like these", problems.len() - MOST_PROBLEMS)).await;
     }
-    Ok(())
 }
 
-/// Returns mistakes in build files; fails if no program is left because of them. Blocking.
+/// Returns mistakes in build files; fails if no program is left because of them. Blocking; reads what was pushed.
 fn find_source_problems(
     request: &PushRequest,
     workspace: &Workspace,
     base: &Base,
 ) -> Result<Vec<SourceProblem>, Error> {
     let version = base.ros.ros_version();
-    privilege::run_as_reader(|| {
-        let problems = foreseen::find_problems(workspace, version);
-        let is_own = |node: &String| {
-            let program = node.split_whitespace().next().unwrap_or_default();
-            let package = program.split_once('/').map(|(package, _)| package);
-            package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
-        };
-        let runs_own = !request.as_underlay && request.launch.is_none() && request.nodes.iter().all(is_own);
-        if runs_own && foreseen::has_no_programs(workspace, version) {
-            let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
-            return Err(Error::NoPrograms { problems: problems.join("; ") });
-        }
-        Ok(problems)
-    })
+    let problems = foreseen::find_problems(workspace, version);
+    let is_own = |node: &String| {
+        let program = node.split_whitespace().next().unwrap_or_default();
+        let package = program.split_once('/').map(|(package, _)| package);
+        package.is_none_or(|package| workspace.packages.iter().any(|own| own.manifest.name == package))
+    };
+    let runs_own = !request.as_underlay && request.launch.is_none() && request.nodes.iter().all(is_own);
+    if runs_own && foreseen::has_no_programs(workspace, version) {
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        return Err(Error::NoPrograms { problems: problems.join("; ") });
+    }
+    Ok(problems)
 }
 
 /// Reports unresolvable dependencies now and not after minutes of preparation. On a base of ROS 2 many may be in the
 /// base itself; where `there`, its packages as the last build found them, is unknown, they are reported by the build.
+/// Blocking.
 fn check_dependencies(
     (archive, base): (&Archive, &Base),
     request: &PushRequest,
