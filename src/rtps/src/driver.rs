@@ -184,8 +184,18 @@ impl DriverState {
         }
     }
 
-    /// Reads the datagrams received by a socket and delivers their samples.
-    fn receive_datagrams(&self, socket: &ReadableSocket, buffer: &mut Vec<u8>) {
+    /// Reads the datagrams received by a socket and delivers their samples. If there may be more, the other tasks of
+    /// this thread get their turn first: the readiness of a socket does not count in a task's budget, so a socket that
+    /// fills as fast as it is read would keep them waiting for as long as it does.
+    async fn receive_in_turn(&self, socket: &ReadableSocket, buffer: &mut Vec<u8>) {
+        if self.receive_datagrams(socket, buffer) == AT_ONCE {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// Reads up to [`AT_ONCE`] datagrams received by a socket and delivers their samples; returns the number of
+    /// datagrams.
+    fn receive_datagrams(&self, socket: &ReadableSocket, buffer: &mut Vec<u8>) -> usize {
         let mut came = Vec::with_capacity(AT_ONCE);
         while came.len() < AT_ONCE {
             buffer.resize(LONGEST, 0);
@@ -202,7 +212,7 @@ impl DriverState {
             came.push((source.ip(), datagram));
         }
         if came.is_empty() {
-            return;
+            return 0;
         }
         let deliveries = {
             let mut core = self.core.lock();
@@ -218,6 +228,7 @@ impl DriverState {
         for (sink, sample) in deliveries {
             sink.on_sample(sample);
         }
+        came.len()
     }
 
     fn tick(&self) {
@@ -292,9 +303,9 @@ pub(crate) async fn drive(shared: Arc<DriverState>, look: Duration) {
             }
         };
         tokio::select! {
-            Ok(socket) = wait_readable(&shared.user) => shared.receive_datagrams(socket, &mut buffer),
-            Ok(socket) = wait_readable(&shared.discovery) => shared.receive_datagrams(socket, &mut buffer),
-            Ok(socket) = multicast => shared.receive_datagrams(socket, &mut buffer),
+            Ok(socket) = wait_readable(&shared.user) => shared.receive_in_turn(socket, &mut buffer).await,
+            Ok(socket) = wait_readable(&shared.discovery) => shared.receive_in_turn(socket, &mut buffer).await,
+            Ok(socket) = multicast => shared.receive_in_turn(socket, &mut buffer).await,
             Ok(mut ready) = timer.readable(), if matches!(waits, FlushOutcome::Receivers(_)) => {
                 let mut expirations = [0; 8];
                 let _ = rustix::io::read(timer.get_ref(), &mut expirations);

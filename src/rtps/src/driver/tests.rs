@@ -2,6 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::unix::net::UnixDatagram;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::Poll;
 
 use async_trait::async_trait;
@@ -89,4 +90,40 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
     assert!(there(), "nobody has looked");
     here.check_ports();
     assert!(!there());
+}
+
+#[tokio::test]
+async fn other_tasks_get_their_turns_while_a_socket_fills_as_fast_as_it_is_read() {
+    const TURNS: usize = 100;
+    let (other, flooded) = (join().await, join().await);
+    let prefix = flooded.guid().prefix;
+    let to = {
+        let mut discovered = other.watch_discovered();
+        let known = discovered.wait_for(|all| all.participants.contains_key(&prefix));
+        let known = timeout(LONG, known).await.expect("in time");
+        known.expect("it runs").participants[&prefix].user[0].udp_address().expect("an address")
+    };
+    let is_served = Arc::new(AtomicBool::new(false));
+    // Long datagrams take their reader longer than their senders.
+    let flooding = || {
+        let is_served = Arc::clone(&is_served);
+        std::thread::spawn(move || {
+            let socket = std::net::UdpSocket::bind("127.0.0.1:0").expect("a socket");
+            let deadline = Instant::now() + LONG;
+            while !is_served.load(Ordering::Relaxed) && Instant::now() < deadline {
+                let _ = socket.send_to(&[0; 60_000], to);
+            }
+        })
+    };
+    let senders = [(); 4].map(|()| flooding());
+    let begun = Instant::now();
+    for _ in 0..TURNS {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    is_served.store(true, Ordering::Relaxed);
+    let took = begun.elapsed();
+    for sender in senders {
+        sender.join().expect("it sends");
+    }
+    assert!(took < LONG / 2, "{TURNS} turns took {took:?}");
 }
