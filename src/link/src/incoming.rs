@@ -65,6 +65,11 @@ impl Incoming {
         ReceiveProgress { number: self.number, bytes: self.bytes }
     }
 
+    /// Returns whether a record is incomplete.
+    pub(crate) fn is_receiving(&self) -> bool {
+        !self.streams.is_empty()
+    }
+
     /// Returns the number of incomplete records and the sum of their lengths.
     #[cfg(test)]
     pub(crate) fn in_flight(&self) -> (usize, usize) {

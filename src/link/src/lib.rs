@@ -13,7 +13,7 @@
 //! States of a session's connection:
 //!
 //! ```text
-//!  (none) ──hello, welcome──▶ Up ──no pong in time──▶ Silent ──silence too long, socket lost──▶ (none)
+//!  (none) ──hello, welcome──▶ Up ──no bytes in time─▶ Silent ──silence too long, socket lost──▶ (none)
 //!                              ▲──anything received────┘
 //! ```
 

@@ -185,6 +185,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         self.received
     }
 
+    /// Returns whether a part of a message has been received.
+    pub fn is_receiving(&self) -> bool {
+        self.header.is_some() || self.partial.is_some() || !self.read.is_empty()
+    }
+
     fn next_header(&mut self) -> Result<Option<Header>, WsError> {
         let Some((header, size)) = Header::parse(&self.read)? else {
             return Ok(None);
@@ -205,8 +210,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
 
     /// Ready when the deadline of the message that is being received has passed.
     fn poll_deadline(&mut self, cx: &mut Context<'_>) -> Poll<()> {
-        let begun = self.header.is_some() || self.partial.is_some() || !self.read.is_empty();
-        let Some(unfinished) = self.unfinished.as_mut().filter(|_| begun) else {
+        let is_receiving = self.is_receiving();
+        let Some(unfinished) = self.unfinished.as_mut().filter(|_| is_receiving) else {
             return Poll::Pending;
         };
         let patience = unfinished.patience;

@@ -3,7 +3,7 @@
 use std::future::{Future, poll_fn};
 use std::pin::{Pin, pin};
 use std::sync::atomic::Ordering;
-use std::task::Poll;
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -27,6 +27,12 @@ const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
 /// Number of messages in a row after which other tasks get a turn, or the queues of those that forward them would
 /// overflow.
 const IN_A_ROW: u32 = 32;
+/// Number of bytes written in a row after which the socket is read, however much it accepts: the peer's signs of life
+/// and acknowledgements must not wait for the end of an image.
+const WRITTEN_IN_A_ROW: usize = 256 * 1024;
+/// Interval at which the peer is shown that a long message is being received. It is shorter than the minimum silence
+/// timeout.
+const SIGN: Duration = Duration::from_millis(20);
 /// Memory overhead of a call in bytes, until it is answered.
 const CALL: usize = 1024;
 /// Time for the peer to receive what is queued when this end closes the session: without a sign of the peer, and in
@@ -86,37 +92,29 @@ impl<O: ControlMessage> Session<O> {
             let mut woken = pin!(self.wake.notified());
             let event = poll_fn(|cx| {
                 loop {
-                    self.fill_socket(socket);
-                    if job.is_none() {
-                        job = self.start_encoding();
+                    let may_write_more = match self.poll_write(socket, &mut job, cx) {
+                        Ok(more) => more,
+                        Err(error) => return Poll::Ready(ConnectionEvent::Message(Err(error))),
+                    };
+                    if self.is_finished(&connection, socket.bytes_queued()) {
+                        return Poll::Ready(ConnectionEvent::Ended);
                     }
-                    let polled = job.as_mut().map(|job| Pin::new(job).poll(cx));
-                    if let Some(Poll::Ready(packed)) = polled {
-                        job = None;
-                        self.finish_encoding(packed.ok());
+                    if let Poll::Ready(message) = socket.poll_next(cx) {
+                        return Poll::Ready(ConnectionEvent::Message(message));
+                    }
+                    if self.note_received_bytes(socket, &mut connection) {
                         continue;
                     }
-                    if socket.bytes_queued() == 0 {
-                        break;
+                    if woken.as_mut().poll(cx).is_ready() {
+                        return Poll::Ready(ConnectionEvent::Woken);
                     }
-                    match socket.poll_flush(cx) {
-                        Poll::Ready(Ok(())) => {}
-                        Poll::Ready(Err(error)) => {
-                            return Poll::Ready(ConnectionEvent::Message(Err(error.into())));
-                        }
-                        Poll::Pending => break,
+                    if tick.as_mut().poll(cx).is_ready() {
+                        return Poll::Ready(ConnectionEvent::Tick);
+                    }
+                    if !may_write_more {
+                        return Poll::Pending;
                     }
                 }
-                if self.is_finished(&connection, socket.bytes_queued()) {
-                    return Poll::Ready(ConnectionEvent::Ended);
-                }
-                if let Poll::Ready(message) = socket.poll_next(cx) {
-                    return Poll::Ready(ConnectionEvent::Message(message));
-                }
-                if woken.as_mut().poll(cx).is_ready() {
-                    return Poll::Ready(ConnectionEvent::Woken);
-                }
-                tick.as_mut().poll(cx).map(|()| ConnectionEvent::Tick)
             })
             .await;
             match event {
@@ -172,6 +170,64 @@ impl<O: ControlMessage> Session<O> {
                 }
             }
         }
+    }
+
+    /// Encodes and writes what is queued, until the socket accepts no more, nothing is left or enough was written in a
+    /// row. Returns whether the latter is why it stopped.
+    fn poll_write<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        socket: &mut WebSocket<S>,
+        job: &mut Option<JoinHandle<EncodedMessage>>,
+        cx: &mut Context<'_>,
+    ) -> Result<bool, WsError> {
+        let mut written = 0;
+        while written < WRITTEN_IN_A_ROW {
+            self.fill_socket(socket);
+            if job.is_none() {
+                *job = self.start_encoding();
+            }
+            let polled = job.as_mut().map(|job| Pin::new(job).poll(cx));
+            if let Some(Poll::Ready(packed)) = polled {
+                *job = None;
+                self.finish_encoding(packed.ok());
+                continue;
+            }
+            let queued = socket.bytes_queued();
+            if queued == 0 {
+                return Ok(false);
+            }
+            match socket.poll_flush(cx) {
+                Poll::Ready(flushed) => flushed?,
+                Poll::Pending => return Ok(false),
+            }
+            written += queued;
+        }
+        Ok(true)
+    }
+
+    /// Counts bytes of an unfinished message as a sign of the peer, and gives it one: it may have sent a message that
+    /// takes longer than its silence timeout. That the kernel accepted bytes is no such sign, since it accepts
+    /// megabytes for a peer that is gone. Returns whether something was queued for the peer.
+    fn note_received_bytes<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        socket: &mut WebSocket<S>,
+        connection: &mut SessionConnection,
+    ) -> bool {
+        let received = socket.bytes_received();
+        if received == std::mem::replace(&mut connection.bytes_received, received) {
+            return false;
+        }
+        connection.heard = Instant::now();
+        self.up.send_if_modified(|up| !std::mem::replace(up, true));
+        let is_due = connection.signed.elapsed() >= SIGN;
+        if !is_due || !(socket.is_receiving() || self.state.lock().incoming.is_receiving()) {
+            return false;
+        }
+        connection.signed = Instant::now();
+        // A pong that nobody asked for (RFC 6455, section 5.5.3). An acknowledgement without progress would disturb the
+        // peer's estimate of the throughput.
+        socket.queue(opcode::PONG, Bytes::new());
+        true
     }
 
     /// Returns whether this end has closed the session and the peer has received everything queued, or had enough time.
@@ -310,6 +366,7 @@ impl<O: ControlMessage> Session<O> {
     /// Returns the receive progress, which the caller sends to the peer.
     fn take_progress(&self, connection: &mut SessionConnection) -> ReceiveProgress {
         let received = self.state.lock().incoming.progress();
+        connection.signed = Instant::now();
         connection.unacknowledged = 0;
         connection.acknowledged_bytes = received.bytes;
         received
@@ -335,7 +392,11 @@ enum ConnectionEvent {
 /// State of one connection.
 struct SessionConnection {
     begun: Instant,
+    /// Time at which the last bytes of the peer were read.
     heard: Instant,
+    bytes_received: u64,
+    /// Time at which the peer was last told that something was received.
+    signed: Instant,
     pinged: Instant,
     pongs: u32,
     unacknowledged: u32,
@@ -349,6 +410,8 @@ impl SessionConnection {
         Self {
             begun: Instant::now(),
             heard: Instant::now(),
+            bytes_received: 0,
+            signed: Instant::now(),
             pinged: Instant::now(),
             pongs: 0,
             unacknowledged: 0,

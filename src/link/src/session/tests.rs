@@ -11,6 +11,7 @@ use crate::{MAX_FRAME, MAX_RECORD};
 
 mod ends;
 mod lanes;
+mod slow;
 
 /// Either end; the type of its control messages does not matter here.
 type Session = RobotSession;
