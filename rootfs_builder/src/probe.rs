@@ -261,7 +261,10 @@ async fn observe(
         heard: OutputRecord::default(),
     };
     if !settle::wait_until_still(&mut look.watch, options).await? {
-        look.warnings.push(format!("topics kept changing for {:?}, so some may be missing", options.restless));
+        look.warnings.push(format!(
+            "new topics, services, parameters or nodes kept appearing for {:?}, so some may be missing",
+            options.restless
+        ));
     }
     tracing::debug!("probe: nothing changes");
     look.subscribe_outputs().await?;

@@ -124,8 +124,10 @@ pub(super) async fn await_answer<T>(
 
 /// Waits until the graph has settled; returns false if it did not in time.
 ///
-/// Settled means more than unchanged: a node that has registered nothing but itself, or that is busy, has not settled.
-/// Neither has a node that waits for a core: all times except `patience` are the nodes' own.
+/// Settled means that nothing appears that was not there before: what comes and goes (a subscription that a node makes
+/// for each lookup, a listener node with a new number each time) is known once it has come, and nothing would be learnt
+/// by waiting for its end. But a node that has registered nothing but itself, or that is busy, has not settled. Neither
+/// has a node that waits for a core: all times except `patience` are the nodes' own.
 pub async fn wait_until_still(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
@@ -134,14 +136,15 @@ pub async fn wait_until_still(
     // Some nodes are always busy; that alone does not justify the whole wait.
     let working_limit = options.restless / 3;
     let mut clock = NodeClock::start(options).await;
-    let mut shape = graph_shape(&watch.borrow_and_update());
+    let mut shown = ShownNames::default();
+    shown.add(&watch.borrow_and_update(), &options.own_name);
     let mut total = Duration::ZERO;
     // Since the last change.
     let (mut silent, mut ran) = (Duration::ZERO, Duration::ZERO);
     loop {
         let pause = options.settle.saturating_sub(silent);
         let until = Instant::now() + pause.max(options.settle / LEAST);
-        let changed = wait_for_difference(watch, &mut shape, until.min(latest)).await?;
+        let changed = wait_for_news(watch, &mut shown, &options.own_name, until.min(latest)).await?;
         let past = clock.read(options).await;
         total += past.time;
         if changed {
@@ -165,18 +168,16 @@ pub async fn wait_until_still(
     }
 }
 
-/// Waits until the graph differs from `shape`, and updates that; returns false if it does not in time.
-async fn wait_for_difference(
+/// Waits until the graph has something that was not `shown` before, and adds it; returns false if it does not in time.
+async fn wait_for_news(
     watch: &mut watch::Receiver<Arc<Graph>>,
-    shape: &mut GraphShape,
+    shown: &mut ShownNames,
+    own: &str,
     until: Instant,
 ) -> Result<bool, ProbeError> {
     while let Ok(changed) = timeout_at(until, graph_changed(watch)).await {
         changed?;
-        // A parameter that is read repeatedly changes the graph's generation, but nothing relevant here.
-        let now = self::graph_shape(&watch.borrow_and_update());
-        if now != *shape {
-            *shape = now;
+        if shown.add(&watch.borrow_and_update(), own) {
             return Ok(true);
         }
         if Instant::now() >= until {
@@ -184,6 +185,74 @@ async fn wait_for_difference(
         }
     }
     Ok(false)
+}
+
+/// A name in the graph, by its role. Which node it belongs to does not matter for the interface.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum ShownName {
+    Published(String),
+    Subscribed(String),
+    Service(String),
+    ActionServer(String),
+    ActionClient(String),
+    Sought(String),
+    Parameter(String),
+    /// Without the number of an anonymous node.
+    Node(String),
+}
+
+/// All names that the nodes of the package have shown so far.
+#[derive(Debug, Default)]
+struct ShownNames(BTreeSet<ShownName>);
+
+impl ShownNames {
+    /// Adds the names in a graph, except those of the node `own`; returns whether any is new.
+    fn add(&mut self, graph: &Graph, own: &str) -> bool {
+        let before = self.0.len();
+        let others = |nodes: &[String]| nodes.iter().any(|node| node != own);
+        for (name, topic) in &graph.topics {
+            self.insert_if(others(&topic.publishers), ShownName::Published, name);
+            self.insert_if(others(&topic.subscribers), ShownName::Subscribed, name);
+        }
+        for (name, server) in &graph.services {
+            self.insert_if(server != own, ShownName::Service, name);
+        }
+        for (name, action) in &graph.actions {
+            self.insert_if(others(&action.servers), ShownName::ActionServer, name);
+            self.insert_if(others(&action.clients), ShownName::ActionClient, name);
+        }
+        for (name, nodes) in &graph.sought {
+            self.insert_if(others(nodes), ShownName::Sought, name);
+        }
+        for name in graph.parameters.keys() {
+            self.insert_if(true, ShownName::Parameter, name);
+        }
+        for node in graph.nodes.keys() {
+            self.insert_if(node != own, ShownName::Node, without_number(node));
+        }
+        self.0.len() > before
+    }
+
+    fn insert_if(&mut self, is_shown: bool, role: fn(String) -> ShownName, name: &str) {
+        if is_shown {
+            self.0.insert(role(name.to_owned()));
+        }
+    }
+}
+
+/// Returns the name of a node without the number that makes anonymous nodes unique: decimal digits at its end, or a
+/// hexadecimal number behind an underscore (`transform_listener_impl_55d0a8e1f2b0`, of tf2_ros).
+fn without_number(node: &str) -> &str {
+    /// Length from which letters up to `f` beside digits are taken for a number.
+    const LONG: usize = 4;
+    let is_number = |end: &str| {
+        let digits = end.bytes().filter(u8::is_ascii_digit).count();
+        digits > 0 && end.len() >= LONG && end.bytes().all(|it| it.is_ascii_hexdigit())
+    };
+    match node.rsplit_once('_') {
+        Some((before, number)) if is_number(number) => before,
+        _ => node.trim_end_matches(|char: char| char.is_ascii_digit()),
+    }
 }
 
 /// Returns whether only what every node has is registered so far. (Of several nodes some may never have anything else,
@@ -205,7 +274,7 @@ fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
     !topics && !services && !served.into_iter().any(|node| !own(node))
 }
 
-/// Parts of a graph that are watched for changes.
+/// Parts of a graph in which two observations are compared.
 pub(super) type GraphShape = (
     BTreeMap<String, TopicNodes>,
     BTreeMap<String, String>,
@@ -230,6 +299,65 @@ pub(super) fn graph_shape(graph: &Graph) -> GraphShape {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A graph in which `/package` publishes these topics, and these nodes subscribe to `/tf`.
+    fn graph_of(topics: &[&str], listeners: &[&str]) -> Arc<Graph> {
+        let publishers = vec!["/package".to_owned()];
+        let published = topics.iter().map(|&name| {
+            let nodes = TopicNodes { publishers: publishers.clone(), ..TopicNodes::default() };
+            (name.to_owned(), nodes)
+        });
+        let subscribers: Vec<String> = listeners.iter().map(|&name| name.to_owned()).collect();
+        let nodes = subscribers.iter().chain(&publishers).map(|name| (name.clone(), String::new())).collect();
+        let transforms = ("/tf".to_owned(), TopicNodes { subscribers, ..TopicNodes::default() });
+        Arc::new(Graph { topics: published.chain([transforms]).collect(), nodes, ..Graph::default() })
+    }
+
+    /// Shows these graphs again and again, one each 100 ms; returns whether the graph settled, and after which time.
+    async fn settle_among(graphs: impl Fn(u32) -> Arc<Graph> + Send + 'static) -> (bool, Duration) {
+        let (sender, mut watch) = watch::channel(graphs(0));
+        let changing = tokio::spawn(async move {
+            for turn in 1.. {
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                sender.send_replace(graphs(turn));
+            }
+        });
+        let begun = Instant::now();
+        let options = ProbeOptions::new(vec!["/package".to_owned()], "/probe");
+        let is_still = wait_until_still(&mut watch, &options).await.expect("watched");
+        changing.abort();
+        (is_still, begun.elapsed())
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_comes_and_goes_keeps_nothing_from_settling() {
+        let soon = Duration::from_secs(2);
+        // A listener for each lookup, which has another number each time, and a topic that is there half of the time.
+        let graphs = |turn| match turn % 2 {
+            0 => graph_of(&["/pose"], &[]),
+            _ => graph_of(&["/pose", "/debug"], &[&format!("/transform_listener_impl_{:012x}", 0x55d0_0000 + turn)]),
+        };
+        let (is_still, took) = settle_among(graphs).await;
+        assert!(is_still && took < soon, "{is_still} after {took:?}");
+        // Topics that were never seen before.
+        let growing = |turn| graph_of(&[&format!("/object_{turn}")], &[]);
+        let (is_still, took) = settle_among(growing).await;
+        assert!(!is_still && took >= Duration::from_secs(15), "{is_still} after {took:?}");
+    }
+
+    #[test]
+    fn anonymous_nodes_are_known_without_their_numbers() {
+        for (node, known) in [
+            ("/transform_listener_impl_55d0a8e1f2b0", "/transform_listener_impl"),
+            ("/launch_ros_4711", "/launch_ros"),
+            ("/relay12", "/relay"),
+            ("/left_face", "/left_face"),
+            ("/camera_1", "/camera_"),
+            ("/wheel_speed", "/wheel_speed"),
+        ] {
+            assert_eq!(without_number(node), known);
+        }
+    }
 
     #[tokio::test]
     async fn a_node_that_its_program_puts_elsewhere_is_known_by_its_mark() {
