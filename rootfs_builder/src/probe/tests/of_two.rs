@@ -131,7 +131,7 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
 }
 
 /// A lifecycle node as in rclcpp: configured, then activated, which starts its work; `refuses` is the transition that
-/// fails.
+/// fails, or what it does while nobody subscribes to its output: [`REFUSES_UNHEARD`] or [`WAITS_UNHEARD`].
 struct Stages {
     registry: Arc<Registry>,
     node: Arc<MemoryBus>,
@@ -153,15 +153,39 @@ impl Stages {
         if !fits || label == self.refuses {
             return false;
         }
+        let begins_to_publish = match self.refuses {
+            REFUSES_UNHEARD | WAITS_UNHEARD => "configure",
+            _ => "activate",
+        };
+        if label == "activate" && !self.is_heard().await {
+            return false;
+        }
         self.state.store(state + 1, Ordering::SeqCst);
-        if label == "activate" {
+        if label == begins_to_publish {
             let of = WireType::from_message(&self.registry.message("std_msgs/msg/String").expect("defined"));
             let publisher = self.node.advertise("/driven", of, QosProfile::keep_last(1)).await;
             *self.working.lock() = Some(publisher.expect("advertised"));
         }
         true
     }
+
+    /// Returns whether somebody subscribes to its output, if that matters to it.
+    async fn is_heard(&self) -> bool {
+        let subscribers = self.working.lock().as_ref().map(|publisher| publisher.matched_subscribers());
+        let Some(mut subscribers) = subscribers else {
+            return true;
+        };
+        if self.refuses == WAITS_UNHEARD {
+            let heard = subscribers.wait_for(|matched| matched.connected_count() > 0).await;
+            return heard.is_ok();
+        }
+        let count = subscribers.borrow().connected_count();
+        count > 0
+    }
 }
+
+const REFUSES_UNHEARD: &str = "refuses while nobody subscribes";
+const WAITS_UNHEARD: &str = "waits while nobody subscribes";
 
 /// One of its lifecycle services.
 struct Stage(Arc<Stages>, &'static str);
@@ -216,6 +240,18 @@ async fn a_node_with_a_lifecycle_is_activated_and_its_services_are_its_lifecycle
     assert_eq!(interface.services, []);
     let topics: Vec<&str> = interface.topics.iter().map(|it| it.name.as_str()).collect();
     assert_eq!(topics, ["/driven"], "it publishes once it is active");
+}
+
+#[tokio::test]
+async fn a_node_that_activates_for_subscribers_only_is_activated() {
+    for refuses in [REFUSES_UNHEARD, WAITS_UNHEARD] {
+        let two = Ros2System::new();
+        let (stages, _served) = start_lifecycle_node(&two, refuses, 1).await;
+        let found = two.run_probe(&["/drive"]).await.unwrap_or_else(|error| panic!("it {refuses}: {error}"));
+        assert_eq!(stages.state()["current_state"]["label"], "active", "{refuses}");
+        let topics: Vec<&str> = found.interface.topics.iter().map(|it| it.name.as_str()).collect();
+        assert_eq!(topics, ["/driven"], "{refuses}");
+    }
 }
 
 #[tokio::test]

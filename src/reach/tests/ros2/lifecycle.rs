@@ -89,3 +89,17 @@ async fn a_node_begins_when_nobody_else_drives_it() {
     let node = LifecycleNode::new(shown, STAGED);
     assert_eq!(node.state().await.unwrap(), State::Active);
 }
+
+#[tokio::test]
+async fn a_node_that_is_active_for_subscribers_only_begins_as_well() {
+    let lab = Lab::new();
+    let (bus, _nodes) = tuned_node(&lab).await;
+    let shown: Arc<dyn Bus> = bus.clone();
+    let shy = vec![("shy".to_owned(), Some(ParamValue::Bool(true)))];
+    bus.node_parameters().unwrap().set(STAGED, shy).await.unwrap();
+    let all = begin_all(&shown, LONG).await.unwrap();
+    assert_eq!(all, [(STAGED.to_owned(), BeginOutcome::Now)]);
+    // The subscriber that it needed for that is gone again.
+    super::lab::wait_graph(&bus, |graph| graph.topics.get("/seen").is_some_and(|ends| ends.subscribers.is_empty()))
+        .await;
+}

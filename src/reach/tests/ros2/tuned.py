@@ -1,6 +1,7 @@
 """Nodes of rclpy: /lab/tuned with parameters of all kinds, and /lab/staged with a lifecycle.
 
-The first refuses a speed above 10, and says why. The second does not activate while its parameter `broken` is true.
+The first refuses a speed above 10, and says why. The second does not activate while its parameter `broken` is true, nor, if `shy` is,
+while nobody subscribes to its output.
 """
 
 import json
@@ -11,6 +12,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 
 
 class Tuned(Node):
@@ -47,9 +49,18 @@ class Staged(LifecycleNode):
     def __init__(self):
         super().__init__('staged', namespace='/lab')
         self.declare_parameter('broken', False)
+        self.declare_parameter('shy', False)
+        self.seen = None
+
+    def on_configure(self, state):
+        if self.get_parameter('shy').value:
+            self.seen = self.create_lifecycle_publisher(String, '/seen', 10)
+        return super().on_configure(state)
 
     def on_activate(self, state):
         if self.get_parameter('broken').value:
+            return TransitionCallbackReturn.FAILURE
+        if self.seen is not None and self.seen.get_subscription_count() == 0:
             return TransitionCallbackReturn.FAILURE
         return super().on_activate(state)
 

@@ -1,11 +1,29 @@
 //! Activation of lifecycle nodes that wait for a manager.
+//!
+//! ```text
+//!  configure ─▶ activate ─▶ done
+//!                  │ refused, or not answered soon
+//!                  └─▶ subscribe to the outputs that nobody subscribes to ─▶ answered, or activate again ─▶ done
+//! ```
+//!
+//! Some nodes become active only while somebody subscribes to what they publish. A servant's robot cannot subscribe
+//! before its nodes are active, so this end does so until they are.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros_bus::{Bus, BusError, Graph};
+use futures_util::future::join_all;
+use ros_bus::{Bus, BusError, Graph, QosProfile, Subscription, WireType, wait_for_connected};
+use tokio::time::{sleep, timeout};
 
-use super::{LifecycleNode, State, Transition};
+use super::{LifecycleNode, PATIENCE, State, Transition};
+use crate::names;
+
+/// Time after which a node that has not answered may be waiting for subscribers.
+const SOON: Duration = Duration::from_secs(1);
+/// Pauses before each further request to a node that refused although its outputs had subscribers: it may not know of
+/// them yet.
+const AGAIN: [Duration; 2] = [Duration::ZERO, Duration::from_secs(1)];
 
 /// Outcome of activating a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -73,11 +91,70 @@ impl LifecycleNode {
         if let Some(driver) = Self::find_driver(&graph, &self.node, ours) {
             return Ok(BeginOutcome::DrivenBy(driver));
         }
-        for transition in [Transition::Configure, Transition::Activate] {
-            let changed = self.change_state(transition, patience).await;
-            changed.map_err(|error| self.begin_error(transition, &error))?;
-        }
+        let configured = self.change_state(Transition::Configure, patience).await;
+        configured.map_err(|error| self.begin_error(Transition::Configure, &error))?;
+        let activated = self.activate(patience).await;
+        activated.map_err(|error| self.begin_error(Transition::Activate, &error))?;
         Ok(BeginOutcome::Now)
+    }
+
+    /// Activates a configured node. If it refuses, or does not answer soon, its outputs get a subscriber until it is
+    /// active.
+    async fn activate(&self, patience: Duration) -> Result<(), BusError> {
+        let mut activating = std::pin::pin!(self.change_state(Transition::Activate, patience));
+        let mut activated = match timeout(SOON, activating.as_mut()).await {
+            Ok(Ok(())) => return Ok(()),
+            Ok(Err(refused)) => Err(refused),
+            Err(_) => {
+                let _listening = self.listen_to_outputs().await;
+                return activating.await;
+            }
+        };
+        let mut listening = self.listen_to_outputs().await;
+        if listening.is_empty() {
+            return activated;
+        }
+        for pause in AGAIN {
+            sleep(pause).await;
+            // A node that fails differently is not inactive any more, and may not be activated.
+            if self.state().await? != State::Inactive {
+                return activated;
+            }
+            activated = self.change_state(Transition::Activate, patience).await;
+            if activated.is_ok() {
+                break;
+            }
+            listening.extend(self.listen_to_outputs().await);
+        }
+        activated
+    }
+
+    /// Subscribes to the outputs of the node that nobody subscribes to, and waits until it knows.
+    async fn listen_to_outputs(&self) -> Vec<Subscription> {
+        let mut graph = self.bus.graph();
+        // What it advertised while it was configured may not be discovered yet.
+        let _ = timeout(SOON, graph.wait_for(|graph| !self.unheard_outputs(graph).is_empty())).await;
+        let topics = self.unheard_outputs(&graph.borrow());
+        let listening = topics.iter().map(|topic| async move {
+            let subscribed = self.bus.subscribe(topic, WireType::any(), QosProfile::keep_last(1)).await;
+            let subscription = subscribed.inspect_err(|error| {
+                tracing::debug!(topic, %error, "a lifecycle node may be waiting for a subscriber that it cannot get");
+            });
+            let subscription = subscription.ok()?;
+            let _ = timeout(PATIENCE, wait_for_connected(subscription.matched.clone(), 1)).await;
+            Some(subscription)
+        });
+        join_all(listening).await.into_iter().flatten().collect()
+    }
+
+    /// Returns the topics that the node publishes and nobody subscribes to, without those that every node has.
+    fn unheard_outputs(&self, graph: &Graph) -> Vec<String> {
+        let of_all_nodes =
+            ["/rosout".to_owned(), "/parameter_events".to_owned(), format!("{}/transition_event", self.node)];
+        let published = graph.ends.get(&self.node).into_iter().flat_map(|ends| ends.publishers.keys());
+        let is_unheard = |topic: &&String| graph.topics.get(*topic).is_none_or(|ends| ends.subscribers.is_empty());
+        let own = published.filter(|topic| !of_all_nodes.contains(topic) && !names::is_hidden(topic));
+        own.filter(is_unheard).cloned().collect()
     }
 
     fn begin_error(&self, transition: Transition, error: &BusError) -> BeginError {
