@@ -175,6 +175,8 @@ impl SessionHandler<FromCloud> for Mirror {
             Record::Control(FromCloud::Line { text, .. }) => {
                 output::STDOUT.print(format!("{}\n", terminal::escape(&text, true)));
             }
+            // Before the messages behind it, which are not queued either.
+            Record::Control(FromCloud::Kept { channel, messages }) => self.outputs.set_kept(channel, messages),
             Record::Control(FromCloud::Lookup { service }) => {
                 self.lent.look_up(self, service, held);
             }

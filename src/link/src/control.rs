@@ -277,6 +277,14 @@ pub enum FromCloud {
         /// Name of the service.
         service: String,
     },
+    /// Number of messages of a transient-local output that the node gives to late subscribers (ROS 2). Until it is told
+    /// it is one.
+    Kept {
+        /// Channel number.
+        channel: u32,
+        /// Number of messages.
+        messages: usize,
+    },
 }
 
 /// Control messages between the sessions of both ends.
@@ -607,6 +615,7 @@ mod tests {
             r#"{"exited":{"code":0,"signal":null,"text":"t"}}"#,
             r#"{"notice":{"warning":true,"text":"t"}}"#,
             r#"{"line":{"error":false,"text":"t"}}"#,
+            r#"{"kept":{"channel":1,"messages":3}}"#,
         ] {
             assert_round_trips::<FromCloud>(told);
         }

@@ -138,8 +138,13 @@ impl Outgoing {
 
     /// Marks a channel as announced by the control record pushed before: no message of the channel is sent earlier.
     pub(crate) fn open_channel(&mut self, channel: u32) {
-        self.openings.insert(channel, self.next_order);
+        self.order_after_control(channel);
         self.encoding.add(channel);
+    }
+
+    /// Makes messages of a channel wait for the control records pushed before.
+    pub(crate) fn order_after_control(&mut self, channel: u32) {
+        self.openings.insert(channel, self.next_order);
     }
 
     pub(crate) fn push(&mut self, record: &Record, quality: DeliveryMode) {

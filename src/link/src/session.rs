@@ -347,6 +347,12 @@ impl<O: ControlMessage> Session<O> {
         state.out.open_channel(channel);
     }
 
+    /// Makes messages of an open channel that are not sent yet wait for the control messages sent before this call, which
+    /// say how they are to be understood.
+    pub fn order_after_control(&self, channel: u32) {
+        self.state.lock().out.order_after_control(channel);
+    }
+
     /// Sets the quality of JPEG images, 1 to 100 (default: 80).
     pub fn set_quality(&self, quality: Option<u8>) {
         self.state.lock().packing.set_quality(quality);

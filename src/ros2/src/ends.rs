@@ -193,6 +193,11 @@ impl WriterEnd {
         self.writer.write_related(payload, related)
     }
 
+    /// Sets how many of its last samples it gives to new readers.
+    pub(super) fn set_kept(&self, samples: usize) {
+        self.writer.set_kept(samples);
+    }
+
     /// Returns the number of samples dropped for slow readers.
     pub(super) fn dropped_count(&self) -> u64 {
         self.writer.dropped_samples()

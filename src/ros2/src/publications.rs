@@ -109,7 +109,8 @@ impl SubscriberWatcher {
             let theirs = seen::wire_type(reader);
             if theirs.is_compatible_with(&self.of) {
                 let connected = ends.confirmed.contains(&reader.guid);
-                let offer = Offer { wire_type: Arc::new(theirs), latching: quality::is_latching(reader) };
+                let latching = quality::is_latching(reader);
+                let offer = Offer { wire_type: Arc::new(theirs), latching, kept: None };
                 now.peers.push(TopicPeer { id: peer, connected, offer: Some(offer) });
             } else {
                 let why = show::type_mismatch_text(&theirs, &self.of);
@@ -151,6 +152,10 @@ impl Publisher for WriterHandle {
 
     fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
         self.matched.clone()
+    }
+
+    fn set_kept(&self, messages: usize) {
+        self.writer.set_kept(messages);
     }
 
     fn dropped_count(&self) -> u64 {

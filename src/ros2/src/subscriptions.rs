@@ -17,7 +17,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros_bus::{BusError, MessageSender, Offer, QosProfile, SerializedMessage, Subscription, WireType, message_queue};
+use ros_bus::ring::{Ring, RingBounds};
+use ros_bus::{
+    BusError, MessageSender, Offer, PeerId, QosProfile, SerializedMessage, Subscription, WireType, message_queue,
+};
 use rtps::{DurabilityKind, EndpointData, Guid, ReceivedSample, Sink};
 use tokio::sync::{Notify, watch};
 
@@ -29,6 +32,9 @@ use super::topic_in::{HeldMessage, KnownWriter, ReaderSetKey, TopicIn, TopicSubs
 
 /// Size below which a message to be kept is copied out of the receive buffer that it shares with others.
 const BIG: usize = 64 * 1024;
+
+/// Bounds of the messages of one transient-local publisher that are kept for later local subscriptions.
+const LATCHED: RingBounds = RingBounds { messages: 256, bytes: 1 << 20 };
 
 /// Maximum number, and size in bytes, of messages held until their node is known. Beyond that they are delivered
 /// without it.
@@ -47,7 +53,11 @@ impl KnownWriter {
     fn new(writer: &EndpointData, wish: Quality, seen: &DiscoverySnapshot) -> Self {
         Self {
             peer: seen.peer(writer.guid),
-            offer: Offer { wire_type: Arc::new(seen::wire_type(writer)), latching: quality::is_latching(writer) },
+            offer: Offer {
+                wire_type: Arc::new(seen::wire_type(writer)),
+                latching: quality::is_latching(writer),
+                kept: None,
+            },
             quality: wish.at_most(&writer.qos),
             type_name: writer.type_name.clone(),
             named: seen.is_named(writer.guid),
@@ -103,12 +113,23 @@ impl TopicIn {
         locals.next += 1;
         let id = locals.next;
         let local = TopicSubscriber { id, sender, wanted };
-        for message in locals.latched.values() {
-            local.send(message.clone());
+        for messages in locals.latched.values() {
+            // As many as the writer itself would give.
+            let given = messages.back().map_or(1, |last| self.kept_by(&last.publisher));
+            for message in messages.iter().skip(messages.len().saturating_sub(given)) {
+                local.send(message.clone());
+            }
         }
         locals.list.push(local);
         self.changed.notify_one();
         id
+    }
+
+    /// Returns the number of messages that a publisher keeps for late subscribers.
+    fn kept_by(&self, publisher: &PeerId) -> usize {
+        let matched = self.matched.borrow();
+        let peer = matched.peers.iter().find(|peer| peer.id == *publisher);
+        peer.and_then(|peer| peer.offer.as_ref()?.kept).unwrap_or(1).max(1)
     }
 
     /// Checks that a publisher of this type matches a local subscription; otherwise returns a requested type.
@@ -207,7 +228,9 @@ impl TopicIn {
             if kept.bytes.len() < BIG {
                 kept.bytes = Bytes::copy_from_slice(&kept.bytes);
             }
-            locals.latched.insert(writer, kept);
+            let messages = locals.latched.entry(writer).or_insert_with(|| Ring::new(LATCHED));
+            // The oldest are displaced.
+            let _ = messages.push(kept);
         }
         if let Some((last, others)) = locals.list.split_last() {
             for local in others {

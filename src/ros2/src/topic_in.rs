@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use ros_bus::ring::Ring;
 use ros_bus::{MatchedPeers, MessageSender, Offer, PeerId, SerializedMessage, WireType};
 use rtps::{DiscoveredGraph, Guid};
 use tokio::sync::{Notify, watch};
@@ -43,8 +44,8 @@ pub(super) struct TopicIn {
 pub(super) struct TopicSubscribers {
     pub(super) next: u64,
     pub(super) list: Vec<TopicSubscriber>,
-    /// Last message of each transient-local writer, for later local subscriptions.
-    pub(super) latched: HashMap<Guid, SerializedMessage>,
+    /// Last messages of each transient-local writer, for later local subscriptions.
+    pub(super) latched: HashMap<Guid, Ring<SerializedMessage>>,
     /// Messages of writers whose node is not known yet, in order: it will be known in a moment, and a message names its
     /// publisher.
     pub(super) held: Vec<HeldMessage>,

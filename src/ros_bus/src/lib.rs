@@ -95,6 +95,11 @@ pub trait Publisher: Send + Sync {
     fn publish(&self, bytes: Bytes);
     /// Returns the matched subscribers, updated as they change.
     fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers>;
+    /// Sets how many of its last messages a transient-local publisher gives to late subscribers, at most its depth;
+    /// without this, as many as its depth. In ROS 1 it is always the last one.
+    fn set_kept(&self, messages: usize) {
+        let _ = messages;
+    }
     /// Returns the number of messages dropped so far because a subscriber of this topic was too slow, summed over
     /// subscribers.
     fn dropped_count(&self) -> u64 {

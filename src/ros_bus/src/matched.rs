@@ -84,6 +84,9 @@ pub struct Offer {
     pub wire_type: Arc<WireType>,
     /// True if the publisher keeps its last message for late subscribers, or the subscriber requests that message.
     pub latching: bool,
+    /// Number of messages that a transient-local publisher keeps for late subscribers now, up to a limit, as its
+    /// heartbeats say (RTPS 2.5, section 8.3.8.6); `None` if unknown, and for subscribers. Its depth is not announced.
+    pub kept: Option<usize>,
 }
 
 /// A publisher as seen by a subscription, or vice versa.

@@ -15,6 +15,7 @@
 //!
 //! Source: OMG DDSI-RTPS 2.5 (formal/22-04-01), whose sections are cited where they are implemented.
 
+mod count_filter;
 mod discovery;
 mod driver;
 mod engine;

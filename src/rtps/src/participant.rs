@@ -430,6 +430,12 @@ impl DataWriter {
         self.end.running.shared.with_engine(|now, engine| engine.write(now, entity, payload, related))
     }
 
+    /// Sets how many of its last samples a transient-local writer gives to new readers, at most its depth. Without this
+    /// they are given all that it keeps for slow readers.
+    pub fn set_kept(&self, samples: usize) {
+        self.end.running.shared.with_engine(|_, engine| engine.set_kept(self.end.guid.entity, samples));
+    }
+
     /// Returns the number of samples dropped before all reliable readers had acknowledged them.
     pub fn dropped_samples(&self) -> u64 {
         self.end.running.shared.read_engine(|engine| engine.dropped_samples(self.end.guid.entity))

@@ -6,6 +6,7 @@
 //!   HEARTBEAT ─────────────┴─▶ ACKNACK, NACK_FRAG
 //! ```
 
+mod proxy;
 #[cfg(test)]
 mod tests;
 
@@ -16,24 +17,22 @@ use std::time::{Duration, Instant};
 
 use budget::Budget;
 
+use crate::count_filter::CountFilter;
 use crate::discovery::EndpointData;
 use crate::fragments::{Assembly, Progress};
 use crate::qos::{DurabilityKind, ReliabilityKind};
-use crate::sequence::{FragmentNumber, SPAN, SequenceNumber, SequenceSet};
+use crate::sequence::{SPAN, SequenceNumber};
 use crate::shared::ReceivedSample;
 use crate::time::WireTime;
 use crate::wire::{DataFrag, NackFrag};
-use crate::writer::CountFilter;
-use crate::{EntityId, Guid, GuidPrefix, VendorId, wire};
+use crate::{Guid, GuidPrefix, VendorId, wire};
+use proxy::WriterProxy;
 
-/// First and longest interval between requests to a writer that has not announced its samples; each interval is twice
-/// as long as the one before.
+/// First interval between requests to a writer that has not announced its samples; each one is twice as long as the one
+/// before.
 const FIRST_ASK: Duration = Duration::from_millis(10);
-const SELDOM_ASK: Duration = Duration::from_secs(2);
 /// Time a volatile reader waits for a writer's first heartbeat before it delivers what has arrived.
 const NO_HEARTBEAT: Duration = Duration::from_millis(200);
-/// Interval between resend requests for the same sample.
-const ASK_AGAIN: Duration = Duration::from_millis(20);
 /// Time after a fragment during which missing fragments are not requested, because they are probably in flight.
 const UNDER_WAY: Duration = Duration::from_millis(5);
 /// Delay of an acknowledgement.
@@ -42,8 +41,6 @@ const ACKNOWLEDGE: Duration = Duration::from_millis(5);
 const MOST_ASSEMBLIES: usize = 8;
 /// Maximum number of samples waiting for an earlier one.
 const MOST_WAITING: usize = SPAN as usize;
-/// Overhead of a kept sample in bytes, which matters for many small ones.
-const KEEPING: usize = 256;
 
 /// Limits of all readers of a participant.
 #[derive(Debug, Clone)]
@@ -60,33 +57,6 @@ pub(crate) struct AckResponse {
     pub prefix: GuidPrefix,
     pub acknack: wire::AckNack,
     pub nack_frags: Vec<NackFrag>,
-}
-
-/// Receive state for one writer.
-#[derive(Debug)]
-struct WriterProxy {
-    data: Arc<EndpointData>,
-    address: SocketAddr,
-    vendor: VendorId,
-    /// Both sides are reliable, so missing samples are requested.
-    reliable: bool,
-    /// Number of the next sample to deliver.
-    next: SequenceNumber,
-    /// `next` is known: a reliable writer announces it with its first heartbeat.
-    begun: bool,
-    matched: Instant,
-    /// Entries after `next`: a sample, or `None` for a number that has none, which takes almost no memory.
-    waiting: BTreeMap<SequenceNumber, Option<Box<ReceivedSample>>>,
-    assemblies: BTreeMap<SequenceNumber, Assembly>,
-    /// Highest number announced by the writer.
-    last: SequenceNumber,
-    heartbeats: CountFilter,
-    acknacks: u32,
-    nack_frags: u32,
-    answer_at: Option<Instant>,
-    pause: Duration,
-    /// The writer has sent something to this reader or to all, so it knows this reader as far as can be told.
-    heard: bool,
 }
 
 /// State of one reader.
@@ -122,6 +92,7 @@ impl ReaderState {
             waiting: BTreeMap::new(),
             assemblies: BTreeMap::new(),
             last: SequenceNumber(0),
+            kept: None,
             heartbeats: CountFilter::default(),
             // A rediscovered writer may not know that it was gone, so counts continue.
             acknacks: self.counted,
@@ -149,6 +120,11 @@ impl ReaderState {
     /// Returns the matched writers in the order of discovery, each with whether it has confirmed the match.
     pub fn writers(&self) -> impl Iterator<Item = (&Arc<EndpointData>, bool)> {
         self.proxies.iter().map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
+    }
+
+    /// Returns the number of samples that each transient-local writer keeps for late readers, where it is known.
+    pub fn kept_samples(&self) -> impl Iterator<Item = (Guid, usize)> {
+        self.proxies.iter().filter_map(|proxy| Some((proxy.data.guid, proxy.kept?)))
     }
 
     fn wants_history(&self) -> bool {
@@ -269,7 +245,8 @@ impl ReaderState {
         heard
     }
 
-    /// Handles a heartbeat. Returns whether it shows for the first time that the writer knows this reader.
+    /// Handles a heartbeat. Returns whether it shows for the first time that the writer knows this reader, or that it
+    /// keeps another number of samples.
     pub fn on_heartbeat(
         &mut self,
         now: Instant,
@@ -277,6 +254,7 @@ impl ReaderState {
         beat: &wire::Heartbeat,
         out: &mut Vec<ReceivedSample>,
     ) -> bool {
+        let wants_history = self.wants_history();
         let Some(proxy) = self.proxies.iter_mut().find(|proxy| proxy.data.guid == writer) else {
             return false;
         };
@@ -298,7 +276,8 @@ impl ReaderState {
             // One response for all heartbeats of this interval.
             proxy.answer_at = Some(proxy.answer_at.unwrap_or(now + ACKNOWLEDGE));
         }
-        !std::mem::replace(&mut proxy.heard, true)
+        let keeps_other = wants_history && proxy.note_kept(beat);
+        !std::mem::replace(&mut proxy.heard, true) || keeps_other
     }
 
     /// Handles the announcement of the fragments available of a sample.
@@ -363,155 +342,5 @@ impl ReaderState {
             again = wake.into_iter().flatten().chain(again).min();
         }
         again
-    }
-}
-
-impl WriterProxy {
-    /// Sets the first number that the writer has.
-    fn start_at(&mut self, first: SequenceNumber, out: &mut Vec<ReceivedSample>) {
-        if !self.begun {
-            self.begun = true;
-            self.next = self.next.max(first);
-            self.deliver_ready(out);
-        }
-    }
-
-    /// Schedules a request for a missing number, unless it arrives before.
-    fn schedule_request(&mut self, now: Instant, number: SequenceNumber) {
-        self.last = self.last.max(number);
-        self.answer_at = Some(self.answer_at.unwrap_or(now + ASK_AGAIN));
-    }
-
-    /// Charges a sample to the budget if it must wait for others; `None` if it does not fit. Otherwise a writer that
-    /// never announces its first number, or leaves a gap, could make us keep any amount.
-    fn charge_sample(&self, sample: ReceivedSample, budget: &Budget) -> Option<ReceivedSample> {
-        let passes = !self.reliable || self.begun && sample.number <= self.next;
-        if passes || !self.can_queue(sample.number) {
-            return Some(sample);
-        }
-        let permit = budget.take(sample.payload.len() + KEEPING).ok()?;
-        // A slice of a datagram would keep all of it.
-        let payload = permit.wrap_bytes(sample.payload.to_vec());
-        Some(ReceivedSample { payload, ..sample })
-    }
-
-    /// Returns whether a sample with this number would be queued if it must wait.
-    fn can_queue(&self, number: SequenceNumber) -> bool {
-        let far = self.begun && number.0 - self.next.0 >= MOST_WAITING as i64;
-        let full = self.waiting.len() >= MOST_WAITING && number != self.next;
-        number >= self.next && !far && !full && !self.waiting.contains_key(&number)
-    }
-
-    /// Accepts a sample that is charged to the budget or need not wait.
-    fn accept(&mut self, sample: ReceivedSample, out: &mut Vec<ReceivedSample>) {
-        let number = sample.number;
-        if number < self.next {
-            return;
-        }
-        if !self.reliable {
-            self.assemblies = self.assemblies.split_off(&number.next());
-            self.next = number.next();
-            out.push(sample);
-            return;
-        }
-        self.last = self.last.max(number);
-        if self.begun && number == self.next {
-            self.next = number.next();
-            out.push(sample);
-            self.deliver_ready(out);
-        } else if self.can_queue(number) {
-            self.waiting.insert(number, Some(Box::new(sample)));
-        }
-    }
-
-    /// Skips a sample that is never accepted, however often it is sent.
-    fn skip(&mut self, number: SequenceNumber, out: &mut Vec<ReceivedSample>) {
-        if self.reliable {
-            self.mark_absent(number);
-            self.deliver_ready(out);
-        }
-    }
-
-    fn mark_absent(&mut self, number: SequenceNumber) {
-        let near = number >= self.next && number.0 - self.next.0 < MOST_WAITING as i64;
-        if near {
-            self.assemblies.remove(&number);
-            self.waiting.entry(number).or_insert(None);
-        }
-    }
-
-    /// Skips all numbers before this one, which will not arrive.
-    fn skip_to(&mut self, first: SequenceNumber, out: &mut Vec<ReceivedSample>) {
-        if first <= self.next {
-            return;
-        }
-        let later = self.waiting.split_off(&first);
-        // Earlier samples that have arrived are delivered in order.
-        out.extend(std::mem::replace(&mut self.waiting, later).into_values().flatten().map(|sample| *sample));
-        self.assemblies = self.assemblies.split_off(&first);
-        self.next = first;
-        self.deliver_ready(out);
-    }
-
-    fn deliver_ready(&mut self, out: &mut Vec<ReceivedSample>) {
-        if !self.begun {
-            return;
-        }
-        while let Some(entry) = self.waiting.first_entry().filter(|entry| *entry.key() <= self.next) {
-            let (number, sample) = entry.remove_entry();
-            self.next = self.next.max(number.next());
-            out.extend(sample.map(|sample| *sample));
-        }
-    }
-
-    /// Creates the response to the writer: what has arrived and what is missing.
-    fn build_response(&mut self, now: Instant, reader: EntityId) -> AckResponse {
-        let writer = self.data.guid.entity;
-        self.answer_at = None;
-        if !self.begun {
-            // Acknowledges and requests nothing: the writer answers with a heartbeat (8.3.7.1.5). Fast DDS expects a
-            // base of 0 for that, others a base of 1.
-            self.answer_at = Some(now + self.pause);
-            self.pause = (self.pause * 2).min(SELDOM_ASK);
-            let set = SequenceSet::empty(SequenceNumber(i64::from(self.vendor != VendorId::FAST_DDS)));
-            return self.build_acknack(reader, set, false, Vec::new());
-        }
-        let mut set = SequenceSet::empty(self.next);
-        let until = self.last.0.min(self.next.0.saturating_add(i64::from(SPAN) - 1));
-        let mut nack_frags = Vec::new();
-        for number in (self.next.0..=until).map(SequenceNumber) {
-            if self.waiting.contains_key(&number) {
-                continue;
-            }
-            let Some(assembly) = self.assemblies.get(&number) else {
-                set.insert(number);
-                continue;
-            };
-            if now.saturating_duration_since(assembly.heard) < UNDER_WAY {
-                continue;
-            }
-            let missing = assembly.missing_fragments(FragmentNumber::MAX);
-            self.nack_frags = self.nack_frags.wrapping_add(1);
-            nack_frags.push(NackFrag { reader, writer, number, set: missing, count: self.nack_frags });
-        }
-        if self.last >= self.next {
-            self.answer_at = Some(now + ASK_AGAIN.max(self.pause));
-            self.pause = (self.pause * 2).min(SELDOM_ASK);
-        }
-        let is_final = set.is_empty();
-        self.build_acknack(reader, set, is_final, nack_frags)
-    }
-
-    fn build_acknack(
-        &mut self,
-        reader: EntityId,
-        set: SequenceSet,
-        is_final: bool,
-        nack_frags: Vec<NackFrag>,
-    ) -> AckResponse {
-        self.acknacks = self.acknacks.wrapping_add(1);
-        let Guid { prefix, entity: writer } = self.data.guid;
-        let acknack = wire::AckNack { reader, writer, set, count: self.acknacks, is_final };
-        AckResponse { to: self.address, prefix, acknack, nack_frags }
     }
 }

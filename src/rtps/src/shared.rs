@@ -52,6 +52,16 @@ pub struct EndpointMatches {
     pub confirmed: Vec<Guid>,
     /// Endpoints with incompatible QoS, with the mismatches.
     pub refused: Vec<(Arc<EndpointData>, Vec<Mismatch>)>,
+    /// Of a transient-local reader: how many samples each matched writer keeps for late readers.
+    pub(crate) kept: Vec<(Guid, usize)>,
+}
+
+impl EndpointMatches {
+    /// Returns the number of samples that a writer keeps for late readers now, up to a limit of some hundreds; `None`
+    /// if it has not said so yet, or reader or writer is not transient-local.
+    pub fn kept_samples(&self, writer: Guid) -> Option<usize> {
+        self.kept.iter().find(|(kept_by, _)| *kept_by == writer).map(|(_, samples)| *samples)
+    }
 }
 
 /// A received sample.

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 
+use crate::count_filter::CountFilter;
 use crate::discovery::EndpointData;
 use crate::fragments::{self, FRAGMENT};
 use crate::qos::{DurabilityKind, HistoryKind, ReliabilityKind};
@@ -26,6 +27,10 @@ const FIRST_HEARTBEAT: Duration = Duration::from_millis(10);
 /// Maximum size of the history in bytes. Beyond it the oldest samples are dropped regardless of the depth, except the
 /// newest one and those that were started.
 const MOST_BYTES: usize = 64 << 20;
+
+/// Size of the history in bytes up to which samples that new readers are not given stay: the number that they are given
+/// may grow.
+const LITTLE: usize = 1 << 20;
 
 /// Unacknowledged bytes of fragmented samples beyond which no further one is started for a reader: it is repaired
 /// first, and samples replaced meanwhile were never started.
@@ -104,6 +109,8 @@ pub(crate) struct WriterState {
     /// Samples of which fragments were sent to reliable readers.
     begun: BTreeSet<SequenceNumber>,
     bytes: usize,
+    /// Number of samples that new readers are given, of those in the history; `None`: all.
+    kept: Option<usize>,
     last: SequenceNumber,
     proxies: Vec<ReaderProxy>,
     heartbeats: u32,
@@ -118,6 +125,7 @@ impl WriterState {
             history: BTreeMap::new(),
             begun: BTreeSet::new(),
             bytes: 0,
+            kept: None,
             last: SequenceNumber(0),
             proxies: Vec::new(),
             heartbeats: 0,
@@ -217,13 +225,37 @@ impl WriterState {
         bytes.map(|change| change.payload.len()).sum::<usize>() >= WINDOW
     }
 
-    /// Drops samples beyond the depth and the memory limit.
+    /// Sets how many samples a new reader is given, at most the depth. Earlier ones stay in the history until the
+    /// readers that are matched have received them, or longer if they are small.
+    pub fn set_kept(&mut self, samples: usize) {
+        self.kept = Some(samples.max(1));
+        self.trim();
+    }
+
+    /// Returns the number up to which samples are not given to new readers.
+    fn last_not_given(&self) -> SequenceNumber {
+        let last = self.kept.and_then(|kept| self.history.keys().rev().nth(kept));
+        last.copied().unwrap_or(SequenceNumber(0))
+    }
+
+    /// Drops samples beyond the depth and the memory limit, and those that neither new readers are given nor others
+    /// still have to receive. Best-effort readers do not say what they have received.
     fn trim(&mut self) {
         while self.history.len() > self.depth().max(1) || self.bytes > MOST_BYTES {
             let Some(number) = self.oldest_droppable() else {
                 break;
             };
             self.drop_sample(number);
+        }
+        if self.proxies.iter().any(|proxy| !proxy.reliable) {
+            return;
+        }
+        while self.bytes > LITTLE && self.kept.is_some_and(|kept| self.history.len() > kept) {
+            let first = self.first();
+            if self.proxies.iter().any(|proxy| proxy.is_missing(first)) {
+                return;
+            }
+            self.forget(first);
         }
     }
 
@@ -269,7 +301,7 @@ impl WriterState {
         self.remove_reader(guid);
         let reliable = self.is_reliable() && data.qos.reliability == ReliabilityKind::Reliable;
         let all = self.keeps_history() && data.qos.durability >= DurabilityKind::TransientLocal;
-        let irrelevant = if all { SequenceNumber(0) } else { self.last };
+        let irrelevant = if all { self.last_not_given() } else { self.last };
         self.proxies.push(ReaderProxy {
             data,
             address,
@@ -283,7 +315,7 @@ impl WriterState {
             nack_frags: CountFilter::default(),
         });
         if all {
-            for (number, change) in &self.history {
+            for (number, change) in self.history.range(irrelevant.next()..) {
                 let item = new_item(&self.own, guid.entity, guid.prefix, *number, change.payload.len());
                 wanted.items.push((address, item));
             }
@@ -463,32 +495,4 @@ fn new_item(
 ) -> SendItem {
     let last = if length > FRAGMENT { fragments::fragment_count(length) } else { 0 };
     SendItem { writer: own.guid.entity, reader, prefix, number, next: last.min(1), last }
-}
-
-/// Filters out duplicate and late submessages by their counts (8.3.8.1, 8.3.8.6).
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct CountFilter {
-    last: Option<(u32, Instant)>,
-}
-
-/// Time after which any count is accepted: a participant that has heard nothing of us for its lease duration discovers
-/// us anew and restarts its counts.
-const TOO_LATE: Duration = Duration::from_secs(3);
-
-impl CountFilter {
-    /// Returns whether a submessage with this count is to be processed, and if so records the count.
-    pub fn accept(&mut self, now: Instant, count: u32) -> bool {
-        let heeded = self
-            .last
-            .is_none_or(|(before, at)| is_newer(count, before) || now.saturating_duration_since(at) > TOO_LATE);
-        if heeded {
-            self.last = Some((count, now));
-        }
-        heeded
-    }
-}
-
-/// Returns whether a count is newer than another one, with wrap-around.
-fn is_newer(count: u32, before: u32) -> bool {
-    count.wrapping_sub(before).wrapping_sub(1) < u32::MAX / 2
 }

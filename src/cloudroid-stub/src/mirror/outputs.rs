@@ -49,6 +49,14 @@ impl Outputs {
         topic.on_message(Responder::Cloud, data.message, data.latching, heard);
     }
 
+    /// Sets how many messages of an output its node gives to late subscribers.
+    pub fn set_kept(&self, channel: u32, messages: usize) {
+        let topic = self.channels.lock().get(&channel).cloned();
+        if let Some(topic) = topic {
+            topic.set_kept(messages);
+        }
+    }
+
     /// Publishes a message of the local original; `heard` is set if it speaks for the node.
     pub fn publish_local(&self, topic: &str, message: SerializedMessage, heard: bool) {
         let topic = self.topics.lock().get(topic).cloned();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, MatchedPeers, PeerId, QosProfile, Subscription, WireType, wait_for_connected};
+use ros::bus::{Bus, Graph, MatchedPeers, PeerId, QosProfile, RosVersion, Subscription, WireType, wait_for_connected};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::Instrument;
@@ -16,6 +16,7 @@ use super::retry::Retry;
 use super::state::{HoldGuard, Hub, NodeLink};
 use link::DeliveryMode;
 use link::clock::now;
+use link::control::FromCloud;
 use link::drops::Cause;
 use link::record::{Data, InputTiming};
 use link::skew::Direction;
@@ -25,6 +26,8 @@ use ros::codec::Stamps;
 const QUEUE: usize = 256;
 /// Maximum number of publishers of a topic that are remembered.
 const REMEMBERED: usize = 256;
+/// Time for a publisher to say how many messages it keeps, once the first of them has arrived.
+const KEPT: std::time::Duration = std::time::Duration::from_millis(100);
 /// First and longest interval at which it is checked whether a node sends a topic to us.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
 const LONGEST_LOOK: std::time::Duration = std::time::Duration::from_millis(50);
@@ -151,6 +154,7 @@ impl Outputs {
             met.mark_changed();
             let read = async {
                 let mut own = OwnPublishers::default();
+                let mut kept = None;
                 loop {
                     let message = tokio::select! {
                         biased;
@@ -158,10 +162,19 @@ impl Outputs {
                             let Some(hub) = hub.upgrade() else { break };
                             let present = met.borrow_and_update().clone();
                             own.add_present(&present, |node| hub.is_of_link(&reader, node));
+                            reader.send_kept(channel, own.kept_messages(&present), &mut kept);
                             continue;
                         }
                         message = subscription.messages.recv() => message,
                     };
+                    let is_first = kept.is_none() && message.as_ref().is_some_and(|message| message.latching);
+                    if latching && is_first && bus.version() == RosVersion::Two {
+                        // The robot keeps as many as the node, from the first message on.
+                        let _ = tokio::time::timeout(KEPT, met.wait_for(say_what_they_keep)).await;
+                        met.mark_changed();
+                        let told = own.kept_messages(&met.borrow()).or(Some(1));
+                        reader.send_kept(channel, told, &mut kept);
+                    }
                     let (Some(message), Some(hub)) = (message, hub.upgrade()) else {
                         break;
                     };
@@ -202,6 +215,12 @@ async fn subscribe(bus: &dyn Bus, topic: &str, latching: bool) -> Subscription {
     }
 }
 
+/// Returns whether all transient-local publishers have said how many messages they keep, as far as their bus knows.
+fn say_what_they_keep(present: &MatchedPeers) -> bool {
+    let offers = present.peers.iter().filter_map(|peer| peer.offer.as_ref());
+    offers.filter(|offer| offer.latching).all(|offer| offer.kept.is_some())
+}
+
 /// Publishers known to belong to the link's process. Messages of a publisher that is gone still belong to the process,
 /// although the graph no longer contains its node.
 #[derive(Default)]
@@ -221,6 +240,13 @@ impl OwnPublishers {
             self.0.insert(publisher.clone());
         }
         has
+    }
+
+    /// Returns the number of messages that the known publishers give to late subscribers, together; `None` if unknown.
+    fn kept_messages(&self, present: &MatchedPeers) -> Option<usize> {
+        let own = present.peers.iter().filter(|peer| self.0.contains(&peer.id));
+        let kept = own.filter_map(|peer| peer.offer.as_ref()?.kept);
+        kept.reduce(|all, kept| all + kept)
     }
 
     /// Adds the publishers that are connected now.
@@ -280,6 +306,16 @@ impl Hub {
 }
 
 impl NodeLink {
+    /// Tells the robot how many messages of an output late subscribers are given, if that is known and differs from
+    /// `sent`.
+    fn send_kept(&self, channel: u32, messages: Option<usize>, sent: &mut Option<usize>) {
+        if let Some(messages) = messages.filter(|messages| *sent != Some(*messages)) {
+            *sent = Some(messages);
+            self.session.send_control(&FromCloud::Kept { channel, messages });
+            self.session.order_after_control(channel);
+        }
+    }
+
     fn send_output(&self, channel: u32, message: Bytes, latching: bool, quality: DeliveryMode) {
         let born = now();
         let data = Data {

@@ -64,7 +64,7 @@ async fn the_robot_is_told_all_that_a_node_has_with_its_quality_of_service() {
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
     let (robot, graph) = connect_robot(&bus, PEER, |graph| {
-        graph.inputs.len() >= 3 && graph.outputs.len() >= 5 && graph.services.len() >= 8
+        graph.inputs.len() >= 3 && graph.outputs.len() >= 6 && graph.services.len() >= 8
     })
     .await;
     let quality = |topic: &str| {
@@ -149,6 +149,25 @@ async fn messages_calls_and_parameters_go_through_a_link() {
     let answer: Value = serde_json::from_str(&json(&get.response, &answer.await.unwrap())).unwrap();
     assert_eq!(answer["values"][0]["type"], 1, "{answer}");
     assert_eq!(answer["values"][0]["bool_value"], false, "{answer}");
+}
+
+#[tokio::test]
+async fn the_robot_is_told_how_many_messages_a_node_keeps_before_it_gets_them() {
+    let lab = Lab::new();
+    let _peer = lab.peer().await;
+    let bus = lab.join(NODE).await;
+    let both = |graph: &Graph| find_output(graph, "/plan").is_some() && find_output(graph, "/map").is_some();
+    let (mut robot, graph) = connect_robot(&bus, PEER, both).await;
+    for (topic, kept) in [("/plan", &["2", "3", "4"][..]), ("/map", &["kept"])] {
+        let output = find_output(&graph, topic).unwrap();
+        assert_eq!(robot.kept(output), None, "{topic}: nobody listens");
+        robot.listen(output);
+        for expected in kept {
+            let (channel, message) = robot.next_message().await;
+            assert_eq!((channel, &*text(&message)), (output.channel, *expected));
+            assert_eq!(robot.kept(output), Some(kept.len()), "{topic}");
+        }
+    }
 }
 
 const GOAL_ID: &str = r#"{"uuid":[1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16]}"#;

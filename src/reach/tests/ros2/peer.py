@@ -28,6 +28,10 @@ class Peer(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.map = self.create_publisher(String, '/map', latched)
         self.map.publish(String(data='kept'))
+        history = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.plan = self.create_publisher(String, '/plan', history)
+        for step in range(5):
+            self.plan.publish(String(data=str(step)))
         self.create_subscription(String, '/late', lambda message: say(['late', message.data]), latched)
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.scan = self.create_publisher(String, '/scan', best_effort)

@@ -125,6 +125,8 @@ pub enum CloudRequest {
 struct CloudRequestForwarder {
     graph: watch::Sender<Graph>,
     types: Mutex<HashMap<(String, String), String>>,
+    /// By channel: the number of messages that late subscribers are given.
+    kept: watch::Sender<HashMap<u32, usize>>,
     heard: mpsc::UnboundedSender<(u32, Bytes)>,
     answers: mpsc::UnboundedSender<(u32, Result<Bytes, FailureReason>)>,
     asked: mpsc::UnboundedSender<CloudRequest>,
@@ -142,6 +144,11 @@ impl SessionHandler<FromCloud> for CloudRequestForwarder {
             Record::Control(FromCloud::Graph(graph)) => drop(self.graph.send_replace(graph)),
             Record::Control(FromCloud::Type { name, md5, definition }) => {
                 drop(self.types.lock().insert((name, md5), definition))
+            }
+            Record::Control(FromCloud::Kept { channel, messages }) => {
+                self.kept.send_modify(|kept| {
+                    kept.insert(channel, messages);
+                });
             }
             Record::Control(_) => {}
         }
@@ -177,6 +184,7 @@ impl LinkedRobot {
         let ear = Arc::new(CloudRequestForwarder {
             graph: watch::Sender::default(),
             types: Mutex::default(),
+            kept: watch::Sender::default(),
             heard,
             answers,
             asked: asks,
@@ -200,6 +208,11 @@ impl LinkedRobot {
     pub fn definition(&self, name: &str, md5: &str) -> Option<String> {
         let types = self.ear.types.lock();
         types.get(&(name.to_owned(), md5.to_owned())).cloned()
+    }
+
+    /// Returns the number of messages of an output that late subscribers are given, if the cloud has told it.
+    pub fn kept(&self, output: &OutputChannel) -> Option<usize> {
+        self.ear.kept.borrow().get(&output.channel).copied()
     }
 
     /// Subscribes to an output on behalf of a node of the robot.

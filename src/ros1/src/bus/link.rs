@@ -128,7 +128,7 @@ async fn connect_and_read(
     let connection = connect(bus, &topic.name, &link.uri, &wanted).await?;
     let PublisherConnection { mut stream, mut frames, publisher, latching, wire_type } = connection;
     let wire_type = Arc::new(wire_type);
-    *link.offer.lock() = Some(Offer { wire_type: wire_type.clone(), latching });
+    *link.offer.lock() = Some(Offer { wire_type: wire_type.clone(), latching, kept: None });
     topic.on_connected(link, &publisher);
     loop {
         let next = frames.next(&mut stream).await;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::future::select_all;
-use ros_bus::{BusError, IncompatiblePeer, MatchedPeers, PeerId, TopicPeer};
+use ros_bus::{BusError, IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer};
 use rtps::{EndpointData, EndpointMatches, EndpointQos, Guid, TopicDescription};
 use tokio::sync::watch;
 
@@ -199,7 +199,7 @@ impl Readers {
                 now.peers.push(TopicPeer {
                     id: peer,
                     connected: ends.confirmed.contains(writer),
-                    offer: Some(source.offer.clone()),
+                    offer: Some(Offer { kept: ends.kept_samples(*writer), ..source.offer.clone() }),
                 });
             } else if let Some((it, why)) = ends.refused.iter().find(|(it, _)| it.guid == *writer) {
                 let why = quality::mismatch_text(why, &it.qos, qos);

@@ -113,6 +113,31 @@ async fn what_was_published_last_is_heard_by_those_who_come_later() {
 }
 
 #[tokio::test]
+async fn those_who_come_later_hear_as_many_as_the_publisher_keeps() {
+    let (one, two) = (join(56, "/one").await, join(56, "/two").await);
+    let qos = QosProfile { depth: 3, ..latching() };
+    let publisher = one.advertise("/plan", string(), qos).await.unwrap();
+    (1..=5).for_each(|number| publisher.publish(numbered_message(number)));
+    let mut first = two.subscribe("/plan", string(), latching()).await.unwrap();
+    assert_eq!(numbers(&mut first, 3).await, [3, 4, 5]);
+    let kept = |matched: &ros_bus::MatchedPeers| {
+        let offer = matched.peers.first().and_then(|peer| peer.offer.as_ref());
+        offer.is_some_and(|offer| offer.kept == Some(3))
+    };
+    wait_for_matched(first.matched.clone(), kept).await;
+    publisher.publish(numbered_message(6));
+    assert_eq!(numbers(&mut first, 1).await, [6]);
+    // It shares the reader of the first.
+    let mut second = two.subscribe("/plan", string(), latching()).await.unwrap();
+    assert_eq!(numbers(&mut second, 3).await, [4, 5, 6]);
+    // A publisher may give fewer than it keeps for slow subscribers.
+    publisher.set_kept(1);
+    let three = join(56, "/three").await;
+    let mut third = three.subscribe("/plan", string(), latching()).await.unwrap();
+    assert_eq!(numbers(&mut third, 1).await, [6]);
+}
+
+#[tokio::test]
 async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     let (one, two) = (join(43, "/one").await, join(43, "/two").await);
     let mut subscription = two.subscribe("/scan", string(), latching()).await.unwrap();

@@ -138,6 +138,13 @@ impl Engine {
         number
     }
 
+    /// Sets how many samples of a transient-local writer are given to new readers.
+    pub fn set_kept(&mut self, entity: EntityId, samples: usize) {
+        if let Some(writer) = self.writers.get_mut(&entity) {
+            writer.state.set_kept(samples);
+        }
+    }
+
     /// Returns the number of samples of a writer that were dropped before all reliable readers had acknowledged them.
     pub fn dropped_samples(&self, entity: EntityId) -> u64 {
         self.writers.get(&entity).map_or(0, |writer| writer.state.dropped)

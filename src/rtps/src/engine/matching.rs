@@ -139,7 +139,9 @@ impl Engine {
             } else if let Some(reader) = self.readers.get(&entity) {
                 let refused = |end: &Arc<EndpointData>| end.qos.mismatches(&reader.state.own.qos);
                 let theirs = self.discovered.writers.values().filter(|end| is_same_topic(&reader.state.own, end));
-                reader.ends.send_replace(Arc::new(collect_matches(reader.state.writers(), theirs, refused)));
+                let mut ends = collect_matches(reader.state.writers(), theirs, refused);
+                ends.kept = reader.state.kept_samples().collect();
+                reader.ends.send_replace(Arc::new(ends));
             }
         }
         if std::mem::take(&mut self.discovered_changed) {

@@ -3,9 +3,11 @@
 use budget::Budget;
 use bytes::Bytes;
 
+use super::proxy::{ASK_AGAIN, KEEPING};
 use super::*;
+use crate::EntityId;
 use crate::qos::{EndpointQos, HistoryKind};
-use crate::sequence::SequenceSet;
+use crate::sequence::{FragmentNumber, SequenceSet};
 
 const UNFINISHED: Duration = Duration::from_secs(30);
 

@@ -21,8 +21,8 @@ use tokio::task::AbortHandle;
 
 /// Queue length for a slow subscriber, in messages.
 const QUEUE: usize = 256;
-/// Log topic of a ROS 2 node, which keeps its messages for late subscribers. Other outputs keep one message for them:
-/// the depth is not transmitted, and a latched message is usually a state.
+/// Log topic of a ROS 2 node, which keeps as many messages for late subscribers as its queue holds. Other outputs keep
+/// as many as the node does, once the cloud has told; before that one, since a latched message is usually a state.
 const LOG: &str = "/rosout";
 
 /// An advertised output.
@@ -37,6 +37,8 @@ pub(super) struct OutputTopic {
     qos: QosProfile,
     publisher: Mutex<Arc<dyn Publisher>>,
     latched: Mutex<LatchedOutput>,
+    /// Number of messages that late subscribers are given by a transient-local advertisement.
+    kept: AtomicUsize,
     /// Number of subscribers on the robot, without other nodes of the servant.
     pub(super) listeners: AtomicUsize,
     /// Notified when another advertisement must be made.
@@ -81,12 +83,11 @@ impl OutputTopic {
     /// Advertises an output with the quality of service that its node offers.
     pub(super) async fn advertise(bus: &dyn Bus, told: &OutputChannel, of: WireType) -> Result<Self, BusError> {
         let qos = match &told.qos {
-            Some(qos) if qos.transient_local && told.topic != LOG => QosProfile { depth: 1, ..qos.to_bus(1) },
             Some(qos) => qos.to_bus(QUEUE),
             None => QosProfile::keep_last(QUEUE),
         };
         let publisher = bus.advertise(&told.topic, of.clone(), qos).await?;
-        Ok(Self {
+        let topic = Self {
             name: told.topic.clone(),
             told: told.clone(),
             wire_type: Arc::new(of),
@@ -95,10 +96,25 @@ impl OutputTopic {
             qos,
             publisher: Mutex::new(publisher.into()),
             latched: Mutex::default(),
+            kept: AtomicUsize::new(1),
             listeners: AtomicUsize::new(0),
             news: Arc::default(),
             counting: Mutex::default(),
-        })
+        };
+        topic.apply_kept(&*topic.publisher());
+        Ok(topic)
+    }
+
+    /// Sets the number of messages that late subscribers are given, as the node does.
+    pub(super) fn set_kept(&self, messages: usize) {
+        self.kept.store(messages.clamp(1, QUEUE), Ordering::Relaxed);
+        self.apply_kept(&*self.publisher());
+    }
+
+    fn apply_kept(&self, publisher: &dyn Publisher) {
+        if self.qos.is_latching() && self.name != LOG {
+            publisher.set_kept(self.kept.load(Ordering::Relaxed));
+        }
     }
 
     /// Returns whether the reported output matches the advertised one.
@@ -217,6 +233,7 @@ impl OutputTopic {
         let (publisher, next) = match advertised {
             Ok(fresh) if replaces => {
                 let fresh: Arc<dyn Publisher> = fresh.into();
+                self.apply_kept(&*fresh);
                 let before = std::mem::replace(&mut *self.publisher.lock(), Arc::clone(&fresh));
                 latched.dropped += before.dropped_count();
                 (fresh, LatchedAdvertisement::Plainly)

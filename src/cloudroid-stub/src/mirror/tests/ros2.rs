@@ -47,6 +47,38 @@ async fn ends_have_the_quality_of_service_of_the_node() {
 }
 
 #[tokio::test]
+async fn a_late_subscriber_is_given_as_many_messages_as_the_node_keeps() {
+    let scene = Scene::new(RosVersion::Two, "/node").await;
+    let string = string_type(RosVersion::Two);
+    let plans = scene.real.advertise("/plan", string, QosProfile::keep_last(3).latching(true)).await.unwrap();
+    for text in ["one", "two", "three", "four"] {
+        plans.publish(scene.bytes(text));
+    }
+    let _link = scene.connect().await;
+    let app = scene.robot.node("/app").await;
+    wait_for_graph(&app, "the output", |graph| is_published(graph, "/plan")).await;
+    // The first makes the cloud subscribe; the second is given what is kept on the robot.
+    let mut heard = subscribe(&app, "/plan").await;
+    let late = scene.robot.node("/late").await;
+    for expected in ["two", "three", "four"] {
+        assert_eq!(next_text(&mut heard).await, expected);
+    }
+    let mut heard_late = subscribe(&late, "/plan").await;
+    for expected in ["two", "three", "four"] {
+        assert_eq!(next_text(&mut heard_late).await, expected);
+    }
+    plans.publish(scene.bytes("five"));
+    for heard in [&mut heard, &mut heard_late] {
+        assert_eq!(next_text(heard).await, "five");
+    }
+    let later = scene.robot.node("/later").await;
+    let mut heard = subscribe(&later, "/plan").await;
+    for expected in ["three", "four", "five"] {
+        assert_eq!(next_text(&mut heard).await, expected);
+    }
+}
+
+#[tokio::test]
 async fn an_old_message_is_given_to_nobody_who_does_not_request_it() {
     let scene = Scene::new(RosVersion::Two, "/node").await;
     let string = || string_type(RosVersion::Two);

@@ -30,6 +30,52 @@ fn newcomers_are_given_what_is_kept_for_them_and_nothing_else() {
 }
 
 #[test]
+fn a_reader_knows_how_many_samples_are_kept_for_newcomers() {
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, transient_local_qos(3));
+    let (_, ends, _) = world.reader(1, transient_local_qos(10));
+    let (_, current, _) = world.reader(1, keep_last_qos(10));
+    for (mark, kept) in [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3)] {
+        world.write(writer, mark, 8);
+        world.advance(SECOND);
+        assert_eq!(ends.borrow().kept_samples(writer), Some(kept), "after {mark}");
+        assert_eq!(current.borrow().kept_samples(writer), None, "it wants none of them");
+    }
+}
+
+#[test]
+fn newcomers_are_given_less_than_slow_readers() {
+    let mut world = NetworkWorld::with_participants(3);
+    let (writer, _) = world.writer(0, transient_local_qos(100));
+    world.engines[0].set_kept(writer.entity, 2);
+    let (_, _, slow) = world.reader(1, transient_local_qos(100));
+    world.advance(SECOND);
+    // The reader of the second participant receives nothing for a while.
+    world.loses = Box::new(|_, bytes| bytes.starts_with(b"RTPS") && bytes[8..20] == [1; 12]);
+    (1..=5).for_each(|mark| world.write(writer, mark, 8));
+    world.carry();
+    world.loses = Box::new(|_, _| false);
+    let (_, _, late) = world.reader(2, transient_local_qos(100));
+    world.advance(SECOND);
+    assert_eq!(slow.marks(), [1, 2, 3, 4, 5]);
+    assert_eq!(late.marks(), [4, 5]);
+    // More are given when more are kept where they come from.
+    world.engines[0].set_kept(writer.entity, 3);
+    let (_, _, later) = world.reader(2, transient_local_qos(100));
+    world.advance(SECOND);
+    assert_eq!(later.marks(), [3, 4, 5]);
+    // Large ones that all readers have are dropped, except those that are given.
+    for mark in 6..=9 {
+        world.write(writer, mark, 500_000);
+        world.advance(SECOND);
+    }
+    let history = &world.engines[0].writers[&writer.entity].state;
+    let is_there = |number: i64| history.change(SequenceNumber(number)).is_some();
+    assert!(!is_there(6) && (7..=9).all(is_there));
+    assert_eq!(slow.marks(), [1, 2, 3, 4, 5, 6, 7, 8, 9]);
+}
+
+#[test]
 fn no_more_is_begun_to_a_reader_than_it_acknowledges() {
     let mut world = NetworkWorld::with_participants(2);
     let (writer, _) = world.writer(0, keep_last_qos(1));
