@@ -78,6 +78,7 @@ impl Builder {
     }
 
     async fn look_at(&self, request: &PushRequest, progress: &Progress) -> Result<InspectedPush, Error> {
+        // What was pushed may have hundreds of thousands of files: it is read on blocking threads.
         let asked = Arc::new(request.clone());
         let (bases, of) = (self.bases_dir().to_owned(), Arc::clone(&asked));
         let choose = move || choice::choose_base(&bases, of.base_name(), &of.source);
@@ -113,16 +114,21 @@ impl Builder {
             return Err(Error::NothingToCompile);
         }
         let inspected = InspectedPush { base, content, foundation };
-        let (base, label) = (&inspected.base, inspected.label(request));
-        let archive = self.archive(&label, base, progress).await?;
-        match &inspected.content {
-            PushContent::Tree(pushed) => {
-                let there = indexed::read_known(self.layers(), base, &archive);
-                check_dependencies((&archive, base), request, pushed, (there, &inspected.foundation))?;
+        let label = inspected.label(request);
+        let archive = self.archive(&label, &inspected.base, progress).await?;
+        let layers = self.layers().clone();
+        let check = move || {
+            let base = &inspected.base;
+            match &inspected.content {
+                PushContent::Tree(pushed) => {
+                    let there = indexed::read_known(&layers, base, &archive);
+                    check_dependencies((&archive, base), &asked, pushed, (there, &inspected.foundation))?;
+                }
+                PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, base, &asked.map)?),
             }
-            PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, base, &request.map)?),
-        }
-        Ok(inspected)
+            Ok::<_, Error>(inspected)
+        };
+        blocking::spawn(check).await?
     }
 }
 
@@ -200,6 +206,7 @@ fn find_source_problems(
 
 /// Reports unresolvable dependencies now and not after minutes of preparation. In install spaces many may be in the
 /// base itself; where `there`, its packages as the last build found them, is unknown, they are reported by the build.
+/// Blocking.
 fn check_dependencies(
     (archive, base): (&Archive, &Base),
     request: &PushRequest,
