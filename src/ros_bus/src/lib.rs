@@ -187,7 +187,7 @@ pub trait Bus: Send + Sync + 'static {
     /// without a subscription: in ROS 1 only the publisher itself announces it.
     async fn topic_offer(&self, topic: &str) -> Result<Offer, BusError> {
         let wire_type = Arc::new(self.topic_type(topic).await?);
-        Ok(Offer { wire_type, latching: false })
+        Ok(Offer { wire_type, latching: false, kept: None })
     }
     /// Serves a service until the returned guard is dropped.
     async fn serve(

@@ -232,10 +232,10 @@ impl Bus for TranslatedBus {
         if let Some((end, action)) = self.actions.find_topic(topic)? {
             return action.offer(end, topic);
         }
-        let Offer { wire_type, latching } = self.translation.inner.topic_offer(topic).await?;
+        let Offer { wire_type, latching, kept } = self.translation.inner.topic_offer(topic).await?;
         let twin = self.translation.twins.message(&wire_type);
         let twin = twin.map_err(|reason| not_translated(format!("topic {topic}"), reason))?;
-        Ok(Offer { wire_type: Arc::new(WireType::from_message(&twin.twin)), latching })
+        Ok(Offer { wire_type: Arc::new(WireType::from_message(&twin.twin)), latching, kept })
     }
 
     async fn serve(

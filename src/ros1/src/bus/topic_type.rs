@@ -15,7 +15,7 @@ const ANSWER: Duration = Duration::from_secs(3);
 /// Returns the type from the first source available: what we advertise, a connection of ours, a publisher's header, the
 /// subscribers' requests. If only a name is known (all endpoints accept any md5), the digest is `*`.
 pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<Offer, BusError> {
-    let offer = |wire_type, latching| Offer { wire_type: Arc::new(wire_type), latching };
+    let offer = |wire_type, latching| Offer { wire_type: Arc::new(wire_type), latching, kept: None };
     let ours = bus.publications.lock().get(name).cloned();
     if let Some((advert, latching)) = ours.as_ref().and_then(|topic| topic.advert()) {
         return Ok(offer(advert, latching));

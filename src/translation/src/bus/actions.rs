@@ -253,7 +253,7 @@ impl ActionFront {
             Self::Two(services) => (!end.is_service()).then(|| Arc::new(services.wire_type(end).clone())),
         };
         let latching = matches!((self, end), (Self::Two(_), ActionEndpoint::Status));
-        let offer = wire_type.map(|wire_type| Offer { wire_type, latching });
+        let offer = wire_type.map(|wire_type| Offer { wire_type, latching, kept: None });
         offer.ok_or_else(|| BusError::NoTopic(topic.to_owned()))
     }
 

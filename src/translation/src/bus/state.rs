@@ -87,7 +87,8 @@ impl Translation {
     pub(super) fn translate_matched(&self, matched: &MatchedPeers) -> MatchedPeers {
         let offer = |offer: &Offer| {
             let twin = self.twins.message(&offer.wire_type).ok()?;
-            Some(Offer { wire_type: Arc::new(WireType::from_message(&twin.twin)), latching: offer.latching })
+            let wire_type = Arc::new(WireType::from_message(&twin.twin));
+            Some(Offer { wire_type, latching: offer.latching, kept: offer.kept })
         };
         let peers = matched.peers.iter().map(|peer| TopicPeer {
             id: self.translate_peer(&peer.id),
