@@ -6,8 +6,8 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use ros::bus::{
-    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, PeerId, Publisher, QosProfile,
-    RosVersion, ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
+    Bus, BusError, CallFate, FailureReason, Lender, LentService, MatchedPeers, PeerId, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType, enclave_for,
 };
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::HostSockets;
