@@ -7,8 +7,8 @@
 //! ```
 //! What has no twin is left out of the graph, and [`TranslatedBus::left_out`] says why. A message that cannot be
 //! carried is dropped and counted; the [`TranslationObserver`] is told of the first one of each topic. A service that
-//! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response. Of an action only goals,
-//! feedback and results are carried, and its topics or services are made anew.
+//! fails in ROS 1 answers a caller of ROS 2, where calls cannot fail, with the default response. Of an action only
+//! goals, feedback and results are carried, and its topics or services are made anew.
 
 mod actions;
 mod graph;

@@ -43,11 +43,14 @@ pub(super) struct GroupBus {
     actions: Mutex<HashMap<(String, String), ActionBackend>>,
 }
 
+/// An action of ROS 2 that is used by its services.
+type GroupServices = Arc<GoalServices<GroupClient>>;
+
 /// An action used by its topics and services.
 #[derive(Clone)]
 enum ActionBackend {
     One(Arc<GoalTopics<GroupClient>>),
-    Two(Arc<GoalServices<GroupClient>>),
+    Two(GroupServices),
 }
 
 impl ActionBackend {
@@ -71,10 +74,7 @@ impl GroupBus {
     }
 
     /// Returns the action and part to which a service belongs; `None` for a regular service.
-    fn find_action_service(
-        &self,
-        service: &str,
-    ) -> Result<Option<(ActionEndpoint, Arc<GoalServices<GroupClient>>)>, BusError> {
+    fn find_action_service(&self, service: &str) -> Result<Option<(ActionEndpoint, GroupServices)>, BusError> {
         let view = self.view();
         let Some((action, end)) = view.find_action_service(service) else {
             return Ok(None);

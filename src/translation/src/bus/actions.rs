@@ -14,7 +14,7 @@
 //!
 //! | in ROS 2 | in ROS 1 |
 //! |---|---|
-//! | the goal is not answered yet | PENDING; RECALLING once it is cancelled, and the server is asked as soon as it has accepted |
+//! | the goal is not answered yet | PENDING; RECALLING once it is cancelled, which the server is told when it accepts |
 //! | accepted | ACTIVE; PREEMPTING if it was cancelled before |
 //! | not accepted | REJECTED |
 //! | the cancel is accepted, or refused | PREEMPTING: in ROS 1 nobody refuses, the goal just goes on to its end |
