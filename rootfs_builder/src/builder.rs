@@ -27,9 +27,7 @@ use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{
-    advice, blocking, imported, packaged, prebuilt, seal, source, sources, stock, unused, wheels,
-};
+use crate::{advice, blocking, imported, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
 
 /// Default base for packages that support ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";

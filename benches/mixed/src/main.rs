@@ -80,7 +80,7 @@ fn measure(
         let times = race.run();
         let micros = |index: usize| times[index].best_micros() / repeats as f64;
         report
-            .figure(&format!("{name}, {} bytes, {way}", message.len()), "µs", micros(0))
+            .figure(format!("{name}, {} bytes, {way}", message.len()), "µs", micros(0))
             .relative_to("a copy", micros(1))
             .require(target(micros(1)));
     }
@@ -98,7 +98,7 @@ fn measure_picture(report: &mut BenchReport) -> Result<()> {
     let pair = find_twin("sensor_msgs/Image")?;
     let json = r#"{"header": {"frame_id": "camera"}, "height": 480, "width": 640, "encoding": "rgb8", "step": 1920}"#;
     let empty = serialize(&pair, json)?;
-    let data: Vec<u8> = (0..640 * 480 * 3u32).map(|index| (index * 7 >> 3) as u8).collect();
+    let data: Vec<u8> = (0..640 * 480 * 3u32).map(|index| ((index * 7) >> 3) as u8).collect();
     // The length of the data is the last value of the empty message.
     let (head, _) = empty.split_at(empty.len() - 4);
     let picture = [head, &(data.len() as u32).to_le_bytes(), &data].concat();

@@ -44,7 +44,6 @@ use tokio_util::task::AbortOnDropHandle;
 use tracing::Instrument;
 
 use crate::TypeTranslations;
-use crate::error::other_version;
 
 use actions::ActionEnds;
 use lending::TranslatedLending;
@@ -78,7 +77,7 @@ impl TranslatedBus {
         observer: Arc<dyn TranslationObserver>,
         budget: &Budget,
     ) -> Arc<Self> {
-        let version = other_version(inner.version());
+        let version = inner.version().other();
         let translation = Arc::new(Translation {
             parameters: TranslatedParameters::new(&inner, budget.clone()),
             inner,

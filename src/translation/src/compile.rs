@@ -53,7 +53,7 @@ impl<'a> Compiler<'a> {
             pairings,
             from,
             sources: Shapes::new(from),
-            targets: Shapes::new(crate::error::other_version(from)),
+            targets: Shapes::new(from.other()),
             programs: HashMap::new(),
         }
     }
@@ -81,10 +81,10 @@ impl<'a> Compiler<'a> {
             })
             .collect();
         let mut targets = Vec::new();
-        let by_target = pairs.iter().map(|(source, target)| (*target, *source)).collect();
+        let by_target: ByPath<'_> = pairs.iter().map(|(source, target)| (*target, *source)).collect();
         self.list_targets(target, &mut Path::new(), &by_target, &mut targets);
         let mut sources = Vec::new();
-        let by_source = pairs.iter().copied().collect();
+        let by_source: ByPath<'_> = pairs.iter().copied().collect();
         self.list_sources(source, &mut Path::new(), &by_source, &mut sources);
 
         let order = targets.iter().filter_map(|target| match target {
@@ -131,7 +131,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a target; those of a message of which only parts are paired in its place.
-    fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], targets: &mut Vec<Target>) {
+    fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &ByPath<'_>, targets: &mut Vec<Target>) {
         if let Some(source) = pairs.get(path) {
             targets.push(Target::Paired { source: (*source).clone(), target: path.clone() });
             return;
@@ -158,7 +158,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a source likewise.
-    fn list_sources(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], sources: &mut Vec<Source>) {
+    fn list_sources(&mut self, root: &MessageType, path: &mut Path, pairs: &ByPath<'_>, sources: &mut Vec<Source>) {
         let Some(slot) = Slot::at_path(root, path) else {
             return;
         };
@@ -228,7 +228,7 @@ impl<'a> Compiler<'a> {
                     }
                     _ => Action::Text {
                         from: text_form(self.from, from),
-                        to: text_form(crate::error::other_version(self.from), to),
+                        to: text_form(self.from.other(), to),
                         most: target.bounds.text.map(|most| most as usize),
                     },
                 }
@@ -239,7 +239,7 @@ impl<'a> Compiler<'a> {
 
 /// Returns true for the message itself, and for a field of which parts are paired.
 fn has_parts(path: &Path, pairs: &ByPath<'_>) -> bool {
-    path.is_empty() || pairs.range(path..).next().is_some_and(|(next, _)| next.starts_with(path))
+    path.is_empty() || pairs.range::<Path, _>(path..).next().is_some_and(|(next, _)| next.starts_with(path))
 }
 
 fn text_form(version: RosVersion, primitive: Primitive) -> TextForm {

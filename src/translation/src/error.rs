@@ -9,7 +9,7 @@ pub type TranslationError = CodecError;
 
 /// A type that has no twin in the other ROS.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{name} of ROS {} has no counterpart in ROS {}: {reason}", .version.number(), other_version(*.version).number())]
+#[error("{name} of ROS {} has no counterpart in ROS {}: {reason}", .version.number(), .version.other().number())]
 pub struct NoTwin {
     /// Name of the type, as in the ROS that it belongs to.
     pub name: String,
@@ -110,12 +110,4 @@ pub struct UnlikeFields {
     pub two_field: String,
     /// Type of the field there.
     pub two_type: String,
-}
-
-/// Returns the other ROS version.
-pub(crate) fn other_version(version: RosVersion) -> RosVersion {
-    match version {
-        RosVersion::One => RosVersion::Two,
-        RosVersion::Two => RosVersion::One,
-    }
 }

@@ -159,7 +159,7 @@ impl TranslationRules {
     /// Returns the name of a message in the other ROS.
     pub(crate) fn message_name(&self, name: &str, from: RosVersion) -> String {
         let parsed = TypeName::parse(name);
-        let to = crate::error::other_version(from);
+        let to = from.other();
         if let Some((short, part)) = split_part(parsed).filter(|_| from == RosVersion::Two) {
             let owner = format!("{}/{}/{short}", parsed.package, parsed.kind);
             let owner =
@@ -176,7 +176,7 @@ impl TranslationRules {
     /// Returns the name of a service in the other ROS.
     pub(crate) fn service_name(&self, name: &str, from: RosVersion) -> String {
         let parsed = TypeName::parse(name);
-        let to = crate::error::other_version(from);
+        let to = from.other();
         let key = (parsed.package.to_owned(), parsed.short.to_owned());
         match self.services.get(from, &key) {
             Some((package, short)) => write_name(to, package, "srv", short),
@@ -188,7 +188,7 @@ impl TranslationRules {
     pub(crate) fn action_name(&self, name: &str, from: RosVersion) -> String {
         let parsed = TypeName::parse(name);
         let package = self.package(from, parsed.package);
-        write_name(crate::error::other_version(from), package, "action", parsed.short)
+        write_name(from.other(), package, "action", parsed.short)
     }
 }
 

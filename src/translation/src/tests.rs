@@ -48,7 +48,7 @@ pub(crate) fn twin_among(
     definitions: &[(&str, &str)],
     others: &[(&str, &str)],
 ) -> Result<Arc<MessageTwin>, NoTwin> {
-    let other = crate::error::other_version(version);
+    let other = version.other();
     let translations = TypeTranslations::new(rules).with_known(registry(other, others), other);
     translations.message(&message(version, definitions))
 }

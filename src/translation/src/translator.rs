@@ -10,7 +10,6 @@ use ros_message::codec::cursor::MessageCursor;
 use ros_message::schema::MessageType;
 
 use crate::TranslationError;
-use crate::error::other_version;
 use crate::fault::Fault;
 use crate::output::Output;
 use crate::program::{Program, Run};
@@ -53,7 +52,7 @@ impl MessageTranslator {
     fn run(&self, bytes: &[u8]) -> Result<Bytes, Fault> {
         let from = self.source.version();
         let cursor = MessageCursor::new(from, bytes).ok_or_else(|| unreadable(bytes))?;
-        let out = Output::new(other_version(from), bytes.len(), self.least);
+        let out = Output::new(from.other(), bytes.len(), self.least);
         let mut run = Run { from, cursor, out, places: Vec::new(), saturated: 0 };
         run.program(&self.program)?;
         // In ROS 2 bytes may follow: some senders serialize into a buffer of estimated size.

@@ -9,7 +9,7 @@ use ros_message::schema::{ActionDef, MessageType, Registry, SchemaError, Service
 
 use crate::compile::Compiler;
 use crate::derive::Derivation;
-use crate::error::{NoTwin, NoTwinReason, other_version};
+use crate::error::{NoTwin, NoTwinReason};
 use crate::pairing::Pairings;
 use crate::rules::TranslationRules;
 use crate::translator::MessageTranslator;
@@ -181,7 +181,7 @@ impl TypeTranslations {
     /// Returns `name`, or, if only that is known, the name in a package whose name ends in `_interfaces` instead of
     /// `_msgs`, as packages of ROS 2 are called: ros1_bridge pairs these without a rule.
     fn choose_name(&self, name: String, from: RosVersion, is_known: impl Fn(&Registry, &str) -> bool) -> String {
-        let Some(known) = self.known(other_version(from)) else {
+        let Some(known) = self.known(from.other()) else {
             return name;
         };
         let (package, rest) = name.split_once('/').unwrap_or((&name, ""));
@@ -210,7 +210,7 @@ impl TypeTranslations {
     }
 
     fn find_message(&self, of: &Arc<MessageType>) -> Result<MessageTwin, NoTwinReason> {
-        let to = other_version(of.version());
+        let to = of.version().other();
         let name = self.message_name(of.name(), of.version());
         let twin = match self.find_known(to, |known| known.message(&name))? {
             Some(known) => known,
@@ -226,7 +226,7 @@ impl TypeTranslations {
 
     fn find_service(&self, of: &Arc<ServiceDef>) -> Result<ServiceTwin, NoTwinReason> {
         let from = of.request.version();
-        let to = other_version(from);
+        let to = from.other();
         let name = self.service_name(&of.name, from);
         let twin = match self.find_known(to, |known| known.service(&name))? {
             Some(known) => known,
@@ -253,7 +253,7 @@ impl TypeTranslations {
 
     fn find_action(&self, of: &Arc<ActionDef>) -> Result<ActionTwin, NoTwinReason> {
         let from = of.action.version();
-        let to = other_version(from);
+        let to = from.other();
         let name = self.action_name(&of.name, from);
         let twin = match self.find_known(to, |known| known.action(&name))? {
             Some(known) => known,

@@ -25,8 +25,10 @@ pub(super) fn adapt_contents(about: &StubInfo<'_>, mut contents: Contents) -> Co
     contents.share.retain(|path, content| match &*content {
         Content::File { executable: true, .. } => false,
         Content::File { bytes, .. } => {
-            !is_definition(path)
-                && !(about.service_ros == RosVersion::Two && ament::belongs_to_install_space(path, content))
+            let is_of_install_space =
+                about.service_ros == RosVersion::Two && ament::belongs_to_install_space(path, content);
+            !is_of_install_space
+                && !is_definition(path)
                 && launch_file_ros(path, bytes).is_none_or(|ros| ros == about.ros)
         }
         Content::Link(_) => true,

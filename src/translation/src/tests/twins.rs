@@ -100,7 +100,7 @@ fn derived_digests_are_those_of_the_packages() {
     for (from, name) in [(One, "a/Fibonacci"), (Two, "a/action/Fibonacci")] {
         let action = registry(from, &[("a/action/Fibonacci", text)]).action(name).unwrap();
         let pair = translations.action(&action).unwrap();
-        let other = registry(crate::error::other_version(from), &[("a/action/Fibonacci", text)]);
+        let other = registry(from.other(), &[("a/action/Fibonacci", text)]);
         let expected = other.action("a/Fibonacci").unwrap();
         assert_eq!(pair.twin.action.digest(), expected.action.digest());
         assert_eq!(pair.twin.name, expected.name);

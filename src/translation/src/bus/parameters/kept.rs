@@ -93,6 +93,7 @@ impl KeptParameters {
     }
 
     /// Returns the keys.
+    #[cfg(test)]
     pub(super) fn keys(&self) -> Vec<String> {
         self.values.lock().keys().cloned().collect()
     }

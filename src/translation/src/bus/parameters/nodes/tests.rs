@@ -44,7 +44,7 @@ impl Servant {
     async fn register(&self) -> Box<dyn Publisher> {
         let registry = Registry::new();
         registry.insert("std_msgs/msg/Bool", "bool data").expect("a definition");
-        let of = WireType::from_message(&*registry.message("std_msgs/Bool").expect("a type"));
+        let of = WireType::from_message(&registry.message("std_msgs/Bool").expect("a type"));
         let publisher = self.node.advertise("/alive", of, QosProfile::keep_last(1)).await.expect("advertised");
         self.wait_graph(|graph| graph.has_node(SEE)).await;
         publisher
