@@ -131,7 +131,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a target; those of a message of which only parts are paired in its place.
-    fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], targets: &mut Vec<Target>) {
+    fn list_targets(&mut self, root: &MessageType, path: &mut Path, pairs: &ByPath<'_>, targets: &mut Vec<Target>) {
         if let Some(source) = pairs.get(path) {
             targets.push(Target::Paired { source: (*source).clone(), target: path.clone() });
             return;
@@ -158,7 +158,7 @@ impl<'a> Compiler<'a> {
     }
 
     /// Lists the fields of a source likewise.
-    fn list_sources(&mut self, root: &MessageType, path: &mut Path, pairs: &[(Path, Path)], sources: &mut Vec<Source>) {
+    fn list_sources(&mut self, root: &MessageType, path: &mut Path, pairs: &ByPath<'_>, sources: &mut Vec<Source>) {
         let Some(slot) = Slot::at_path(root, path) else {
             return;
         };
@@ -239,7 +239,7 @@ impl<'a> Compiler<'a> {
 
 /// Returns true for the message itself, and for a field of which parts are paired.
 fn has_parts(path: &Path, pairs: &ByPath<'_>) -> bool {
-    path.is_empty() || pairs.range(path..).next().is_some_and(|(next, _)| next.starts_with(path))
+    path.is_empty() || pairs.range::<Path, _>(path..).next().is_some_and(|(next, _)| next.starts_with(path))
 }
 
 fn text_form(version: RosVersion, primitive: Primitive) -> TextForm {
