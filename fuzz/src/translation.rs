@@ -22,7 +22,8 @@ pub(crate) static PAIRS: LazyLock<Vec<Arc<MessageTwin>>> = LazyLock::new(|| {
             (
                 "a/msg/All",
                 "bool a\nint8 b\nuint16 c\nint32 d\nuint64 e\nfloat32 f\nfloat64 g\ntime h\nduration i\nbyte j\n\
-                 bool[] k\nuint8[] l\nint16[2] m\nfloat64[] n\nstring[] o\ntime[] p\nNothing[] q\nPoint[] r\nText[2] s\n",
+                 bool[] k\nuint8[] l\nint16[2] m\nfloat64[] n\nstring[] o\ntime[] p\nNothing[] q\nPoint[] r\n\
+                 Text[2] s\n",
             ),
             ("a/msg/Nothing", ""),
             ("a/msg/Point", "float64 x\nfloat64 y\n"),
@@ -56,7 +57,8 @@ pub(crate) static PAIRS: LazyLock<Vec<Arc<MessageTwin>>> = LazyLock::new(|| {
             ("a/msg/Point", "float64 x\nfloat64 y\n"),
             (
                 "sensor_msgs/msg/Image",
-                "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+                "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 \
+                step\n\
                  uint8[] data\n",
             ),
         ],

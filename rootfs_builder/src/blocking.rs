@@ -2,8 +2,8 @@
 //!
 //! Dropping the future of a build ends its containers, but not the threads that pack, hash and extract for it: those
 //! would continue for minutes and delay the daemon's shutdown. So such work is started here, under the build's
-//! [`foreign::cancel::Cancel`], which its loops check. Layers that are complete but for their archives are the exception:
-//! they outlive a cancelled build, for the next one to go on from, and end with the daemon.
+//! [`foreign::cancel::Cancel`], which its loops check. Layers that are complete but for their archives are the
+//! exception: they outlive a cancelled build, for the next one to go on from, and end with the daemon.
 
 use std::future::Future;
 
@@ -27,8 +27,8 @@ pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Jo
     tokio::task::spawn_blocking(cancel_with_caller(work))
 }
 
-/// Runs `work` on a blocking thread, also after the [`cancellable`] future that calls this was dropped: until it is done
-/// or `ending` is cancelled.
+/// Runs `work` on a blocking thread, also after the [`cancellable`] future that calls this was dropped: until it is
+/// done or `ending` is cancelled.
 pub(crate) fn spawn_until<T: Send + 'static>(
     ending: Cancel,
     work: impl FnOnce() -> T + Send + 'static,

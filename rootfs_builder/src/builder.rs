@@ -103,8 +103,8 @@ impl Builder {
         })
     }
 
-    /// Builds the image of a push, or an underlay. To cancel, drop the future: containers and blocking work are ended, what was compiled
-    /// or installed completely is still packed into the cache, and the build's directory is removed
+    /// Builds the image of a push, or an underlay. To cancel, drop the future: containers and blocking work are ended,
+    /// what was compiled or installed completely is still packed into the cache, and the build's directory is removed
     /// ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
     pub async fn build(
         &self,

@@ -294,7 +294,8 @@ pub enum Error {
     },
     /// A package is in two underlays.
     #[error(
-        "package {package} is in underlay {first} and, differently, in {second}; stand on one of them, or push {second} \
+        "package {package} is in underlay {first} and, differently, in {second}; stand on one of them, or push \
+        {second} \
             again --on {first} and without {package}"
     )]
     UnderlayConflict {

@@ -103,7 +103,8 @@ impl RunReport {
     }
 }
 
-/// Returns the begin and the end of a reason in one line: it begins with what was done, and ends with what a program said.
+/// Returns the begin and the end of a reason in one line: it begins with what was done, and ends with what a program
+/// said.
 fn shorten_to_line(reason: &str) -> String {
     let words = reason.split_whitespace().collect::<Vec<&str>>().join(" ");
     let length = words.chars().count();

@@ -266,7 +266,8 @@ impl Site {
         self.start(command, &overlay.join("log"))
     }
 
-    /// Installs a stub of a service from the archive for this robot's ROS, with `settings` appended to its `stub.toml`; returns the overlay.
+    /// Installs a stub of a service from the archive for this robot's ROS, with `settings` appended to its `stub.toml`;
+    /// returns the overlay.
     pub fn install_stub(&self, daemon: &Daemon, service: &str, settings: &str) -> anyhow::Result<PathBuf> {
         self.install_stub_for(daemon, service, std::env::consts::ARCH, settings)
     }

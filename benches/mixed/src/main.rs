@@ -1,5 +1,5 @@
-//! `make bench ONLY=mixed`: what it costs that a robot's ROS is not its service's. Messages are carried to the other ROS
-//! and, in turns with it, copied, which is the least that a message of the same ROS costs on its way.
+//! `make bench ONLY=mixed`: what it costs that a robot's ROS is not its service's. Messages are carried to the other
+//! ROS and, in turns with it, copied, which is the least that a message of the same ROS costs on its way.
 //!
 //! The arguments name the parts to run (small, picture, path); without arguments all parts run.
 

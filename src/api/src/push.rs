@@ -46,8 +46,8 @@ pub struct PushOptions {
     /// Additions to the interface, where the push cannot find all of it: the text of a TOML or JSON file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub interface: Option<String>,
-    /// Manual dependency mapping: rosdep key or ROS package → Debian packages, or packages of the push or the base; empty
-    /// for a key that needs none.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian packages, or packages of the push or the base;
+    /// empty for a key that needs none.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
     /// Request pairs that override those found by the push: `INPUT=OUTPUT`, or as in a robot's stub.toml,
@@ -135,7 +135,8 @@ impl PushEvent {
     }
 }
 
-/// One line of the response. The last line is `done`, `underlay` or `error`; a stream that ends otherwise was truncated.
+/// One line of the response. The last line is `done`, `underlay` or `error`; a stream that ends otherwise was
+/// truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]

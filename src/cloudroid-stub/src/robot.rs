@@ -26,8 +26,9 @@ pub struct LaunchedNode {
     pub node: String,
     /// Absolute name that the program gives its node, if known.
     pub name_by_program: Option<String>,
-    /// Arguments for the node in the cloud, as the robot's ROS writes them. In ROS 1 they omit those that define its name and namespace; in ROS 2 they
-    /// contain them, because a program may create several nodes. Parameters from files of the robot are expanded.
+    /// Arguments for the node in the cloud, as the robot's ROS writes them. In ROS 1 they omit those that define its
+    /// name and namespace; in ROS 2 they contain them, because a program may create several nodes. Parameters from
+    /// files of the robot are expanded.
     pub argv: Vec<String>,
     /// Arguments for the local original.
     pub original_argv: Vec<String>,

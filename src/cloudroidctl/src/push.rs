@@ -78,8 +78,8 @@ pub struct PushArgs {
     /// Base image definition (default: one that fits the package's ROS).
     #[arg(long, value_name = "BASE")]
     base: Option<String>,
-    /// Debian package, or package of the workspace or base, that provides a dependency; KEY= if it needs nothing. May be
-    /// given several times.
+    /// Debian package, or package of the workspace or base, that provides a dependency; KEY= if it needs nothing. May
+    /// be given several times.
     #[arg(long = "map", value_name = "KEY=PACKAGE", value_parser = mapping)]
     map: Vec<(String, String)>,
     /// Additional Debian or ROS package, for compiling and running; may be given several times.
@@ -232,8 +232,8 @@ impl PushArgs {
         self.publish(client, format, stop).await.map(|_| ())
     }
 
-    /// Publishes the package; `None` if the push goes on without this command, and for an underlay. `on_interrupt` decides what becomes of
-    /// the push with this number.
+    /// Publishes the package; `None` if the push goes on without this command, and for an underlay. `on_interrupt`
+    /// decides what becomes of the push with this number.
     async fn publish(
         self,
         client: &DaemonClient,

@@ -347,8 +347,8 @@ impl<O: ControlMessage> Session<O> {
         state.out.open_channel(channel);
     }
 
-    /// Makes messages of an open channel that are not sent yet wait for the control messages sent before this call, which
-    /// say how they are to be understood.
+    /// Makes messages of an open channel that are not sent yet wait for the control messages sent before this call,
+    /// which say how they are to be understood.
     pub fn order_after_control(&self, channel: u32) {
         self.state.lock().out.order_after_control(channel);
     }

@@ -112,8 +112,8 @@ impl Manifest {
         !self.group_dependencies.is_disjoint(&other.groups)
     }
 
-    /// Returns whether at most the Python module of a dependency can be meant: the package itself consists of Python, or
-    /// needs it only at run time.
+    /// Returns whether at most the Python module of a dependency can be meant: the package itself consists of Python,
+    /// or needs it only at run time.
     pub fn needs_as_module(&self, name: &str) -> bool {
         // Looked up, since a package may have any number of dependencies.
         let needs = |kind: Kind| self.dependencies.contains(&Dependency { name: name.to_owned(), kind });

@@ -261,8 +261,8 @@ impl Hub {
         lost
     }
 
-    /// Finds or starts the link for a hello; the servant's ROS cannot express the arguments in `ignored`. Returns whether
-    /// it was resumed, and the turn of this connection.
+    /// Finds or starts the link for a hello; the servant's ROS cannot express the arguments in `ignored`. Returns
+    /// whether it was resumed, and the turn of this connection.
     async fn attach(
         self: &Arc<Self>,
         hello: &Hello,

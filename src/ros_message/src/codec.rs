@@ -14,8 +14,9 @@
 //! header, may have either byte order, and is written little endian.
 //!
 //! Values follow rosbridge: bytes (`uint8[]`, `char[]`, ROS 2's `byte[]`) are base64 in JSON and a byte string in CBOR;
-//! times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (both are accepted as input, and so is `seq` in
-//! a ROS 2 header, which is dropped); other numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
+//! times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (both are accepted as input, and so is
+//! `seq` in a ROS 2 header, which is dropped); other numeric arrays are lists in JSON and RFC 8746 typed arrays in
+//! CBOR.
 //!
 //! On an error the output buffer is left unchanged.
 

@@ -68,8 +68,8 @@ pub struct TranslatedBus {
 
 impl TranslatedBus {
     /// Creates the bus that robots of the other ROS see in place of `inner`. `registry` has the definitions of the
-    /// servant's image; goals under way, results and parameters that are kept for robots are charged to `budget`. Call it
-    /// within a Tokio runtime.
+    /// servant's image; goals under way, results and parameters that are kept for robots are charged to `budget`. Call
+    /// it within a Tokio runtime.
     pub fn new(
         inner: Arc<dyn Bus>,
         types: Arc<TypeTranslations>,

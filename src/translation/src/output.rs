@@ -8,8 +8,8 @@ use crate::fault::Fault;
 /// Header of ROS 2's serialization: plain CDR, little endian (OMG DDS-XTypes 1.3, section 7.6.3.1.2).
 const HEADER: [u8; 4] = [0, 1, 0, 0];
 
-/// Bytes that are written for each byte read, at most: UTF-16 takes four times the bytes of its UTF-8, padding less than
-/// twice, and a few fields that only the twin has come in each element of an array.
+/// Bytes that are written for each byte read, at most: UTF-16 takes four times the bytes of its UTF-8, padding less
+/// than twice, and a few fields that only the twin has come in each element of an array.
 const MOST_TIMES: usize = 16;
 
 /// A message in the serialization of one ROS version, up to a limit.

@@ -1,9 +1,9 @@
 //! Which field of one definition belongs to which field of the other.
 //!
 //! Without a rule, fields of one name belong together (capital letters and underscores aside, if that leaves no doubt).
-//! A field on one side alone is left out there and has its default here; if both sides have such fields, they may be the
-//! same thing under two names, and the messages are no pair. A rule lists all pairs, and what it does not list is left
-//! out. This is how ros1_bridge decides too.
+//! A field on one side alone is left out there and has its default here; if both sides have such fields, they may be
+//! the same thing under two names, and the messages are no pair. A rule lists all pairs, and what it does not list is
+//! left out. This is how ros1_bridge decides too.
 
 use std::collections::{HashMap, HashSet};
 

@@ -4,7 +4,8 @@
 //! - the packages, if there is nothing else;
 //! - a message: `ros1_message_name`, `ros2_message_name`, and, if their fields differ, `fields_1_to_2`, which lists all
 //!   fields that belong together as paths `a.b.c`;
-//! - a service: `ros1_service_name`, `ros2_service_name`, and `request_fields_1_to_2`, `response_fields_1_to_2` likewise.
+//! - a service: `ros1_service_name`, `ros2_service_name`, and `request_fields_1_to_2`, `response_fields_1_to_2`
+//!   likewise.
 //!
 //! Beyond ros1_bridge's syntax, `.` is the path of the message itself, and a message's rule may have the definition of
 //! either side (`ros1_definition`, `ros2_definition`), for the case that it is not known otherwise: a robot of ROS 1

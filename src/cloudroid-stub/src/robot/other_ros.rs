@@ -81,8 +81,9 @@ fn to_one(robot: &LaunchedNode) -> Vec<String> {
         match part.kind {
             Kind::Own => argv.extend(part.words),
             Kind::Rule(rule) if rule.applies_to(name) => match to_one_rule(&rule) {
-                Ok(words) => argv.extend(words),
-                Err(pattern) => tracing::warn!(
+                SpelledRule::OfTheName => {}
+                SpelledRule::Rule(word) => argv.push(word),
+                SpelledRule::Pattern(pattern) => tracing::warn!(
                     "{} does not reach the node in the cloud, which uses ROS 1: {pattern} is a pattern",
                     part.words.join(" ")
                 ),
@@ -99,15 +100,24 @@ fn to_one(robot: &LaunchedNode) -> Vec<String> {
     argv
 }
 
-/// Returns a rule as ROS 1 writes it, none for those of the node's name. Fails for a pattern, which it returns.
-fn to_one_rule(rule: &RemapRule) -> Result<Option<String>, String> {
+/// A remap rule of ROS 2 in ROS 1.
+enum SpelledRule {
+    /// It names the node, which ROS 1 does with other arguments.
+    OfTheName,
+    /// The argument.
+    Rule(String),
+    /// There are no patterns in ROS 1.
+    Pattern(String),
+}
+
+/// Returns a rule as ROS 1 writes it.
+fn to_one_rule(rule: &RemapRule) -> SpelledRule {
     if !rule.of.is_name() {
-        return Ok(None);
+        return SpelledRule::OfTheName;
     }
-    let pattern = [&rule.from, &rule.to].into_iter().find(|name| name.contains(['*', '\\']));
-    match pattern {
-        Some(pattern) => Err(pattern.clone()),
-        None => Ok(Some(format!("{}:={}", to_one_name(&rule.from), to_one_name(&rule.to)))),
+    match [&rule.from, &rule.to].into_iter().find(|name| name.contains(['*', '\\'])) {
+        Some(pattern) => SpelledRule::Pattern(pattern.clone()),
+        None => SpelledRule::Rule(format!("{}:={}", to_one_name(&rule.from), to_one_name(&rule.to))),
     }
 }
 

@@ -104,7 +104,8 @@ impl PushProgress {
                 let (name, revision) = (&underlay.name, underlay.revision);
                 let packages = count(underlay.packages.len(), "package");
                 output::line(&format!(
-                    "== underlay {name} {state} in {:.1} s: revision {revision}, {packages}; push others with --on {name}",
+                    "== underlay {name} {state} in {:.1} s: revision {revision}, {packages}; push others with --on \
+                    {name}",
                     *took as f64 / 1000.0
                 ))
             }

@@ -1,8 +1,8 @@
 //! Calls in either direction.
 //!
 //! A service of ROS 1 can fail, and its caller learns so. In ROS 2 a server that does not answer leaves its caller
-//! waiting. So where a caller of ROS 2 uses a service of ROS 1 that fails, the failure is logged and the caller gets the
-//! default response of the type: numbers are zero, texts empty, `success` is false.
+//! waiting. So where a caller of ROS 2 uses a service of ROS 1 that fails, the failure is logged and the caller gets
+//! the default response of the type: numbers are zero, texts empty, `success` is false.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -39,7 +39,8 @@ fn a_rule_of_a_message_renames_it() {
 
 #[test]
 fn a_rule_of_fields_lists_all_that_are_carried() {
-    let head = "- ros1_package_name: a\n  ros1_message_name: B\n  ros2_package_name: a\n  ros2_message_name: B\n  fields_1_to_2:\n";
+    let head = "- ros1_package_name: a\n  ros1_message_name: B\n  ros2_package_name: a\n  ros2_message_name: B\n  \
+        fields_1_to_2:\n";
     let one = [("a/B", "uint8 x\nuint8 y\nInner inner"), ("a/Inner", "float64 p\nstring q")];
     let two = [("a/msg/B", "string deep\nuint8 first\nuint8 y\nPart part"), ("a/msg/Part", "float64 p\nuint8 more")];
     let by = |fields: &str| twin_among(rules(&format!("{head}{fields}")), One, &one, &two);
@@ -78,7 +79,8 @@ fn a_rule_makes_definitions_in_its_order() {
     let error = twin_by(rules(yaml), Two, &[("a/msg/B", "float64 k_new\nstring text")]).unwrap_err().to_string();
     assert!(error.contains("rule 1 pairs field \"inner.q\" of a/B, whose definition is unknown"), "{error}");
     let given = format!("{yaml}  ros1_definition: |\n    float64 K\n    Inner inner\n");
-    let inner = "- ros1_package_name: a\n  ros1_message_name: Inner\n  ros2_package_name: a\n  ros2_message_name: Inner\n  \
+    let inner = "- ros1_package_name: a\n  ros1_message_name: Inner\n  ros2_package_name: a\n  ros2_message_name: \
+        Inner\n  \
                  ros1_definition: string q\n";
     let pair = twin_by(rules(&format!("{given}{inner}")), Two, &[("a/msg/B", "float64 k_new\nstring text")]).unwrap();
     assert_eq!(carry(&pair, r#"{"k_new": 0.5, "text": "x"}"#), value!({"K": 0.5, "inner": {"q": "x"}}));
@@ -87,7 +89,8 @@ fn a_rule_makes_definitions_in_its_order() {
 #[test]
 fn a_rule_of_a_service_names_it_and_its_fields() {
     let yaml = "- ros1_package_name: a\n  ros1_service_name: Old\n  ros2_package_name: b\n  ros2_service_name: New\n  \
-                request_fields_1_to_2:\n    x: first\n  response_fields_1_to_2:\n    y: second\n  enable_foreign_mappings: true\n";
+                request_fields_1_to_2:\n    x: first\n  response_fields_1_to_2:\n    y: second\n  \
+                enable_foreign_mappings: true\n";
     let service = crate::tests::registry(One, &[("a/srv/Old", "uint8 x\n---\nuint8 y\n")]).service("a/Old").unwrap();
     let pair = crate::TypeTranslations::new(rules(yaml)).service(&service).unwrap();
     assert_eq!(pair.twin.name, "b/srv/New");
@@ -101,7 +104,8 @@ fn a_rule_of_a_service_names_it_and_its_fields() {
 
 #[test]
 fn rules_of_a_lab_win_over_the_table() {
-    let yaml = "- ros1_package_name: sensor_msgs\n  ros1_message_name: CameraInfo\n  ros2_package_name: lab_msgs\n  ros2_message_name: Camera\n";
+    let yaml = "- ros1_package_name: sensor_msgs\n  ros1_message_name: CameraInfo\n  ros2_package_name: lab_msgs\n  \
+        ros2_message_name: Camera\n";
     assert_eq!(rules(yaml).message_name("sensor_msgs/CameraInfo", One), "lab_msgs/msg/Camera");
     let packages = rules("- ros1_package_name: sensor_msgs\n  ros2_package_name: lab_msgs\n");
     assert_eq!(packages.message_name("sensor_msgs/CompressedImage", One), "lab_msgs/msg/CompressedImage");

@@ -68,7 +68,7 @@ pub(super) struct Rule {
 }
 
 /// Pairs of field paths, in the order of the file.
-pub(super) type Fields = Vec<(String, String)>;
+pub(super) type FieldPairs = Vec<(String, String)>;
 
 /// What a rule is about.
 #[derive(Debug, PartialEq, Eq)]
@@ -77,15 +77,15 @@ pub(super) enum About {
     Message {
         one: String,
         two: String,
-        fields: Option<Fields>,
+        fields: Option<FieldPairs>,
         one_definition: Option<String>,
         two_definition: Option<String>,
     },
     Service {
         one: String,
         two: String,
-        request: Option<Fields>,
-        response: Option<Fields>,
+        request: Option<FieldPairs>,
+        response: Option<FieldPairs>,
     },
 }
 
@@ -165,7 +165,7 @@ impl RawRule {
 
 /// A map whose order is kept: a derived definition has its fields in the order of the rule.
 #[derive(Debug)]
-struct OrderedFields(Fields);
+struct OrderedFields(FieldPairs);
 
 impl<'de> Deserialize<'de> for OrderedFields {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {

@@ -40,7 +40,8 @@ fn packages_of_interfaces_are_found_without_a_rule() {
 
 #[test]
 fn definitions_are_derived_from_ros_1() {
-    let text = "uint8 LOW=1\nstring Mode=a 'b' # c\nbool on=2\ntime stamp\nduration[] waits\nbyte raw\nchar[2] letters\n\
+    let text = "uint8 LOW=1\nstring Mode=a 'b' # c\nbool on=2\ntime stamp\nduration[] waits\nbyte raw\nchar[2] \
+        letters\n\
                 string frameId\nfloat64[] D\nstd_msgs/Header header\nInner[3] inner\n";
     let pair = twin(One, &[("a/B", text), ("a/Inner", "std_msgs/Empty none"), ("std_msgs/Empty", "")]);
     assert_eq!(pair.twin.name(), "a/msg/B");
@@ -62,7 +63,8 @@ fn definitions_are_derived_from_ros_1() {
 
 #[test]
 fn definitions_are_derived_from_ros_2() {
-    let text = "uint8 LOW=0x1\nwstring WIDE=\"ü\"\nbuiltin_interfaces/Time stamp\nstring<=5 name 'x'\nwstring[<=3] wide\n\
+    let text = "uint8 LOW=0x1\nwstring WIDE=\"ü\"\nbuiltin_interfaces/Time stamp\nstring<=5 name 'x'\nwstring[<=3] \
+        wide\n\
                 int32[<=4] few [1, 2]\nbyte raw\nstd_msgs/Header header\nInner inner\n";
     let pair = twin(Two, &[("a/msg/B", text), ("a/msg/Inner", "builtin_interfaces/Duration[2] waits")]);
     assert_eq!(pair.twin.name(), "a/B");
