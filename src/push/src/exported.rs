@@ -20,7 +20,6 @@ use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
-use super::building::PushedImage;
 use super::reporter::Reporter;
 use super::{Error, HOME_INSIDE, Options, OptionsError, Pusher};
 
@@ -225,15 +224,13 @@ impl Pusher {
         options: &PushOptions,
         tree: PathBuf,
         report: &Reporter,
-    ) -> Result<PushedImage, Error> {
+    ) -> Result<ImportedService, Error> {
         check_options(options)?;
         report.step("importing the exported service").await;
         let store = Arc::clone(self.catalogue.images());
         let (asked, limits) = (options.clone(), self.options.clone());
         let work = blocking::cancel_with_caller(move || import_image(&store, &tree, &asked, &limits));
-        let imported =
-            privilege::spawn_blocking(work).await.map_err(|_| Error::Internal("importing an exported service"))??;
-        Ok(PushedImage::Imported(Box::new(imported)))
+        privilege::spawn_blocking(work).await.map_err(|_| Error::Internal("importing an exported service"))?
     }
 
     /// Writes the dictionary rows of an exported service if the service has none; rows measured here are better.

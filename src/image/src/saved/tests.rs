@@ -293,6 +293,7 @@ fn a_root_file_system_is_taken_with_all_that_one_has_but_devices() {
         (EntryType::Regular, "./usr/bin/tool", 0o4755, "#!/bin/sh\n"),
         (EntryType::Link, "./usr/bin/same", 0o755, "./usr/bin/tool"),
         (EntryType::Symlink, "./bin", 0o777, "/usr/bin"),
+        (EntryType::Directory, "./etc/", 0o755, ""),
         (EntryType::Symlink, "./escape", 0o777, "/etc"),
         (EntryType::Regular, "./escape/passwd", 0o644, "mine"),
         (EntryType::Char, "./dev/null", 0o666, ""),

@@ -2,7 +2,10 @@
 
 use std::collections::BTreeSet;
 
-use super::{Contents, Files, RosTerms, StubInfo, nodelets, text_file};
+use super::contents::{Contents, Files, text_file};
+use super::info::StubInfo;
+use super::nodelets;
+use super::terms::RosTerms;
 
 const SETUP_SH: &str = include_str!("inside/setup.sh");
 const SETUP_BASH: &str = include_str!("inside/setup.bash");

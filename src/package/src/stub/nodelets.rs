@@ -4,7 +4,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Content, StubInfo};
+use super::contents::Content;
+use super::info::StubInfo;
 
 /// Returns the nodelet plugin lists exported by the package, as paths in its share directory.
 pub(super) fn plugin_lists(share: &BTreeMap<String, Content>) -> BTreeSet<String> {

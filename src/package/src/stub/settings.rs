@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::{ProgramRequest, RosTerms, StubInfo};
+use super::info::{ProgramRequest, StubInfo};
+use super::terms::RosTerms;
 
 /// Returns the robot's settings, with the available options as comments.
 pub(super) fn stub_toml(about: &StubInfo<'_>) -> String {

@@ -40,6 +40,7 @@ const WORDS: &[(&str, &str, &str)] = &[
     ("DELETE", "/api/v1/pushes/{number}", "cancel a push"),
     ("DELETE", "/api/v1/underlays/{name}", "remove an underlay"),
     ("POST", "/api/v1/bases", "import a base"),
+    ("PUT", "/api/v1/bases/{name}", "make a base from an image"),
     ("DELETE", "/api/v1/bases/{name}", "remove a base"),
 ];
 
