@@ -72,7 +72,6 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("tls", &["cloudroidd", "tls"]),
     ("tokens", &["portal", "store"]),
     ("trying", &["cloudroidctl", "push"]),
-    ("underlays", &["catalogue", "package", "push", "rootfs_builder"]),
     ("untrusted", &["budget", "ws"]),
     ("viewers", &["viewer"]),
     ("warm_pool", &["choreographer"]),

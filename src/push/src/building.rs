@@ -6,12 +6,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use api::PushOptions;
-use rootfs_builder::{BuildEvent, BuildResult, InspectedPush, NamedUnderlay, PushRequest, PushSource};
+use rootfs_builder::{
+    BuildEvent, BuildOutcome, BuildResult, BuiltUnderlay, InspectedPush, NamedUnderlay, PushRequest, PushSource,
+};
 use store::UnderlayRecord;
 use tokio::sync::mpsc;
 
+use super::exported::ImportedService;
 use super::reporter::Reporter;
-use super::{Deployer, EVENTS_AHEAD, Error, PushedImage, Pusher, exported, receive, told};
+use super::{Deployer, EVENTS_AHEAD, Error, Pusher, exported, receive, told};
 
 impl Pusher {
     /// Looks at what was received: a service that another server has exported, or something to build.
@@ -90,10 +93,7 @@ impl Pusher {
         (by, report): (&Deployer, &Reporter),
     ) -> Result<PushedImage, Error> {
         let BuildWork { request, inspected, underlays } = match work {
-            PushedWork::Exported(tree) => {
-                let imported = self.import(options, tree, report).await?;
-                return Ok(PushedImage::Imported(Box::new(imported)));
-            }
+            PushedWork::Exported(tree) => return self.import(options, tree, report).await,
             PushedWork::Build(work) => *work,
         };
         report.step("preparing the build").await;
@@ -162,4 +162,14 @@ pub(super) struct BuildWork {
     inspected: InspectedPush,
     /// Underlays that it is built on, with their revisions.
     underlays: BTreeMap<String, u64>,
+}
+
+/// What was built or imported, before it is probed or published.
+pub(super) enum PushedImage {
+    /// The image of a service, with the underlays that it stands on and their revisions.
+    Built(Box<(BuildOutcome, BTreeMap<String, u64>)>),
+    /// An exported service.
+    Imported(Box<ImportedService>),
+    /// An underlay, of which nothing is run.
+    Underlay(Box<BuiltUnderlay>),
 }

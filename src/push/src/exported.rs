@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
+use super::building::PushedImage;
 use super::reporter::Reporter;
 use super::{Error, HOME_INSIDE, Options, OptionsError, Pusher};
 
@@ -224,13 +225,15 @@ impl Pusher {
         options: &PushOptions,
         tree: PathBuf,
         report: &Reporter,
-    ) -> Result<ImportedService, Error> {
+    ) -> Result<PushedImage, Error> {
         check_options(options)?;
         report.step("importing the exported service").await;
         let store = Arc::clone(self.catalogue.images());
         let (asked, limits) = (options.clone(), self.options.clone());
         let work = blocking::cancel_with_caller(move || import_image(&store, &tree, &asked, &limits));
-        privilege::spawn_blocking(work).await.map_err(|_| Error::Internal("importing an exported service"))?
+        let imported =
+            privilege::spawn_blocking(work).await.map_err(|_| Error::Internal("importing an exported service"))??;
+        Ok(PushedImage::Imported(Box::new(imported)))
     }
 
     /// Writes the dictionary rows of an exported service if the service has none; rows measured here are better.

@@ -54,12 +54,13 @@ use package::inventory::Inventory;
 use package::requests;
 use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildOutcome, Builder, BuiltUnderlay, PushSource};
+use rootfs_builder::{BuildOutcome, Builder, PushSource};
 use servant::engine::Engine;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use bounds::PushBudget;
+use building::PushedImage;
 use disks::Disks;
 use exported::ImportedService;
 use places::PushQueue;
@@ -169,7 +170,7 @@ impl Pusher {
     ) -> Result<PushResult, Error> {
         let began = Instant::now();
         let asked_name = options.name.as_deref();
-        let as_underlay = options.as_underlay.as_deref().map(places::underlay_key);
+        let as_underlay = options.as_underlay.as_deref().map(underlays::lock_name);
         let known = asked_name.or(options.apt.as_deref()).or(as_underlay.as_deref());
         let _entered = self.places.enter()?;
         self.disks.check().await?;
@@ -328,16 +329,6 @@ impl Pusher {
             _ => Ok(()),
         }
     }
-}
-
-/// What was built or imported, before it is probed or published.
-enum PushedImage {
-    /// The image of a service, with the underlays that it stands on and their revisions.
-    Built(Box<(BuildOutcome, BTreeMap<String, u64>)>),
-    /// An exported service.
-    Imported(Box<ImportedService>),
-    /// An underlay, of which nothing is run.
-    Underlay(Box<BuiltUnderlay>),
 }
 
 /// Describes a layer for the deployer.

@@ -34,11 +34,6 @@ pub(super) struct AdmittedPush<'a> {
     place: Option<OwnedSemaphorePermit>,
 }
 
-/// Returns the name under which pushes of an underlay are serialized; no service has it.
-pub(super) fn underlay_key(name: &str) -> String {
-    format!("underlay {name}")
-}
-
 impl PushQueue {
     pub(super) fn new(options: &Options) -> PushQueue {
         PushQueue {

@@ -4,12 +4,16 @@ use api::PushOptions;
 use rootfs_builder::{BuiltUnderlay, UnderlayContents};
 use store::{NewEvent, StandingService, UnderlayRecord};
 
-use super::places::underlay_key;
 use super::reporter::Reporter;
 use super::{Deployer, Error, Pusher, UnderlayUse, api_layer};
 
 /// Maximum number of services that are named.
 const NAMED: usize = 10;
+
+/// Returns the name under which pushes of an underlay are serialized; no service has it.
+pub(super) fn lock_name(name: &str) -> String {
+    format!("underlay {name}")
+}
 
 impl Pusher {
     /// Returns the underlays that a push names, with their contents.
@@ -130,7 +134,7 @@ impl Pusher {
     /// # Errors
     /// [`Error::UnknownUnderlay`], [`Error::NotAllowed`], and [`Error::UnderlayInUse`].
     pub async fn remove_underlay(&self, name: &str, by: &Deployer) -> Result<api::Underlay, Error> {
-        let _turn = self.places.lock_service(&underlay_key(name)).await;
+        let _turn = self.places.lock_service(&lock_name(name)).await;
         let Some((record, _)) = self.find_underlays(&[name.to_owned()], by)?.pop() else {
             return Err(Error::Internal("removing an underlay"));
         };

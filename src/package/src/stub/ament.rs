@@ -6,9 +6,7 @@
 
 use std::collections::BTreeSet;
 
-use super::contents::{Content, Contents, Files, text_file};
-use super::info::StubInfo;
-use super::terms::RosTerms;
+use super::{Content, Contents, Files, RosTerms, StubInfo, text_file};
 
 const INDEX: &str = "share/ament_index/resource_index";
 const SETUP_SH: &str = include_str!("inside/ament/setup.sh");

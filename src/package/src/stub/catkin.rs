@@ -2,10 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::contents::{Contents, Files, text_file};
-use super::info::StubInfo;
-use super::nodelets;
-use super::terms::RosTerms;
+use super::{Contents, Files, RosTerms, StubInfo, nodelets, text_file};
 
 const SETUP_SH: &str = include_str!("inside/setup.sh");
 const SETUP_BASH: &str = include_str!("inside/setup.bash");

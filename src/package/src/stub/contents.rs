@@ -26,9 +26,6 @@ pub struct Contents {
     pub components: BTreeSet<String>,
 }
 
-/// Files of a stub, by path in the install space.
-pub type Files = BTreeMap<String, Content>;
-
 /// A file, or a link that stays within the package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Content {
@@ -120,11 +117,6 @@ fn stays_inside(target: &Path, directory: &str) -> bool {
         }
     }
     true
-}
-
-/// Returns a file with this text.
-pub(super) fn text_file(text: &str) -> Content {
-    Content::File { bytes: text.as_bytes().to_vec(), executable: false }
 }
 
 #[cfg(test)]

@@ -8,9 +8,8 @@ use std::sync::Arc;
 use ros::bus::RosVersion;
 use ros::schema::{Base, MessageType, Registry, SchemaError};
 
-use super::contents::{Files, text_file};
-use super::info::StubInfo;
 use super::other_ros::manifest_head;
+use super::{Files, StubInfo, text_file};
 use crate::names;
 
 /// Directory of the source packages in the package's share directory.

@@ -4,8 +4,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::contents::Content;
-use super::info::StubInfo;
+use super::{Content, StubInfo};
 
 /// Returns the nodelet plugin lists exported by the package, as paths in its share directory.
 pub(super) fn plugin_lists(share: &BTreeMap<String, Content>) -> BTreeSet<String> {

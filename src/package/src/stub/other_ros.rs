@@ -8,10 +8,8 @@ use std::path::Path;
 use ros::bus::RosVersion;
 use roxmltree::{Document, Node};
 
-use super::ament;
-use super::contents::{Content, Contents};
-use super::info::StubInfo;
 use super::nodelets::{self, escape_xml};
+use super::{Content, Contents, StubInfo, ament};
 use crate::condition::Variables;
 use crate::manifest::Manifest;
 

@@ -4,8 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::info::{ProgramRequest, StubInfo};
-use super::terms::RosTerms;
+use super::{ProgramRequest, RosTerms, StubInfo};
 
 /// Returns the robot's settings, with the available options as comments.
 pub(super) fn stub_toml(about: &StubInfo<'_>) -> String {

@@ -1,10 +1,7 @@
 mod ament;
 mod other_ros;
 
-use std::collections::BTreeMap;
-
 use super::*;
-use crate::interface::Interface;
 use crate::interface::{Direction, Topic};
 
 const PACKAGE_XML: &str = r#"<package format="2"><name>p</name>

@@ -21,7 +21,7 @@ use crate::bus::state::Translation;
 const CONNECTS: Duration = Duration::from_secs(10);
 
 /// A client of one action. Goals that are under way when it is dropped are cancelled.
-pub(crate) struct TranslatedActionClient {
+pub(in crate::bus) struct TranslatedActionClient {
     carrier: Arc<ActionCarrier>,
     inner: Arc<dyn ActionClient>,
     orders: mpsc::UnboundedSender<Order>,
