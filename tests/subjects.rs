@@ -72,6 +72,7 @@ pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("tls", &["cloudroidd", "tls"]),
     ("tokens", &["portal", "store"]),
     ("trying", &["cloudroidctl", "push"]),
+    ("underlays", &["catalogue", "push", "rootfs_builder"]),
     ("untrusted", &["budget", "ws"]),
     ("viewers", &["viewer"]),
     ("warm_pool", &["choreographer"]),

@@ -1,21 +1,25 @@
 //! Base definitions: properties of a distribution and its ROS (`images/NAME.toml`).
 
+mod imported_image;
 mod wheels;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use image::Digest;
 use ros::flavour::{Flavour, Version};
 use serde::{Deserialize, Serialize};
-
-use crate::imported::ImportedImage;
 
 pub use crate::base_file_error::{BaseFileError, BaseFileProblem, WheelsError};
 use crate::error::{Error, IoContext};
 
+pub use imported_image::{Finding, ImportedImage};
 pub(crate) use wheels::RequiredWheels;
 pub use wheels::Wheels;
+
+/// Default base for packages that support ROS 1.
+pub const DEFAULT_BASE: &str = "bookworm-ros1";
 
 /// A base image.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,7 +41,27 @@ impl Base {
     /// Returns whether its ROS is the distribution's own, of ROS 1 below `/usr`. Otherwise ROS is in install spaces,
     /// and its Debian packages, if there are any, are named by its distribution (REP 2003: `ros-jazzy-std-msgs`).
     pub(crate) fn has_distributions_ros(&self) -> bool {
-        self.ros == Version::Ros1 && crate::indexed::install_prefixes(self).is_empty()
+        self.ros == Version::Ros1 && self.install_prefixes().is_empty()
+    }
+
+    /// Returns the install spaces as absolute paths: those in the environment of all processes and of compilers.
+    /// Empty for the distribution's own ROS 1, which is below `/usr`.
+    pub(crate) fn install_prefixes(&self) -> Vec<String> {
+        let mut named: Vec<String> = Vec::new();
+        for environment in [&self.environment, &self.build.environment] {
+            for variable in ["AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"] {
+                let value = environment.get(variable).map_or("", String::as_str);
+                named.extend(value.split(':').map(str::to_owned));
+            }
+        }
+        if self.ros == Version::Ros2 {
+            named.push(format!("/opt/ros/{}", self.ros_distribution));
+        }
+        let mut seen = BTreeSet::new();
+        named.retain(|prefix| {
+            prefix.len() > 1 && prefix.starts_with('/') && prefix != "/usr" && seen.insert(prefix.clone())
+        });
+        named
     }
 
     /// Returns the properties that affect installed trees, as a part of their cache keys. A new rosdep key does not
@@ -195,6 +219,14 @@ pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
     }
     names.sort();
     Ok(names)
+}
+
+/// Returns the layers of all bases in a directory that were made from images. Definitions that cannot be read are left
+/// out.
+pub(crate) fn image_layers(directory: &Path) -> Vec<Digest> {
+    let all = names(directory).unwrap_or_default();
+    let images = all.iter().filter_map(|name| load(directory, name).ok()?.definition.image);
+    images.flat_map(|image| image.layers).collect()
 }
 
 /// Parses and validates a definition; the error does not contain the file name yet.

@@ -16,7 +16,7 @@ use crate::bootstrap::EPOCH;
 use crate::debian_package::Deb;
 use crate::error::Error;
 use crate::event::Progress;
-use crate::indexed;
+use crate::indexed::{self, IndexedPackages};
 use crate::install::{self, LayerAddition, LayerSet};
 use crate::key::Key;
 use crate::keys;
@@ -70,6 +70,25 @@ impl Build<'_> {
     pub(crate) async fn indexed_packages(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
         let trees = self.shop.extract_layers(layers).await?;
         indexed::find_packages(&self.base, trees).await
+    }
+
+    /// Returns the Python modules in the install spaces of these layers.
+    pub(crate) async fn indexed_modules(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
+        let trees = self.shop.extract_layers(layers).await?;
+        indexed::find_modules(&self.base, trees).await
+    }
+
+    /// Finds the packages of the base, in `tools` with its toolchain, and keeps them for pushes that are only looked
+    /// at.
+    pub(crate) async fn find_known_packages(&self, tools: &[Digest]) -> Result<IndexedPackages, Error> {
+        let below = self.base_diff_ids();
+        let there = IndexedPackages {
+            build: self.indexed_packages(tools).await?,
+            run: self.indexed_packages(&below).await?,
+            modules: self.indexed_modules(&below).await?,
+        };
+        indexed::write_known(&self.shop.layers, &self.base, &self.archive, &there)?;
+        Ok(there)
     }
 
     /// Adds layers with these Debian packages and their dependencies on top of `below`.

@@ -16,7 +16,7 @@ use crate::archive::Archive;
 use crate::base::{self, Base};
 use crate::bootstrap;
 use crate::build::Build;
-use crate::cache::{LayerCache, LayerEntry};
+use crate::cache::{LayerCache, LayerEntry, keep_note_key};
 use crate::debian_package::Deb;
 use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
@@ -27,10 +27,7 @@ use crate::request::{BuildResult, PushRequest, PushSource};
 use crate::sandbox::{self, BuildSite};
 use crate::stock::BaseStock;
 use crate::workshop::{BuildContext, KeyLocks, PushLabel};
-use crate::{advice, blocking, imported, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
-
-/// Default base for packages that support ROS 1.
-pub const DEFAULT_BASE: &str = "bookworm-ros1";
+use crate::{advice, blocking, packaged, prebuilt, seal, source, sources, stock, unused, wheels};
 
 /// Maximum number of logs of failed builds.
 const LOGS_KEPT: usize = 50;
@@ -74,11 +71,6 @@ pub struct Builder {
 struct OpenedArchive {
     base: Base,
     archive: Arc<Archive>,
-}
-
-/// Returns the key of the note with the layers to keep for a base.
-pub(crate) fn keep_note_key(base: &str) -> String {
-    format!("keep-{base}")
 }
 
 impl OpenedArchive {
@@ -239,7 +231,7 @@ impl Builder {
     pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
         let notes = names.iter().filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
-        notes.flatten().chain(imported::image_layers(&self.config.bases_dir)).collect()
+        notes.flatten().chain(base::image_layers(&self.config.bases_dir)).collect()
     }
 
     /// Returns the archive of a base for a push, which reads the package lists if they are old.
@@ -350,6 +342,7 @@ pub(crate) mod tests {
     use servant::sandbox::SandboxContainer;
 
     use super::*;
+    use crate::base::DEFAULT_BASE;
 
     /// A sandbox that must not be used.
     struct UnusedSandbox;

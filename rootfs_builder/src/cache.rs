@@ -14,6 +14,11 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, IoContext};
 use crate::unused;
 
+/// Returns the key of the note with the layers to keep for a base.
+pub(crate) fn keep_note_key(base: &str) -> String {
+    format!("keep-{base}")
+}
+
 /// The layer cache and its image store.
 #[derive(Clone)]
 pub(crate) struct LayerCache {

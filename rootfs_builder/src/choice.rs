@@ -6,8 +6,7 @@ use std::path::Path;
 use package::fits::{self, Distribution, RosSupport};
 use ros::bus::RosVersion;
 
-use crate::base::{self, Base};
-use crate::builder::DEFAULT_BASE;
+use crate::base::{self, Base, DEFAULT_BASE};
 use crate::error::Error;
 use crate::request::PushSource;
 

@@ -15,20 +15,18 @@ mod findings;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::ErrorKind;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use foreign::Tree;
 use image::{Digest, LayerInfo, Limits, write_atomically};
 use package::system;
-use serde::{Deserialize, Serialize};
 
 use crate::archive::Archive;
-use crate::base::{self, Base};
+use crate::base::{self, Base, ImportedImage};
 use crate::bootstrap::parse_status;
-use crate::builder::{Builder, keep_note_key};
+use crate::builder::Builder;
+use crate::cache::keep_note_key;
 use crate::error::{Error, IoContext};
-
-pub use findings::Finding;
 
 /// Content of an archive that becomes a base, as received.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,38 +48,6 @@ pub struct BaseImport {
     pub replace: bool,
     /// ROS distribution that counts, if it has several.
     pub ros_distribution: Option<String>,
-}
-
-/// Image that a base was made from, in its definition.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ImportedImage {
-    /// Description of what was imported, such as `image docker.io/library/ros:jazzy`.
-    pub source: String,
-    /// Diff-ids of its layers, lowest first.
-    pub layers: Vec<Digest>,
-    /// Names of tools for compiling sources that the layers lack.
-    pub missing_tools: Vec<String>,
-    /// True if packages of Python alone can be installed without these tools.
-    pub installs_python: bool,
-    /// Table of what was found, and what it means for pushes.
-    pub findings: Vec<Finding>,
-    /// Packages of dpkg with their versions; empty if the system has no dpkg.
-    pub debian: BTreeMap<String, String>,
-    /// ROS packages with their versions.
-    pub ros: BTreeMap<String, String>,
-}
-
-impl ImportedImage {
-    /// Returns an error for layers that are missing in the store, to which nothing can bring them back. Blocking.
-    pub(crate) fn check_layers(&self, store: &image::Store, base: &str) -> Result<(), Error> {
-        for layer in &self.layers {
-            if store.layer(layer)?.is_none() {
-                return Err(Error::ImageGone { base: base.to_owned(), layer: layer.to_string() });
-            }
-        }
-        Ok(())
-    }
 }
 
 impl Archive {
@@ -206,14 +172,6 @@ struct ReceivedLayers {
     layers: Vec<LayerInfo>,
     env: BTreeMap<String, String>,
     source: String,
-}
-
-/// Returns the layers of all bases in a directory that were made from images. Definitions that cannot be read are left
-/// out.
-pub(crate) fn image_layers(directory: &Path) -> Vec<Digest> {
-    let names = base::names(directory).unwrap_or_default();
-    let images = names.iter().filter_map(|name| base::load(directory, name).ok()?.definition.image);
-    images.flat_map(|image| image.layers).collect()
 }
 
 #[cfg(test)]

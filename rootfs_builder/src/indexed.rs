@@ -4,14 +4,12 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use image::Digest;
 use ros::flavour::Version;
 use serde::{Deserialize, Serialize};
 
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::blocking;
-use crate::build::Build;
 use crate::cache::LayerCache;
 use crate::error::Error;
 use crate::key::Key;
@@ -27,30 +25,10 @@ pub(crate) struct IndexedPackages {
     pub(crate) modules: BTreeSet<String>,
 }
 
-/// Returns the install spaces of a base as absolute paths: those in the environment of all processes and of compilers.
-/// Empty for the distribution's own ROS 1, which is below `/usr`.
-pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
-    let mut named: Vec<String> = Vec::new();
-    for environment in [&base.environment, &base.build.environment] {
-        for variable in ["AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"] {
-            let value = environment.get(variable).map_or("", String::as_str);
-            named.extend(value.split(':').map(str::to_owned));
-        }
-    }
-    if base.ros == Version::Ros2 {
-        named.push(format!("/opt/ros/{}", base.ros_distribution));
-    }
-    let mut seen = BTreeSet::new();
-    named.retain(|prefix| {
-        prefix.len() > 1 && prefix.starts_with('/') && prefix != "/usr" && seen.insert(prefix.clone())
-    });
-    named
-}
-
 /// Returns the directories of shared libraries searched by a base's own programs, relative to the root.
 pub(crate) fn library_directories(base: &Base) -> Vec<String> {
     let mut places: Vec<String> =
-        install_prefixes(base).iter().map(|prefix| format!("{}/lib", prefix.trim_matches('/'))).collect();
+        base.install_prefixes().iter().map(|prefix| format!("{}/lib", prefix.trim_matches('/'))).collect();
     if !places.is_empty() {
         let given = base.environment.get("LD_LIBRARY_PATH");
         let given = given.map_or("", String::as_str).split(':');
@@ -67,7 +45,7 @@ fn known_key(base: &Base, archive: &Archive) -> String {
         .inputs("toolchain", &base.build.packages)
         .input("runtime", base.required.runtime.key())
         .input("tools", base.required.build.key())
-        .inputs("prefixes", install_prefixes(base))
+        .inputs("prefixes", base.install_prefixes())
         .input("lists", &archive.stamp)
         .finish()
 }
@@ -75,18 +53,6 @@ fn known_key(base: &Base, archive: &Archive) -> String {
 /// Returns the packages of a base as the last build with the same package lists found them. Blocking.
 pub(crate) fn read_known(layers: &LayerCache, base: &Base, archive: &Archive) -> Option<IndexedPackages> {
     layers.read_note(&known_key(base, archive))
-}
-
-/// Finds the packages of a base, in `tools` with its toolchain, and keeps them for pushes that are only looked at.
-pub(crate) async fn find_known(build: &Build<'_>, tools: &[Digest]) -> Result<IndexedPackages, Error> {
-    let below = build.base_diff_ids();
-    let there = IndexedPackages {
-        build: build.indexed_packages(tools).await?,
-        run: build.indexed_packages(&below).await?,
-        modules: find_modules(build, &below).await?,
-    };
-    write_known(&build.shop.layers, &build.base, &build.archive, &there)?;
-    Ok(there)
 }
 
 /// Keeps the packages of a base for [`read_known`]. Blocking.
@@ -99,21 +65,21 @@ pub(crate) fn write_known(
     layers.write_note(&known_key(base, archive), there)
 }
 
-/// Returns the Python modules in the install spaces of a base, in these layers.
-pub(crate) async fn find_modules(build: &Build<'_>, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
-    let (trees, prefixes) = (build.shop.extract_layers(layers).await?, install_prefixes(&build.base));
-    Ok(blocking::spawn_reader(move || package::ament::modules(&trees, &prefixes)).await??)
-}
-
 /// Returns the packages in the install spaces of trees, given lowest first: of ROS 2 by ament's index, of ROS 1 by
 /// their package.xml.
 pub(crate) async fn find_packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
-    let prefixes = install_prefixes(base);
+    let prefixes = base.install_prefixes();
     if prefixes.is_empty() {
         return Ok(BTreeSet::new());
     }
     let ros = base.ros;
     blocking::spawn_reader(move || list_packages(ros, &trees, &prefixes)).await?
+}
+
+/// Returns the Python modules in the install spaces of trees, given lowest first.
+pub(crate) async fn find_modules(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
+    let prefixes = base.install_prefixes();
+    Ok(blocking::spawn_reader(move || package::ament::modules(&trees, &prefixes)).await??)
 }
 
 /// Returns the packages in install spaces of trees, given lowest first. Blocking.
@@ -146,7 +112,7 @@ mod tests {
     #[test]
     fn spaces_are_those_that_the_base_names() {
         let two = base(Version::Ros2);
-        assert_eq!(install_prefixes(&two), ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]);
+        assert_eq!(two.install_prefixes(), ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]);
         assert_eq!(
             library_directories(&two),
             ["opt/wheels/lib", "opt/tools/lib", "opt/ros/jazzy/lib", "opt/wheels/lib", "opt/more"]
@@ -155,10 +121,10 @@ mod tests {
         one.definition.build.environment.clear();
         let prefix = |prefix: &str| [("CMAKE_PREFIX_PATH".to_owned(), prefix.to_owned())].into();
         one.definition.environment = prefix("/usr");
-        assert!(install_prefixes(&one).is_empty() && library_directories(&one).is_empty());
+        assert!(one.install_prefixes().is_empty() && library_directories(&one).is_empty());
         assert!(one.has_distributions_ros());
         one.definition.environment = prefix("/home/robot/install:/opt/ros/noetic");
-        assert_eq!(install_prefixes(&one), ["/home/robot/install", "/opt/ros/noetic"]);
+        assert_eq!(one.install_prefixes(), ["/home/robot/install", "/opt/ros/noetic"]);
         assert_eq!(library_directories(&one), ["home/robot/install/lib", "opt/ros/noetic/lib"]);
         assert!(!one.has_distributions_ros());
     }

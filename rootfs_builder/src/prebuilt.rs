@@ -16,7 +16,7 @@ use crate::key::{self, Key};
 use crate::keys::{self, RequiredKeys};
 use crate::modes::set_mode;
 use crate::workshop::PackJob;
-use crate::{indexed, pushed, source};
+use crate::{pushed, source};
 
 /// Packs the install space and finds its dependencies.
 pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<BuildParts, Error> {
@@ -28,7 +28,7 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Buil
     let there = IndexedPackages {
         build: pushed::build_tools(&asked),
         run: build.indexed_packages(&build.base_diff_ids()).await?,
-        modules: indexed::find_modules(build, &build.base_diff_ids()).await?,
+        modules: build.indexed_modules(&build.base_diff_ids()).await?,
     };
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {

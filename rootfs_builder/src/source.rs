@@ -14,14 +14,14 @@ use std::path::PathBuf;
 use image::Digest;
 use package::workspace::Workspace;
 use ros::flavour::Version;
-use serde::{Deserialize, Serialize};
 
+use crate::base::ImportedImage;
 use crate::build::{Build, BuildParts};
-use crate::builder::keep_note_key;
+use crate::cache::keep_note_key;
 use crate::error::Error;
-use crate::imported::ImportedImage;
 use crate::install::LayerSet;
 use crate::keys::{self, ResolvedKeys};
+use crate::needs::RuntimeNeeds;
 use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
 
 /// Compiles and packs the workspace.
@@ -33,7 +33,7 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
         pushed::has_python(&workspace.root),
     );
     let tools = toolchain(build, &workspace).await?;
-    let mut there = indexed::find_known(build, &tools).await?;
+    let mut there = build.find_known_packages(&tools).await?;
     build.foundation.add_to(&mut there);
     let resolved = keys::resolve_keys(&build.archive, &build.base, &build.request.map, &own, &asked, &there)?;
     for warning in &resolved.warnings {
@@ -118,7 +118,7 @@ async fn check_interfaces(build: &Build<'_>, workspace: Workspace, below: &[Dige
         return Ok(workspace);
     }
     let trees = build.shop.extract_layers(below).await?;
-    let mut prefixes = indexed::install_prefixes(&build.base);
+    let mut prefixes = build.base.install_prefixes();
     // Where underlays are.
     prefixes.push(build.base.build.prefix.display().to_string());
     let shares: Vec<String> = prefixes.iter().map(|prefix| format!("{prefix}/share")).collect();
@@ -142,29 +142,6 @@ pub(crate) async fn needed_libraries(build: &Build<'_>, package: &LayerSet) -> R
         Ok(needed)
     })
     .await?
-}
-
-/// What packages need at run time.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct RuntimeNeeds {
-    /// ROS packages, still to be gathered.
-    ros: BTreeSet<String>,
-    /// Debian packages.
-    debs: BTreeSet<String>,
-    /// Shared libraries.
-    libraries: BTreeSet<String>,
-    /// True if Python code uses the ROS packages.
-    python: bool,
-}
-
-impl RuntimeNeeds {
-    /// Adds what others need.
-    pub(crate) fn extend(&mut self, others: &Self) {
-        self.ros.extend(others.ros.iter().cloned());
-        self.debs.extend(others.debs.iter().cloned());
-        self.libraries.extend(others.libraries.iter().cloned());
-        self.python |= others.python;
-    }
 }
 
 /// Returns what the packages of a push need at run time, with what their underlays need.

@@ -21,16 +21,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::apt::Apt;
 use crate::archive::Archive;
-use crate::base::{self, Base};
+use crate::base::{self, Base, ImportedImage};
 use crate::blocking;
 use crate::bootstrap::{self, EPOCH};
 use crate::build::Build;
-use crate::builder::{Builder, keep_note_key};
-use crate::cache::{LayerCache, LayerEntry};
+use crate::builder::Builder;
+use crate::cache::{LayerCache, LayerEntry, keep_note_key};
 use crate::candidates::Candidates;
 use crate::contents::Contents;
 use crate::error::{Error, IoContext};
-use crate::imported::ImportedImage;
 use crate::indexed;
 use crate::install::LayerSet;
 use crate::key::Key;
@@ -284,7 +283,7 @@ fn ros_packages(
         let carried = archive.contents.ros_packages_by_deb(&debian.keys().map(String::as_str).collect());
         return Ok(carried.into_iter().map(|(package, deb)| (package, debian[&deb].clone())).collect());
     }
-    let prefixes = indexed::install_prefixes(base);
+    let prefixes = base.install_prefixes();
     let names: BTreeSet<String> = indexed::list_packages(base.ros, trees, &prefixes)?;
     let version = |name: &str| {
         let mut places = prefixes.iter().flat_map(|prefix| trees.iter().map(move |tree| (prefix, tree)));
@@ -435,7 +434,7 @@ mod tests {
     use image::{Limits, TreeOptions};
 
     use super::*;
-    use crate::builder::DEFAULT_BASE;
+    use crate::base::DEFAULT_BASE;
     use crate::builder::tests::new_builder;
 
     /// Records a base of two layers, of which the upper one is the toolchain.

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::base::Base;
 use crate::error::Error;
 use crate::indexed::IndexedPackages;
-use crate::source::RuntimeNeeds;
+use crate::needs::RuntimeNeeds;
 use package::workspace::Package;
 
 /// Install space of an underlay, as two layers with the same files.

@@ -9,7 +9,7 @@ use support::deployer::path_str;
 use support::world::world;
 
 /// Writes files below a directory.
-fn write_files(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
+pub fn write_files(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
     for (path, text) in files {
         let path = directory.join(path);
         std::fs::create_dir_all(path.parent().context("below")?)?;
@@ -18,7 +18,8 @@ fn write_files(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()>
     Ok(())
 }
 
-fn manifest(name: &str, needs: &str) -> String {
+/// Returns a package.xml with these dependencies and exports.
+pub fn manifest(name: &str, needs: &str) -> String {
     format!(
         "<package format=\"3\"><name>{name}</name><version>1.0.0</version><description>A part.</description>\
          <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>{needs}</package>\n"
@@ -185,8 +186,8 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
     Ok(())
 }
 
-/// Writes a package of Python for ROS 2 below `workspace`, with one module and perhaps a program `go` in its `node.py`.
-fn write_python_package(
+/// Writes a package of Python for ROS 2 below `workspace`, with one module and a program `go` if it has a `node.py`.
+pub fn write_python_package(
     workspace: &Path,
     name: &str,
     needs: &str,

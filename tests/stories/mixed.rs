@@ -20,14 +20,6 @@ use crate::goals::GoalApplication;
 
 const NODE: &str = "/crossing";
 
-/// Returns the other ROS.
-fn other(ros: RosVersion) -> RosVersion {
-    match ros {
-        RosVersion::One => RosVersion::Two,
-        RosVersion::Two => RosVersion::One,
-    }
-}
-
 /// Returns a robot's name that is unique for its ROS.
 fn robot_name(ros: RosVersion, name: &str) -> String {
     format!("mixed-{name}-{}", ros.number())
@@ -36,7 +28,7 @@ fn robot_name(ros: RosVersion, name: &str) -> String {
 /// Starts a stub of the crossing node of the other ROS, with these further words on its command line.
 fn start_crossing(site: &Site, daemon: &Daemon, name: &str, more: &[&str]) -> anyhow::Result<NodeProcess> {
     let robot = site.system.version();
-    let (service, executable) = crossing::service(other(robot));
+    let (service, executable) = crossing::service(robot.other());
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
         daemon.address,
@@ -76,7 +68,7 @@ fn transform(ros: RosVersion, child: &str) -> bytes::Bytes {
 }
 
 pub fn stamps_transforms_and_calls_cross(ros: RosVersion) -> Verdict {
-    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
     let site = Site::with_ros(ros)?;
     let transforms = find_type(ros, "tf2_msgs/TFMessage")?;
     // Latched by two publishers before the node exists.
@@ -119,12 +111,12 @@ pub fn stamps_transforms_and_calls_cross(ros: RosVersion) -> Verdict {
 }
 
 pub fn an_action_is_carried_out_in_the_other_ros(ros: RosVersion) -> Verdict {
-    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
     let site = Site::with_ros(ros)?;
     let app = site.join("/app")?;
     let stub = start_crossing(&site, &daemon, "action", &[])?;
     wait_until_ready(&site, &app, &stub)?;
-    let sender = GoalApplication::for_node_of(other(ros), &site, &app, &stub)?;
+    let sender = GoalApplication::for_node_of(ros.other(), &site, &app, &stub)?;
     sender.send_until_all_steps("three", 3)?;
     // A goal that never ends is cancelled while it is in progress.
     let long = sender.send("long", 1_000_000);
@@ -136,7 +128,7 @@ pub fn an_action_is_carried_out_in_the_other_ros(ros: RosVersion) -> Verdict {
     let older = sender.send("older", 1_000_000);
     sender.wait_for_steps(&older, 1)?;
     let newer = sender.send("newer", 2);
-    if other(ros) == RosVersion::Two {
+    if ros.other() == RosVersion::Two {
         sender.client.cancel_goal("older");
     }
     let (outcome, _) = sender.wait_for_end(&older)?;
@@ -147,7 +139,7 @@ pub fn an_action_is_carried_out_in_the_other_ros(ros: RosVersion) -> Verdict {
 }
 
 pub fn a_node_calls_a_robot_of_the_other_ros(ros: RosVersion) -> Verdict {
-    let (here, there) = (Twin::caller(ros), Twin::caller(other(ros)));
+    let (here, there) = (Twin::caller(ros), Twin::caller(ros.other()));
     let daemon = world().daemon_with(there.service)?;
     let site = Site::with_ros(ros)?;
     let (app, server) = (site.join("/app")?, site.join("/server")?);
@@ -164,7 +156,7 @@ pub fn a_node_calls_a_robot_of_the_other_ros(ros: RosVersion) -> Verdict {
 }
 
 pub fn simulated_time_is_the_robots(ros: RosVersion) -> Verdict {
-    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
     let site = Site::with_ros(ros)?;
     let app = site.join("/app")?;
     // In ROS 1 one parameter applies to all nodes, in ROS 2 each node has its own.
@@ -208,7 +200,7 @@ fn wait_for_label(site: &Site, app: &(impl HasBus + ?Sized), stub: &NodeProcess,
 }
 
 pub fn parameters_of_the_node_are_the_robots(ros: RosVersion) -> Verdict {
-    let daemon = world().daemon_with(crossing::service(other(ros)).0)?;
+    let daemon = world().daemon_with(crossing::service(ros.other()).0)?;
     let site = Site::with_ros(ros)?;
     let app = site.join("/app")?;
     let label = |text: &str| ParamValue::String(text.to_owned());
@@ -243,7 +235,7 @@ pub fn parameters_of_the_node_are_the_robots(ros: RosVersion) -> Verdict {
 }
 
 pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -> Verdict {
-    let (own, cloud) = (localiser(ros), localiser(other(ros)));
+    let (own, cloud) = (localiser(ros), localiser(ros.other()));
     // The original comes from an image of the robot's ROS.
     world().daemon_with(own.service)?;
     let daemon = world().daemon_with(cloud.service)?;

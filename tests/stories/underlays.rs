@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use serde_json::{Value, json};
 use support::Verdict;
 use support::daemon::Daemon;
@@ -10,22 +10,7 @@ use support::deployer::path_str;
 use support::world::world;
 
 use crate::access::{create_token, run_with_token};
-
-fn write_files(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
-    for (path, text) in files {
-        let path = directory.join(path);
-        std::fs::create_dir_all(path.parent().context("below")?)?;
-        std::fs::write(path, text)?;
-    }
-    Ok(())
-}
-
-fn manifest(name: &str, needs: &str) -> String {
-    format!(
-        "<package format=\"3\"><name>{name}</name><version>1.0.0</version><description>A part.</description>\
-         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>{needs}</package>\n"
-    )
-}
+use crate::borrowed::{manifest, write_files, write_python_package};
 
 /// Writes an underlay of ROS 1 below `place`: messages, and a library that says `word`, which needs yaml-cpp.
 fn write_library(place: &Path, word: &str) -> Verdict {
@@ -164,49 +149,28 @@ pub fn an_underlay_of_ros_2_has_interfaces_and_modules() -> Verdict {
                        <exec_depend>rosidl_default_runtime</exec_depend>\
                        <member_of_group>rosidl_interface_packages</member_of_group>\
                        <export><build_type>ament_cmake</build_type></export>";
-    let setup = |name: &str, module: &str, programs: &str| {
-        format!(
-            "from setuptools import setup\nsetup(name='{name}', version='1.0.0', packages=['{module}'],\n\
-             data_files=[('share/ament_index/resource_index/packages', ['resource/{name}']),\n\
-             ('share/{name}', ['package.xml'])],\nentry_points={{'console_scripts': [{programs}]}})\n"
-        )
-    };
-    let settings = |name: &str| format!("[install]\ninstall_scripts=$base/lib/{name}\n");
-    let python = "<export><build_type>ament_python</build_type></export>";
     let doubling = "from lab2_msgs.msg import Word\n\n\ndef make(text):\n    return Word(word=2 * text)\n";
     write_files(
-        &underlay.join("src"),
+        &underlay.join("src/lab2_msgs"),
         &[
-            ("lab2_msgs/package.xml", manifest("lab2_msgs", of_messages)),
-            ("lab2_msgs/CMakeLists.txt", messages.to_owned()),
-            ("lab2_msgs/msg/Word.msg", "string word\n".to_owned()),
-            ("lab2_words_py/package.xml", manifest("lab2_words_py", &format!("<depend>lab2_msgs</depend>{python}"))),
-            ("lab2_words_py/setup.py", setup("lab2_words_py", "lab2_words", "")),
-            ("lab2_words_py/setup.cfg", settings("lab2_words_py")),
-            ("lab2_words_py/resource/lab2_words_py", String::new()),
-            ("lab2_words_py/lab2_words/__init__.py", doubling.to_owned()),
+            ("package.xml", manifest("lab2_msgs", of_messages)),
+            ("CMakeLists.txt", messages.to_owned()),
+            ("msg/Word.msg", "string word\n".to_owned()),
         ],
     )?;
-    let speaker = place.path().join("lab2_speaker");
+    let module = [("__init__.py", doubling)];
+    write_python_package(&underlay, "lab2_words_py", "<depend>lab2_msgs</depend>", ("lab2_words", &module))?;
     let node = "import rclpy\nfrom lab2_msgs.msg import Word\n\nfrom lab2_words import make\n\n\ndef main():\n\
                 \x20   rclpy.init()\n    node = rclpy.create_node('speaker')\n\
                 \x20   said = node.create_publisher(Word, '/said', 1)\n\
                 \x20   node.create_timer(0.2, lambda: said.publish(make('ha')))\n    rclpy.spin(node)\n";
     // By the name of the module, as tf2_ros is named for tf2_ros_py.
     let needs = "<depend>rclpy</depend><depend>lab2_msgs</depend><depend>lab2_words</depend>";
-    write_files(
-        &speaker,
-        &[
-            ("package.xml", manifest("lab2_speaker", &format!("{needs}{python}"))),
-            ("setup.py", setup("lab2_speaker", "lab2_speaker", "'speaker = lab2_speaker.node:main'")),
-            ("setup.cfg", settings("lab2_speaker")),
-            ("resource/lab2_speaker", String::new()),
-            ("lab2_speaker/__init__.py", String::new()),
-            ("lab2_speaker/node.py", node.to_owned()),
-        ],
-    )?;
+    let module = [("__init__.py", ""), ("node.py", node)];
+    write_python_package(place.path(), "lab2_speaker", needs, ("lab2_speaker", &module))?;
+    let speaker = place.path().join("src/lab2_speaker");
     deployer.run(&["push", path_str(&underlay), "--as-underlay", "words2"])?.expect_success()?;
-    deployer.run(&["push", path_str(&speaker), "--node", "speaker", "--on", "words2"])?.expect_success()?;
+    deployer.run(&["push", path_str(&speaker), "--node", "go", "--on", "words2"])?.expect_success()?;
     ensure!(hear(&daemon, "lab2_speaker", "first")? == "haha");
     // It is in the image, which is exported with it.
     let exported = place.path().join("speaker.oci.tar");

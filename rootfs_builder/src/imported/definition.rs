@@ -6,9 +6,7 @@ use std::path::{Path, PathBuf};
 use package::system::FoundSystem;
 use ros::flavour::Version;
 
-use super::ImportedImage;
-use crate::base::{self, Build, Definition, Runtime};
-use crate::builder::DEFAULT_BASE;
+use crate::base::{self, Build, DEFAULT_BASE, Definition, ImportedImage, Runtime};
 use crate::error::Error;
 
 /// Base whose settings for ROS 2 are used: packages to ignore, arguments of CMake.

@@ -2,27 +2,9 @@
 
 use package::system::{FoundSystem, MIDDLEWARES, RosSpace};
 use ros::flavour::Version;
-use serde::{Deserialize, Serialize};
 
 use super::definition::{find_missing_tools, installs_python, version};
-
-/// Result of looking for one subject, and what it means.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Finding {
-    /// Subject, such as `ROS` or `compiling`.
-    pub subject: String,
-    /// Description of what was found; begins with `missing` if it is not there.
-    pub found: String,
-    /// Consequence for pushes; empty if there is none.
-    pub consequence: String,
-}
-
-impl Finding {
-    fn new(subject: &str, found: impl Into<String>, consequence: impl Into<String>) -> Self {
-        Self { subject: subject.to_owned(), found: found.into(), consequence: consequence.into() }
-    }
-}
+use crate::base::Finding;
 
 /// Returns the table. `debs`: number of packages of dpkg.
 pub(super) fn list_findings(system: &FoundSystem, debs: usize) -> Vec<Finding> {

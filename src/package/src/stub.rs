@@ -12,6 +12,7 @@
 mod ament;
 mod catkin;
 mod contents;
+mod info;
 mod manifest;
 mod message_packages;
 mod needed;
@@ -19,14 +20,15 @@ mod nodelets;
 mod other_ros;
 mod settings;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 pub use contents::{Content, Contents};
+pub use info::{Files, Portal, ProgramRequest, StubInfo};
+use info::{RosTerms, definition_path, text_file};
 pub use manifest::{MANIFEST, SIGNATURE, SIGNER, manifest};
 use ros::bus::RosVersion;
 
 use crate::Error;
-use crate::interface::Interface;
 
 /// Name of the robot's program in `lib/PACKAGE`.
 pub const PROGRAM: &str = "cloudroid-stub";
@@ -36,73 +38,9 @@ const ORIGINAL: &str = include_str!("stub/inside/original.sh");
 const INSTALL: &str = include_str!("stub/inside/install.sh");
 const README: &str = include_str!("stub/inside/README.md");
 
-/// Address of the portal for robots.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Portal {
-    /// URL, such as `wss://server:9090`.
-    pub address: String,
-    /// Fingerprint of the certificate, if it is not issued by a CA.
-    pub fingerprint: Option<String>,
-}
-
-/// Properties of the service that a stub is built for.
-#[derive(Debug, Clone)]
-pub struct StubInfo<'a> {
-    /// ROS version of the robot.
-    pub ros: RosVersion,
-    /// ROS version of the service.
-    pub service_ros: RosVersion,
-    /// Name of the service.
-    pub service: &'a str,
-    /// ROS package.
-    pub package: &'a str,
-    /// Revision of the service.
-    pub revision: u64,
-    /// Digest of the image.
-    pub image: &'a str,
-    /// Address of the portal.
-    pub portal: &'a Portal,
-    /// Architecture of the robot's program, in the terms of `uname -m`.
-    pub architecture: &'a str,
-    /// Executables that run in the cloud.
-    pub outsourced: &'a BTreeSet<String>,
-    /// Names that programs give their own nodes, by executable, as far as known.
-    pub names: &'a BTreeMap<String, String>,
-    /// Interface of the service, with types of the robot's ROS.
-    pub interface: &'a Interface,
-    /// True if answers depend on earlier requests, as declared by the deployer.
-    pub stateful: bool,
-    /// Request pairs of the nodes.
-    pub requests: &'a [ProgramRequest],
-    /// Default T_desire and T_max in seconds, as set by the deployer.
-    pub times: Option<(f64, f64)>,
-}
-
-impl StubInfo<'_> {
-    /// Returns whether robot and service have different versions of ROS.
-    pub fn is_for_other_ros(&self) -> bool {
-        self.ros != self.service_ros
-    }
-}
-
-/// Request pair of a node, with topics as its program names them.
-#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct ProgramRequest {
-    /// Absolute name of the node at the push; topics below or beside it are so on a robot as well.
-    pub node: String,
-    /// Executable of the node, if known.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub program: Option<String>,
-    /// Absolute names of the topics before remapping.
-    pub request: qos::TopicPair,
-}
-
 /// Files that the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a
 /// robot's token would get its permissions, and its content would be read as a setting.
 const OURS: [&str; 6] = ["token", "ca.pem", "install.sh", "stub.toml", "interface.toml", "revision.toml"];
-
-/// Files of a stub, by path in the install space.
-pub type Files = BTreeMap<String, Content>;
 
 /// Composes the files of a stub.
 pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Error> {
@@ -175,18 +113,6 @@ fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String>
     names
 }
 
-/// Terms in the generated texts that differ between the ROS versions.
-struct RosTerms {
-    /// Command that starts a node.
-    run: &'static str,
-    /// Reason why the overlay's setup file is sourced last.
-    order: &'static str,
-    /// Description of what cannot be loaded on the robot.
-    plugins: &'static str,
-    /// Where a robot may give a setting besides `stub.toml`.
-    settings: &'static str,
-}
-
 impl RosTerms {
     fn for_ros(ros: RosVersion) -> &'static RosTerms {
         match ros {
@@ -224,10 +150,6 @@ fn launcher(about: &StubInfo<'_>, node: &str, up: &str) -> Content {
 /// Quotes a word for a shell.
 fn shell_quote(word: &str) -> String {
     format!("'{}'", word.replace('\'', "'\\''"))
-}
-
-fn text_file(text: &str) -> Content {
-    Content::File { bytes: text.as_bytes().to_vec(), executable: false }
 }
 
 fn fill_template(template: &str, about: &StubInfo<'_>) -> String {
@@ -277,13 +199,6 @@ fn other_ros_notice(about: &StubInfo<'_>) -> String {
         "\nThe service is of ROS {service_ros}, this archive for robots of ROS {ros}: the server translates the \
          messages, the stub the nodes' arguments.{sources}\n"
     )
-}
-
-/// Returns the path of `pkg/msg/Type` in the install space, if it is of this package.
-fn definition_path(package: &str, key: &str) -> Option<String> {
-    let (kind, name) = key.strip_prefix(package)?.strip_prefix('/')?.split_once('/')?;
-    let known = matches!(kind, "msg" | "srv" | "action") && crate::names::is_type(name);
-    known.then(|| format!("share/{package}/{kind}/{name}.{kind}"))
 }
 
 #[cfg(test)]

@@ -13,8 +13,9 @@ use store::UnderlayRecord;
 use tokio::sync::mpsc;
 
 use super::exported::ImportedService;
+use super::pusher::EVENTS_AHEAD;
 use super::reporter::Reporter;
-use super::{Deployer, EVENTS_AHEAD, Error, Pusher, exported, receive, told};
+use super::{Deployer, Error, Pusher, exported, receive, told};
 
 impl Pusher {
     /// Looks at what was received: a service that another server has exported, or something to build.

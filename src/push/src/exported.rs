@@ -21,8 +21,9 @@ use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
 use super::building::PushedImage;
+use super::pusher::HOME_INSIDE;
 use super::reporter::Reporter;
-use super::{Error, HOME_INSIDE, Options, OptionsError, Pusher};
+use super::{Error, Options, OptionsError, Pusher};
 
 /// Annotation of the image's index entry with the digest of the record.
 pub const RECORD: &str = "org.cloudroid.record";

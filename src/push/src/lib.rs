@@ -29,6 +29,7 @@ mod patience;
 mod places;
 mod probe;
 mod publish;
+mod pusher;
 mod receive;
 mod registry;
 mod reporter;
@@ -42,31 +43,21 @@ mod told;
 mod underlays;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use api::PushOptions;
-use catalogue::{Catalogue, names};
-use choreographer::Choreographer;
+use catalogue::names;
 use package::inventory::Inventory;
 use package::requests;
-use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildOutcome, Builder, PushSource};
-use servant::engine::Engine;
-use tokio_util::sync::CancellationToken;
-use tokio_util::task::TaskTracker;
+use rootfs_builder::{BuildOutcome, PushSource};
 
 use bounds::PushBudget;
 use building::PushedImage;
-use disks::Disks;
 use exported::ImportedService;
-use places::PushQueue;
-use registry::PushRegistry;
+use pusher::HOME_INSIDE;
 use reporter::Reporter;
-use store::{Journal, Plan, RevisionRecord, State};
+use store::{Plan, RevisionRecord};
 use told::PUSHED;
 
 pub use bases::NewBase;
@@ -74,91 +65,12 @@ pub use deployer::{Deployer, UnderlayUse};
 pub use error::{Error, OptionsError};
 pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
+pub use pusher::{Pusher, PusherParts};
 pub use receive::Archive;
 pub use request::{Published, PushResult};
 pub use running::{PushFollower, ReceptionGuard, RunningPush};
 
-/// Capacity of a queue of events, which the task of the push empties.
-const EVENTS_AHEAD: usize = 256;
-/// Home directory of nodes in the container, a tmpfs.
-const HOME_INSIDE: &str = "/root";
-
-/// Dependencies of a [`Pusher`].
-pub struct PusherParts {
-    /// Builds images.
-    pub builder: Arc<Builder>,
-    /// Publishes revisions.
-    pub catalogue: Arc<Catalogue>,
-    /// Runs the container in which the interface is probed.
-    pub engine: Arc<dyn Engine>,
-    /// Connects to the ROS graph of that container.
-    pub opener: Arc<dyn Opener>,
-    /// Admits that container, and stops the servants of removed services.
-    pub choreographer: Choreographer,
-    /// Records the outcome for the operator.
-    pub journal: Journal,
-    /// Database, which keeps the pushes of late.
-    pub state: Arc<State>,
-}
-
-/// Publishes, rolls back and removes services.
-pub struct Pusher {
-    options: Options,
-    home: PathBuf,
-    catalogue: Arc<Catalogue>,
-    engine: Arc<dyn Engine>,
-    opener: Arc<dyn Opener>,
-    choreographer: Choreographer,
-    builder: Arc<Builder>,
-    journal: Journal,
-    places: PushQueue,
-    registry: PushRegistry,
-    disks: Disks,
-    published: AtomicU64,
-    failed: AtomicU64,
-    cancel: CancellationToken,
-    tasks: TaskTracker,
-}
-
 impl Pusher {
-    /// Creates a pusher with build directories below `home`, the state directory.
-    pub fn new(options: Options, home: PathBuf, parts: PusherParts) -> Pusher {
-        let PusherParts { builder, catalogue, engine, opener, choreographer, journal, state } = parts;
-        Pusher {
-            places: PushQueue::new(&options),
-            registry: PushRegistry::new(state),
-            disks: Disks::new(&home, builder.cache_dir(), options.free),
-            options,
-            home,
-            journal,
-            catalogue,
-            engine,
-            opener,
-            choreographer,
-            builder,
-            published: AtomicU64::new(0),
-            failed: AtomicU64::new(0),
-            cancel: CancellationToken::new(),
-            tasks: TaskTracker::new(),
-        }
-    }
-
-    /// Returns the numbers of successful and failed pushes since the start.
-    pub fn counts(&self) -> (u64, u64) {
-        (self.published.load(Ordering::Relaxed), self.failed.load(Ordering::Relaxed))
-    }
-
-    /// Cancels all pushes and waits up to `patience` until they have cleaned up; what is left is removed at the next
-    /// start.
-    pub async fn cancel_all(&self, patience: Duration) {
-        self.cancel.cancel();
-        self.builder.stop_packing();
-        self.tasks.close();
-        if tokio::time::timeout(patience, self.tasks.wait()).await.is_err() {
-            tracing::warn!("leftovers of cancelled pushes are removed at the next start");
-        }
-    }
-
     /// Receives a push, and runs it when its turn comes, within its budget.
     async fn push(
         &self,

@@ -16,9 +16,10 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::deployer::Deployer;
+use super::pusher::EVENTS_AHEAD;
 use super::reporter::Reporter;
 use super::running::RunningPush;
-use super::{Archive, EVENTS_AHEAD, Error, OptionsError, Pusher, option_check, receive, shared};
+use super::{Archive, Error, OptionsError, Pusher, option_check, receive, shared};
 
 /// What a push has published, or found unchanged.
 #[derive(Debug, Clone, PartialEq)]

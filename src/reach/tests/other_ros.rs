@@ -11,7 +11,9 @@ use link::control::{Exit, FromRobot, Hello, InputChannel, NodeLaunch};
 use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::{Hub, HubOptions, NodeController, NodeError};
-use ros::bus::{Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType};
+use ros::bus::{
+    Bus, FailureReason, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType, wait_for_connected,
+};
 use ros::codec::put::CdrWriter;
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::HostSockets;
@@ -156,10 +158,7 @@ impl Servant {
 
     /// Returns the robot's ROS.
     fn robot(&self) -> RosVersion {
-        match self.version {
-            RosVersion::One => RosVersion::Two,
-            RosVersion::Two => RosVersion::One,
-        }
+        self.version.other()
     }
 }
 
@@ -223,6 +222,8 @@ async fn topics_and_calls_cross(version: RosVersion) {
     robot.publish(1, say(ours, "picture"));
     let message = timeout(LONG, heard.messages.recv()).await.expect("it comes").expect("the topic is there");
     assert_eq!(message.bytes, say(theirs, "picture"));
+    // In ROS 1 the hub hears nothing that is published before it is connected.
+    timeout(LONG, wait_for_connected(found.matched_subscribers(), 1)).await.expect("the robot listens");
     found.publish(say(theirs, "people"));
     assert_eq!(robot.next_message().await, (output.channel, say(ours, "people")));
     // What was latched before the robot subscribed reaches it.

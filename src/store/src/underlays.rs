@@ -132,12 +132,11 @@ struct StoredUnderlay {
 
 impl StoredUnderlay {
     fn parse(self) -> Result<UnderlayRecord, Error> {
-        let unreadable = |source| Error::Record { what: format!("underlay {}", self.record.name), source };
-        Ok(UnderlayRecord {
-            flavour: serde_json::from_str(&self.flavour).map_err(unreadable)?,
-            contents: serde_json::from_str(&self.contents).map_err(unreadable)?,
-            ..self.record.clone()
-        })
+        let Self { record, flavour, contents } = self;
+        let unreadable = |source| Error::Record { what: format!("underlay {}", record.name), source };
+        let flavour = serde_json::from_str(&flavour).map_err(unreadable)?;
+        let contents = serde_json::from_str(&contents).map_err(unreadable)?;
+        Ok(UnderlayRecord { flavour, contents, ..record })
     }
 }
 

@@ -9,8 +9,7 @@ use super::{BridgeClient, ReplyTarget};
 impl BridgeClient {
     /// Returns the message of a payload. If a `seq` was dropped from it, warns the client, but only once for each
     /// topic, service or action: clients made for ROS 1 write one into every header. `about` is the kind of name and
-    /// the name,
-    /// `("topic", "/scan")`.
+    /// the name, `("topic", "/scan")`.
     pub(super) fn take_decoded(
         &self,
         decoded: DecodedPayload,

@@ -1,8 +1,10 @@
 mod ament;
 mod other_ros;
 
+use std::collections::BTreeMap;
+
 use super::*;
-use crate::interface::{Direction, Topic};
+use crate::interface::{Direction, Interface, Topic};
 
 const PACKAGE_XML: &str = r#"<package format="2"><name>p</name>
 <export><nodelet plugin="${prefix}/nodelets.xml"/><rviz plugin="${prefix}/rviz.xml"/></export></package>"#;

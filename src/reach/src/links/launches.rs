@@ -19,11 +19,7 @@ pub(super) fn adapt_node(hello: &mut Hello, servant: RosVersion) -> Vec<String> 
     if robot == servant.number() || spelling(node) == servant {
         return Vec::new();
     }
-    let RespelledArguments { mut argv, ignored } = RespelledArguments::new(&node.argv, &node.name, servant);
-    // In ROS 1 it is a parameter of all nodes.
-    if servant == RosVersion::Two && is_simulated(hello.parameters.get(SIMULATED)) {
-        argv.extend([BEGIN, "-p", "use_sim_time:=true"].map(str::to_owned));
-    }
+    let RespelledArguments { argv, ignored } = RespelledArguments::new(&node.argv, &node.name, servant);
     node.argv = argv;
     // The robot's name is given to all nodes of the program, which is one node on the robot.
     node.named_by_argv = false;
@@ -41,22 +37,6 @@ fn is_simulated(value: Option<&ParamValue>) -> bool {
     value == Some(&ParamValue::Bool(true))
 }
 
-impl Hub {
-    /// Sets whether the time of a servant of ROS 1 is simulated, as a robot of ROS 2 says it for its node.
-    pub(super) async fn copy_simulated_time(&self, hello: &Hello) -> Result<(), BusError> {
-        let Ok(parameters) = self.bus.parameters() else {
-            return Ok(());
-        };
-        let key = format!("/{SIMULATED}");
-        let wanted = is_simulated(hello.parameters.get(SIMULATED));
-        let there = is_simulated(parameters.get(&key).await.ok().as_ref());
-        if wanted != there {
-            parameters.set(&key, ParamValue::Bool(wanted)).await?;
-        }
-        Ok(())
-    }
-}
-
 /// Returns the types of the parameters of a service's nodes, as its push has recorded them. A name that has several is
 /// left out: which of the nodes is meant is not known.
 fn parameter_kinds(interface: &Interface) -> BTreeMap<String, ParameterKind> {
@@ -71,6 +51,20 @@ fn parameter_kinds(interface: &Interface) -> BTreeMap<String, ParameterKind> {
 }
 
 impl Hub {
+    /// Sets whether the time of a servant of ROS 1 is simulated, as a robot of ROS 2 says it for its node.
+    pub(super) async fn copy_simulated_time(&self, hello: &Hello) -> Result<(), BusError> {
+        let Ok(parameters) = self.bus.parameters() else {
+            return Ok(());
+        };
+        let key = format!("/{SIMULATED}");
+        let wanted = is_simulated(hello.parameters.get(SIMULATED));
+        let there = is_simulated(parameters.get(&key).await.ok().as_ref());
+        if wanted != there {
+            parameters.set(&key, ParamValue::Bool(wanted)).await?;
+        }
+        Ok(())
+    }
+
     /// Returns the node of a robot as it is to be started, and what it is not given, in words. For a robot of the other
     /// ROS its parameters are passed on as the servant's ROS has them.
     pub(super) async fn prepare_launch(&self, view: &ServantView, node: &NodeLaunch) -> (NodeLaunch, Option<String>) {
@@ -146,13 +140,5 @@ mod tests {
         }
         let mut unknown = hello(2, true, "--ros-args --log-level debug");
         assert_eq!(adapt_node(&mut unknown, RosVersion::One), ["--log-level debug"]);
-    }
-
-    #[test]
-    fn time_that_is_simulated_for_all_of_a_robot_is_so_for_a_node_of_ros_2() {
-        let mut hello = hello(1, false, "image:=/left");
-        hello.parameters.insert(SIMULATED.into(), ParamValue::Bool(true));
-        adapt_node(&mut hello, RosVersion::Two);
-        assert_eq!(hello.node.argv.join(" "), "--ros-args -r image:=/left -- --ros-args -p use_sim_time:=true");
     }
 }

@@ -11,8 +11,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros::bus::hidden_names;
-use ros::bus::{Graph, NodeEntities, Offer, QosProfile, RosVersion, ServiceType, TopicNodes, TypeInquiries, WireType};
+use ros::bus::{
+    Graph, NodeEntities, Offer, QosProfile, RosVersion, ServiceType, TopicNodes, TypeInquiries, WireType, hidden_names,
+};
 use ros::ros2::names;
 use tokio::sync::watch;
 

@@ -342,9 +342,10 @@ async fn what_cannot_be_carried_is_left_out_or_dropped_with_a_reason() {
     let counted = bus.losses();
     assert!(matches!(&counted[..], [one] if one.name == "/found" && one.untranslated == 2), "{counted:?}");
     assert_eq!(losses.0.lock().len(), 1, "said once");
-    // No type of the robot's that nobody describes is published.
-    let refused = bus.advertise("/brew", WireType::new("lab_msgs/Brew", "0", ""), QosProfile::keep_last(1)).await;
-    assert!(refused.is_err() || bus.message(&WireType::with_name("lab_msgs/Brew")).is_none());
+    // A type of the robot's that refers to one that nobody describes is not published.
+    let brew = WireType::new("lab_msgs/Brew", "0", "lab_msgs/Bean bean\n");
+    let refused = bus.advertise("/brewed", brew, QosProfile::keep_last(1)).await.err();
+    assert!(matches!(refused, Some(BusError::NotTranslated { .. })), "{refused:?}");
 }
 
 #[tokio::test]

@@ -11,17 +11,18 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::bus::{ActionClient, BusError, GoalEnd, GoalError, GoalEvents, GoalOutcome};
 use ros::codec::default_message;
+use ros::schema::MessageType;
 use tokio::sync::mpsc;
 use tracing::Instrument;
 
-use crate::ActionTwin;
 use crate::bus::state::Translation;
+use crate::{ActionTwin, MessageTranslator};
 
 /// Time for which goals wait for a server that the graph shows.
 const CONNECTS: Duration = Duration::from_secs(10);
 
 /// A client of one action. Goals that are under way when it is dropped are cancelled.
-pub(in crate::bus) struct TranslatedActionClient {
+pub(crate) struct TranslatedActionClient {
     carrier: Arc<ActionCarrier>,
     inner: Arc<dyn ActionClient>,
     orders: mpsc::UnboundedSender<Order>,
@@ -33,6 +34,22 @@ pub(super) struct ActionCarrier {
     pub(super) action: String,
     /// The servant's type, and the robot's as its twin.
     pub(super) twin: Arc<ActionTwin>,
+}
+
+impl ActionCarrier {
+    /// Returns the end of a goal with its result carried by `by` to the type `of`. A goal has not succeeded for
+    /// somebody who cannot read what came of it.
+    pub(super) fn carry_end(&self, end: GoalEnd, by: &MessageTranslator, of: &MessageType) -> GoalEnd {
+        let GoalEnd { outcome, text, result } = end;
+        match self.translation.losses.translate(&self.action, by, &result) {
+            Ok(result) => GoalEnd { outcome, text, result },
+            Err(error) => GoalEnd {
+                outcome: if outcome == GoalOutcome::Succeeded { GoalOutcome::Aborted } else { outcome },
+                text: format!("the result is not carried to the other ROS: {error}; {text}"),
+                result: default_message(of).into(),
+            },
+        }
+    }
 }
 
 /// What is to be done in order.
@@ -177,21 +194,15 @@ impl GoalEvents for TranslatedEvents {
     }
 
     fn on_ended(&self, end: Result<GoalEnd, GoalError>) {
-        let GoalEnd { outcome, text, result } = match end {
-            Ok(end) => end,
-            Err(error) => return self.events.on_ended(Err(error)),
-        };
-        if matches!(outcome, GoalOutcome::Rejected) {
-            return self.end(outcome, text);
-        }
-        let ActionCarrier { translation, action, twin } = &*self.carrier;
-        match translation.losses.translate(action, &twin.result.to_twin, &result) {
-            Ok(result) => self.events.on_ended(Ok(GoalEnd { outcome, text, result })),
-            // A goal has not succeeded for somebody who cannot read what came of it.
-            Err(error) => {
-                let outcome = if outcome == GoalOutcome::Succeeded { GoalOutcome::Aborted } else { outcome };
-                self.end(outcome, format!("the result is not carried to the other ROS: {error}; {text}"));
+        match end {
+            // Nothing came of it that could be carried.
+            Ok(GoalEnd { outcome: GoalOutcome::Rejected, text, .. }) => self.end(GoalOutcome::Rejected, text),
+            Ok(end) => {
+                let twin = &self.carrier.twin;
+                let end = self.carrier.carry_end(end, &twin.result.to_twin, &twin.twin.result);
+                self.events.on_ended(Ok(end));
             }
+            Err(error) => self.events.on_ended(Err(error)),
         }
     }
 }

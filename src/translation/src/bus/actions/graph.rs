@@ -12,7 +12,7 @@ use crate::bus::twins::{KnownTwins, Untranslatable};
 
 /// Adds the actions that nodes of the servant serve, as a robot of this version sees them. `own` is the bus's own node,
 /// which is a client of those in use.
-pub(in crate::bus) fn add_actions(
+pub(crate) fn add_actions(
     version: RosVersion,
     inner: &Graph,
     own: &str,

@@ -3,8 +3,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros::bus::{ActionHandler, ActionServer, BusError, FailureReason, GoalEnd, GoalOutcome};
-use ros::codec::default_message;
+use ros::bus::{ActionHandler, ActionServer, BusError, FailureReason, GoalEnd};
 
 use super::client::ActionCarrier;
 use crate::bus::state::Translation;
@@ -46,16 +45,8 @@ impl ActionServer for TranslatedActionServer {
     }
 
     fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
-        let ActionCarrier { translation, action, twin } = &*self.carrier;
-        let GoalEnd { outcome, text, result } = end;
-        let end = match translation.losses.translate(action, &twin.result.from_twin, &result) {
-            Ok(result) => GoalEnd { outcome, text, result },
-            Err(error) => GoalEnd {
-                outcome: if outcome == GoalOutcome::Succeeded { GoalOutcome::Aborted } else { outcome },
-                text: format!("the result is not carried to the other ROS: {error}; {text}"),
-                result: default_message(&twin.original.result).into(),
-            },
-        };
+        let twin = &self.carrier.twin;
+        let end = self.carrier.carry_end(end, &twin.result.from_twin, &twin.original.result);
         self.inner.end_goal(id, end)
     }
 }

@@ -44,12 +44,12 @@ const DEFINITIONS: [(&str, &str); 10] = [
 ];
 
 /// Returns a message type by its name.
-pub(in crate::bus::parameters) fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
+pub(crate) fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
     look_up(name, |registry| registry.message(name))
 }
 
 /// Returns the type of the service that changes parameters.
-pub(in crate::bus::parameters) fn service() -> Result<Arc<ServiceDef>, BusError> {
+pub(crate) fn service() -> Result<Arc<ServiceDef>, BusError> {
     let name = "dynamic_reconfigure/Reconfigure";
     look_up(name, |registry| registry.service(name))
 }
@@ -64,7 +64,7 @@ fn look_up<T>(name: &str, find: impl FnOnce(&Registry) -> Result<T, SchemaError>
 
 /// Type of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::bus::parameters) enum ConfigKind {
+pub(crate) enum ConfigKind {
     Bool,
     Integer,
     Double,
@@ -73,7 +73,7 @@ pub(in crate::bus::parameters) enum ConfigKind {
 
 impl ConfigKind {
     /// Returns the name of the type in descriptions.
-    pub(in crate::bus::parameters) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Bool => "bool",
             Self::Integer => "int",
@@ -89,13 +89,13 @@ impl ConfigKind {
 
 /// A parameter as its server describes it.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::bus::parameters) struct DescribedParameter {
-    pub(in crate::bus::parameters) kind: ConfigKind,
-    pub(in crate::bus::parameters) description: String,
+pub(crate) struct DescribedParameter {
+    pub(crate) kind: ConfigKind,
+    pub(crate) description: String,
     /// The named values that it can have, as the server writes them; may be empty.
-    pub(in crate::bus::parameters) choices: String,
+    pub(crate) choices: String,
     /// Smallest and largest value of a number.
-    pub(in crate::bus::parameters) range: Option<(f64, f64)>,
+    pub(crate) range: Option<(f64, f64)>,
 }
 
 /// The parameters of a server.
@@ -106,8 +106,8 @@ pub(super) struct ConfigDescription {
 
 /// Values by name.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(in crate::bus::parameters) struct Config {
-    pub(in crate::bus::parameters) values: BTreeMap<String, ParamValue>,
+pub(crate) struct Config {
+    pub(crate) values: BTreeMap<String, ParamValue>,
 }
 
 impl ConfigDescription {
@@ -145,12 +145,12 @@ impl ConfigDescription {
 
 impl Config {
     /// Reads a serialized `Config`, which is also the request and the response of the service.
-    pub(in crate::bus::parameters) fn parse(bytes: &[u8]) -> Option<Self> {
+    pub(crate) fn parse(bytes: &[u8]) -> Option<Self> {
         ConfigReader::new(bytes)?.config()
     }
 
     /// Returns the serialized `Config`. Values that are neither bools, integers, texts nor doubles are left out.
-    pub(in crate::bus::parameters) fn serialize(&self) -> Bytes {
+    pub(crate) fn serialize(&self) -> Bytes {
         let mut lists: [(u32, Vec<u8>); 4] = Default::default();
         for (name, value) in &self.values {
             let at = match value {
