@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use api::stub::{ARCHITECTURES, parse_architecture};
 use flate2::{Compression, GzBuilder};
@@ -92,6 +93,8 @@ pub struct TargetRobots<'a> {
     pub program: &'a StubProgram,
     /// Where the robots reach the portal.
     pub portal: &'a Portal,
+    /// Rules by which types have counterparts in the robots' ROS.
+    pub rules: &'a Arc<TranslationRules>,
 }
 
 /// Returns the files of a revision's stub, except the robot's program.
@@ -110,7 +113,7 @@ fn compose_files(
     let interface = if ros == service_ros {
         Cow::Borrowed(&revision.interface)
     } else {
-        let translations = TypeTranslations::new(TranslationRules::default());
+        let translations = TypeTranslations::new(Arc::clone(robots.rules));
         let twin = revision.interface.to_other_ros(service_ros, &revision.service, &translations);
         Cow::Owned(twin.map_err(no_stub)?)
     };
