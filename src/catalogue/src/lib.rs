@@ -17,6 +17,7 @@ pub mod names;
 mod owned;
 mod publish;
 pub mod stubs;
+mod twins;
 mod unchanged;
 mod underlays;
 
@@ -55,6 +56,12 @@ impl Catalogue {
     /// Returns the rules by which types have counterparts in the other ROS.
     pub fn translation_rules(&self) -> &Arc<TranslationRules> {
         &self.rules
+    }
+
+    /// Returns which types of a revision have no counterpart in the other ROS, with their fields, if there are any.
+    pub fn find_types_without_twins(&self, revision: &RevisionRecord) -> Option<package::Error> {
+        let robots = revision.flavour.ros.ros_version().other();
+        twins::interface_for_robots(revision, robots, &self.rules).err()
     }
 
     /// Returns the image store.
