@@ -642,6 +642,7 @@ fn main() -> ExitCode {
             a_robot_of_ros_2_starts_a_node_of_ros_1_as_its_own,
             a_robot_of_ros_1_starts_a_node_of_ros_2_as_its_own,
             tools_of_ros_1_find_the_stub_of_a_service_of_ros_2,
+            rules_of_a_lab_name_the_types_of_its_robots,
             the_same_service_has_an_archive_for_either_ros,
         ],
         stories![shadowing:

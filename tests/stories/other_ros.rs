@@ -87,6 +87,36 @@ pub fn tools_of_ros_1_find_the_stub_of_a_service_of_ros_2() -> Verdict {
     Ok(())
 }
 
+pub fn rules_of_a_lab_name_the_types_of_its_robots() -> Verdict {
+    let place = world().directory("translation-rules")?;
+    let configure = |name: &str, rules: &str| -> anyhow::Result<String> {
+        let path = place.path().join(name);
+        std::fs::write(&path, rules)?;
+        Ok(format!("[ros]\ntranslation_rules = [{path:?}]\n"))
+    };
+    let unfinished = configure("unfinished.yaml", "- ros1_package_name: lab_msgs\n")?;
+    let refused = world().setup("unfinished-rules").config(&unfinished).expect_refusal()?;
+    ensure!(refused.contains("unfinished.yaml, rule 1 lacks ros2_package_name"), "{refused}");
+    let lab = configure("lab.yaml", "- {ros1_package_name: lab_msgs, ros2_package_name: herald_msgs}\n")?;
+    let daemon = world().setup("rules-of-a-lab").config(&lab).start()?;
+    HERALD.push_to(&daemon)?;
+    let site = Site::new()?;
+    let app = site.node("/app")?;
+    let overlay = site.install_stub(&daemon, "herald", "robot = \"rules-of-a-lab\"\nlocal = \"none\"\n")?;
+    let definition = overlay.join("share/herald/message_packages/lab_msgs/msg/Greeting.msg");
+    ensure!(definition.is_file(), "{}", definition.display());
+    let stub = site.start_installed(&overlay, "herald", "herald", &["__name:=herald", "greeting:=/heard"])?;
+    let mut greetings = site.subscribe(&app, "/heard")?;
+    let name = site.advertise_strings(&app, "/name", false)?;
+    let ask = || {
+        name.publish(string("crowd"));
+        Ok(())
+    };
+    let greeted = with_log(site.ask_until(&mut greetings, ask, |_| Ok(true)), &stub)?;
+    ensure!(greeted.wire_type.name == "lab_msgs/Greeting", "{greeted:?}");
+    Ok(())
+}
+
 pub fn the_same_service_has_an_archive_for_either_ros() -> Verdict {
     let daemon = world().daemon_with(TELLER)?;
     for (query, expected) in [("?ros=1", 200), ("?ros=2", 200), ("", 200), ("?ros=3", 400)] {

@@ -17,6 +17,7 @@ pub mod names;
 mod owned;
 mod publish;
 pub mod stubs;
+mod twins;
 mod unchanged;
 mod underlays;
 
@@ -24,6 +25,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use store::{RevisionRecord, State};
+use translation::TranslationRules;
 
 pub use error::Error;
 pub use fit::StubError;
@@ -37,12 +39,29 @@ pub struct Catalogue {
     state: Arc<State>,
     images: Arc<image::Store>,
     in_use: ContentsCache,
+    rules: Arc<TranslationRules>,
 }
 
 impl Catalogue {
     /// Creates a catalogue on a state database and an image store.
     pub fn new(state: Arc<State>, images: Arc<image::Store>) -> Catalogue {
-        Catalogue { state, images, in_use: ContentsCache::default() }
+        Catalogue { state, images, in_use: ContentsCache::default(), rules: Arc::default() }
+    }
+
+    /// Sets the rules by which types have counterparts in the other ROS (default: the built-in ones).
+    pub fn with_translation_rules(self, rules: TranslationRules) -> Catalogue {
+        Catalogue { rules: Arc::new(rules), ..self }
+    }
+
+    /// Returns the rules by which types have counterparts in the other ROS.
+    pub fn translation_rules(&self) -> &Arc<TranslationRules> {
+        &self.rules
+    }
+
+    /// Returns which types of a revision have no counterpart in the other ROS, with their fields, if there are any.
+    pub fn find_types_without_twins(&self, revision: &RevisionRecord) -> Option<package::Error> {
+        let robots = revision.flavour.ros.ros_version().other();
+        twins::interface_for_robots(revision, robots, &self.rules).err()
     }
 
     /// Returns the image store.

@@ -1,10 +1,10 @@
 //! Stub archives of published services: composed from the image and the interface, and packed with the robot's program.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use api::stub::{ARCHITECTURES, parse_architecture};
 use flate2::{Compression, GzBuilder};
@@ -18,8 +18,9 @@ use ros::ros2::arguments;
 use sign::SigningKey;
 use store::RevisionRecord;
 use tar::{EntryType, Header};
-use translation::{TranslationRules, TypeTranslations};
+use translation::TranslationRules;
 
+use crate::twins::interface_for_robots;
 use crate::{Error, inventory};
 
 /// Modification time of all files, so that the same input gives the same archive.
@@ -92,6 +93,8 @@ pub struct TargetRobots<'a> {
     pub program: &'a StubProgram,
     /// Where the robots reach the portal.
     pub portal: &'a Portal,
+    /// Rules by which types have counterparts in the robots' ROS.
+    pub rules: &'a Arc<TranslationRules>,
 }
 
 /// Returns the files of a revision's stub, except the robot's program.
@@ -107,13 +110,7 @@ fn compose_files(
     };
     let service_ros = revision.flavour.ros.ros_version();
     let ros = robots.ros;
-    let interface = if ros == service_ros {
-        Cow::Borrowed(&revision.interface)
-    } else {
-        let translations = TypeTranslations::new(TranslationRules::default());
-        let twin = revision.interface.to_other_ros(service_ros, &revision.service, &translations);
-        Cow::Owned(twin.map_err(no_stub)?)
-    };
+    let interface = interface_for_robots(revision, ros, robots.rules).map_err(no_stub)?;
     let layers = inventory::layers(store, &revision.image)?;
     let contents = match inventory.packages.get(&revision.package) {
         Some(package) => Contents::read(&layers, package).map_err(no_stub)?,

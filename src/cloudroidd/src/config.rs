@@ -14,6 +14,7 @@ mod options;
 mod people;
 mod portal;
 mod push;
+mod ros;
 mod servant;
 mod telemetry;
 mod time;
@@ -37,6 +38,7 @@ use crate::machine;
 pub use self::oidc::OidcConfig;
 pub use self::portal::{LoopbackRobots, NonFinite, PortalConfig};
 pub use self::push::PushConfig;
+pub use self::ros::RosConfig;
 pub use self::servant::{Hung, ServantConfig};
 pub use acme::AcmeConfig;
 pub use archives::ArchivesConfig;
@@ -112,6 +114,8 @@ pub struct Config {
     pub logs: LogsConfig,
     /// Limits of pushes.
     pub push: PushConfig,
+    /// Robots of another ROS than their service.
+    pub ros: RosConfig,
     /// Grants beyond a container that pushes may ask for.
     pub allow: Allow,
 }
@@ -172,6 +176,7 @@ impl Default for Config {
             black_box: BlackBoxConfig::default(),
             logs: LogsConfig::default(),
             push: PushConfig::default(),
+            ros: RosConfig::default(),
             allow: Allow::default(),
         }
     }
@@ -234,6 +239,7 @@ impl Config {
             telemetry.check(cfg!(feature = "otel")).context("[telemetry] of the configuration")?;
         }
         self.push.check().context("[push] of the configuration")?;
+        self.ros.read_rules().context("[ros] of the configuration")?;
         self.archives.check().context("[archives] of the configuration")?;
         self.capacity.check().context("[capacity] of the configuration")?;
         if let Some(service) = &self.default_service {

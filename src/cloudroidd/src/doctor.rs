@@ -20,8 +20,8 @@ const SPACE_WANTED: u64 = 10 << 30;
 /// Time in which a server must accept a connection.
 const CONNECTED: Duration = Duration::from_secs(2);
 
-/// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are settings
-/// that exceed this machine; `collector` is where traces are sent.
+/// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are
+/// problems of the configuration; `collector` is where traces are sent.
 pub fn examine(
     home: &Path,
     listening: Option<SocketAddr>,

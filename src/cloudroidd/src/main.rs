@@ -137,7 +137,8 @@ fn home_path(arguments: &DaemonArguments) -> anyhow::Result<PathBuf> {
 }
 
 fn examine(arguments: &DaemonArguments, config: &Config, json: bool) -> anyhow::Result<()> {
-    let doubts = config.machine_warnings(machine::resources());
+    let mut doubts = config.machine_warnings(machine::resources());
+    doubts.extend(config.ros.read_rules().err().map(|error| format!("[ros] {error}")));
     let collector = config.telemetry.as_ref();
     let doctor = doctor::examine(&home_path(arguments)?, None, &doubts, collector);
     if json {

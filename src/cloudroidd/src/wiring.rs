@@ -40,7 +40,8 @@ pub fn build(config: &Config, home: &Home, machine: MachineChecks, listen: Socke
     let known = known.map(|known| (known.provider.issuer(), &known.roles));
     let principals = principals.with_provider(known)?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
-    let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
+    let rules = config.ros.read_rules().context("[ros] of the configuration")?;
+    let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images).with_translation_rules(rules));
     let resources = EngineResources { catalogue: Arc::clone(&catalogue), egress: config.allow.egress.clone() };
     let local = LocalEngine::new(engine_config(config, home)?)?.with_resources(Arc::new(resources));
     let engine: Arc<dyn Engine> = Arc::new(local.clone());

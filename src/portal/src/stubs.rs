@@ -93,8 +93,9 @@ pub async fn archive(
     let architecture = program.architecture;
     let ros = asked.ros.map_or_else(|| revision.flavour.ros.ros_version(), RobotRos::to_version);
     let key = Arc::clone(&app.signing);
+    let rules = Arc::clone(app.catalogue.translation_rules());
     let packing = move || {
-        let robots = TargetRobots { ros, program: &program, portal: &portal };
+        let robots = TargetRobots { ros, program: &program, portal: &portal, rules: &rules };
         stubs::build_archive(&store, &revision, &inventory, &robots, &key)
     };
     // The semaphore is never closed.

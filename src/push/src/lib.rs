@@ -228,6 +228,9 @@ impl Pusher {
             plan,
             interface,
         };
+        if let Some(problem) = self.catalogue.find_types_without_twins(&record) {
+            report.warning(problem.to_string()).await;
+        }
         report.step(api::push::PUBLISHING).await;
         Ok((record, built.inventory))
     }

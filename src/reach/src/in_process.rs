@@ -66,6 +66,7 @@ impl InProcess {
             grace: options.grace,
             budget: options.budget.clone(),
             unfinished: options.unfinished,
+            rules: options.rules,
             ..HubOptions::default()
         };
         let hub = Hub::new(&id, linked, Arc::clone(&registry), Arc::clone(&nodes), habits);

@@ -63,6 +63,7 @@ use servant::engine::ServantHandle;
 use servant::spec::NodeSpec;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
+use translation::TranslationRules;
 
 use components::Loads;
 use egress::Relays;
@@ -121,6 +122,8 @@ pub struct ReachOptions {
     pub budget: Budget,
     /// Maximum time from the first to the last byte of a message or frame.
     pub unfinished: Duration,
+    /// Rules for types whose counterparts in the other ROS are not obvious.
+    pub rules: Arc<TranslationRules>,
 }
 
 /// Counts of what was sent to nodes and received from them.

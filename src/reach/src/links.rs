@@ -87,7 +87,7 @@ impl Default for HubOptions {
             warm_up: Duration::from_secs(1),
             budget: Budget::without_limit(),
             unfinished: Duration::from_secs(300),
-            rules: TranslationRules::default(),
+            rules: Arc::new(TranslationRules::default()),
         }
     }
 }

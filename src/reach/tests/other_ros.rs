@@ -23,6 +23,7 @@ use ros::schema::{MessageType, Registry};
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
+use translation::TranslationRules;
 
 #[allow(dead_code, reason = "not all of its nodes are needed here")]
 #[path = "../../../tests/support/memory_bus.rs"]
@@ -130,6 +131,10 @@ struct Servant {
 
 impl Servant {
     async fn new(version: RosVersion, interface: Option<Interface>) -> Self {
+        Self::with_options(version, interface, HubOptions::default()).await
+    }
+
+    async fn with_options(version: RosVersion, interface: Option<Interface>, options: HubOptions) -> Self {
         let (bus, node): (Arc<dyn Bus>, Arc<dyn Bus>) = match version {
             RosVersion::One => {
                 let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
@@ -146,7 +151,7 @@ impl Servant {
         };
         let nodes = Arc::new(ServantNodes { interface, ..ServantNodes::default() });
         let registry = Arc::new(definitions(version));
-        let hub = Hub::new("s", Arc::clone(&bus), registry, Arc::clone(&nodes) as _, HubOptions::default());
+        let hub = Hub::new("s", Arc::clone(&bus), registry, Arc::clone(&nodes) as _, options);
         Self { version, hub, nodes, bus, node }
     }
 
@@ -250,6 +255,20 @@ async fn a_robot_of_ros_1_uses_a_servant_of_ros_2() {
 #[tokio::test]
 async fn a_robot_of_ros_2_uses_a_servant_of_ros_1() {
     topics_and_calls_cross(RosVersion::One).await;
+}
+
+#[tokio::test]
+async fn rules_of_a_lab_name_the_types_of_its_robots() {
+    let rule = "- {ros1_package_name: lab_msgs, ros1_message_name: Text, ros2_package_name: std_msgs, \
+                ros2_message_name: String}";
+    let rules = TranslationRules::default().with_yaml("lab.yaml", rule).expect("a rule");
+    let options = HubOptions { rules: Arc::new(rules), ..HubOptions::default() };
+    let servant = Servant::with_options(RosVersion::Two, None, options).await;
+    let of = WireType::from_message(&string(RosVersion::Two));
+    let _found = servant.node.advertise("/found", of, QosProfile::keep_last(5)).await.expect("a topic");
+    let robot = LinkedRobot::connect(&servant.hub, &servant.hello()).await;
+    let graph = robot.wait_graph(|graph| find_output(graph, "/found").is_some()).await;
+    assert_eq!(find_output(&graph, "/found").expect("an output").type_name, "lab_msgs/Text");
 }
 
 #[tokio::test]

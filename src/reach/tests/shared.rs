@@ -168,6 +168,7 @@ fn place(group: &Arc<ServantGroup>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
         grace: Duration::from_secs(30),
         budget: Budget::without_limit(),
         unfinished: LONG,
+        rules: Arc::default(),
     };
     let reach = open_seat(group, "place", test_revision(), options, Arc::new(NullObserver));
     let tenant: Arc<dyn Tenant> = Arc::new(NullObserver);

@@ -15,6 +15,7 @@ mod table;
 mod yaml;
 
 use std::collections::HashMap;
+use std::path::Path;
 
 use ros_message::RosVersion;
 
@@ -98,6 +99,15 @@ impl TranslationRules {
             self.insert(rule);
         }
         Ok(self)
+    }
+
+    /// Adds the rules of a file on this machine, as [`with_yaml`](Self::with_yaml) does.
+    ///
+    /// # Errors
+    /// It cannot be read, is too long, or is no list of rules.
+    pub fn with_file(self, path: &Path) -> Result<TranslationRules, RuleError> {
+        let text = yaml::read_text(path)?;
+        self.with_yaml(&path.display().to_string(), &text)
     }
 
     fn insert(&mut self, rule: yaml::Rule) {

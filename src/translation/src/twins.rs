@@ -20,7 +20,7 @@ const MAX_KEPT: usize = 1024;
 /// Finds the twins of types of either ROS, and keeps them. Share it by `Arc`; all methods take `&self`.
 #[derive(Debug)]
 pub struct TypeTranslations {
-    rules: TranslationRules,
+    rules: Arc<TranslationRules>,
     known_one: Option<Arc<Registry>>,
     known_two: Option<Arc<Registry>>,
     messages: Kept<MessageTwin>,
@@ -121,9 +121,9 @@ impl<T> Kept<T> {
 
 impl TypeTranslations {
     /// Creates translations by these rules; [`TranslationRules::default`] is the built-in table.
-    pub fn new(rules: TranslationRules) -> Self {
+    pub fn new(rules: impl Into<Arc<TranslationRules>>) -> Self {
         TypeTranslations {
-            rules,
+            rules: rules.into(),
             known_one: None,
             known_two: None,
             messages: Kept::default(),

@@ -59,6 +59,7 @@ pub(crate) fn reach_options(
         grace: inner.options.grace,
         budget: memory.servant(id),
         unfinished: memory.unfinished,
+        rules: Arc::clone(inner.catalogue.translation_rules()),
     };
     let reports = ServantObserver {
         id: id.to_owned(),

@@ -1,55 +1,66 @@
 //! Command lines for a node in the cloud that is of the other ROS than the robot
 //! (<http://wiki.ros.org/Remapping%20Arguments>, <https://design.ros2.org/articles/ros_command_line_arguments.html>).
 //!
+//! Names and remap rules are spelt by [`ros::spelling`], which leaves the node's own name and the types of values to
+//! this side: only the robot knows which name the program gives itself, and reads values as its ROS does.
+//!
 //! | ROS 1 | ROS 2 |
 //! |---|---|
-//! | `_p:=v`, `_a/b:=v` | `-p p:=v`, `-p a.b:=v` |
-//! | `from:=to`, `~from:=to` | `-r from:=to`, `-r ~/from:=to` |
 //! | `__name:=n`, `ROS_NAMESPACE` | `-r __node:=n`, `-r __ns:=/above` |
-//!
-//! What the other ROS does not know is left out: settings of logging, and with a warning what it cannot express.
+//! | `_p:=base link` | `-p p:="base link"` |
 
 use ros::bus::{ParamValue, RosVersion};
-use ros::ros2::arguments::{self, BEGIN, END, Kind, RemapRule};
+use ros::ros2::arguments::{BEGIN, END};
 use ros::ros2::process;
+use ros::spelling::RespelledArguments;
 
 use super::{LaunchedNode, ros2};
 use crate::params_file::value;
 
-/// Returns the arguments of a robot's node for a program of the other ROS.
+/// Returns the arguments of a robot's node for a program of the other ROS. What it cannot express is left out with a
+/// warning.
 pub fn translate_arguments(robot: &LaunchedNode) -> Vec<String> {
-    match robot.ros {
-        RosVersion::One => to_two(robot),
-        RosVersion::Two => to_one(robot),
+    let service = robot.ros.other();
+    match service {
+        RosVersion::One => {
+            let argv = respell(robot, &robot.argv, service).into_iter();
+            argv.filter(|word| !is_setting(word)).map(|word| map_parameter(&word, to_one_text)).collect()
+        }
+        RosVersion::Two => {
+            let typed: Vec<String> = robot.argv.iter().map(|word| map_parameter(word, to_yaml)).collect();
+            let mut argv = respell(robot, &typed, service);
+            let names = naming_rules(robot);
+            if !names.is_empty() {
+                argv.push(BEGIN.to_owned());
+                argv.extend(names);
+                argv.push(END.to_owned());
+            }
+            argv
+        }
     }
 }
 
-/// Translates arguments of ROS 1, from which those that define the node's name are already removed.
-fn to_two(robot: &LaunchedNode) -> Vec<String> {
-    let mut own = Vec::new();
-    let mut given = Vec::new();
-    for argument in &robot.argv {
-        let Some((name, text)) = argument.split_once(":=") else {
-            own.push(argument.clone());
-            continue;
-        };
-        let words = match name.strip_prefix('_') {
-            Some(parameter) => ["-p".to_owned(), format!("{}:={}", parameter.replace('/', "."), to_yaml(text))],
-            None => ["-r".to_owned(), format!("{}:={}", to_two_name(name), to_two_name(text))],
-        };
-        // A single invalid argument would end the node.
-        match arguments::parse(&[&[BEGIN.to_owned()], &words[..]].concat()) {
-            Ok(_) => given.extend(words),
-            Err(error) => tracing::warn!("{argument} does not reach the node in the cloud, which uses ROS 2: {error}"),
-        }
+/// Returns `argv` as ROS `service` spells it.
+fn respell(robot: &LaunchedNode, argv: &[String], service: RosVersion) -> Vec<String> {
+    let RespelledArguments { argv, ignored } = RespelledArguments::new(argv, &robot.node, service);
+    for argument in ignored {
+        let number = service.number();
+        tracing::warn!("{argument} does not reach the node in the cloud: it means nothing to a node of ROS {number}");
     }
-    given.extend(naming_rules(robot));
-    if !given.is_empty() {
-        own.push(BEGIN.to_owned());
-        own.extend(given);
-        own.push(END.to_owned());
+    argv
+}
+
+/// Returns an argument of ROS 1 with another value, if it is a parameter.
+fn map_parameter(argument: &str, convert: fn(&str) -> String) -> String {
+    match argument.split_once(":=") {
+        Some((name, value)) if name.starts_with('_') => format!("{name}:={}", convert(value)),
+        _ => argument.to_owned(),
     }
-    own
+}
+
+/// Returns whether an argument of ROS 1 is a parameter that configures the stub.
+fn is_setting(argument: &str) -> bool {
+    argument.strip_prefix('_').is_some_and(|parameter| parameter.starts_with(&ros2::SETTINGS.replace('.', "/")))
 }
 
 /// Returns the rules for the parts of the node's name that its program does not set in this way.
@@ -69,72 +80,6 @@ fn naming_rules(robot: &LaunchedNode) -> Vec<String> {
         rules.extend(["-r".to_owned(), format!("__ns:={above}")]);
     }
     rules
-}
-
-/// Translates arguments of ROS 2, in which parameters from files are already expanded. The cloud sets the node's name.
-fn to_one(robot: &LaunchedNode) -> Vec<String> {
-    // They were parsed before.
-    let parts = arguments::parse(&robot.argv).unwrap_or_default();
-    let name = robot.node.rsplit('/').next().unwrap_or_default();
-    let mut argv = Vec::new();
-    for part in parts {
-        match part.kind {
-            Kind::Own => argv.extend(part.words),
-            Kind::Rule(rule) if rule.applies_to(name) => match to_one_rule(&rule) {
-                SpelledRule::OfTheName => {}
-                SpelledRule::Rule(word) => argv.push(word),
-                SpelledRule::Pattern(pattern) => tracing::warn!(
-                    "{} does not reach the node in the cloud, which uses ROS 1: {pattern} is a pattern",
-                    part.words.join(" ")
-                ),
-            },
-            Kind::Parameter(given) if !given.is_for_other_node(&robot.node) => {
-                // Time is the cloud's matter.
-                if given.name != "use_sim_time" && !given.name.starts_with(ros2::SETTINGS) {
-                    argv.push(format!("_{}:={}", given.name.replace('.', "/"), to_one_text(&given.value)));
-                }
-            }
-            Kind::Rule(_) | Kind::Parameter(_) | Kind::File(_) | Kind::Setting | Kind::Mark => {}
-        }
-    }
-    argv
-}
-
-/// A remap rule of ROS 2 in ROS 1.
-enum SpelledRule {
-    /// It names the node, which ROS 1 does with other arguments.
-    OfTheName,
-    /// The argument.
-    Rule(String),
-    /// There are no patterns in ROS 1.
-    Pattern(String),
-}
-
-/// Returns a rule as ROS 1 writes it.
-fn to_one_rule(rule: &RemapRule) -> SpelledRule {
-    if !rule.of.is_name() {
-        return SpelledRule::OfTheName;
-    }
-    match [&rule.from, &rule.to].into_iter().find(|name| name.contains(['*', '\\'])) {
-        Some(pattern) => SpelledRule::Pattern(pattern.clone()),
-        None => SpelledRule::Rule(format!("{}:={}", to_one_name(&rule.from), to_one_name(&rule.to))),
-    }
-}
-
-/// Returns a name as ROS 2 writes it: private ones have a slash.
-fn to_two_name(name: &str) -> String {
-    match name.strip_prefix('~') {
-        Some(private) => format!("~/{}", private.trim_start_matches('/')),
-        None => name.to_owned(),
-    }
-}
-
-/// Returns a name as ROS 1 writes it.
-fn to_one_name(name: &str) -> String {
-    match name.strip_prefix("~/") {
-        Some(private) => format!("~{private}"),
-        None => name.to_owned(),
-    }
 }
 
 /// Returns a value of ROS 1, where any text is one, in YAML as ROS 2 reads it.
@@ -198,7 +143,7 @@ mod tests {
             &["-r", "image:=/camera/image", "-r", "~/told:=/told"],
             &["-p", "rate:=2", "-p", "frame:=\"base link\"", "-p", "text:=\"a: b\"", "-p", "none:=\"\""],
             &["-p", "list:=[1, 2]", "-p", "gains.p:=0.5"],
-            &["-r", "__node:=people", "-r", "__ns:=/front", "--"],
+            &["--", "--ros-args", "-r", "__node:=people", "-r", "__ns:=/front", "--"],
         ];
         assert_eq!(translate_to_two(GUESSED, &argv, "/front"), expected.concat());
     }

@@ -47,7 +47,7 @@ pub struct HubOptions {
     /// Time after which an incomplete frame ends its connection.
     pub unfinished: Duration,
     /// Rules for types whose counterparts in the other ROS are not obvious.
-    pub rules: TranslationRules,
+    pub rules: Arc<TranslationRules>,
 }
 
 /// The links of one servant.

@@ -47,7 +47,7 @@ impl Hub {
         }
         let view = self.other_view.get_or_init(|| {
             let registry = || Arc::clone(&self.registry);
-            let types = TypeTranslations::new(self.options.rules.clone());
+            let types = TypeTranslations::new(Arc::clone(&self.options.rules));
             let types = Arc::new(types.with_known(registry(), self.bus.version()));
             let observer = Arc::new(LossNotifier { hub: Arc::downgrade(self), version });
             let _span = self.log_span.enter();

@@ -113,6 +113,31 @@ fn rules_of_a_lab_win_over_the_table() {
 }
 
 #[test]
+fn rules_are_read_from_a_file() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join("lab.yaml");
+    let read = |text: &[u8]| {
+        std::fs::write(&path, text).unwrap();
+        TranslationRules::default().with_file(&path)
+    };
+    let rules = read(b"- ros1_package_name: old\n  ros2_package_name: new\n").unwrap();
+    assert_eq!(rules.message_name("old/B", One), "new/msg/B");
+    let long = " ".repeat(2 << 20);
+    for (text, reason) in [
+        (&b"- ros1_package_name: old\n"[..], "rule 1 lacks ros2_package_name"),
+        (b"\xff\xfe", "cannot read the rules in"),
+        (long.as_bytes(), "has 2097152 bytes"),
+    ] {
+        let error = read(text).unwrap_err().to_string();
+        assert!(error.contains(reason) && error.contains("lab.yaml"), "{error}");
+    }
+    for (path, reason) in [(place.path().join("none.yaml"), "none.yaml"), (place.path().to_owned(), "it is no file")] {
+        let error = TranslationRules::default().with_file(&path).unwrap_err().to_string();
+        assert!(error.contains("cannot read the rules in") && error.contains(reason), "{error}");
+    }
+}
+
+#[test]
 fn files_that_are_no_rules_are_refused_with_their_place() {
     let refused = |yaml: &str| TranslationRules::default().with_yaml("rules.yaml", yaml).unwrap_err().to_string();
     for (yaml, reason) in [

@@ -1,6 +1,9 @@
 //! Reads a file of rules.
 
 use std::fmt;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
 
 use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
@@ -13,6 +16,14 @@ const MAX_RULES: usize = 4096;
 /// An error in a file of rules.
 #[derive(Debug, thiserror::Error)]
 pub enum RuleError {
+    /// The file cannot be read.
+    #[error("cannot read the rules in {file}: {error}")]
+    Unreadable {
+        /// Path of the file.
+        file: String,
+        /// The problem.
+        error: io::Error,
+    },
     /// The file is no list of rules; the error names line and column.
     #[error("{file}: {error}; write a list of rules as for ros1_bridge")]
     Yaml {
@@ -106,6 +117,26 @@ struct RawRule {
     /// ros1_bridge needs it for rules of one package about another; a lab's file is of none.
     #[serde(default, rename = "enable_foreign_mappings")]
     _enable_foreign_mappings: bool,
+}
+
+/// Returns the text of a file of rules.
+pub(super) fn read_text(path: &Path) -> Result<String, RuleError> {
+    let file = path.display().to_string();
+    let unreadable = |error| RuleError::Unreadable { file: file.clone(), error };
+    // To open a pipe would wait for its writer.
+    let about = std::fs::metadata(path).map_err(unreadable)?;
+    if !about.is_file() {
+        return Err(unreadable(io::Error::other("it is no file")));
+    }
+    let found = usize::try_from(about.len()).unwrap_or(usize::MAX);
+    if found > MAX_BYTES {
+        return Err(RuleError::TooLong { file, found });
+    }
+    let opened = File::open(path).map_err(unreadable)?;
+    let mut text = String::new();
+    // It may grow meanwhile; `read` refuses one byte more.
+    opened.take(MAX_BYTES as u64 + 1).read_to_string(&mut text).map_err(unreadable)?;
+    Ok(text)
 }
 
 /// Reads the rules of a file.
