@@ -58,6 +58,9 @@ pub enum SystemError {
     /// Nothing says which distribution it is.
     #[error("{0} does not say which ROS distribution it is; name it with --ros-distro, such as --ros-distro jazzy")]
     UnknownDistribution(String),
+    /// The requested distribution has no name that ROS distributions have.
+    #[error("{0:?} is no name of a ROS distribution: they consist of lower-case letters, digits and _, such as jazzy")]
+    DistributionName(String),
     /// The requested distribution is not there.
     #[error("it has no ROS {wanted}; found: {}", .found.join(", "))]
     NoSuchRos {
@@ -144,6 +147,9 @@ pub fn find_system<L: AsRef<Path>>(
     environment: &BTreeMap<String, String>,
     distribution: Option<&str>,
 ) -> Result<FoundSystem, SystemError> {
+    if let Some(name) = distribution.filter(|name| !spaces::is_distribution(name)) {
+        return Err(SystemError::DistributionName(name.chars().take(64).collect()));
+    }
     let view = View::open(layers)?;
     let release = read_release(&view)?;
     let field = |name: &str| release.get(name).cloned().filter(|value| !value.is_empty());

@@ -233,7 +233,7 @@ pub const ROUTES: &[Route] = &[
         operation(
             "calibrate",
             "Replays recorded requests at several limits and proposes rows for the SLA table without writing them. The \
-                last line is `done`, `underlay` or `error`.",
+                last line is `done` or `error`.",
         )
         .asks_json::<api::CalibrationOptions>("options", "Options of the calibration.")
         .takes_file(

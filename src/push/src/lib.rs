@@ -55,6 +55,7 @@ use rootfs_builder::{BuildOutcome, PushSource};
 use bounds::PushBudget;
 use building::PushedImage;
 use exported::ImportedService;
+use places::QueuedPush;
 use pusher::HOME_INSIDE;
 use reporter::Reporter;
 use store::{Plan, RevisionRecord};
@@ -71,20 +72,21 @@ pub use request::{Published, PushResult};
 pub use running::{PushFollower, ReceptionGuard, RunningPush};
 
 impl Pusher {
-    /// Receives a push, and runs it when its turn comes, within its budget.
-    async fn push(
-        &self,
+    /// Receives a push, and runs it when its turn comes, within its budget. `entered` is what counts it among the
+    /// others; it outlives a push that is cancelled.
+    async fn push<'a>(
+        &'a self,
         id: &str,
         options: &PushOptions,
-        by: &Deployer,
-        archive: Archive,
+        (by, archive): (&Deployer, Archive),
         report: &Reporter,
+        entered: &mut Option<QueuedPush<'a>>,
     ) -> Result<PushResult, Error> {
         let began = Instant::now();
         let asked_name = options.name.as_deref();
         let as_underlay = options.as_underlay.as_deref().map(underlays::lock_name);
         let known = asked_name.or(options.apt.as_deref()).or(as_underlay.as_deref());
-        let _entered = self.places.enter()?;
+        *entered = Some(self.places.enter()?);
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
         let build = self.home.join("build").join(id);

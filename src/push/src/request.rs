@@ -164,7 +164,9 @@ impl Pusher {
         running: &RunningPush,
     ) -> Result<PushResult, Error> {
         let (id, cancel) = (&*running.id, &running.cancel);
-        let push = Box::pin(self.push(id, options, by, archive, report));
+        // Held until its files are gone: what a cancelled push leaves to be packed takes as much as a push.
+        let mut entered = None;
+        let push = Box::pin(self.push(id, options, (by, archive), report, &mut entered));
         let work = blocking::cancellable(push);
         let over = async {
             tokio::select! {
@@ -183,6 +185,7 @@ impl Pusher {
         if let Ok(Err(error)) = removed {
             tracing::warn!("leftovers of the push remain until the next start: {error}");
         }
+        drop(entered);
         match outcome {
             Ok(published) => {
                 self.published.fetch_add(1, Ordering::Relaxed);

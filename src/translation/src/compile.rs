@@ -19,6 +19,9 @@ use crate::text::TextForm;
 const MAX_INLINED: usize = 64;
 const MAX_STEPS: usize = 1024;
 
+/// Maximum length in bytes of the path of a step that becomes one of the message around it.
+const MAX_PATH: usize = 512;
+
 /// Compiles programs from one ROS version to the other, and keeps those of messages.
 pub(crate) struct Compiler<'a> {
     pairings: &'a Pairings,
@@ -67,6 +70,11 @@ impl<'a> Compiler<'a> {
         let program = Arc::new(self.compile(source, target));
         self.programs.insert(key, program.clone());
         program
+    }
+
+    /// Returns about how many bytes all programs take.
+    pub(crate) fn bytes_held(&self) -> usize {
+        self.programs.values().map(|program| program.bytes_held()).sum()
     }
 
     fn compile(&mut self, source: &MessageType, target: &MessageType) -> Program {
@@ -285,7 +293,9 @@ impl Assembly {
             return;
         };
         self.program.filled = self.program.filled.saturating_add(inner.filled);
-        let is_short = inner.steps.len() <= MAX_INLINED && self.program.steps.len() <= MAX_STEPS;
+        let is_short = inner.steps.len() <= MAX_INLINED
+            && self.program.steps.len() <= MAX_STEPS
+            && inner.steps.iter().all(|one| step.path.len() + one.path.len() < MAX_PATH);
         if !is_short || !inner.scan.is_empty() {
             self.push(step);
             return;

@@ -27,6 +27,14 @@ pub(crate) struct Program {
     pub(crate) filled: usize,
 }
 
+impl Program {
+    /// Returns about how many bytes it takes without the programs that it calls.
+    pub(crate) fn bytes_held(&self) -> usize {
+        let steps = self.steps.iter().map(|step| size_of::<Step>() + step.path.len());
+        steps.sum::<usize>() + self.scan.len() * size_of::<(Shape, bool)>()
+    }
+}
+
 /// One step, with the path of the field that it reads.
 #[derive(Debug, Clone)]
 pub(crate) struct Step {

@@ -24,14 +24,27 @@ pub struct MessageTranslator {
     program: Arc<Program>,
     /// Bytes that the smallest message of the twin may take.
     least: usize,
+    /// Bytes that the program and those of the messages in it take.
+    bytes: usize,
     saturated: AtomicU64,
 }
 
 impl MessageTranslator {
-    pub(crate) fn new(source: Arc<MessageType>, target: &MessageType, program: Arc<Program>) -> MessageTranslator {
+    /// Creates a translator by a program that takes this number of bytes, with those that it calls.
+    pub(crate) fn new(
+        source: Arc<MessageType>,
+        target: &MessageType,
+        program: Arc<Program>,
+        bytes: usize,
+    ) -> MessageTranslator {
         // Padding takes less than the numbers behind it.
         let least = target.min_size().saturating_mul(2).saturating_add(program.filled).saturating_add(LITTLE);
-        MessageTranslator { source, program, least, saturated: AtomicU64::new(0) }
+        MessageTranslator { source, program, least, bytes, saturated: AtomicU64::new(0) }
+    }
+
+    /// Returns about how many bytes its programs take.
+    pub(crate) fn bytes_held(&self) -> usize {
+        self.bytes
     }
 
     /// Returns the message in the twin's serialization.

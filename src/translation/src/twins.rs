@@ -14,8 +14,13 @@ use crate::pairing::Pairings;
 use crate::rules::TranslationRules;
 use crate::translator::MessageTranslator;
 
-/// Maximum number of types of each kind whose twins are kept.
+/// Maximum number of types of each kind whose twins are kept, and what these may take in bytes: robots and nodes announce
+/// any number of definitions, of any size.
 const MAX_KEPT: usize = 1024;
+pub(crate) const MAX_KEPT_BYTES: usize = 16 << 20;
+
+/// Bytes that a pair of messages takes beside texts and programs.
+const OVERHEAD: usize = 4 << 10;
 
 /// Finds the twins of types of either ROS, and keeps them. Share it by `Arc`; all methods take `&self`.
 #[derive(Debug)]
@@ -39,6 +44,36 @@ pub struct MessageTwin {
     pub to_twin: Arc<MessageTranslator>,
     /// Translates messages of `twin` into those of `original`.
     pub from_twin: Arc<MessageTranslator>,
+}
+
+/// A type with its twin, as something that takes memory.
+pub(crate) trait TypePair {
+    /// Returns about how many bytes it takes.
+    fn bytes_held(&self) -> usize;
+}
+
+impl TypePair for MessageTwin {
+    fn bytes_held(&self) -> usize {
+        let texts = self.original.full_text().len() + self.twin.full_text().len();
+        OVERHEAD + texts + self.to_twin.bytes_held() + self.from_twin.bytes_held()
+    }
+}
+
+impl TypePair for ServiceTwin {
+    fn bytes_held(&self) -> usize {
+        let parts = [&self.original.request, &self.original.response, &self.twin.request, &self.twin.response];
+        let translators =
+            [&self.request_to_twin, &self.request_from_twin, &self.response_to_twin, &self.response_from_twin];
+        let texts: usize = parts.iter().map(|part| part.full_text().len()).sum();
+        OVERHEAD + texts + translators.iter().map(|translator| translator.bytes_held()).sum::<usize>()
+    }
+}
+
+impl TypePair for ActionTwin {
+    fn bytes_held(&self) -> usize {
+        // Each text is once more in the messages that carry goals, results and feedback.
+        2 * [&self.goal, &self.result, &self.feedback].iter().map(|part| part.bytes_held()).sum::<usize>()
+    }
 }
 
 impl MessageTwin {
@@ -91,17 +126,23 @@ type Key = (RosVersion, String, String);
 
 /// Twins that were found, or the reasons why there are none.
 #[derive(Debug)]
-struct Kept<T>(Mutex<HashMap<Key, Result<Arc<T>, NoTwin>>>);
+struct Kept<T>(Mutex<KeptTwins<T>>);
+
+#[derive(Debug)]
+struct KeptTwins<T> {
+    found: HashMap<Key, Result<Arc<T>, NoTwin>>,
+    bytes: usize,
+}
 
 impl<T> Default for Kept<T> {
     fn default() -> Self {
-        Kept(Mutex::new(HashMap::new()))
+        Kept(Mutex::new(KeptTwins { found: HashMap::new(), bytes: 0 }))
     }
 }
 
-impl<T> Kept<T> {
+impl<T: TypePair> Kept<T> {
     fn get_or_find(&self, key: Key, find: impl FnOnce() -> Result<T, NoTwinReason>) -> Result<Arc<T>, NoTwin> {
-        if let Some(kept) = self.0.lock().get(&key) {
+        if let Some(kept) = self.0.lock().found.get(&key) {
             return kept.clone();
         }
         // Unlocked: two threads may find the same, and the first one's stays.
@@ -111,11 +152,18 @@ impl<T> Kept<T> {
             version: *version,
             reason: Box::new(reason),
         });
+        let bytes = found.as_ref().map_or(OVERHEAD, |found| found.bytes_held());
         let mut kept = self.0.lock();
-        if kept.len() >= MAX_KEPT {
-            kept.clear();
+        if let Some(first) = kept.found.get(&key) {
+            return first.clone();
         }
-        kept.entry(key).or_insert(found).clone()
+        if kept.found.len() >= MAX_KEPT || kept.bytes.saturating_add(bytes) > MAX_KEPT_BYTES {
+            kept.found.clear();
+            kept.bytes = 0;
+        }
+        kept.bytes = kept.bytes.saturating_add(bytes);
+        kept.found.insert(key, found.clone());
+        found
     }
 }
 
@@ -196,10 +244,11 @@ impl TypeTranslations {
         }
     }
 
-    /// Returns the number of message types whose twins are kept.
+    /// Returns the number of message types whose twins are kept, and the bytes that they take.
     #[cfg(test)]
-    pub(crate) fn kept_messages(&self) -> usize {
-        self.messages.0.lock().len()
+    pub(crate) fn kept_messages(&self) -> (usize, usize) {
+        let kept = self.messages.0.lock();
+        (kept.found.len(), kept.bytes)
     }
 
     fn known(&self, version: RosVersion) -> Option<&Registry> {
@@ -296,8 +345,9 @@ impl TypeTranslations {
             RosVersion::Two => pairings.add(&self.rules, twin, original)?,
         }
         let translator = |source: &Arc<MessageType>, target: &Arc<MessageType>| {
-            let program = Compiler::new(&pairings, source.version()).message(source, target);
-            Arc::new(MessageTranslator::new(source.clone(), target, program))
+            let mut compiler = Compiler::new(&pairings, source.version());
+            let program = compiler.message(source, target);
+            Arc::new(MessageTranslator::new(source.clone(), target, program, compiler.bytes_held()))
         };
         Ok(MessageTwin {
             original: original.clone(),

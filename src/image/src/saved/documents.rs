@@ -13,6 +13,8 @@ use crate::{Digest, Error, oci};
 const MOST_NESTED: usize = 3;
 /// Maximum number of images in a layout, and of names in a message.
 const MOST_IMAGES: usize = 100;
+/// Maximum number of lists that are read: the entries of each may all name the same list, and so on.
+const MOST_INDEXES: usize = 100;
 /// Maximum length of an image's name in characters.
 const LONGEST_NAME: usize = 256;
 /// Maximum total size of the environment in bytes.
@@ -114,8 +116,9 @@ impl SavedDocuments {
 
     fn read_layout(layout: &Tree) -> Result<Self, Error> {
         let index: SavedIndex = parse_json("index.json", &read(layout, "index.json")?)?;
-        let mut images = Vec::new();
-        collect_images(layout, index, "", MOST_NESTED, &mut images)?;
+        let mut found = FoundImages::default();
+        found.collect(layout, index, "", MOST_NESTED)?;
+        let images = found.images;
         if images.is_empty() {
             return Err(several_images(std::iter::empty()));
         }
@@ -205,38 +208,48 @@ impl FoundImage {
     }
 }
 
-/// Collects the images of an index and the indexes in it. `name`: that of the index.
-fn collect_images(
-    layout: &Tree,
-    index: SavedIndex,
-    name: &str,
-    depth: usize,
-    images: &mut Vec<FoundImage>,
-) -> Result<(), Error> {
-    for entry in index.manifests {
-        let annotations = entry.annotations.unwrap_or_default();
-        // Signatures and build records that buildkit lists beside images.
-        if annotations.contains_key("vnd.docker.reference.type") {
-            continue;
-        }
-        let own = annotations.get("io.containerd.image.name").or_else(|| annotations.get(oci::REF_NAME));
-        let name = own.map_or(name, String::as_str);
-        let media = entry.media_type.as_deref().unwrap_or(oci::MEDIA_MANIFEST);
-        if MANIFESTS.contains(&media) {
-            if entry.platform.as_ref().is_some_and(|platform| !matches!(platform.os.as_str(), "" | "linux")) {
+/// The images of a layout that were found so far.
+#[derive(Default)]
+struct FoundImages {
+    images: Vec<FoundImage>,
+    /// Number of lists that were read.
+    indexes: usize,
+}
+
+impl FoundImages {
+    /// Collects the images of an index and the indexes in it. `name`: that of the index.
+    fn collect(&mut self, layout: &Tree, index: SavedIndex, name: &str, depth: usize) -> Result<(), Error> {
+        for entry in index.manifests {
+            let annotations = entry.annotations.unwrap_or_default();
+            // Signatures and build records that buildkit lists beside images.
+            if annotations.contains_key("vnd.docker.reference.type") {
                 continue;
             }
-            if images.len() >= MOST_IMAGES {
-                return Err(unreceivable_error(format!("it contains more than {MOST_IMAGES} images; save one")));
+            let own = annotations.get("io.containerd.image.name").or_else(|| annotations.get(oci::REF_NAME));
+            let name = own.map_or(name, String::as_str);
+            let media = entry.media_type.as_deref().unwrap_or(oci::MEDIA_MANIFEST);
+            if MANIFESTS.contains(&media) {
+                if entry.platform.as_ref().is_some_and(|platform| !matches!(platform.os.as_str(), "" | "linux")) {
+                    continue;
+                }
+                if self.images.len() >= MOST_IMAGES {
+                    return Err(unreceivable_error(format!("it contains more than {MOST_IMAGES} images; save one")));
+                }
+                let architecture = entry.platform.map(|platform| platform.architecture).filter(|its| !its.is_empty());
+                self.images.push(FoundImage { digest: entry.digest, architecture, name: name.to_owned() });
+            } else if INDEXES.contains(&media) && depth > 0 {
+                self.indexes += 1;
+                if self.indexes > MOST_INDEXES {
+                    return Err(unreceivable_error(format!(
+                        "it contains more than {MOST_INDEXES} lists; save one image"
+                    )));
+                }
+                let inner: SavedIndex = parse_json("its index", &read_layout_document(layout, &entry.digest)?)?;
+                self.collect(layout, inner, name, depth - 1)?;
             }
-            let architecture = entry.platform.map(|platform| platform.architecture).filter(|its| !its.is_empty());
-            images.push(FoundImage { digest: entry.digest, architecture, name: name.to_owned() });
-        } else if INDEXES.contains(&media) && depth > 0 {
-            let inner: SavedIndex = parse_json("its index", &read_layout_document(layout, &entry.digest)?)?;
-            collect_images(layout, inner, name, depth - 1, images)?;
         }
+        Ok(())
     }
-    Ok(())
 }
 
 fn wrong_architecture(others: &str) -> Error {

@@ -201,6 +201,21 @@ fn of_several_architectures_that_of_this_machine_is_taken() {
 }
 
 #[test]
+fn lists_that_name_a_list_many_times_are_not_read_as_often() {
+    let place = new_fixture();
+    let mut entry = place.write_blob("lists", br#"{"schemaVersion": 2, "manifests": []}"#);
+    for _ in 0..2 {
+        entry["mediaType"] = json!(oci::MEDIA_INDEX);
+        let index = json!({"schemaVersion": 2, "manifests": vec![entry.clone(); 1000]});
+        entry = place.write_blob("lists", index.to_string().as_bytes());
+    }
+    entry["mediaType"] = json!(oci::MEDIA_INDEX);
+    place.write_layout("lists", &vec![entry; 1000]);
+    let refused = place.expect_refusal("lists");
+    assert!(refused.contains("more than 100 lists"), "{refused}");
+}
+
+#[test]
 fn an_archive_of_docker_is_read_with_its_links() {
     let place = new_fixture();
     let lower = make_layer(&[(EntryType::Regular, "etc/a", 0o644, "lower")]);

@@ -219,7 +219,8 @@ impl<O: ControlMessage> Session<O> {
         }
         connection.heard = Instant::now();
         self.up.send_if_modified(|up| !std::mem::replace(up, true));
-        let is_due = connection.signed.elapsed() >= SIGN;
+        // What is queued already is as good a sign. A peer that sends and never reads would make more and more of them.
+        let is_due = connection.signed.elapsed() >= SIGN && socket.bytes_queued() == 0;
         if !is_due || !(socket.is_receiving() || self.state.lock().incoming.is_receiving()) {
             return false;
         }

@@ -3,6 +3,8 @@
 //! dependencies that they cannot have. Programs and definitions are those of the service's ROS: launchers and twins
 //! stand in for them.
 
+use std::collections::BTreeSet;
+use std::ops::Bound;
 use std::path::Path;
 
 use ros::bus::RosVersion;
@@ -34,7 +36,7 @@ pub(super) fn adapt_contents(about: &StubInfo<'_>, mut contents: Contents) -> Co
         Content::Link(_) => true,
     });
     // Links lead nowhere if their files were left out.
-    let kept: Vec<String> = contents.share.keys().cloned().collect();
+    let kept: BTreeSet<String> = contents.share.keys().cloned().collect();
     contents.share.retain(|path, content| match content {
         Content::Link(target) => is_kept(path, target, &kept),
         Content::File { .. } => true,
@@ -52,7 +54,7 @@ fn is_definition(path: &str) -> bool {
 }
 
 /// Returns whether a link at `path` leads to a file, or to a directory with files, among `kept`.
-fn is_kept(path: &str, target: &str, kept: &[String]) -> bool {
+fn is_kept(path: &str, target: &str, kept: &BTreeSet<String>) -> bool {
     let mut parts: Vec<&str> = path.split('/').collect();
     parts.pop();
     for part in target.split('/') {
@@ -63,7 +65,10 @@ fn is_kept(path: &str, target: &str, kept: &[String]) -> bool {
         }
     }
     let target = parts.join("/");
-    kept.iter().any(|path| path.strip_prefix(&target).is_some_and(|rest| rest.is_empty() || rest.starts_with('/')))
+    // Not by reading all names: a package may have as many links as files.
+    let below = format!("{target}/");
+    let first = kept.range::<str, _>((Bound::Included(below.as_str()), Bound::Unbounded)).next();
+    kept.contains(&target) || first.is_some_and(|path| path.starts_with(&below))
 }
 
 /// Returns the ROS whose tools read a launch file; `None` for other files, and for launch files that say nothing of one
@@ -157,14 +162,24 @@ mod tests {
     }
 
     #[test]
+    fn many_links_among_many_files_are_looked_at_in_no_time() {
+        let kept: BTreeSet<String> = (0..100_000).map(|number| format!("maps/lab/tiles/tile-{number}.png")).collect();
+        let begun = std::time::Instant::now();
+        assert!((0..50_000).all(|_| !is_kept("launch/link", "../maps/lab/tiles/tile", &kept)));
+        assert!(begun.elapsed() < std::time::Duration::from_secs(20), "{:?}", begun.elapsed());
+    }
+
+    #[test]
     fn links_are_kept_with_their_files() {
-        let kept = ["launch/a.launch", "maps/lab/map.yaml"].map(str::to_owned);
+        let kept = ["launch/a.launch", "maps/lab-2", "maps/lab/map.yaml"].map(str::to_owned).into();
         for (path, target, expected) in [
             ("launch/same", "a.launch", true),
             ("same", "launch/a.launch", true),
             ("launch/map", "../maps/lab", true),
             ("launch/gone", "b.launch", false),
             ("launch/part", "a.lau", false),
+            ("launch/all", "../maps/la", false),
+            ("launch/file", "../maps/lab-2", true),
         ] {
             assert_eq!(is_kept(path, target, &kept), expected, "{path} -> {target}");
         }

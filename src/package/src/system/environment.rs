@@ -74,7 +74,7 @@ pub fn make_environment<L: AsRef<Path>>(
     for name in LISTS {
         let mut all = lists.remove(name).unwrap_or_default();
         let theirs = given.get(name).map_or(if name == "PATH" { PATH } else { "" }, String::as_str);
-        for path in theirs.split(':').filter(|path| path.starts_with('/')) {
+        for path in theirs.split(':').filter(|path| path.starts_with('/') && !path.contains('\0')) {
             if !all.iter().any(|known| known == path) {
                 all.push(path.to_owned());
             }

@@ -83,6 +83,9 @@ pub(super) fn find_spaces(view: &View, environment: &BTreeMap<String, String>) -
     let variable = |name: &str| environment.get(name).map_or("", String::as_str).split(':');
     let named = ["COLCON_PREFIX_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"].into_iter().flat_map(variable);
     for path in named.filter(|path| is_plain_path(path)) {
+        if found.spaces.len() >= MOST_SPACES {
+            break;
+        }
         let path = path.trim_end_matches('/');
         // A prefix of a single package belongs to the space above it.
         let above = path.rsplit_once('/').map_or("", |(above, _)| above);
@@ -122,12 +125,17 @@ pub(super) fn find_spaces(view: &View, environment: &BTreeMap<String, String>) -
     Ok(found)
 }
 
-/// Returns whether a path from an environment is absolute and goes only down.
+/// Returns whether a path from an environment is absolute and goes only down, in the one way of writing it.
 fn is_plain_path(path: &str) -> bool {
     path.starts_with('/')
         && path.len() < 4096
         && path.chars().all(|c| !c.is_control() && !matches!(c, ':' | '"' | '\''))
-        && path.split('/').all(|part| part != "..")
+        && path.trim_end_matches('/').split('/').skip(1).all(|part| !matches!(part, "" | "." | ".."))
+}
+
+/// Returns a path for messages.
+fn show_path(path: &str) -> String {
+    path.chars().filter(|c| !c.is_control()).collect()
 }
 
 /// Records the space at a directory; returns whether there is one.
@@ -137,7 +145,8 @@ fn look_at(view: &View, path: &str, found: &mut FoundSpaces) -> Result<bool, Err
         (RosVersion::Two, SpaceLayout::Merged)
     } else if let Some(marker) = view.read_text(&format!("{path}/{MARKER}"), LARGEST_TEXT)? {
         if !marker.trim().is_empty() {
-            found.unusable.push((path.to_owned(), "is a devel space; install its workspace (catkin_make install)"));
+            let reason = "is a devel space; install its workspace (catkin_make install)";
+            found.unusable.push((show_path(path), reason));
             return Ok(true);
         }
         (RosVersion::One, SpaceLayout::Merged)
@@ -159,7 +168,7 @@ fn look_at(view: &View, path: &str, found: &mut FoundSpaces) -> Result<bool, Err
         (RosVersion::Two, SpaceLayout::Isolated)
     };
     if !is_plain_path(path) {
-        found.unusable.push((path.chars().filter(|c| !c.is_control()).collect(), "has a name with special characters"));
+        found.unusable.push((show_path(path), "has a name with special characters"));
         return Ok(true);
     }
     if HIDDEN.iter().any(|hidden| path == *hidden || path.starts_with(&format!("{hidden}/"))) {

@@ -246,4 +246,15 @@ fn hostile_names_and_links_lead_nowhere() {
     assert_eq!(found.packages()["rclpy"], "1");
     assert_eq!(found.spaces.len(), 1, "{:?}", found.spaces);
     assert_eq!(found.unusable[0].1, "has a name with special characters");
+    // One space under many names is one, and no name ends a list of the environment early.
+    let names: Vec<String> = (1..200).map(|more| format!("/opt{}ros/./jazzy", "/".repeat(more))).collect();
+    let names = format!("{}:/opt/ros/jazzy", names.join(":"));
+    let found = root.find(&[("AMENT_PREFIX_PATH", &names)], None).expect("a system");
+    assert_eq!(found.spaces.iter().map(|space| &*space.path).collect::<Vec<_>>(), ["/opt/ros/jazzy"]);
+    assert_eq!(root.make_environment(&[("PATH", "/a\0b:/bin")])["PATH"], "/opt/ros/jazzy/bin:/bin");
+    root.write("1", "opt/\u{1b}[31mdevel/.catkin", "/src");
+    let found = root.find(&[], None).expect("a system");
+    assert!(found.unusable.iter().all(|(path, _)| !path.contains('\u{1b}')), "{:?}", found.unusable);
+    let refused = root.find(&[], Some("../jazzy")).expect_err("no name").to_string();
+    assert!(refused.contains("is no name of a ROS distribution"), "{refused}");
 }

@@ -263,7 +263,10 @@ impl<C: ActionClient + 'static> GoalServices<C> {
         let asked = wanted.new_ids().map(|id| {
             let (sender, answer) = oneshot::channel();
             let mut canceling = self.canceling.lock();
-            canceling.entry(id.clone()).or_default().push(sender);
+            let waiting = canceling.entry(id.clone()).or_default();
+            // A server may never answer, and its client may ask again and again.
+            waiting.retain(|earlier| !earlier.is_closed());
+            waiting.push(sender);
             drop(canceling);
             if self.goals.is_under_way(&id) {
                 self.client.cancel_goal(&id)

@@ -1,11 +1,13 @@
 //! What is lost on the way between two ROSes: messages that cannot be carried, and values that the other ROS cannot
 //! represent. Both are counted, and the first of each is reported.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
+use tokio::time::Instant;
 
 use crate::MessageTranslator;
 use crate::TranslationError;
@@ -13,10 +15,13 @@ use crate::TranslationError;
 /// Maximum number of topics and services that are counted; a robot can name any number.
 const MOST: usize = 1000;
 
+/// Time after which another failure of a service is reported. A caller may repeat its call as fast as it fails.
+const AGAIN: Duration = Duration::from_secs(1);
+
 /// Receives what a translated bus reports to its robot.
 pub trait TranslationObserver: Send + Sync + 'static {
     /// Called with a text for people when something of a topic or service is lost for the first time, and whenever a
-    /// service fails whose caller cannot be told.
+    /// service fails whose caller cannot be told, though not more often than once a second for each.
     fn on_loss(&self, name: &str, text: &str);
 }
 
@@ -35,11 +40,13 @@ pub struct TranslationLosses {
 pub(super) struct LossCounters {
     observer: Arc<dyn TranslationObserver>,
     counts: Mutex<BTreeMap<String, TranslationLosses>>,
+    /// Services that failed, and when this was last reported.
+    failed: Mutex<HashMap<String, Instant>>,
 }
 
 impl LossCounters {
     pub(super) fn new(observer: Arc<dyn TranslationObserver>) -> Self {
-        Self { observer, counts: Mutex::default() }
+        Self { observer, counts: Mutex::default(), failed: Mutex::default() }
     }
 
     /// Translates a message of a topic or service, and counts what is lost.
@@ -74,13 +81,33 @@ impl LossCounters {
         }
     }
 
-    /// Reports a failed call whose caller gets a default response.
+    /// Reports a failed call whose caller gets a default response, unless one was reported a moment ago.
     pub(super) fn report_failed_call(&self, service: &str, reason: &str) {
+        if !self.is_due(service) {
+            return;
+        }
         tracing::warn!(service, reason, "a call has failed; its caller of ROS 2 gets the default response");
         let text = format!(
             "{service} has failed: {reason}; its caller gets the default response, because calls of ROS 2 cannot fail"
         );
         self.observer.on_loss(service, &text);
+    }
+
+    /// Returns whether a failure of this service is to be reported now, which counts as done.
+    fn is_due(&self, service: &str) -> bool {
+        let mut failed = self.failed.lock();
+        if failed.get(service).is_some_and(|before| before.elapsed() < AGAIN) {
+            return false;
+        }
+        if failed.len() >= MOST {
+            failed.retain(|_, before| before.elapsed() < AGAIN);
+        }
+        // A flood of names is not reported further.
+        let has_room = failed.len() < MOST;
+        if has_room {
+            failed.insert(service.to_owned(), Instant::now());
+        }
+        has_room
     }
 
     /// Reports something that the robot's ROS has no field for.
@@ -119,6 +146,22 @@ mod tests {
         fn on_loss(&self, name: &str, text: &str) {
             self.0.lock().push((name.to_owned(), text.to_owned()));
         }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_service_that_fails_all_the_time_is_reported_now_and_then() {
+        let recorded = Arc::new(Recorded::default());
+        let losses = LossCounters::new(Arc::clone(&recorded) as _);
+        for _ in 0..3 {
+            for _ in 0..100 {
+                losses.report_failed_call("/reset", "it is busy");
+                losses.report_failed_call("/start", "it is busy");
+            }
+            tokio::time::advance(AGAIN).await;
+        }
+        assert_eq!(recorded.0.lock().len(), 6);
+        (0..2 * MOST).for_each(|number| losses.report_failed_call(&format!("/{number}"), "it is busy"));
+        assert!(recorded.0.lock().len() <= 6 + MOST && losses.failed.lock().len() <= MOST);
     }
 
     #[test]

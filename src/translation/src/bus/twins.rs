@@ -7,9 +7,10 @@ use parking_lot::Mutex;
 use ros::bus::{BusError, Digest, RosVersion, ServiceType, WireType};
 use ros::schema::{ActionDef, MessageType, Registry, SchemaError, ServiceDef};
 
+use crate::twins::{MAX_KEPT_BYTES, TypePair};
 use crate::{ActionTwin, MessageTranslator, MessageTwin, NoTwin, ServiceTwin, TypeTranslations};
 
-/// Maximum number of types remembered; beyond it they are found anew.
+/// Maximum number of types remembered, which take at most [`MAX_KEPT_BYTES`]; beyond it they are found anew.
 const MOST: usize = 4096;
 /// Maximum number of definitions of one name that are remembered.
 const MOST_OF_NAME: usize = 8;
@@ -49,36 +50,45 @@ pub(super) enum Untranslatable {
 pub(super) struct KnownTwins {
     registry: Arc<Registry>,
     types: Arc<TypeTranslations>,
-    messages: Mutex<HashMap<String, Vec<Arc<MessageTwin>>>>,
-    services: Mutex<HashMap<String, Vec<Arc<ServiceTwin>>>>,
+    messages: Mutex<RememberedTwins<MessageTwin>>,
+    services: Mutex<RememberedTwins<ServiceTwin>>,
     /// ROS version of the twins.
     version: RosVersion,
 }
 
-/// Adds a twin under its name, unless it is known.
-fn remember<T>(known: &Mutex<HashMap<String, Vec<Arc<T>>>>, name: &str, twin: &Arc<T>) {
-    let mut known = known.lock();
-    if known.len() >= MOST {
-        known.clear();
+/// Twins by their names.
+struct RememberedTwins<T> {
+    by_name: HashMap<String, Vec<Arc<T>>>,
+    bytes: usize,
+}
+
+impl<T> Default for RememberedTwins<T> {
+    fn default() -> Self {
+        Self { by_name: HashMap::new(), bytes: 0 }
     }
-    let of_name = known.entry(name.to_owned()).or_default();
-    if of_name.iter().any(|it| Arc::ptr_eq(it, twin)) {
+}
+
+/// Adds a twin under its name, unless it is known.
+fn remember<T: TypePair>(known: &Mutex<RememberedTwins<T>>, name: &str, twin: &Arc<T>) {
+    let mut known = known.lock();
+    if known.by_name.get(name).is_some_and(|of_name| of_name.iter().any(|it| Arc::ptr_eq(it, twin))) {
         return;
     }
-    if of_name.len() >= MOST_OF_NAME {
-        of_name.remove(0);
+    let bytes = twin.bytes_held();
+    if known.by_name.len() >= MOST || known.bytes.saturating_add(bytes) > MAX_KEPT_BYTES {
+        *known = RememberedTwins::default();
     }
+    let of_name = known.by_name.entry(name.to_owned()).or_default();
+    let replaced = (of_name.len() >= MOST_OF_NAME).then(|| of_name.remove(0));
     of_name.push(Arc::clone(twin));
+    let replaced = replaced.map_or(0, |replaced| replaced.bytes_held());
+    known.bytes = known.bytes.saturating_add(bytes).saturating_sub(replaced);
 }
 
 /// Finds a twin of this name.
-fn find_known<T>(
-    known: &Mutex<HashMap<String, Vec<Arc<T>>>>,
-    name: &str,
-    is_it: impl Fn(&Arc<T>) -> bool,
-) -> Option<Arc<T>> {
+fn find_known<T>(known: &Mutex<RememberedTwins<T>>, name: &str, is_it: impl Fn(&Arc<T>) -> bool) -> Option<Arc<T>> {
     let known = known.lock();
-    known.get(name)?.iter().find(|it| is_it(it)).cloned()
+    known.by_name.get(name)?.iter().find(|it| is_it(it)).cloned()
 }
 
 impl KnownTwins {

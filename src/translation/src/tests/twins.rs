@@ -188,5 +188,27 @@ fn twins_are_kept() {
         let text = format!("uint8 x{index}");
         translations.message(&message(One, &[("a/B", &text)])).unwrap();
     }
-    assert!(translations.kept_messages() <= 1024);
+    assert!(translations.kept_messages().0 <= 1024);
+}
+
+#[test]
+fn definitions_of_any_size_and_number_take_no_more_memory_than_is_theirs() {
+    let translations = TypeTranslations::new(TranslationRules::default());
+    // 64 steps each time that it is mentioned, of a few bytes of text.
+    let many: String = (0..32).map(|field| format!("string s{field}\nfloat32 f{field}\n")).collect();
+    for index in 0..400 {
+        let mentions: String = (0..16).map(|field| format!("Many m{index}_{field}\n")).collect();
+        translations.message(&message(One, &[("a/B", &mentions), ("a/Many", &many)])).unwrap();
+        assert!(translations.kept_messages().1 <= crate::twins::MAX_KEPT_BYTES);
+    }
+    assert!(translations.kept_messages().0 < 400, "{:?}", translations.kept_messages());
+    // Names grow with the depth of a definition, but paths do so only in errors.
+    let long = "n".repeat(250);
+    let nested: Vec<(String, String)> = (0..60)
+        .map(|level| (format!("a/L{level}"), format!("L{} {long}\n", level + 1)))
+        .chain([("a/L60".to_owned(), "string s\nfloat32 f\n".to_owned())])
+        .collect();
+    let nested: Vec<(&str, &str)> = nested.iter().map(|(name, text)| (&**name, &**text)).collect();
+    let pair = translations.message(&message(One, &nested)).unwrap();
+    assert!(pair.to_twin.bytes_held() < 1 << 20, "{}", pair.to_twin.bytes_held());
 }

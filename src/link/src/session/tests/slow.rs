@@ -135,3 +135,26 @@ async fn a_ping_is_answered_although_the_socket_takes_all_that_is_written() {
     };
     assert!(behind < PICTURE / 4, "the answer came behind {behind} bytes");
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_peer_that_sends_and_never_reads_makes_no_pile_of_signs() {
+    let hour = Duration::from_secs(3600);
+    let cloud = Session::new(SessionOptions { ping: hour, silent: hour, lost: 2 * hour, max_age: None });
+    cloud.reconnect(0, &[], 1);
+    // What is written is never read: after 16 bytes the rest stays in the queue.
+    let (mut dribbling, far) = duplex(16);
+    let mut at_cloud = WebSocket::new(far, b"", MAX_FRAME, MAX_RECORD);
+    let nobody = RecordSender(mpsc::unbounded_channel().0);
+    let dribble = async {
+        dribbling.write_all(&[0x82, 0xff, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]).await.unwrap();
+        for _ in 0..2000 {
+            dribbling.write_all(&[0]).await.unwrap();
+            tokio::time::sleep(Duration::from_millis(25)).await;
+        }
+    };
+    tokio::select! {
+        lost = cloud.run(&mut at_cloud, &nobody) => panic!("{lost}"),
+        () = dribble => {}
+    }
+    assert!(at_cloud.bytes_queued() < 100, "{}", at_cloud.bytes_queued());
+}

@@ -212,6 +212,18 @@ async fn a_cancel_is_answered_as_the_server_answers_it() {
 }
 
 #[tokio::test]
+async fn cancels_that_nobody_answers_take_no_more_memory_each_time() {
+    let world = World::new();
+    world.send_accepted(1).await;
+    for _ in 0..100 {
+        let mut canceling = Box::pin(world.cancel(id(1)));
+        assert!(poll!(&mut canceling).is_pending());
+    }
+    let waiting = world.services.canceling.lock().values().map(Vec::len).sum::<usize>();
+    assert!(waiting <= 1, "{waiting} wait, of whom none is left");
+}
+
+#[tokio::test]
 async fn a_goal_that_ends_instead_answers_its_cancel() {
     for (outcome, expected) in [(GoalOutcome::Succeeded, Err(1)), (GoalOutcome::Canceled, Ok(()))] {
         let world = World::new();

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use ros::bus::{Bus, Graph};
+use ros::ros1::xmlrpc::MAX_DEPTH;
 
 /// Key and name of the parameter by which simulated time is turned on: for all nodes in ROS 1, for each in ROS 2.
 pub(super) const SIM_TIME: &str = "use_sim_time";
@@ -67,7 +68,8 @@ impl ParameterNodes {
         if self.has(key) {
             return Some((key, ""));
         }
-        let mut ends = key.rmatch_indices('/').map(|(at, _)| at);
+        // No more than a key may have: each costs as much as the key is long.
+        let mut ends = key.rmatch_indices('/').map(|(at, _)| at).take(MAX_DEPTH);
         ends.find_map(|at| self.has(&key[..at]).then(|| (&key[..at], &key[at + 1..])))
     }
 

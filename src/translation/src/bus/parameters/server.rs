@@ -29,7 +29,7 @@ use ros::ros1::names::canonical;
 use super::kept::KeptParameters;
 use super::names::{ParameterNodes, SIM_TIME, SIM_TIME_KEY, below, join, shown_key, to_key, to_name};
 use super::refusals::RefusedParameters;
-use super::values::{NodeValues, ParameterRefusal, Tree, check_for_ros1, put_at, value_at};
+use super::values::{NodeValues, ParameterRefusal, Tree, check_for_ros1, is_too_deep, put_at, value_at};
 use changes::Watcher;
 
 /// Number of nodes queried for their parameters concurrently.
@@ -60,6 +60,9 @@ struct PlannedChanges {
 impl PlannedChanges {
     /// Adds the values of a key, by where they belong.
     fn add(&mut self, nodes: &ParameterNodes, key: String, value: ParamValue) {
+        if is_too_deep(&key) {
+            return self.refused.add(&key, &ParameterRefusal::TooDeep);
+        }
         let owner = nodes.owner(&key);
         if let Some((node, rest)) = owner.filter(|(_, rest)| !rest.is_empty()) {
             return self.nodes.entry(node.to_owned()).or_default().add(to_name(rest), value);
@@ -284,6 +287,9 @@ impl GlobalParameters for ParameterServerView {
 
     async fn delete(&self, key: &str) -> Result<(), BusError> {
         let key = canonical(key);
+        if is_too_deep(&key) {
+            return Err(BusError::NoParam(key));
+        }
         let nodes = self.nodes();
         let was_kept = self.kept.remove(&key);
         let Some((node, rest)) = nodes.owner(&key).filter(|(_, rest)| !rest.is_empty()) else {

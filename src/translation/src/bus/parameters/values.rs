@@ -16,6 +16,7 @@
 use std::collections::BTreeMap;
 
 use ros::bus::ParamValue;
+use ros::ros1::xmlrpc::MAX_DEPTH;
 
 /// Reasons why a value of one ROS is none in the other.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -49,6 +50,9 @@ pub enum ParameterRefusal {
         /// The integer.
         i64,
     ),
+    /// A Master refuses it.
+    #[error("it has more than {MAX_DEPTH} parts; shorten its name")]
+    TooDeep,
     /// A Master holds either a value or a dictionary at a name.
     #[error("there are parameters below it, and ROS 1 cannot hold both")]
     HasParametersBelow,
@@ -126,9 +130,22 @@ pub(super) fn check_for_ros1(value: &ParamValue) -> Result<(), ParameterRefusal>
 /// A tree of values as a Master holds it.
 pub(super) type Tree = BTreeMap<String, ParamValue>;
 
+/// Returns whether a key or path has more levels than a Master allows.
+pub(super) fn is_too_deep(path: &str) -> bool {
+    path.split('/').nth(MAX_DEPTH + 1).is_some()
+}
+
 /// Puts a value into the tree at a path with slashes, and replaces what was there. A dictionary is merged with the one
-/// that is there.
+/// that is there. A path that is too deep is left out: trees are walked and dropped by recursion, and whoever names
+/// parameters must not decide how deep that goes.
 pub(super) fn put_at(tree: &mut Tree, path: &str, value: ParamValue) {
+    if is_too_deep(path) {
+        return;
+    }
+    put_below(tree, path, value);
+}
+
+fn put_below(tree: &mut Tree, path: &str, value: ParamValue) {
     match path.split_once('/') {
         Some((first, rest)) => {
             let below = tree.entry(first.to_owned()).or_insert_with(|| ParamValue::Map(Tree::new()));
@@ -136,7 +153,7 @@ pub(super) fn put_at(tree: &mut Tree, path: &str, value: ParamValue) {
                 *below = ParamValue::Map(Tree::new());
             }
             if let ParamValue::Map(below) = below {
-                put_at(below, rest, value);
+                put_below(below, rest, value);
             }
         }
         None => match (tree.get_mut(path), value) {
@@ -175,6 +192,17 @@ mod tests {
         let mut values = NodeValues::default();
         values.add("a".to_owned(), value(json));
         values
+    }
+
+    #[test]
+    fn a_tree_is_no_deeper_than_at_a_master() {
+        let mut tree = Tree::new();
+        let deepest = ["d"; MAX_DEPTH].join("/");
+        put_at(&mut tree, &deepest, value("1"));
+        assert_eq!(value_at(&tree, &deepest), Some(&value("1")));
+        // Dropping it would take more than the stack has.
+        put_at(&mut tree, &"/d".repeat(200_000)[1..], value("2"));
+        assert_eq!(value_at(&tree, &deepest), Some(&value("1")));
     }
 
     #[test]

@@ -57,6 +57,20 @@ fn tree(json: &str) -> Tree {
 }
 
 #[tokio::test]
+async fn a_parameter_is_no_deeper_than_at_a_master_whoever_names_it() {
+    let servant = Servant::new();
+    let deep = "/d".repeat(100_000);
+    let refused = servant.refusal(&deep, "1").await;
+    assert!(refused.contains("more than 100 parts"), "{}", &refused[refused.len() - 100..]);
+    assert_eq!(servant.value("/").await, Some(ParamValue::Map(Tree::new())));
+    // Nor does a node make a tree that cannot be walked.
+    let node = servant.start(SEE, r#"{"rate": 2}"#).await;
+    let changes = vec![(deep[1..].replace('/', "."), Some(value("1")))];
+    NodeParameters::set(&*node, SEE, changes).await.expect("a node");
+    assert_eq!(servant.value(SEE).await, Some(value(r#"{"rate": 2}"#)));
+}
+
+#[tokio::test]
 async fn parameters_of_a_node_stand_below_its_name() {
     let servant = Servant::new();
     let _see = servant.start(SEE, r#"{"gains": {"p": 1, "i": 2}, "rate": 0.5, "qos_overrides./x.depth": 1}"#).await;
