@@ -136,7 +136,8 @@ impl LifecycleNode {
         let _ = timeout(SOON, graph.wait_for(|graph| !self.unheard_outputs(graph).is_empty())).await;
         let topics = self.unheard_outputs(&graph.borrow());
         let listening = topics.iter().map(|topic| async move {
-            let subscribed = self.bus.subscribe(topic, WireType::any(), QosProfile::keep_last(1)).await;
+            let any = WireType::any().with_version(self.bus.version());
+            let subscribed = self.bus.subscribe(topic, any, QosProfile::keep_last(1)).await;
             let subscription = subscribed.inspect_err(|error| {
                 tracing::debug!(topic, %error, "a lifecycle node may be waiting for a subscriber that it cannot get");
             });

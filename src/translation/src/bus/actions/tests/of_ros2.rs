@@ -203,7 +203,9 @@ async fn topics_outlive_a_server_that_comes_back_but_not_its_type() {
     let mut robot = Robot::new(&world).await;
     world.servant.graph.send_replace(graph(RosVersion::Two, &[]));
     world.wait_for_graph(|graph| !graph.actions.contains_key("/count")).await;
-    let reason = world.bus.left_out().borrow()["action /count"].reason.clone();
+    let mut left_out = world.bus.left_out();
+    let left_out = left_out.wait_for(|all| all.contains_key("action /count")).await.expect("followed").clone();
+    let reason = &left_out["action /count"].reason;
     assert!(reason.contains("robot"), "{reason}");
     robot.send("meanwhile");
     let (_, events) = world.server.goal("meanwhile").await;
