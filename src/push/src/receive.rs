@@ -106,7 +106,7 @@ pub(super) async fn detect_kind(mut archive: Archive, limits: &Options) -> Resul
     let mut beginning = chunks.concat();
     beginning.truncate(image::BEGINNING);
     let detect = move || image::detect_archive(&beginning);
-    let kind = blocking::spawn(detect).await.map_err(|_| Error::Internal("looking at the archive"))?;
+    let kind = blocking::spawn_reader(detect).await.map_err(|_| Error::Internal("looking at the archive"))?;
     let first = futures_util::stream::iter(chunks.into_iter().map(Ok));
     Ok((kind, first.chain(archive).boxed()))
 }

@@ -27,6 +27,11 @@ use super::reconfigure::{Config, ReconfigureRefusal, ReconfigureServer};
 use super::values::{ParameterRefusal, Tree, check_for_ros1, value_at};
 use events::MasterWatch;
 
+/// Maximum size of the values or descriptions of one answer, in bytes: a request may name one parameter a million times.
+const MAX_ANSWER: usize = 64 << 20;
+/// Bytes counted for each parameter of an answer beside its texts.
+const EACH: usize = 64;
+
 /// The parameters of nodes, over the Master of a ROS 1 bus.
 pub struct NodeParameterView {
     inner: Arc<dyn Bus>,
@@ -168,11 +173,6 @@ fn check_chosen(asked: Option<&ParamValue>, chosen: Option<&ParamValue>) -> Resu
 }
 
 impl NodeState {
-    /// Returns the value of a parameter.
-    fn value(&self, name: &str) -> Option<ParamValue> {
-        find_value(&self.tree, self.simulated, name)
-    }
-
     /// Checks a change.
     fn plan(&self, node: &str, (name, value): ParamChange) -> Result<PlannedChange, SetRefusal> {
         let value = value.filter(|value| *value != ParamValue::Nil);
@@ -207,15 +207,31 @@ impl NodeState {
     }
 }
 
-/// Returns the value of a parameter. A dictionary is no value, but has parameters below it.
-fn find_value(tree: &Tree, simulated: bool, name: &str) -> Option<ParamValue> {
-    if name == SIM_TIME {
-        return Some(ParamValue::Bool(simulated));
-    }
+/// Returns the value of a parameter but `use_sim_time`. A dictionary is no value, but has parameters below it.
+fn find_value<'t>(tree: &'t Tree, name: &str) -> Option<&'t ParamValue> {
     to_key("", name)?;
-    match value_at(tree, &name.replace('.', "/"))? {
-        ParamValue::Map(_) | ParamValue::Nil => None,
-        value => Some(value.clone()),
+    let value = value_at(tree, &name.replace('.', "/"))?;
+    (!matches!(value, ParamValue::Map(_) | ParamValue::Nil)).then_some(value)
+}
+
+/// Room for an answer.
+struct AnswerRoom {
+    left: usize,
+}
+
+impl AnswerRoom {
+    fn new() -> Self {
+        Self { left: MAX_ANSWER }
+    }
+
+    /// Takes the room for one parameter.
+    fn take(&mut self, node: &str, bytes: usize) -> Result<(), BusError> {
+        let left = self.left.checked_sub(bytes.saturating_add(EACH));
+        self.left = left.ok_or_else(|| BusError::Protocol {
+            what: format!("a request for parameters of {node}"),
+            reason: format!("the answer takes more than {MAX_ANSWER} bytes; ask for fewer parameters at once"),
+        })?;
+        Ok(())
     }
 }
 
@@ -259,15 +275,14 @@ fn collect_names(above: &str, tree: &Tree, into: &mut BTreeSet<String>) {
 /// Selects names as the nodes of ROS 2 do: below one of the prefixes, and of at most so many levels beyond it.
 fn select_names(all: BTreeSet<String>, prefixes: &[String], depth: u64) -> ParameterNames {
     let is_within = |rest: &str| depth == 0 || (rest.matches('.').count() as u64) < depth;
+    // A request may have as many prefixes as a node has parameters.
+    let wanted: BTreeSet<&str> = prefixes.iter().map(String::as_str).collect();
     let is_meant = |name: &String| {
-        if prefixes.is_empty() {
+        if wanted.is_empty() {
             return is_within(name);
         }
-        prefixes.iter().any(|prefix| match name.strip_prefix(&**prefix) {
-            Some("") => true,
-            Some(rest) => rest.strip_prefix('.').is_some_and(is_within),
-            None => false,
-        })
+        let mut above = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
+        wanted.contains(name.as_str()) || above.any(|(prefix, rest)| wanted.contains(prefix) && is_within(rest))
     };
     let names: Vec<String> = all.into_iter().filter(is_meant).collect();
     let prefixes = names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned()));
@@ -280,7 +295,17 @@ impl NodeParameters for NodeParameterView {
     async fn get(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParamValue>>, BusError> {
         let tree = self.read_tree(node).await?;
         let simulated = names.iter().any(|name| name == SIM_TIME) && self.read_sim_time().await?;
-        Ok(names.iter().map(|name| find_value(&tree, simulated, name)).collect())
+        let mut room = AnswerRoom::new();
+        let mut values = Vec::with_capacity(names.len());
+        for name in names {
+            let value = match &**name {
+                SIM_TIME => Some(&ParamValue::Bool(simulated)),
+                name => find_value(&tree, name),
+            };
+            room.take(node, value.map_or(0, ParamValue::bytes_held))?;
+            values.push(value.cloned());
+        }
+        Ok(values)
     }
 
     async fn set(&self, node: &str, changes: Vec<ParamChange>) -> Result<Vec<Result<(), FailureReason>>, BusError> {
@@ -318,23 +343,32 @@ impl NodeParameters for NodeParameterView {
 
     async fn describe(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParameterDescription>>, BusError> {
         let state = self.read_state(node).await?;
-        let describe = |name: &String| {
-            let described = state.servers.iter().find_map(|server| Some(server.find(name)?.1.describe(name)));
-            described.or_else(|| {
-                let value = state.value(name)?;
-                let kind = kind_of(&value);
-                let is_time = name == SIM_TIME;
-                // What is at a Master may change its type at any time.
-                Some(ParameterDescription {
+        let mut room = AnswerRoom::new();
+        let mut all = Vec::with_capacity(names.len());
+        for name in names {
+            let described = state.servers.iter().find_map(|server| Some(server.find(name)?.1));
+            let value = find_value(&state.tree, name);
+            let texts = described.map_or(0, |described| described.description.len() + described.choices.len());
+            room.take(node, name.len() + texts + value.map_or(0, ParamValue::bytes_held))?;
+            all.push(match (described, value) {
+                (Some(described), _) => Some(described.describe(name)),
+                (None, _) if name == SIM_TIME => Some(ParameterDescription {
                     name: name.clone(),
-                    kind,
-                    read_only: is_time,
-                    dynamic_typing: !is_time,
+                    kind: ParameterKind::Bool,
+                    read_only: true,
                     ..ParameterDescription::default()
-                })
-            })
-        };
-        Ok(names.iter().map(describe).collect())
+                }),
+                // What is at a Master may change its type at any time.
+                (None, Some(value)) => Some(ParameterDescription {
+                    name: name.clone(),
+                    kind: kind_of(value),
+                    dynamic_typing: true,
+                    ..ParameterDescription::default()
+                }),
+                (None, None) => None,
+            });
+        }
+        Ok(all)
     }
 
     async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError> {

@@ -137,6 +137,24 @@ async fn reconfigurable(servant: &Servant) -> (Arc<Server>, impl Sized) {
 }
 
 #[tokio::test]
+async fn an_answer_has_a_limit_however_often_a_parameter_is_asked_for() {
+    let servant = Servant::start().await;
+    let _alive = servant.register().await;
+    servant.set_at_master("/camera/see/text", &format!("{:?}", "x".repeat(1 << 20))).await;
+    let names = vec!["text".to_owned(); 1000];
+    for refused in [
+        servant.view.get(SEE, &names).await.err(),
+        servant.view.describe(SEE, &names).await.err(),
+        servant.view.get(SEE, &vec!["none".to_owned(); (MAX_ANSWER / EACH) + 1]).await.err(),
+    ] {
+        let refused = refused.expect("it is too long").to_string();
+        assert!(refused.contains("ask for fewer parameters at once"), "{refused}");
+    }
+    let values = servant.view.get(SEE, &names[..2]).await.expect("an answer");
+    assert!(values.iter().all(Option::is_some));
+}
+
+#[tokio::test]
 async fn private_parameters_at_the_master_are_the_nodes() {
     let servant = Servant::start().await;
     let _alive = servant.register().await;
