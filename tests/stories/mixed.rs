@@ -256,11 +256,13 @@ pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -
     // The map was latched before the node of the other ROS existed: without it no scan is answered.
     robot.expect_localised((2, 4), &stub)?;
     let (over, back) = ("the local original answers, too why=LinkDown", "the cloud answers alone why=LinkUp");
-    let before = stub.output().matches(over).count();
+    let count = |words| stub.output().matches(words).count();
+    let taken_over = count(over);
     cable.degrade(SILENT)?;
-    wait_for_log(&stub, over, before + 1)?;
+    wait_for_log(&stub, over, taken_over + 1)?;
     robot.expect_localised((6, 2), &stub)?;
+    let taken_back = count(back);
     cable.restore()?;
-    wait_for_log(&stub, back, before + 1)?;
+    wait_for_log(&stub, back, taken_back + 1)?;
     robot.expect_localised((1, 1), &stub)
 }
