@@ -57,6 +57,7 @@ mod manifest;
 mod merge;
 mod modes;
 mod packaged;
+mod packings;
 mod plan;
 mod prebuilt;
 pub mod probe;
