@@ -14,8 +14,8 @@ use crate::pairing::Pairings;
 use crate::rules::TranslationRules;
 use crate::translator::MessageTranslator;
 
-/// Maximum number of types of each kind whose twins are kept, and what these may take in bytes: robots and nodes announce
-/// any number of definitions, of any size.
+/// Maximum number of types of each kind whose twins are kept, and what these may take in bytes: robots and nodes
+/// announce any number of definitions, of any size.
 const MAX_KEPT: usize = 1024;
 pub(crate) const MAX_KEPT_BYTES: usize = 16 << 20;
 
