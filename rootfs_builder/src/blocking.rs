@@ -3,7 +3,8 @@
 //! Dropping the future of a build ends its containers, but not the threads that pack, hash and extract for it: those
 //! would continue for minutes and delay the daemon's shutdown. So such work is started here, under the build's
 //! [`foreign::cancel::Cancel`], which its loops check. Layers that are complete but for their archives are the
-//! exception: they outlive a cancelled build, for the next one to go on from, and end with the daemon.
+//! exception: they outlive a cancelled build, for the next one to go on from, and end with the daemon
+//! or when the disk is full.
 
 use std::future::Future;
 
@@ -28,13 +29,13 @@ pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Jo
 }
 
 /// Runs `work` on a blocking thread, also after the [`cancellable`] future that calls this was dropped: until it is
-/// done or `ending` is cancelled.
+/// done or `given_up` is cancelled.
 pub(crate) fn spawn_until<T: Send + 'static>(
-    ending: Cancel,
+    given_up: Cancel,
     work: impl FnOnce() -> T + Send + 'static,
 ) -> JoinHandle<T> {
     let span = Span::current();
-    tokio::task::spawn_blocking(move || span.in_scope(|| ending.run(work)))
+    tokio::task::spawn_blocking(move || span.in_scope(|| given_up.run(work)))
 }
 
 /// Runs `work`, which reads untrusted data, on a blocking thread with no other privileges than reading all files.

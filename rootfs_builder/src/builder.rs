@@ -134,13 +134,19 @@ impl Builder {
 
     /// Gives up the packing that cancelled builds have left, since the daemon ends.
     pub fn stop_packing(&self) {
-        self.layers.ending().cancel();
+        self.layers.packings().give_up_all();
+    }
+
+    /// Gives up the packing that a cancelled build has left, since there is no room for it.
+    pub fn give_up_packing(&self, id: &str) {
+        self.layers.packings().give_up(id);
     }
 
     /// Waits until the containers of a build have ended, its complete layers are in the cache, and its directory is
     /// removed.
     pub async fn wait_removed(&self, id: &str) {
         self.removals.wait(id).await;
+        self.layers.packings().forget(id);
     }
 
     async fn make(

@@ -6,12 +6,12 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use foreign::cancel::Cancel;
 use image::{LayerInfo, Store};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, IoContext};
+use crate::packings::Packings;
 use crate::unused;
 
 /// Returns the key of the note with the layers to keep for a base.
@@ -25,7 +25,7 @@ pub(crate) struct LayerCache {
     directory: PathBuf,
     notes: PathBuf,
     store: Arc<Store>,
-    ending: Cancel,
+    packings: Packings,
 }
 
 /// A cached layer.
@@ -43,12 +43,12 @@ impl LayerCache {
         for path in [&directory, &notes] {
             fs::create_dir_all(path).io_context("making", path)?;
         }
-        Ok(Self { directory, notes, store, ending: Cancel::default() })
+        Ok(Self { directory, notes, store, packings: Packings::default() })
     }
 
-    /// Returns the flag that is cancelled when the daemon ends, and with it the packing of layers.
-    pub(crate) fn ending(&self) -> &Cancel {
-        &self.ending
+    /// Returns what packs layers, and can be given up.
+    pub(crate) fn packings(&self) -> &Packings {
+        &self.packings
     }
 
     pub(crate) fn store(&self) -> &Arc<Store> {

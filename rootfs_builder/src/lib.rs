@@ -58,6 +58,7 @@ mod merge;
 mod modes;
 mod needs;
 mod packaged;
+mod packings;
 mod plan;
 mod prebuilt;
 pub mod probe;

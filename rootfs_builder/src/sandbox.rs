@@ -93,6 +93,11 @@ impl BuildSite {
         Ok(Self { id: id.to_owned(), directory, sandbox, limits, removals, running: Arc::default() })
     }
 
+    /// Returns the id of the build.
+    pub(crate) fn id(&self) -> &str {
+        &self.id
+    }
+
     /// Creates a new directory of this build, even if others are called `name`.
     pub(crate) fn fresh_directory(&self, name: &str) -> Result<PathBuf, Error> {
         let mut number = 1;

@@ -93,7 +93,7 @@ impl BuildContext {
             Ok(foreign::remove(&packing.directory)?)
         };
         // Before anything is awaited, since the build may be cancelled at any await.
-        let archive = crate::blocking::spawn_until(self.layers.ending().clone(), work);
+        let archive = crate::blocking::spawn_until(self.layers.packings().begin(self.site.id()), work);
         self.packing.lock().unwrap_or_else(PoisonError::into_inner).push(archive);
         match staged.await {
             Ok(diff_id) => Ok(diff_id),

@@ -179,7 +179,16 @@ impl Pusher {
         // The builder first: it removes its files when its containers have ended.
         report.building.close();
         report.building.wait().await;
-        self.builder.wait_removed(id).await;
+        let mut removed = std::pin::pin!(self.builder.wait_removed(id));
+        tokio::select! {
+            biased;
+            () = &mut removed => {}
+            // What the push has left to be packed must not take what others need.
+            _ = self.disks.wait_until_low() => {
+                self.builder.give_up_packing(id);
+                removed.await;
+            }
+        }
         let build = self.home.join("build").join(id);
         let removed = privilege::spawn_blocking(move || foreign::remove(&build)).await;
         if let Ok(Err(error)) = removed {

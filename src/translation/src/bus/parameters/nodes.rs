@@ -27,8 +27,7 @@ use super::reconfigure::{Config, ReconfigureRefusal, ReconfigureServer};
 use super::values::{ParameterRefusal, Tree, check_for_ros1, value_at};
 use events::MasterWatch;
 
-/// Maximum size of the values or descriptions of one answer, in bytes: a request may name one parameter a million
-/// times.
+/// Maximum size of the values or descriptions of one answer, in bytes: a request may name a parameter a million times.
 const MAX_ANSWER: usize = 64 << 20;
 /// Bytes counted for each parameter of an answer beside its texts.
 const EACH: usize = 64;
