@@ -674,7 +674,7 @@ export type PushEvent =
   | { done: number; total?: number; type: 'progress'; unit: string }
   | { message: string; type: 'warning' }
   | { layers: Layer[]; service: ServiceDetail; took: number; type: 'done'; unchanged?: boolean }
-  | { layers: Layer[]; took: number; type: 'underlay'; underlay: Underlay; unchanged?: boolean }
+  | { layers: Layer[]; took: number; type: 'underlay'; unchanged?: boolean; underlay: Underlay }
   | { problem: Problem; type: 'error' };
 
 export interface PushOptions {
@@ -1161,7 +1161,7 @@ export interface Underlay {
   distribution: string;
   name: string;
   packages: string[];
-  published: Millis;
+  published: u64;
   revision: number;
   ros: number;
   services: StandingService[];
@@ -1218,3 +1218,5 @@ export interface Whoami {
   roles: string[];
   services: string[];
 }
+
+export type u64 = number;
