@@ -66,9 +66,8 @@ pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
     let ros = made_of.ros();
     let variable = |name: &str| std::env::var(name).ok();
     // Before anything joins the wrong network, where nobody would see it.
-    if let Some(found) = RosSetup::read(&variable)
-        && let Err(error) = found.check(ros)
-    {
+    let checked = RosSetup::read(&variable).map_or(Ok(()), |found| found.check(ros));
+    if let Err(error) = checked {
         bail!("{error}; {}", setup::advice(ros, &config.service));
     }
     let executable = &asked.node.node;

@@ -169,7 +169,8 @@ async fn a_robot_of_ros_1_hears_a_node_of_ros_2_and_is_heard() {
     let map = bus.advertise("/map", of, qos.latching(true)).await.expect("a publisher");
     map.publish(say(RosVersion::One, "walls"));
     let late = node.subscribe("/map", string(RosVersion::Two), qos.latching(true)).await;
-    let message = next(&mut late.expect("a subscription")).await;
+    let mut late = late.expect("a subscription");
+    let message = next(&mut late).await;
     assert_eq!(message.bytes, say(RosVersion::Two, "walls"));
     wait_matched(map.matched_subscribers(), "/see").await;
 }
