@@ -71,6 +71,11 @@ impl Base {
         serde_json::to_string(&parts).unwrap_or_default()
     }
 
+    /// Returns the diff-ids of the layers that the base was made from; none if it was built.
+    pub(crate) fn layers_of_image(&self) -> &[Digest] {
+        self.image.as_ref().map_or(&[], |image| &image.layers)
+    }
+
     /// Returns the properties that affect compiled packages.
     pub(crate) fn build_key(&self) -> String {
         serde_json::to_string(&(&self.build, &self.environment)).unwrap_or_default()

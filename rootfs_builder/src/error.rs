@@ -292,11 +292,18 @@ pub enum Error {
         /// Base of the push.
         wanted: String,
     },
+    /// The image that the base was made from has been replaced since the underlay was compiled.
+    #[error("underlay {underlay} was compiled on another image of base {base}; push the underlay again")]
+    UnderlayImage {
+        /// Name of the underlay.
+        underlay: String,
+        /// Its base.
+        base: String,
+    },
     /// A package is in two underlays.
     #[error(
         "package {package} is in underlay {first} and, differently, in {second}; stand on one of them, or push \
-        {second} \
-            again --on {first} and without {package}"
+            {second} again --on {first} and without {package}"
     )]
     UnderlayConflict {
         /// Name of the package.

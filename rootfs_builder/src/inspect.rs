@@ -17,7 +17,7 @@ use crate::pushed::{self, InspectedTree};
 use crate::request::{PushRequest, PushSource};
 use crate::underlay::Foundation;
 use crate::workshop::PushLabel;
-use crate::{blocking, choice, keys, launch};
+use crate::{blocking, choice, keys, launch, source};
 
 /// Maximum number of mistakes in build files that are named.
 const MOST_PROBLEMS: usize = 20;
@@ -121,6 +121,9 @@ impl Builder {
             let base = &inspected.base;
             match &inspected.content {
                 PushContent::Tree(pushed) => {
+                    if let PushedDirectory::Source(workspace) = pushed {
+                        source::check_tools(base, &archive, workspace)?;
+                    }
                     let there = indexed::read_known(&layers, base, &archive);
                     check_dependencies((&archive, base), &asked, pushed, (there, &inspected.foundation))?;
                 }

@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_mapped_but_to_packages_of_the_archive() {
+    fn nothing_is_mapped_but_to_known_packages() {
         let lab = new_fixture();
         let map = |debs: &str| BTreeMap::from([("frob".to_owned(), debs.to_owned())]);
         let mapped = |debs: &str| mapped_packages(&lab.archive, &lab.base, &map(debs));

@@ -15,7 +15,8 @@ use image::Digest;
 use package::workspace::Workspace;
 use ros::flavour::Version;
 
-use crate::base::ImportedImage;
+use crate::archive::Archive;
+use crate::base::{Base, ImportedImage};
 use crate::build::{Build, BuildParts};
 use crate::cache::keep_note_key;
 use crate::error::Error;
@@ -57,6 +58,32 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Bui
     Ok(BuildParts { packages, versions, dependencies, package: compiled.package, prefix, contents })
 }
 
+/// Returns whether the packages are installed as they are, with what the image of the base has.
+fn is_installed_without_tools(base: &Base, workspace: &Workspace) -> bool {
+    let is_python = workspace.packages.iter().all(|package| package.manifest.build_type == "ament_python");
+    is_python && base.image.as_ref().is_some_and(|image| image.installs_python)
+}
+
+fn no_tools(base: &Base, image: &ImportedImage, words: String) -> Error {
+    Error::NoTools { base: base.name.clone(), missing: image.missing_tools.join(", "), words }
+}
+
+/// Fails if the packages are to be compiled on a base from an image that lacks tools, and the archive has them not
+/// either: without it, what the packages depend on is not known.
+pub(crate) fn check_tools(base: &Base, archive: &Archive, workspace: &Workspace) -> Result<(), Error> {
+    let Some(image) = base.image.as_ref().filter(|_| !is_installed_without_tools(base, workspace)) else {
+        return Ok(());
+    };
+    let tools = &base.build.packages;
+    if tools.is_empty() {
+        return Err(no_tools(base, image, "it has no dpkg".to_owned()));
+    }
+    match tools.iter().find(|tool| !archive.candidates.contains(*tool)) {
+        Some(tool) => Err(no_tools(base, image, format!("the archive has no {tool}"))),
+        None => Ok(()),
+    }
+}
+
 /// Returns the layers of base and toolchain.
 async fn toolchain(build: &Build<'_>, workspace: &Workspace) -> Result<Vec<Digest>, Error> {
     if let Some(tools) = &build.tools {
@@ -64,22 +91,13 @@ async fn toolchain(build: &Build<'_>, workspace: &Workspace) -> Result<Vec<Diges
     }
     let mut below = build.base_diff_ids();
     let image = build.base.image.as_ref();
-    let is_python = workspace.packages.iter().all(|package| package.manifest.build_type == "ament_python");
-    if is_python && image.is_some_and(|image| image.installs_python) {
+    if is_installed_without_tools(&build.base, workspace) {
         return Ok(below);
-    }
-    let no_tools = |image: &ImportedImage, words: String| Error::NoTools {
-        base: build.base.name.clone(),
-        missing: image.missing_tools.join(", "),
-        words,
-    };
-    if let Some(image) = image.filter(|_| build.base.build.packages.is_empty()) {
-        return Err(no_tools(image, "it has no dpkg".to_owned()));
     }
     let toolchain = build.base.build.packages.iter().cloned().collect();
     let toolchain = match (build.add_packages("toolchain", &below, &toolchain, Vec::new()).await, image) {
         (Err(error @ (Error::Unsolvable { .. } | Error::Download { .. })), Some(image)) => {
-            return Err(no_tools(image, error.to_string()));
+            return Err(no_tools(&build.base, image, error.to_string()));
         }
         (made, _) => made?,
     };

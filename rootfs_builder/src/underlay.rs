@@ -35,6 +35,9 @@ pub struct UnderlayLayer {
 pub struct UnderlayContents {
     /// Name of its base.
     pub base: String,
+    /// Diff-ids of the base's layers if it was made from an image, which another import may replace.
+    #[serde(default)]
+    pub(crate) image: Vec<Digest>,
     /// Its ROS packages and those of the underlays below it, each with its layer in images.
     pub packages: BTreeMap<String, Digest>,
     /// Install spaces of the underlays below it and its own, lowest first.
@@ -71,7 +74,7 @@ impl Foundation {
     /// once.
     ///
     /// # Errors
-    /// One is on another base, or a package is in two of them that are not the same.
+    /// One is on another base or on another image of it, or a package is in two of them that are not the same.
     pub(crate) fn combine(underlays: &[NamedUnderlay], base: &Base) -> Result<Self, Error> {
         let mut whole = Self::default();
         for NamedUnderlay { name, contents } in underlays {
@@ -81,6 +84,9 @@ impl Foundation {
                     base: contents.base.clone(),
                     wanted: base.name.clone(),
                 });
+            }
+            if contents.image != base.layers_of_image() {
+                return Err(Error::UnderlayImage { underlay: name.clone(), base: base.name.clone() });
             }
             let all = &mut whole.contents;
             for (package, layer) in &contents.packages {
@@ -160,6 +166,7 @@ impl Foundation {
     ) -> UnderlayContents {
         let mut contents = self.contents.clone();
         contents.base.clone_from(&base.name);
+        contents.image = base.layers_of_image().to_vec();
         contents.layers.push(layer);
         for package in packages {
             contents.packages.insert(package.manifest.name.clone(), layer.run);
@@ -219,11 +226,17 @@ mod tests {
         let refused = Foundation::combine(&[maps.clone(), arms], &base()).expect_err("two").to_string();
         assert!(refused.contains("grid") && refused.contains("maps") && refused.contains("arms"), "{refused}");
         let other = NamedUnderlay {
-            contents: UnderlayContents { base: "noble-jazzy".to_owned(), ..maps.contents.clone() },
+            contents: UnderlayContents { base: "lab-jazzy".to_owned(), ..maps.contents.clone() },
             ..maps.clone()
         };
         let refused = Foundation::combine(&[other], &base()).expect_err("another base").to_string();
-        assert!(refused.contains("--base noble-jazzy"), "{refused}");
+        assert!(refused.contains("--base lab-jazzy"), "{refused}");
+        let replaced = NamedUnderlay {
+            contents: UnderlayContents { image: vec![digest(9)], ..maps.contents.clone() },
+            ..maps.clone()
+        };
+        let refused = Foundation::combine(&[replaced], &base()).expect_err("another image").to_string();
+        assert!(refused.contains("push the underlay again"), "{refused}");
         let maps = Foundation::combine(&[maps], &base()).expect("it fits");
         let place = tempfile::tempdir().expect("a directory");
         let text = "<package><name>grid</name><version>1.0.0</version></package>";

@@ -29,14 +29,19 @@ const PAUSE: Duration = Duration::from_millis(50);
 /// Type of the square.
 const SQUARE: &str = "geometry_msgs/msg/PolygonStamped";
 
+/// Returns a message of the square.
+fn square(header: &Value) -> Value {
+    let points = [[0.0, 0.0], [1.5, 0.0], [1.5, 1.5], [0.0, 1.5]];
+    let points = points.map(|[x, y]| json!({"x": x, "y": y, "z": 0.0}));
+    json!({"header": header, "polygon": {"points": points}})
+}
+
 /// Runs `does` while the robot publishes its name and a square periodically.
 fn run_while_publishing(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict {
     for (topic, of) in [("/name", "std_msgs/msg/String"), ("/square", SQUARE)] {
         robot.send(json!({"op": "advertise", "topic": topic, "type": of}))?;
     }
-    let points = [[0.0, 0.0], [1.5, 0.0], [1.5, 1.5], [0.0, 1.5]];
-    let points = points.map(|[x, y]| json!({"x": x, "y": y, "z": 0.0}));
-    let square = json!({"header": {"frame_id": "floor"}, "polygon": {"points": points}});
+    let square = square(&json!({"frame_id": "floor"}));
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         let crying = scope.spawn(|| {
@@ -75,7 +80,7 @@ fn expect_seq_dropped(robot: &mut Robot) -> Verdict {
     robot.send(json!({"op": "advertise", "topic": "/square", "type": SQUARE}))?;
     robot.subscribe("/square")?;
     let header = json!({"seq": 7, "stamp": {"secs": 5, "nsecs": 6}, "frame_id": "floor"});
-    let square = json!({"op": "publish", "topic": "/square", "msg": {"header": header, "polygon": {"points": []}}});
+    let square = json!({"op": "publish", "topic": "/square", "msg": square(&header)});
     let is_square = |told: &Value| told["op"] == "publish" && told["topic"] == "/square";
     for _ in 0..2 {
         let heard = robot.send_until(&square, "the square", is_square)?;

@@ -50,6 +50,7 @@ const NOT_DONE: &[(&str, &str)] = &[
     ("importBase", "no base is sent"),
     ("makeBase", "no image is sent"),
     ("removeBase", "no base was imported"),
+    ("removeUnderlay", "no underlay was pushed"),
 ];
 
 /// Number of responses by operation and status.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock
-//! servants/<id>/  ended/<id>/  build/<push>/  logs/  recordings/
+//! servants/<id>/  ended/<id>/  build/<push>/  logs/  recordings/  definitions/  bases/
 //! ```
 //!
 //! No other user can enter it (docs/adr/033).
@@ -110,6 +110,7 @@ impl Home {
         let nothing = |_: &Path| false;
         closed("images", 3, &nothing)?;
         closed("definitions", 1, &nothing)?;
+        closed("bases", 1, &nothing)?;
         closed("logs", 1, &nothing)?;
         closed("ended", 2, &nothing)?;
         closed("run", 1, &nothing)?;
@@ -200,8 +201,21 @@ pub fn sweep_builds(half_made: &[PathBuf]) {
 }
 
 /// Directories that a daemon, or a new file system, makes in a home.
-const DIRECTORIES: [&str; 11] =
-    ["images", "layers", "run", "servants", "ended", "build", "logs", "tls", "definitions", "cache", "lost+found"];
+const DIRECTORIES: [&str; 13] = [
+    "images",
+    "layers",
+    "run",
+    "servants",
+    "ended",
+    "build",
+    "logs",
+    "tls",
+    "definitions",
+    "bases",
+    "recordings",
+    "cache",
+    "lost+found",
+];
 
 /// Returns whether a directory is used by a daemon only: it belongs to this user and contains no other directories.
 fn is_exclusive(path: &Path) -> std::io::Result<bool> {
