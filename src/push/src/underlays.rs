@@ -135,10 +135,11 @@ impl Pusher {
     /// [`Error::UnknownUnderlay`], [`Error::NotAllowed`], and [`Error::UnderlayInUse`].
     pub async fn remove_underlay(&self, name: &str, by: &Deployer) -> Result<api::Underlay, Error> {
         let _turn = self.places.lock_service(&lock_name(name)).await;
+        // First, so that names beyond the caller's scope are not told apart.
+        self.check_may_publish_underlay(name, by)?;
         let Some((record, _)) = self.find_underlays(&[name.to_owned()], by)?.pop() else {
             return Err(Error::Internal("removing an underlay"));
         };
-        self.check_may_publish_underlay(name, by)?;
         let standing = self.catalogue.services_on_underlays()?.remove(name).unwrap_or_default();
         if let Some(services) = name_services(&standing, by) {
             return Err(Error::UnderlayInUse { name: name.to_owned(), services });
