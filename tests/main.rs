@@ -372,13 +372,13 @@ fn main() -> ExitCode {
             rosrun_gives_the_node_the_name_that_the_original_has,
             a_launch_file_says_what_is_promised,
         ],
+        stories![mixed: the_robots_own_original_answers_while_the_cable_is_cut],
         of_both![mixed:
             stamps_transforms_and_calls_cross,
             an_action_is_carried_out_in_the_other_ros,
             a_node_calls_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
             parameters_of_the_node_are_the_robots,
-            the_robots_own_original_answers_while_the_cable_is_cut,
         ],
         of_both![crossing:
             stamps_mean_the_same_where_clocks_differ,
@@ -431,7 +431,6 @@ fn main() -> ExitCode {
             an_application_of_rclpy_asks_the_cloud,
             a_node_lives_on_when_the_daemon_starts_again,
             pictures_are_made_smaller_where_the_link_is_slow,
-            a_robot_of_the_other_ros_is_refused_by_name,
         ],
         stories![lifecycle: nodes_of_a_servant_become_active_and_share_their_memory],
         stories![robot_network:

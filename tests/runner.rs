@@ -208,8 +208,8 @@ fn run_once(story: &RunnableStory, attempt: usize) -> StoryOutcome {
             eprintln!("nothing is kept of {}: {error}", story.name);
         }
         // A killed daemon leaves servants behind, and the second run should not find anything of the first.
-        for place in telling.homes().iter().chain(&telling.directories()) {
-            if let Err(error) = claim::end_users(place) {
+        for home in telling.homes() {
+            if let Err(error) = claim::end_users(&home) {
                 eprintln!("{}: {error:#}", story.name);
             }
         }

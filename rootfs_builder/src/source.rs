@@ -78,7 +78,7 @@ pub(crate) fn check_tools(base: &Base, archive: &Archive, workspace: &Workspace)
     if tools.is_empty() {
         return Err(no_tools(base, image, "it has no dpkg".to_owned()));
     }
-    match tools.iter().find(|tool| !archive.candidates.contains(*tool)) {
+    match tools.iter().find(|tool| !archive.candidates.contains(tool)) {
         Some(tool) => Err(no_tools(base, image, format!("the archive has no {tool}"))),
         None => Ok(()),
     }

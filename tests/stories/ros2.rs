@@ -22,7 +22,7 @@ use support::layout::MessageLayout;
 use support::patience::{Deadline, scale, tell_patience, wait_for};
 use support::people::{self, PeopleCamera};
 use support::site::{NodeProcess, Site, string_in};
-use support::world::{ADDER, HERALD, SEER, world};
+use support::world::{HERALD, SEER, world};
 use support::{Verdict, binaries};
 use tokio::sync::Notify;
 
@@ -496,26 +496,6 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             ensure!(people::number(&found) == Some(number), "{found:?}");
             carried.push(cable.transferred_bytes()?.0 - before);
         }
-    }
-    Ok(())
-}
-
-pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
-    let daemon = world().daemon_with(HERALD)?;
-    world().daemon_with(ADDER)?;
-    for (ros, (service, package, executable), words) in [
-        (RosVersion::One, THE_HERALD, ["herald", "ROS 2"]),
-        (RosVersion::Two, ("adder_py", "adder_py", "adder.py"), ["adder_py", "ROS 1"]),
-    ] {
-        let site = Site::with_ros(ros)?;
-        let toml = format!(
-            "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"ros2-other\"\nlocal = \"none\"\n",
-            daemon.address
-        );
-        let mut stub = site.start_stub_with_config(&toml, package, executable, &[])?;
-        let status = stub.wait_for_exit()?;
-        let said = stub.output();
-        ensure!(status.code() == Some(1) && words.iter().all(|word| said.contains(word)), "{status}\n{said}");
     }
     Ok(())
 }

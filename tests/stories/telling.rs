@@ -7,8 +7,8 @@ use std::process::{Child, Command, Stdio};
 use anyhow::{Context, ensure};
 use support::Verdict;
 use support::deployer::{CommandOutcome, path_str, run};
-use support::leftovers;
 use support::world::{Directory, PREFIX, world};
+use support::{claim, leftovers};
 
 use crate::rehearsal;
 
@@ -120,9 +120,11 @@ pub fn what_the_machine_lacks_is_said_in_a_line() -> Verdict {
     Ok(())
 }
 
-/// A rehearsal run in progress.
+/// A rehearsal run in progress. When it is dropped, what it has started ends with it.
 struct RehearsalRun {
     child: Child,
+    /// Parent of the run's directory.
+    place: PathBuf,
     /// The network namespace that it uses.
     network: PathBuf,
 }
@@ -131,6 +133,7 @@ impl RehearsalRun {
     fn start_with_servant(place: &Directory) -> anyhow::Result<RehearsalRun> {
         let mut run = RehearsalRun {
             child: rehearse_command(place, &["waits"])?.stdout(Stdio::piped()).spawn()?,
+            place: place.path().to_owned(),
             network: PathBuf::new(),
         };
         let lines = BufReader::new(run.child.stdout.take().context("piped")?).lines();
@@ -156,6 +159,9 @@ impl RehearsalRun {
 impl Drop for RehearsalRun {
     fn drop(&mut self) {
         let _ = self.kill();
+        for left in run_directories(&self.place).unwrap_or_default() {
+            let _ = claim::end_users(&left);
+        }
     }
 }
 
