@@ -98,6 +98,10 @@ pub fn a_node_is_compiled_and_runs_upon_a_compiled_workspace() -> Verdict {
     let (library, speaker) = (place.path().join("lab_ws"), place.path().join("lab_speaker"));
     write_library(&library, "hello")?;
     write_speaker(&speaker)?;
+    // What an earlier run has compiled is not compiled again.
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.as_nanos();
+    let mut cmake = std::fs::OpenOptions::new().append(true).open(speaker.join("CMakeLists.txt"))?;
+    std::io::Write::write_all(&mut cmake, format!("# written at {now}\n").as_bytes())?;
     let on_words = ["push", path_str(&speaker), "--node", "speaker", "--on", "words"];
     deployer.run(&on_words)?.expect_failure(&["there is no underlay \"words\"", "--as-underlay"])?;
     let publish = ["push", path_str(&library), "--as-underlay", "words"];

@@ -229,7 +229,9 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(ros: Ro
     // Goals are separate: each robot gets feedback for its own only.
     for robot in [&plain, &front] {
         let mut feedback = robot.subscribe_to_feedback()?;
-        let mut goals = [&plain, &front].map(|robot| robot.send_count_goal("mine", 5));
+        // An action server ignores the id of a goal that has just ended.
+        let id = format!("mine of {}", robot.name);
+        let mut goals = [&plain, &front].map(|robot| robot.send_count_goal(&id, 5));
         for (robot, goal) in [&plain, &front].into_iter().zip(&mut goals) {
             let goal = goal.as_mut().map_err(|error| anyhow::anyhow!("{error:#}"))?;
             let end = robot.wait_for_end(goal)?;
