@@ -372,13 +372,13 @@ fn main() -> ExitCode {
             rosrun_gives_the_node_the_name_that_the_original_has,
             a_launch_file_says_what_is_promised,
         ],
-        stories![mixed: the_robots_own_original_answers_while_the_cable_is_cut],
         of_both![mixed:
             stamps_transforms_and_calls_cross,
             an_action_is_carried_out_in_the_other_ros,
             a_node_calls_a_robot_of_the_other_ros,
             simulated_time_is_the_robots,
             parameters_of_the_node_are_the_robots,
+            the_robots_own_original_answers_while_the_cable_is_cut,
         ],
         of_both![crossing:
             stamps_mean_the_same_where_clocks_differ,

@@ -234,8 +234,7 @@ pub fn parameters_of_the_node_are_the_robots(ros: RosVersion) -> Verdict {
     wait_for_label(&site, &app, &stub, "rear")
 }
 
-pub fn the_robots_own_original_answers_while_the_cable_is_cut() -> Verdict {
-    let ros = RosVersion::One;
+pub fn the_robots_own_original_answers_while_the_cable_is_cut(ros: RosVersion) -> Verdict {
     let (own, cloud) = (localiser(ros), localiser(ros.other()));
     // The original comes from an image of the robot's ROS.
     world().daemon_with(own.service)?;

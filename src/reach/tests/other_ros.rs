@@ -215,6 +215,7 @@ async fn topics_and_calls_cross(version: RosVersion) {
     assert_eq!((&output.type_name, output.md5.as_str()), (&wanted.name, wanted.digest.as_str()));
     let told = graph.inputs.iter().find(|input| input.topic == "/image").expect("an input");
     assert_eq!((&told.type_name, told.md5.as_str()), (&wanted.name, wanted.digest.as_str()));
+    assert!(told.qos.is_none(), "with a request for latched messages an original is given no others: {told:?}");
     let definition = robot.definition(&wanted.name, wanted.digest.as_str()).expect("told");
     assert_eq!(definition.trim_end(), wanted.definition);
     if ours == RosVersion::Two {

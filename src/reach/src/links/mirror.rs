@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros::bus::{Digest, ServiceType, TypeInquiries, WireType};
+use ros::bus::{Digest, RosVersion, ServiceType, TypeInquiries, WireType};
 use translation::bus::LeftOut;
 
 use super::seen::{self, DeclaredType, NodeEndpointSet};
@@ -96,7 +96,9 @@ impl MirrorState {
                 type_name,
                 md5,
                 feed: hub.feeder(topic).as_deref() == Some(&link.node),
-                qos: declared.qos(),
+                // A node of ROS 1 requests nothing: it takes what is latched and what is not. The graph of robots of
+                // ROS 2 has no such subscribers.
+                qos: declared.qos().filter(|_| hub.bus.version() == RosVersion::Two),
             });
         }
         for (service, of) in &seen.services {
